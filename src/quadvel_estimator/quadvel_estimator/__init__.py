@@ -1,0 +1,1 @@
+"""Linear velocity of the trunk from IMU, joint encoders and the previous joint targets."""

@@ -1,0 +1,83 @@
+"""What the learned velocity estimator sees, and how its network file describes that: one code for training and run time.
+
+Nothing here needs torch, onnxruntime or ROS. Body frame x forward, y left, z up; joint order FR, FL, RR, RL.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from quadvel_description.kinematics import rotate_inverse
+from quadvel_description.network_input import InputLayout, InputTerm
+from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.state import RobotState
+
+STANDARD_GRAVITY = 9.81  # m/s^2, only the unit in which the network reads the accelerometer
+RATE_HZ = 200
+METADATA_KEY = "quadvel"
+KIND = "velocity_estimator"
+NETWORK_INPUTS = ("obs", "h_in", "c_in")
+NETWORK_OUTPUTS = ("velocity", "log_variance", "h_out", "c_out")
+
+# Clips lie beyond anything that walking shows; they only keep a shock from throwing the memory far off.
+DEFAULT_LAYOUT = InputLayout(
+    [
+        InputTerm("q", 12, offset=NOMINAL_Q, clip=4.0),  # rad
+        InputTerm("dq", 12, scale=0.1, clip=4.0),  # rad/s
+        InputTerm("angular_velocity", 3, scale=0.5, clip=5.0),  # rad/s, body frame
+        InputTerm("linear_acceleration", 3, scale=1.0 / STANDARD_GRAVITY, clip=5.0),  # m/s^2, body frame, with gravity
+        InputTerm("gravity", 3),  # unit vector pointing down, body frame
+        InputTerm("previous_action", 12, clip=4.0),  # rad, joint targets minus NOMINAL_Q
+    ]
+)
+KNOWN_INPUTS = {term.name: term.size for term in DEFAULT_LAYOUT.terms}
+
+
+def build(
+    state: RobotState, previous_action: ArrayLike, layout: InputLayout = DEFAULT_LAYOUT
+) -> NDArray[np.float32]:
+    """The network input (..., 45) of a state whose arrays carry leading axes (...).
+
+    `previous_action` (..., 12) is the joint targets in force when the state was taken, minus `NOMINAL_Q`, in rad: what
+    was commanded in answer to the state before this one.
+    """
+    quaternion = np.asarray(state.quaternion)
+    down = np.broadcast_to((0.0, 0.0, -1.0), (*quaternion.shape[:-1], 3))
+    return layout.build(
+        {
+            "q": state.q,
+            "dq": state.dq,
+            "angular_velocity": state.angular_velocity,
+            "linear_acceleration": state.linear_acceleration,
+            "gravity": rotate_inverse(quaternion, down),
+            "previous_action": previous_action,
+        }
+    )
+
+
+def metadata(
+    state_shape: tuple[int, int, int],
+    recipe: Any,
+    commit: str,
+    output_scale: float = 1.0,
+    layout: InputLayout = DEFAULT_LAYOUT,
+) -> dict[str, Any]:
+    """The JSON object that an estimator's ONNX file carries under the key `METADATA_KEY`.
+
+    `state_shape` is the shape of `h_in` and of `c_in` (layers, 1, hidden); `output_scale` multiplies the network's
+    `velocity` into m/s, and its square the exponential of `log_variance` into (m/s)^2.
+    """
+    return {
+        "schema": 1,
+        "kind": KIND,
+        "joint_names": list(JOINT_NAMES),
+        "nominal_q": [float(q) for q in NOMINAL_Q],
+        "rate_hz": RATE_HZ,
+        "inputs": layout.to_metadata(),
+        "output_scale": output_scale,
+        "state_shape": list(state_shape),
+        "recipe": recipe,
+        "commit": commit,
+    }
