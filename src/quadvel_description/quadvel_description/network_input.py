@@ -53,7 +53,9 @@ class InputLayout:
         self.size = sum(term.size for term in self.terms)
 
         def spread(values: Iterable[Any]) -> NDArray[np.float64]:
-            return np.concatenate([np.broadcast_to(v, t.size) for t, v in zip(self.terms, values, strict=True)])
+            return np.concatenate(
+                [np.broadcast_to(v, t.size) for t, v in zip(self.terms, values, strict=True)]
+            )
 
         self._offset = spread(t.offset for t in self.terms)
         self._scale = spread(t.scale for t in self.terms)
@@ -88,7 +90,9 @@ class InputLayout:
                 raise ValueError(f"holds {entry!r}, expected the fields {', '.join(fields)}")
             if known.get(entry["name"]) != entry["size"]:
                 sizes = ", ".join(f"{name} ({size})" for name, size in known.items())
-                raise ValueError(f"holds {entry['name']!r} with size {entry['size']}, expected one of {sizes}")
+                raise ValueError(
+                    f"holds {entry['name']!r} with size {entry['size']}, expected one of {sizes}"
+                )
             try:
                 terms.append(InputTerm(**entry))
             except TypeError as error:

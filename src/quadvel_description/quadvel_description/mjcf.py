@@ -1,0 +1,153 @@
+"""The AlienGo as an MJCF of primitives, made from `robot`. Terrain beyond a plane is added by who simulates."""
+
+from __future__ import annotations
+
+import attrs
+import mujoco
+import numpy as np
+
+from . import robot
+from .robot import FOOT_RADIUS, FRONT, KINDS, LEFT, LEGS
+
+
+def _text(values: object) -> str:
+    return " ".join(repr(float(v)) for v in np.ravel(values))  # type: ignore[arg-type]
+
+
+@attrs.frozen(eq=False)
+class Plant:
+    """What may be varied of the robot in a simulation; defaults are the nominal AlienGo."""
+
+    timestep: float = 0.001  # s
+    armature: np.ndarray = attrs.field(factory=lambda: robot.ARMATURE)  # (12,) kg m^2
+    joint_friction: np.ndarray = attrs.field(factory=lambda: robot.FRICTION)  # (12,) N m
+    joint_damping: np.ndarray = attrs.field(factory=lambda: robot.DAMPING)  # (12,) N m s/rad
+    foot_friction: float = 0.8  # sliding friction coefficient of foot and ground
+    plane: bool = True  # add a flat ground; False where the caller brings a terrain
+    only_feet_and_trunk: bool = False  # leave the legs' own collision shapes out (training: faster)
+    sensors: bool = True  # IMU sensors at the IMU site
+    iterations: int = 20  # of the Newton solver
+    ls_iterations: int = 20
+
+
+def _leg(leg: str, plant: Plant) -> str:
+    sx, sy = FRONT[leg], LEFT[leg]
+    first = 3 * LEGS.index(leg)
+    shells = {
+        "hip": f'<geom class="shell" type="cylinder" size="0.046 0.0209" pos="0 {0.083 * sy!r} 0" euler="{np.pi / 2!r} 0 0"/>',
+        "thigh": '<geom class="shell" type="box" size="0.0215 0.0187 0.125" pos="0 0 -0.125"/>',
+        "calf": '<geom class="shell" type="box" size="0.008 0.0104 0.125" pos="0 0 -0.125"/>',
+    }
+    foot = (
+        f'<geom class="foot" name="{leg}_foot" pos="0 0 {-robot.CALF_LENGTH!r}"/>'
+        f'<site name="{leg}_foot" pos="0 0 {-robot.CALF_LENGTH!r}" size="{FOOT_RADIUS!r}"/>'
+    )
+    inner = foot
+    for k in reversed(range(3)):
+        kind = KINDS[k]
+        link = next(item for item in robot.LINKS if item.name == f"{leg}_{kind}")
+        inertial = robot.lumped(link.name)
+        i = first + k
+        axis = "1 0 0" if link.axis == "x" else "0 1 0"
+        shell = shells[kind].replace('class="shell"', 'class="visual"') if plant.only_feet_and_trunk else shells[kind]
+        inner = (
+            f'<body name="{link.name}" pos="{_text(link.origin)}">'
+            f'<inertial mass="{_text(inertial.mass)}" pos="{_text(inertial.com)}" fullinertia="{_text(inertial.full())}"/>'
+            f'<joint name="{leg}_{kind}_joint" axis="{axis}" range="{_text([robot.LOWER[i], robot.UPPER[i]])}"'
+            f' armature="{_text(plant.armature[i])}" frictionloss="{_text(plant.joint_friction[i])}"'
+            f' damping="{_text(plant.joint_damping[i])}"/>'
+            f"{shell}{inner}</body>"
+        )
+    return inner
+
+
+def _keyframe(name: str, height: float, q: np.ndarray) -> str:
+    return f'<key name="{name}" qpos="0 0 {height!r} 1 0 0 0 {_text(q)}"/>'
+
+
+def mjcf(plant: Plant | None = None) -> str:
+    """The model as MJCF text. Motors take joint torque (N m), in the order of `robot.JOINT_NAMES`."""
+    plant = plant or Plant()
+    trunk = robot.lumped("trunk")
+    ground = (
+        '<geom name="ground" type="plane" size="0 0 0.1" contype="1" conaffinity="0" material="ground"/>'
+        if plant.plane
+        else ""
+    )
+    sensors = """<sensor>
+    <accelerometer name="accelerometer" site="imu"/>
+    <gyro name="gyro" site="imu"/>
+    <framequat name="orientation" objtype="site" objname="imu"/>
+  </sensor>""" if plant.sensors else ""
+    motors = "\n    ".join(
+        f'<motor name="{name}" joint="{name}" ctrlrange="{-limit!r} {limit!r}"/>'
+        for name, limit in zip(robot.JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)
+    )
+    legs = "\n      ".join(_leg(leg, plant) for leg in LEGS)
+    return f"""<mujoco model="aliengo">
+  <compiler angle="radian" autolimits="true"/>
+  <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="pyramidal"
+          iterations="{plant.iterations}" ls_iterations="{plant.ls_iterations}" gravity="0 0 {-robot.GRAVITY!r}"/>
+  <default>
+    <geom contype="0" conaffinity="1" condim="3" solref="0.01 1" friction="{plant.foot_friction!r} 0.02 0.01"/>
+    <default class="visual"><geom contype="0" conaffinity="0" group="1" rgba="0.25 0.27 0.3 1"/></default>
+    <default class="shell"><geom friction="0.4 0.02 0.01" priority="1" rgba="0.25 0.27 0.3 1"/></default>
+    <default class="foot">
+      <geom type="sphere" size="{FOOT_RADIUS!r}" priority="1" rgba="0.9 0.45 0.1 1"/>
+    </default>
+  </default>
+  <asset>
+    <texture name="sky" type="skybox" builtin="gradient" rgb1="0.75 0.85 0.95" rgb2="0.3 0.4 0.55" width="64" height="64"/>
+    <texture name="ground" type="2d" builtin="checker" rgb1="0.42 0.46 0.44" rgb2="0.36 0.4 0.38" width="256" height="256"/>
+    <material name="ground" texture="ground" texrepeat="1 1" texuniform="true" reflectance="0.05"/>
+  </asset>
+  <visual>
+    <headlight diffuse="0.5 0.5 0.5" ambient="0.35 0.35 0.35"/>
+    <global offwidth="1280" offheight="720"/>
+  </visual>
+  <worldbody>
+    <light pos="0 0 4" dir="0.2 0.1 -1" type="directional" diffuse="0.6 0.6 0.6"/>
+    {ground}
+    <body name="trunk" pos="0 0 {robot.NOMINAL_HEIGHT!r}">
+      <freejoint name="root"/>
+      <inertial mass="{_text(trunk.mass)}" pos="{_text(trunk.com)}" fullinertia="{_text(trunk.full())}"/>
+      <geom name="trunk" class="shell" type="box" size="0.3235 0.075 0.056" rgba="0.8 0.82 0.85 1"/>
+      <site name="imu" pos="{_text(robot.IMU_POSITION)}" size="0.01"/>
+      {legs}
+    </body>
+  </worldbody>
+  <actuator>
+    {motors}
+  </actuator>
+  {sensors}
+  <keyframe>
+    {_keyframe("stand", robot.NOMINAL_HEIGHT, robot.NOMINAL_Q)}
+    {_keyframe("lie", robot.LIE_HEIGHT, robot.LIE_Q)}
+  </keyframe>
+</mujoco>
+"""
+
+
+def build_spec(plant: Plant | None = None) -> mujoco.MjSpec:
+    """The model as an editable specification."""
+    return mujoco.MjSpec.from_string(mjcf(plant))
+
+
+def load_model(plant: Plant | None = None) -> mujoco.MjModel:
+    """The compiled model."""
+    return mujoco.MjModel.from_xml_string(mjcf(plant))
+
+
+def gravity_torque(model: mujoco.MjModel) -> np.ndarray:
+    """Joint torque (12,) N m that holds NOMINAL_Q while the four feet carry the robot's weight equally."""
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
+    mujoco.mj_forward(model, data)
+    weight = float(model.body_subtreemass[1]) * robot.GRAVITY
+    torque = data.qfrc_bias[6:].copy()
+    jacobian = np.zeros((3, model.nv))
+    for leg in LEGS:
+        body = model.body(f"{leg}_calf").id
+        mujoco.mj_jac(model, data, jacobian, None, data.geom(f"{leg}_foot").xpos, body)
+        torque -= jacobian[:, 6:].T @ [0.0, 0.0, weight / 4]
+    return torque

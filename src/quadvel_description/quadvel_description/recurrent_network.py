@@ -1,0 +1,118 @@
+"""An ONNX network with an LSTM's memory and a description of itself, as the policy and the estimator files are.
+
+Loads the file, checks by name that it is what the caller expects, and runs it one step at a time on one thread. What the
+inputs and outputs mean is the caller's matter. Needs onnxruntime, nothing else.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnxruntime
+from numpy.typing import NDArray
+
+from .robot import JOINT_NAMES
+
+METADATA_KEY = "quadvel"
+SCHEMA = 1
+MEMORY_INPUTS = ("h_in", "c_in")
+MEMORY_OUTPUTS = ("h_out", "c_out")
+
+
+class NetworkFileError(ValueError):
+    """A network file that is missing, unreadable, or not what was asked for; the message is one sentence with its name."""
+
+
+class RecurrentNetwork:
+    """Inputs `obs` (1, n), `h_in`, `c_in`; outputs `outputs` (1, m each), `h_out`, `c_out`; all float32.
+
+    `fields` are the metadata fields that the caller needs besides `schema`, `joint_names` and `state_shape`, the shape of
+    both memories. Raises NetworkFileError.
+    """
+
+    def __init__(self, path: str | Path, outputs: Sequence[str], fields: Sequence[str] = ()) -> None:
+        self.path = Path(path)
+        self._session = self._open()
+        self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
+        self._require("metadata field schema", self.metadata["schema"], SCHEMA)
+        self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
+        self._outputs = tuple(outputs)
+        self._check_signature()
+        self._zero = np.zeros(self.metadata["state_shape"], np.float32)
+        self.reset()
+
+    @property
+    def input_size(self) -> int:
+        """The length of `obs`."""
+        return int(self._session.get_inputs()[0].shape[-1])
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._h = self._c = self._zero
+
+    def step(self, observation: NDArray[np.float32]) -> list[NDArray[np.float32]]:
+        """One time step: `obs` (n,) to the outputs, each (m,).
+
+        Raises FloatingPointError where an output is not finite; the memory then is of no use until `reset`.
+        """
+        feed = {"obs": observation[None], "h_in": self._h, "c_in": self._c}
+        *results, self._h, self._c = self._session.run(None, feed)
+        for name, result in zip(self._outputs, results, strict=True):
+            if not np.isfinite(result).all():
+                raise FloatingPointError(f"{self.path}: the network's output {name} is not finite")
+        return [result[0] for result in results]
+
+    def refuse(self, what: str, found: object, expected: object) -> NetworkFileError:
+        """The error for a file of which `what` is `found`, for the caller to raise."""
+        return NetworkFileError(f"{self.path}: {what} is {found!r}, expected {expected!r}")
+
+    def _require(self, what: str, found: object, expected: object) -> None:
+        if found != expected:
+            raise self.refuse(what, found, expected)
+
+    def _open(self) -> onnxruntime.InferenceSession:
+        if not self.path.is_file():
+            raise NetworkFileError(f"{self.path}: no such file, expected an ONNX network")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        options.inter_op_num_threads = 1
+        options.log_severity_level = 4  # what goes wrong is raised, not printed
+        try:
+            return onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # onnxruntime's exceptions share no other base
+            raise NetworkFileError(
+                f"{self.path}: is not an ONNX network that onnxruntime can read"
+            ) from error
+
+    def _read_metadata(self, fields: Sequence[str]) -> dict[str, Any]:
+        text = self._session.get_modelmeta().custom_metadata_map.get(METADATA_KEY)
+        if text is None:
+            raise NetworkFileError(
+                f"{self.path}: has no metadata under the key {METADATA_KEY!r}, expected a JSON object"
+            )
+        try:
+            metadata = json.loads(text)
+        except ValueError:
+            metadata = None
+        if not isinstance(metadata, dict):
+            raise NetworkFileError(
+                f"{self.path}: metadata {METADATA_KEY!r} is {text[:40]!r}, expected a JSON object"
+            )
+        missing = [field for field in fields if field not in metadata]
+        if missing:
+            raise NetworkFileError(f"{self.path}: metadata {METADATA_KEY!r} lacks {', '.join(missing)}")
+        return metadata
+
+    def _check_signature(self) -> None:
+        inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
+        self._require("list of inputs", [i.name for i in inputs], ["obs", *MEMORY_INPUTS])
+        self._require("list of outputs", [o.name for o in outputs], [*self._outputs, *MEMORY_OUTPUTS])
+        for memory in inputs[1:]:
+            self._require(f"shape of input {memory.name}", memory.shape, self.metadata["state_shape"])
+        shape = inputs[0].shape
+        if len(shape) != 2 or shape[0] != 1 or not isinstance(shape[1], int):
+            raise self.refuse("shape of input obs", shape, [1, "n"])
