@@ -11,15 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from quadvel_description.kinematics import rotate_inverse
 from quadvel_description.network_input import InputLayout, InputTerm
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
 from quadvel_description.state import RobotState
 
-STANDARD_GRAVITY = 9.81  # m/s^2, only the unit in which the network reads the accelerometer
 RATE_HZ = 200
-METADATA_KEY = "quadvel"
 KIND = "velocity_estimator"
-NETWORK_INPUTS = ("obs", "h_in", "c_in")
-NETWORK_OUTPUTS = ("velocity", "log_variance", "h_out", "c_out")
+OUTPUTS = ("velocity", "log_variance")  # and the memory that `recurrent_network` names
 
 # Clips lie beyond anything that walking shows; they only keep a shock from throwing the memory far off.
 DEFAULT_LAYOUT = InputLayout(
@@ -27,7 +24,7 @@ DEFAULT_LAYOUT = InputLayout(
         InputTerm("q", 12, offset=NOMINAL_Q, clip=4.0),  # rad
         InputTerm("dq", 12, scale=0.1, clip=4.0),  # rad/s
         InputTerm("angular_velocity", 3, scale=0.5, clip=5.0),  # rad/s, body frame
-        InputTerm("linear_acceleration", 3, scale=1.0 / STANDARD_GRAVITY, clip=5.0),  # m/s^2, body frame, with gravity
+        InputTerm("linear_acceleration", 3, scale=1.0 / GRAVITY, clip=5.0),  # m/s^2, body, with gravity
         InputTerm("gravity", 3),  # unit vector pointing down, body frame
         InputTerm("previous_action", 12, clip=4.0),  # rad, joint targets minus NOMINAL_Q
     ]
@@ -64,7 +61,7 @@ def metadata(
     output_scale: float = 1.0,
     layout: InputLayout = DEFAULT_LAYOUT,
 ) -> dict[str, Any]:
-    """The JSON object that an estimator's ONNX file carries under the key `METADATA_KEY`.
+    """The JSON object that an estimator's ONNX file carries, see `quadvel_description.recurrent_network`.
 
     `state_shape` is the shape of `h_in` and of `c_in` (layers, 1, hidden); `output_scale` multiplies the network's
     `velocity` into m/s, and its square the exponential of `log_variance` into (m/s)^2.
