@@ -57,18 +57,34 @@ def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
     return np.stack([hip, thigh, calf], axis=-1).reshape(*p.shape[:-2], 12)
 
 
+def _rotation_tensor() -> np.ndarray:
+    """R of q = (w, u) as a quadratic form in q, (16, 9): R_ab = (w^2 - u.u) delta_ab + 2 u_a u_b - 2 w eps_abc u_c."""
+    eye = np.eye(3)
+    tensor = np.zeros((4, 4, 3, 3))
+    tensor[0, 0] = eye
+    tensor[0, 1:] = -2.0 * np.moveaxis(np.cross(eye[:, None], eye), -1, 0)
+    tensor[1:, 1:] = 2.0 * np.einsum("ia,jb->ijab", eye, eye) - np.einsum("ij,ab->ijab", eye, eye)
+    return tensor.reshape(16, 9)
+
+
+_ROTATION = _rotation_tensor()
+
+
+def rotation_matrix(quaternion: np.ndarray) -> np.ndarray:
+    """Body to world of a unit quaternion wxyz, (..., 4) -> (..., 3, 3)."""
+    q = np.asarray(quaternion)
+    squares = (q[..., :, None] * q[..., None, :]).reshape(*q.shape[:-1], 16)
+    return (squares @ _ROTATION).reshape(*q.shape[:-1], 3, 3)
+
+
 def rotate(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
     """Body vector to world: R(quaternion wxyz) v, (..., 4), (..., 3) -> (..., 3)."""
-    w, u = quaternion[..., :1], quaternion[..., 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + w * t + np.cross(u, t)
+    return (rotation_matrix(quaternion) @ np.asarray(v)[..., None])[..., 0]
 
 
 def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
     """World vector to body: R(quaternion wxyz)^T v."""
-    w, u = quaternion[..., :1], -quaternion[..., 1:]
-    t = 2.0 * np.cross(u, v)
-    return v + w * t + np.cross(u, t)
+    return (np.asarray(v)[..., None, :] @ rotation_matrix(quaternion))[..., 0, :]
 
 
 def roll_pitch(quaternion: np.ndarray) -> np.ndarray:
