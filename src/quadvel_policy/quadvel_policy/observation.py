@@ -18,7 +18,7 @@ from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
 from quadvel_description.recurrent_network import SCHEMA
-from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, NOMINAL_Q
 
 RATE_HZ = 200.0
 JOINTS = len(JOINT_NAMES)
@@ -271,9 +271,10 @@ METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
 
 
 class ActionMap:
-    """What a network's output means: target = offset + scale * clip(action), rad.
+    """What a network's output means: target = offset + scale * clip(action), rad, held to the range of commands.
 
-    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output.
+    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. The range is part of
+    the meaning (the robot's own safety layer clamps targets to it), so that training sees what the robot will do.
     """
 
     def __init__(self, offset: ArrayLike, scale: ArrayLike, clip: float | Bounds | None = None) -> None:
@@ -285,4 +286,4 @@ class ActionMap:
         """Joint targets (..., 12), rad, of the raw network output (..., 12)."""
         if self.clip is not None:
             action = np.clip(action, *self.clip)
-        return self.offset + self.scale * np.asarray(action)
+        return np.clip(self.offset + self.scale * np.asarray(action), COMMAND_LOWER, COMMAND_UPPER)
