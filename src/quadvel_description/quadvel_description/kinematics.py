@@ -58,7 +58,7 @@ def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
 
 
 def _rotation_tensor() -> np.ndarray:
-    """R of q = (w, u) as a quadratic form in q, (16, 9): R_ab = (w^2 - u.u) delta_ab + 2 u_a u_b - 2 w eps_abc u_c."""
+    """R as a quadratic form in q = (w, u), (16, 9): R_ab = (w^2 - u.u) delta_ab + 2 u_a u_b - 2 w eps_abc u_c."""
     eye = np.eye(3)
     tensor = np.zeros((4, 4, 3, 3))
     tensor[0, 0] = eye

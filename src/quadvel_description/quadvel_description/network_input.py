@@ -1,7 +1,8 @@
 """How named quantities become one network input: order, offset, scale and clip of each.
 
-The policy's observation and the velocity estimator's features are both described this way, in training, in simulation
-and on the robot, and the description travels inside the ONNX file. What the quantities mean is said where they are named.
+The policy's observation and the velocity estimator's features are both described this way, in training,
+in simulation and on the robot, and the description travels inside the ONNX file. What the quantities mean
+is said where they are named.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ def _floats(value: float | Iterable[float]) -> float | tuple[float, ...]:
 class InputTerm:
     """One named quantity of `size` numbers; the network sees clip((value - offset) * scale, -clip, clip).
 
-    `offset` and `scale` are one number or `size` numbers, in the quantity's unit and its inverse; `clip` is a bound or None.
+    `offset` and `scale` are one number or `size` numbers, in the quantity's unit and its inverse; `clip` is a
+    bound or None.
     """
 
     name: str

@@ -1,7 +1,7 @@
-"""An ONNX network with an LSTM's memory and a description of itself, as the policy and the estimator files are.
+"""An ONNX network with an LSTM's memory and a description of itself: policy files and estimator files.
 
-Loads the file, checks by name that it is what the caller expects, and runs it one step at a time on one thread. What the
-inputs and outputs mean is the caller's matter. Needs onnxruntime, nothing else.
+Loads the file, checks by name that it is what the caller expects, and runs it one step at a time on one
+thread. What the inputs and outputs mean is the caller's matter.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
 class NetworkFileError(ValueError):
-    """A network file that is missing, unreadable, or not what was asked for; the message is one sentence with its name."""
+    """A network file that is missing, unreadable or not what was asked for, in one sentence with its name."""
 
 
 class RecurrentNetwork:
     """Inputs `obs` (1, n), `h_in`, `c_in`; outputs `outputs` (1, m each), `h_out`, `c_out`; all float32.
 
-    `fields` are the metadata fields that the caller needs besides `schema`, `joint_names` and `state_shape`, the shape of
-    both memories. Raises NetworkFileError.
+    `fields` are the metadata fields that the caller needs besides `schema`, `joint_names` and `state_shape`,
+    the shape of both memories. Raises NetworkFileError.
     """
 
     def __init__(self, path: str | Path, outputs: Sequence[str], fields: Sequence[str] = ()) -> None:

@@ -1,4 +1,4 @@
-"""What the learned velocity estimator sees, and how its network file describes that: one code for training and run time.
+"""What the learned velocity estimator sees, and how its network file says so; for training and run time.
 
 Nothing here needs torch, onnxruntime or ROS. Body frame x forward, y left, z up; joint order FR, FL, RR, RL.
 """
@@ -37,8 +37,8 @@ def build(
 ) -> NDArray[np.float32]:
     """The network input (..., 45) of a state whose arrays carry leading axes (...).
 
-    `previous_action` (..., 12) is the joint targets in force when the state was taken, minus `NOMINAL_Q`, in rad: what
-    was commanded in answer to the state before this one.
+    `previous_action` (..., 12) is the joint targets in force when the state was taken, minus `NOMINAL_Q`, in
+    rad: the answer to the state before this one.
     """
     quaternion = np.asarray(state.quaternion)
     down = np.broadcast_to((0.0, 0.0, -1.0), (*quaternion.shape[:-1], 3))
@@ -63,7 +63,7 @@ def metadata(
 ) -> dict[str, Any]:
     """The JSON object that an estimator's ONNX file carries, see `quadvel_description.recurrent_network`.
 
-    `state_shape` is the shape of `h_in` and of `c_in` (layers, 1, hidden); `output_scale` multiplies the network's
+    `state_shape` is the shape of `h_in` and of `c_in` (layers, 1, hidden); `output_scale` turns the network's
     `velocity` into m/s, and its square the exponential of `log_variance` into (m/s)^2.
     """
     return {
