@@ -1,0 +1,88 @@
+"""The actuator parameter file: Table 4, round trip, and errors that say what is wrong."""
+
+import attrs
+import numpy as np
+import pytest
+import yaml
+
+from quadvel_actuator import ActuatorParameters, DelayPair, Effect
+
+
+def _written(tmp_path, **changes):
+    path = tmp_path / "changed.yaml"
+    ActuatorParameters.default().save(path)
+    values = yaml.safe_load(path.read_text()) | changes
+    path.write_text(yaml.safe_dump({key: value for key, value in values.items() if value is not None}))
+    return path
+
+
+def test_the_shipped_default_is_table_4():
+    shipped = ActuatorParameters.default()
+    assert (shipped.kp_ref, shipped.kd_ref, shipped.delta_kp, shipped.delta_kd) == (30.0, 0.5, -0.706, -0.021)
+    assert shipped.torque_noise == 0.066
+    assert shipped.best_pair == DelayPair(0.007, 0.001, 0.066)
+    inputs = {pair.input_delay_s for pair in shipped.probable_pairs}
+    outputs = {pair.output_delay_s for pair in shipped.probable_pairs}
+    assert inputs == {0.006, 0.007, 0.008}
+    assert outputs == {0.0, 0.001, 0.002}
+
+
+def test_probable_pairs_lie_under_one_and_a_half_times_the_least_error():
+    errors = [0.5, 0.25, 0.374, 0.375]
+    pairs = [DelayPair(0.001 * i, 0.0, error) for i, error in enumerate(errors)]
+    parameters = attrs.evolve(ActuatorParameters.default(), pairs=pairs)
+    assert [pair.mse for pair in parameters.probable_pairs] == [0.25, 0.374]
+
+
+def test_ideal_is_a_plain_pd_law():
+    ideal = ActuatorParameters.ideal()
+    assert (ideal.delta_kp, ideal.delta_kd, ideal.torque_noise) == (0.0, 0.0, 0.0)
+    assert ideal.probable_pairs == (DelayPair(0.0, 0.0, 0.0),)
+
+
+def test_saved_parameters_load_unchanged_with_their_effects(tmp_path):
+    effect = Effect("friction", ["FR_hip_joint"], {"coulomb": 0.4}, {"coulomb": "N m"}, {"coulomb": [0.35, 0.45]})
+    saved = attrs.evolve(ActuatorParameters.default(), delta_kp=[-0.1 * i for i in range(12)], effects=[effect])
+    saved.save(tmp_path / "saved.yaml")
+    assert ActuatorParameters.load(tmp_path / "saved.yaml") == saved
+    assert "# Variance of the torque noise (N^2 m^2)." in (tmp_path / "saved.yaml").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"schema": 2}, "schema: found 2, expected 1"),
+        ({"kp_ref": -1}, "kp_ref: found -1, expected a gain above 0"),
+        ({"delta_kp": [0.1] * 11}, "delta_kp: found .* expected a number, 3 numbers or 12 numbers"),
+        ({"delta_kd": "soft"}, "delta_kd: found 'soft', expected a finite number"),
+        ({"torque_noise": float("nan")}, "torque_noise: found nan, expected a variance of 0 or more"),
+        ({"torque_limit": [35.0, 0.0, 44.0]}, "torque_limit: found 0.0, expected a torque above 0"),
+        ({"pairs": []}, "pairs: found .*, expected at least one pair"),
+        (
+            {"pairs": [{"input_delay_s": -0.1, "output_delay_s": 0, "mse": 1}]},
+            r"pairs\[0\].input_delay_s: found -0.1, expected a delay of 0 s or more",
+        ),
+        ({"pairs": [{"input_delay_s": 0.1, "mse": 1}]}, r"pairs\[0\].output_delay_s: the field is missing"),
+        ({"torque_noise": None}, "torque_noise: the field is missing"),
+        ({"stiffness": 3}, "stiffness: unknown field, expected one of schema, name"),
+        ({"effects": [{"name": "friction", "joints": [], "parameters": {}}]}, r"effects\[0\].joints: found"),
+    ],
+)
+def test_a_wrong_file_is_refused_with_file_field_value_and_expectation(tmp_path, changes, sentence):
+    path = _written(tmp_path, **changes)
+    with pytest.raises(ValueError, match=f"^{path}: {sentence}"):
+        ActuatorParameters.load(path)
+
+
+@pytest.mark.parametrize("text", ["a: [1, 2", "- 1\n- 2\n", ""])
+def test_a_file_that_is_no_parameter_mapping_is_refused(tmp_path, text):
+    path = tmp_path / "odd.yaml"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=f"^{path}: .+"):
+        ActuatorParameters.load(path)
+
+
+def test_numbers_are_python_numbers_in_the_file(tmp_path):
+    parameters = attrs.evolve(ActuatorParameters.default(), kp_ref=float(np.float32(25.0)))
+    parameters.save(tmp_path / "file.yaml")
+    assert yaml.safe_load((tmp_path / "file.yaml").read_text())["kp_ref"] == 25.0
