@@ -19,7 +19,8 @@ _ROUND_OFF = 1e-9  # steps; a delay that is a multiple of the step but for round
 class DelayLine:
     """A ring of the last samples of a signal of `shape` (..., C), read back with one delay per leading index.
 
-    Each step takes one `push()`, whose slot the caller fills, and then any number of `read()`.
+    Each step takes one `push()`, whose slot the caller fills, and then any number of `read()`. `head` is the place of the
+    newest sample; setting it back takes pushes back.
     """
 
     def __init__(self, shape: tuple[int, ...], dt: float):
@@ -28,7 +29,7 @@ class DelayLine:
         self._ring = np.zeros((self.length, *shape))
         self._rows = self._ring.reshape(-1, shape[-1])
         self._row = np.arange(self._rows.shape[0] // self.length)
-        self._head = 0
+        self.head = 0
         self.delay: ArrayLike = 0.0
 
     @property
@@ -54,13 +55,13 @@ class DelayLine:
 
     def push(self) -> NDArray[np.float64]:
         """Begin a step: the slot (..., C) to write its sample into."""
-        self._head = (self._head + 1) % self.length
-        slot: NDArray[np.float64] = self._ring[self._head]
+        self.head = (self.head + 1) % self.length
+        slot: NDArray[np.float64] = self._ring[self.head]
         return slot
 
     def hold(self, where: Any) -> None:
         """Make the newest sample the whole past of the leading indices `where`."""
-        self._ring[:, where] = self._ring[self._head][where]
+        self._ring[:, where] = self._ring[self.head][where]
 
     def read(self) -> NDArray[np.float64]:
         """The delayed sample (..., C) of this step, a new array."""
@@ -74,6 +75,6 @@ class DelayLine:
 
     def _back_by(self, extra: int) -> NDArray[np.float64]:
         if self._common is not None:
-            return self._ring[self._head - self._common - extra].copy()
-        rows = self._back + (self._head - extra) * self._row.size
+            return self._ring[self.head - self._common - extra].copy()
+        rows = self._back + (self.head - extra) * self._row.size
         return self._rows.take(rows, axis=0, mode="wrap").reshape(self._ring.shape[1:])

@@ -3,8 +3,8 @@
     command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff, clipped
     asked torque --output delay--> + noise, clipped = torque on the joint
 
-The law is evaluated every step on the present joint state, with the command held between its updates. One model serves the
-simulator, the batch training and the identification. It knows no robot beyond its parameters and no simulator.
+The law is evaluated every step on the present joint state, with the command held between its updates. One model
+serves the simulator, the batch training and the identification. It knows no robot beyond its parameters.
 """
 
 from __future__ import annotations
@@ -12,15 +12,18 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.parameters import ActuatorParameters
 
+Array = NDArray[np.float64]
+Values = float | Array
+
 _NOISE_BLOCK = 16384  # samples drawn at once
 
 
-def _per_joint(field: str, value: float | tuple[float, ...], joints: int) -> NDArray[np.float64]:
+def _per_joint(field: str, value: float | tuple[float, ...], joints: int) -> Array:
     """A number, one for each of hip, thigh and calf, or one for each joint, as an array (joints,)."""
     values = np.atleast_1d(np.asarray(value, dtype=float))
     if values.size == 3 and joints % 3 == 0:
@@ -30,16 +33,16 @@ def _per_joint(field: str, value: float | tuple[float, ...], joints: int) -> NDA
     return np.broadcast_to(values, (joints,)).copy()
 
 
-def _is_zero(value: ArrayLike) -> bool:
+def _is_zero(value: Values) -> bool:
     return isinstance(value, (int, float)) and value == 0
 
 
 class ActuatorModel:
     """The joints of one robot, shape (12,), or of a batch of them, (N, 12); one `step` covers `dt` seconds.
 
-    `input_delay`, `output_delay` (s), shape (..., 1), `kp_scale`, `kd_scale` (1) and `noise_std` (N m), shape (..., J), are
-    read as copies and set as wholes with anything that broadcasts to these shapes, so that each environment may differ.
-    A new gain scale acts at once, also on commands not under way yet: change it together with `reset`.
+    `input_delay`, `output_delay` (s), shape (..., 1), and `kp_scale`, `kd_scale` (1), `noise_std` (N m), shape
+    (..., J), are read as copies and set as wholes with anything that broadcasts to these shapes, so that each
+    environment may differ. Change gain scales together with `reset`: a command under way keeps the old ones.
 
     The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), which is Eq. 2 at the reference gains.
     Two models with the same parameters, shape, seed and calls give the same torques bit for bit.
@@ -48,27 +51,29 @@ class ActuatorModel:
     def __init__(
         self, parameters: ActuatorParameters, shape: tuple[int, ...] = (12,), dt: float = 0.001, seed: int = 0
     ) -> None:
-        if parameters.effects:  # effects act on the asked torque, before the output delay, in `_asked_torque`
+        if parameters.effects:  # they would act on the asked torque, in `_asked_torque`
             names = ", ".join(effect.name for effect in parameters.effects)
-            raise ValueError(f"actuator {parameters.name}: effects: found {names}, expected none: no effect is known")
+            raise ValueError(f"actuator {parameters.name}: effects: found {names}, expected none (none is known)")
         self.parameters = parameters
         self.shape = shape
         self.dt = dt
         self._rng = np.random.default_rng(seed)
         joints = shape[-1]
-        self._limit = np.broadcast_to(_per_joint("torque_limit", parameters.torque_limit, joints), shape).copy()
+        limit = _per_joint("torque_limit", parameters.torque_limit, joints)
+        self._limit = np.broadcast_to(limit, shape).copy()
         self._floor = -self._limit
         self._kp_deviation = _per_joint("delta_kp", parameters.delta_kp, joints) / parameters.kp_ref
         self._kd_deviation = _per_joint("delta_kd", parameters.delta_kd, joints) / parameters.kd_ref
 
         self._packets = DelayLine(shape, dt)  # kp_hat q_des + kd_hat dq_des + tau_ff
-        self._gains = DelayLine((*shape[:-1], 2 * joints), dt)  # commanded kp, kd; used while a change is under way
+        self._gains = DelayLine((*shape[:-1], 2 * joints), dt)  # kp, kd; used while a change is under way
         self._torques = DelayLine(shape, dt)  # asked torque
         self._noise = np.zeros((0, *shape), dtype=np.float32)
         self._noise_used = 0
+        self._scratch = np.zeros(shape)
 
-        self._kp: ArrayLike | None = None  # commanded last
-        self._kd: ArrayLike | None = None
+        self._kp: Array | None = None  # as last commanded
+        self._kd: Array | None = None
         self._kp_scale = self._kd_scale = np.ones(shape)
         self.input_delay = parameters.best_pair.input_delay_s
         self.output_delay = parameters.best_pair.output_delay_s
@@ -79,63 +84,64 @@ class ActuatorModel:
         self.reset()
 
     @property
-    def input_delay(self) -> NDArray[np.float64]:
+    def input_delay(self) -> Array:
         """Delay of the command on its way to the actuator (s), t_i."""
         return self._packets.delay
 
     @input_delay.setter
-    def input_delay(self, seconds: ArrayLike) -> None:
+    def input_delay(self, seconds: Values) -> None:
         self._packets.delay = seconds
         self._gains.delay = seconds
 
     @property
-    def output_delay(self) -> NDArray[np.float64]:
+    def output_delay(self) -> Array:
         """Delay from the asked torque to the torque on the joint (s), t_o."""
         return self._torques.delay
 
     @output_delay.setter
-    def output_delay(self, seconds: ArrayLike) -> None:
+    def output_delay(self, seconds: Values) -> None:
         self._torques.delay = seconds
 
     @property
-    def kp_scale(self) -> NDArray[np.float64]:
+    def kp_scale(self) -> Array:
         """Real over commanded proportional gain."""
         return self._kp_scale.copy()
 
     @kp_scale.setter
-    def kp_scale(self, scale: ArrayLike) -> None:
+    def kp_scale(self, scale: Values) -> None:
         self._kp_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
     @property
-    def kd_scale(self) -> NDArray[np.float64]:
+    def kd_scale(self) -> Array:
         """Real over commanded derivative gain."""
         return self._kd_scale.copy()
 
     @kd_scale.setter
-    def kd_scale(self, scale: ArrayLike) -> None:
+    def kd_scale(self, scale: Values) -> None:
         self._kd_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
     @property
-    def noise_std(self) -> NDArray[np.float64]:
+    def noise_std(self) -> Array:
         """Standard deviation of the torque noise (N m)."""
         return self._noise_std.copy()
 
     @noise_std.setter
-    def noise_std(self, std: ArrayLike) -> None:
+    def noise_std(self, std: Values) -> None:
         self._noise_std = np.broadcast_to(std, self.shape).astype(float)
         self._noisy = bool(self._noise_std.any())
 
     def sample(self, ids: Any = None, rng: np.random.Generator | None = None) -> None:
         """Draw the delays and gains of the environments `ids` (all by default) as Section 3.1 randomises them.
 
-        A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform, independent between
-        environments and the same share of the deviation for all joints of one. Follow it with `reset(ids)`.
+        A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform, independent
+        between environments, the same share of the deviation for all joints of one. Follow it with `reset(ids)`.
         """
         where = ... if ids is None else ids
         rng = self._rng if rng is None else rng
-        pairs = np.array([(pair.input_delay_s, pair.output_delay_s) for pair in self.parameters.probable_pairs])
+        probable = self.parameters.probable_pairs
+        pairs = np.array([(pair.input_delay_s, pair.output_delay_s) for pair in probable])
         input_delay, output_delay = self.input_delay, self.output_delay
         kp_scale, kd_scale = self.kp_scale, self.kd_scale
         count = input_delay[where].shape
@@ -149,8 +155,8 @@ class ActuatorModel:
     def reset(self, ids: Any = None) -> None:
         """Forget the past of the environments `ids` (all by default).
 
-        Their next command counts as held since ever, and so does the torque that it asks for: no step out of empty buffers.
-        The noise goes on where it is.
+        Their next command counts as held since ever, and so does the torque that it asks for: no step of torque out
+        of empty buffers. The noise goes on where it is.
         """
         self._new[... if ids is None else ids] = True
         self._any_new = True
@@ -160,18 +166,18 @@ class ActuatorModel:
 
     def step(
         self,
-        q: NDArray[np.float64],
-        dq: NDArray[np.float64],
-        q_des: NDArray[np.float64],
-        kp: ArrayLike,
-        kd: ArrayLike,
-        dq_des: ArrayLike = 0.0,
-        tau_ff: ArrayLike = 0.0,
-    ) -> NDArray[np.float64]:
+        q: Array,
+        dq: Array,
+        q_des: Array,
+        kp: Values,
+        kd: Values,
+        dq_des: Values = 0.0,
+        tau_ff: Values = 0.0,
+    ) -> Array:
         """The mean torque (N m) of the next `dt`, a new array of `shape`.
 
-        `q`, `dq`: the present joint state (rad, rad/s); the rest is the command as sent now: `q_des` (rad), `dq_des` (rad/s),
-        `tau_ff` (N m), `kp` (N m/rad) and `kd` (N m s/rad), each of `shape` or broadcast to it.
+        `q`, `dq`: the present joint state (rad, rad/s); the rest is the command as sent now: `q_des` (rad), `dq_des`
+        (rad/s), `tau_ff` (N m), `kp` (N m/rad) and `kd` (N m s/rad), each of `shape` or broadcast to it.
         """
         self._take_command(q_des, kp, kd, dq_des, tau_ff)
         asked = self._torques.push()
@@ -182,11 +188,39 @@ class ActuatorModel:
             self._any_new = False
         torque = self._torques.read()
         if self._noisy:
-            torque += self._noise_std * self._next_noise()
+            torque += np.multiply(self._noise_std, self._next_noise(), out=self._scratch)
             self._clip(torque, out=torque)
         return torque
 
-    def _take_command(self, q_des: Any, kp: ArrayLike, kd: ArrayLike, dq_des: ArrayLike, tau_ff: ArrayLike) -> None:
+    def peek(
+        self,
+        q: Array,
+        dq: Array,
+        q_des: Array,
+        kp: Values,
+        kd: Values,
+        dq_des: Values = 0.0,
+        tau_ff: Values = 0.0,
+    ) -> Array:
+        """What `step` would return now, time standing still: memory and noise stay where they are.
+
+        A sample of the torque at the very instant of `q` and `dq`, before the command that answers this sample is there.
+        """
+        lines = (self._packets, self._gains, self._torques)
+        heads = [line.head for line in lines]
+        memory = self._kp, self._kd, self._gain_age, self._any_new
+        new = self._new.copy()
+        torque = self.step(q, dq, q_des, kp, kd, dq_des, tau_ff)
+        for line, head in zip(lines, heads, strict=True):
+            line.head = head  # what lay in the slots written since was too old to be read again
+        self._kp, self._kd, self._gain_age, self._any_new = memory
+        self._new[...] = new
+        self._update_gains()
+        if self._noisy:
+            self._noise_used -= 1
+        return torque
+
+    def _take_command(self, q_des: Array, kp: Values, kd: Values, dq_des: Values, tau_ff: Values) -> None:
         """Send the command packet off and, while gains change, the gains."""
         self._take_gains(kp, kd)
         packet = self._packets.push()
@@ -198,9 +232,9 @@ class ActuatorModel:
         if self._any_new:
             self._packets.hold(self._new)
 
-    def _take_gains(self, kp: ArrayLike, kd: ArrayLike) -> None:
+    def _take_gains(self, kp: Values, kd: Values) -> None:
         """Note the commanded gains; their history is kept only until a change has passed the longest delay."""
-        if not (np.array_equal(kp, self._kp) and np.array_equal(kd, self._kd)):  # type: ignore[arg-type]
+        if self._kp is None or not (np.array_equal(kp, self._kp) and np.array_equal(kd, self._kd)):  # type: ignore[arg-type]
             if self._kp is not None:
                 if self._gain_age >= self._gains.length:
                     self._write_gains(self._gains.push())
@@ -214,7 +248,7 @@ class ActuatorModel:
             if self._any_new:
                 self._gains.hold(self._new)
 
-    def _write_gains(self, slot: NDArray[np.float64]) -> None:
+    def _write_gains(self, slot: Array) -> None:
         joints = self.shape[-1]
         slot[..., :joints] = self._kp
         slot[..., joints:] = self._kd
@@ -224,7 +258,7 @@ class ActuatorModel:
             self._kp_hat = self._kp_scale * self._kp
             self._kd_hat = self._kd_scale * self._kd
 
-    def _asked_torque(self, q: NDArray[np.float64], dq: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    def _asked_torque(self, q: Array, dq: Array, out: Array) -> None:
         """Eq. 1 within the brackets, clipped: the law that the actuator computes on the delayed command."""
         kp_hat, kd_hat = self._kp_hat, self._kd_hat
         if self._gain_age < self._gains.length:
@@ -232,16 +266,16 @@ class ActuatorModel:
             joints = self.shape[-1]
             kp_hat, kd_hat = self._kp_scale * gains[..., :joints], self._kd_scale * gains[..., joints:]
         torque = self._packets.read()
-        torque -= kp_hat * q
-        torque -= kd_hat * dq
+        torque -= np.multiply(kp_hat, q, out=self._scratch)
+        torque -= np.multiply(kd_hat, dq, out=self._scratch)
         self._clip(torque, out=out)
 
-    def _clip(self, torque: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    def _clip(self, torque: Array, out: Array) -> None:
         np.minimum(torque, self._limit, out=out)
         np.maximum(out, self._floor, out=out)
 
     def _next_noise(self) -> NDArray[np.float32]:
-        """Standard normal numbers of one step, drawn in blocks because a call costs more than the numbers of one robot."""
+        """Standard normal numbers for one step, drawn in blocks: a call costs more than one robot's numbers."""
         if self._noise_used == len(self._noise):
             steps = max(1, _NOISE_BLOCK // int(np.prod(self.shape)))
             self._noise = self._rng.standard_normal((steps, *self.shape), dtype=np.float32)
