@@ -1,0 +1,102 @@
+"""From messages to the plain records of `state` and back, and the refusal of what is not fit to use.
+
+Works on the fields of `quadvel_msgs` messages without importing them: generated classes check no field, so
+every node reads what it receives through here.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .state import JointCommand, RobotState
+
+QUATERNION_TOLERANCE = 0.05
+
+
+class MessageError(ValueError):
+    """A message that must not be used; the text names the field, the value found and what was expected."""
+
+
+def seconds(stamp: Any) -> float:
+    """A builtin_interfaces/Time in seconds."""
+    return float(stamp.sec + 1e-9 * stamp.nanosec)
+
+
+def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
+    """The field as (size,) finite numbers. Raises MessageError."""
+    value = np.array(getattr(message, field), np.float64)
+    if value.shape != (size,):
+        raise MessageError(f"{field} has {value.size} numbers, expected {size}")
+    if not np.isfinite(value).all():
+        raise MessageError(f"{field} holds {value[~np.isfinite(value)][0]}, expected finite numbers")
+    return value
+
+
+def read_low_state(message: Any) -> RobotState:
+    """LowState to RobotState, the quaternion normalised. Raises MessageError."""
+    quaternion = numbers(message, "orientation_wxyz", 4)
+    norm = float(np.sqrt(quaternion @ quaternion))
+    if abs(norm - 1.0) > QUATERNION_TOLERANCE:
+        raise MessageError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
+    return RobotState(
+        time=seconds(message.stamp),
+        tick=message.tick,
+        q=numbers(message, "q", 12),
+        dq=numbers(message, "dq", 12),
+        tau=numbers(message, "tau", 12),
+        quaternion=quaternion / norm,
+        angular_velocity=numbers(message, "angular_velocity", 3),
+        linear_acceleration=numbers(message, "linear_acceleration", 3),
+        foot_force=numbers(message, "foot_force", 4),
+    )
+
+
+def write_low_state(state: RobotState, message: Any) -> None:
+    """Fill a LowState; its stamp is the caller's matter."""
+    message.tick = state.tick
+    message.orientation_wxyz = np.asarray(state.quaternion, np.float32)
+    for field in ("q", "dq", "tau", "angular_velocity", "linear_acceleration", "foot_force"):
+        setattr(message, field, np.asarray(getattr(state, field), np.float32))
+
+
+def read_low_cmd(message: Any) -> JointCommand:
+    """LowCmd to JointCommand. Raises MessageError."""
+    fields = {field: numbers(message, field, 12) for field in ("q", "dq", "tau", "kp", "kd")}
+    return JointCommand(**fields, mode=message.mode, tick=message.tick)
+
+
+def write_low_cmd(command: JointCommand, message: Any) -> None:
+    """Fill a LowCmd; its stamp is the caller's matter."""
+    message.mode = command.mode
+    message.tick = command.tick
+    for field in ("q", "dq", "tau", "kp", "kd"):
+        setattr(message, field, np.asarray(getattr(command, field), np.float32))
+
+
+class Refusals:
+    """Counts refused messages by topic and remembers why the last one of each was refused."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._reasons: dict[str, str] = {}
+
+    def add(self, topic: str, reason: object) -> None:
+        """Count one."""
+        self._counts[topic] += 1
+        self._reasons[topic] = str(reason)
+
+    @property
+    def total(self) -> int:
+        """All refused messages since the start."""
+        return self._counts.total()
+
+    def values(self) -> dict[str, str]:
+        """What `/diagnostics` shows: for each topic how many and the last reason."""
+        return {
+            f"refused {topic}": f"{count}, last: {self._reasons[topic]}"
+            for topic, count in self._counts.items()
+        }
