@@ -24,7 +24,7 @@ def _parameters(input_delay=0.0, output_delay=0.0, noise=0.0, limit=UNLIMITED, d
 
 
 def _held(signal, delay, dt):
-    """Means over each step of `signal` (one value per step, its first one held before time 0), delayed by `delay`."""
+    """Step means of the delayed `signal`, one value per step, its first one held before time 0."""
     fine = 1e-5
     per_step = round(dt / fine)
     time = (np.arange(len(signal) * per_step) + 0.5) * fine - delay
@@ -101,7 +101,9 @@ def test_the_torque_noise_has_the_asked_variance_and_no_memory():
 
 def test_torque_stays_within_the_limit_of_each_joint_noise_included():
     model = ActuatorModel(_parameters(noise=4.0, limit=(35.278, 35.278, 44.4)))
-    torque = np.array([model.step(ZERO, ZERO, ZERO + sign * 3.0, 30.0, 0.5) for sign in (1, -1) for _ in range(100)])
+    torque = np.array(
+        [model.step(ZERO, ZERO, ZERO + sign * 3.0, 30.0, 0.5) for sign in (1, -1) for _ in range(100)]
+    )
     limit = np.tile([35.278, 35.278, 44.4], 4)
     assert (np.abs(torque) <= limit).all()
     assert (np.abs(torque).max(axis=0) == limit).all()
@@ -164,7 +166,9 @@ def test_environments_with_their_own_parameters_equal_single_runs():
 
 
 def test_sampling_stays_within_the_probable_set_and_fills_it():
-    parameters = attrs.evolve(ActuatorParameters.default(), pairs=[*ActuatorParameters.default().pairs, DelayPair(0.02, 0.02, 1.0)])
+    parameters = attrs.evolve(
+        ActuatorParameters.default(), pairs=[*ActuatorParameters.default().pairs, DelayPair(0.02, 0.02, 1.0)]
+    )
     model = ActuatorModel(parameters, (2000, 12))
     model.sample(rng=np.random.default_rng(6))
     drawn = set(zip(model.input_delay[:, 0], model.output_delay[:, 0], strict=True))
@@ -195,14 +199,16 @@ def test_the_same_seed_gives_the_same_torques_bit_for_bit():
 
 def test_a_delay_out_of_range_is_refused():
     model = ActuatorModel(_parameters())
-    with pytest.raises(ValueError, match="delay: found .* expected 0 to 0.05 s"):
+    with pytest.raises(ValueError, match=r"delay: found .* expected 0 to 0\.05 s"):
         model.input_delay = 0.051
     with pytest.raises(ValueError, match="delay: found"):
         model.output_delay = -0.001
 
 
 def test_an_effect_is_refused_by_name():
-    parameters = attrs.evolve(ActuatorParameters.default(), effects=[Effect("backlash", ["FR_hip_joint"], {})])
+    parameters = attrs.evolve(
+        ActuatorParameters.default(), effects=[Effect("backlash", ["FR_hip_joint"], {})]
+    )
     with pytest.raises(ValueError, match="aliengo: effects: found backlash, expected none"):
         ActuatorModel(parameters)
 

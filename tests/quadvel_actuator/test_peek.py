@@ -35,7 +35,10 @@ def run(model: ActuatorModel, peek_every: int) -> np.ndarray:
 
 @pytest.mark.parametrize("delays", [(0.0, 0.0), (0.007, 0.001), (0.0073, 0.0014), (0.05, 0.05)])
 @pytest.mark.parametrize("peek_every", [1, 7])
-def test_peek_foretells_the_step_and_leaves_the_run_as_it_is(delays: tuple[float, float], peek_every: int) -> None:
+def test_peek_foretells_the_step_and_leaves_the_run_as_it_is(
+    delays: tuple[float, float], peek_every: int
+) -> None:
     np.testing.assert_array_equal(
-        run(ActuatorModel(parameters(*delays), seed=3), peek_every), run(ActuatorModel(parameters(*delays), seed=3), 0)
+        run(ActuatorModel(parameters(*delays), seed=3), peek_every),
+        run(ActuatorModel(parameters(*delays), seed=3), 0),
     )

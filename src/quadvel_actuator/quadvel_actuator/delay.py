@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-LONGEST = 0.05
+LONGEST = 0.05  # s
 
 _ROUND_OFF = 1e-9  # steps; a delay that is a multiple of the step but for rounding is one
 
@@ -19,8 +19,8 @@ _ROUND_OFF = 1e-9  # steps; a delay that is a multiple of the step but for round
 class DelayLine:
     """A ring of the last samples of a signal of `shape` (..., C), read back with one delay per leading index.
 
-    Each step takes one `push()`, whose slot the caller fills, and then any number of `read()`. `head` is the place of the
-    newest sample; setting it back takes pushes back.
+    Each step takes one `push()`, whose slot the caller fills, and then any number of `read()`. `head` is the
+    place of the newest sample; setting it back takes pushes back.
     """
 
     def __init__(self, shape: tuple[int, ...], dt: float):
@@ -74,7 +74,10 @@ class DelayLine:
         return sample
 
     def _back_by(self, extra: int) -> NDArray[np.float64]:
+        sample: NDArray[np.float64]
         if self._common is not None:
-            return self._ring[self.head - self._common - extra].copy()
-        rows = self._back + (self.head - extra) * self._row.size
-        return self._rows.take(rows, axis=0, mode="wrap").reshape(self._ring.shape[1:])
+            sample = self._ring[self.head - self._common - extra].copy()
+        else:
+            rows = self._back + (self.head - extra) * self._row.size
+            sample = self._rows.take(rows, axis=0, mode="wrap").reshape(self._ring.shape[1:])
+        return sample

@@ -3,8 +3,8 @@
     command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff, clipped
     asked torque --output delay--> + noise, clipped = torque on the joint
 
-The law is evaluated every step on the present joint state, with the command held between its updates. One model
-serves the simulator, the batch training and the identification. It knows no robot beyond its parameters.
+The law is evaluated every step on the present joint state, with the command held between its updates. One
+model serves the simulator, the batch training and the identification.
 """
 
 from __future__ import annotations
@@ -40,12 +40,13 @@ def _is_zero(value: Values) -> bool:
 class ActuatorModel:
     """The joints of one robot, shape (12,), or of a batch of them, (N, 12); one `step` covers `dt` seconds.
 
-    `input_delay`, `output_delay` (s), shape (..., 1), and `kp_scale`, `kd_scale` (1), `noise_std` (N m), shape
-    (..., J), are read as copies and set as wholes with anything that broadcasts to these shapes, so that each
-    environment may differ. Change gain scales together with `reset`: a command under way keeps the old ones.
+    `input_delay`, `output_delay` (s), shape (..., 1), and `kp_scale`, `kd_scale` (1), `noise_std` (N m),
+    shape (..., J), are read as copies and set as wholes with anything that broadcasts to these shapes, so
+    that each environment may differ. Change gain scales together with `reset`: a command under way keeps the
+    old ones.
 
-    The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), which is Eq. 2 at the reference gains.
-    Two models with the same parameters, shape, seed and calls give the same torques bit for bit.
+    The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), Eq. 2 at the reference gains. Two models
+    with the same parameters, shape, seed and calls give the same torques bit for bit.
     """
 
     def __init__(
@@ -53,7 +54,9 @@ class ActuatorModel:
     ) -> None:
         if parameters.effects:  # they would act on the asked torque, in `_asked_torque`
             names = ", ".join(effect.name for effect in parameters.effects)
-            raise ValueError(f"actuator {parameters.name}: effects: found {names}, expected none (none is known)")
+            raise ValueError(
+                f"actuator {parameters.name}: effects: found {names}, expected none (none is known)"
+            )
         self.parameters = parameters
         self.shape = shape
         self.dt = dt
@@ -133,10 +136,11 @@ class ActuatorModel:
         self._noisy = bool(self._noise_std.any())
 
     def sample(self, ids: Any = None, rng: np.random.Generator | None = None) -> None:
-        """Draw the delays and gains of the environments `ids` (all by default) as Section 3.1 randomises them.
+        """Draw delays and gains of the environments `ids` (all by default) as Section 3.1 randomises them.
 
-        A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform, independent
-        between environments, the same share of the deviation for all joints of one. Follow it with `reset(ids)`.
+        A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform,
+        independent between environments, the same share of the deviation for all joints of one. Follow it
+        with `reset(ids)`.
         """
         where = ... if ids is None else ids
         rng = self._rng if rng is None else rng
@@ -155,8 +159,8 @@ class ActuatorModel:
     def reset(self, ids: Any = None) -> None:
         """Forget the past of the environments `ids` (all by default).
 
-        Their next command counts as held since ever, and so does the torque that it asks for: no step of torque out
-        of empty buffers. The noise goes on where it is.
+        Their next command counts as held since ever, and so does the torque that it asks for: no step of
+        torque out of empty buffers. The noise goes on where it is.
         """
         self._new[... if ids is None else ids] = True
         self._any_new = True
@@ -176,8 +180,8 @@ class ActuatorModel:
     ) -> Array:
         """The mean torque (N m) of the next `dt`, a new array of `shape`.
 
-        `q`, `dq`: the present joint state (rad, rad/s); the rest is the command as sent now: `q_des` (rad), `dq_des`
-        (rad/s), `tau_ff` (N m), `kp` (N m/rad) and `kd` (N m s/rad), each of `shape` or broadcast to it.
+        `q`, `dq`: the present joint state (rad, rad/s); the rest is the command as sent now: `q_des` (rad),
+        `dq_des` (rad/s), `tau_ff` (N m), `kp` (N m/rad), `kd` (N m s/rad), of `shape` or broadcast to it.
         """
         self._take_command(q_des, kp, kd, dq_des, tau_ff)
         asked = self._torques.push()
@@ -204,7 +208,8 @@ class ActuatorModel:
     ) -> Array:
         """What `step` would return now, time standing still: memory and noise stay where they are.
 
-        A sample of the torque at the very instant of `q` and `dq`, before the command that answers this sample is there.
+        A sample of the torque at the very instant of `q` and `dq`, before the command that answers this
+        sample is there.
         """
         lines = (self._packets, self._gains, self._torques)
         heads = [line.head for line in lines]
@@ -233,20 +238,24 @@ class ActuatorModel:
             self._packets.hold(self._new)
 
     def _take_gains(self, kp: Values, kd: Values) -> None:
-        """Note the commanded gains; their history is kept only until a change has passed the longest delay."""
-        if self._kp is None or not (np.array_equal(kp, self._kp) and np.array_equal(kd, self._kd)):  # type: ignore[arg-type]
-            if self._kp is not None:
-                if self._gain_age >= self._gains.length:
-                    self._write_gains(self._gains.push())
-                    self._gains.hold(...)
-                self._gain_age = 0
-            self._kp, self._kd = np.array(kp, dtype=float), np.array(kd, dtype=float)
-            self._update_gains()
+        """Note the commanded gains; their history is kept until a change has passed the longest delay."""
+        if self._kp is None or self._kd is None:
+            self._set_gains(kp, kd)
+        elif not (np.array_equal(kp, self._kp) and np.array_equal(kd, self._kd)):
+            if self._gain_age >= self._gains.length:  # the history begins with the gains held until now
+                self._write_gains(self._gains.push())
+                self._gains.hold(...)
+            self._gain_age = 0
+            self._set_gains(kp, kd)
         if self._gain_age < self._gains.length:
             self._gain_age += 1
             self._write_gains(self._gains.push())
             if self._any_new:
                 self._gains.hold(self._new)
+
+    def _set_gains(self, kp: Values, kd: Values) -> None:
+        self._kp, self._kd = np.array(kp, dtype=float), np.array(kd, dtype=float)
+        self._update_gains()
 
     def _write_gains(self, slot: Array) -> None:
         joints = self.shape[-1]
@@ -275,7 +284,7 @@ class ActuatorModel:
         np.maximum(out, self._floor, out=out)
 
     def _next_noise(self) -> NDArray[np.float32]:
-        """Standard normal numbers for one step, drawn in blocks: a call costs more than one robot's numbers."""
+        """Standard normal numbers for one step, drawn in blocks: calls cost more than one robot's numbers."""
         if self._noise_used == len(self._noise):
             steps = max(1, _NOISE_BLOCK // int(np.prod(self.shape)))
             self._noise = self._rng.standard_normal((steps, *self.shape), dtype=np.float32)

@@ -1,7 +1,7 @@
 """The parameters of the empirical actuator model and their YAML file.
 
-They say how the joints of one robot answer; `quadvel_actuator.model` computes with them. Identification, which writes such
-files from measured logs, lives elsewhere. The shipped default is Table 4 of the paper.
+They say how the joints of one robot answer; `quadvel_actuator.model` computes with them. Identification,
+which writes such files from measured logs, lives elsewhere. The shipped default is Table 4 of the paper.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import yaml
 
 SCHEMA = 1
 JOINTS = 12
-PROBABLE = 1.5  # pairs with an error below this many times the least one count as probable (Section 3.1)
+PROBABLE = 1.5  # a pair whose error is below this many times the least one is probable (Section 3.1)
 
 _DEFAULT_FILE = Path(__file__).parent / "data" / "aliengo.yaml"
 
@@ -24,10 +24,10 @@ _COMMENTS = {
     "kp_ref": "Gains at which the deviations were identified (N m/rad, N m s/rad).",
     "delta_kp": "Deviation of the gains, Eq. 2: one number, one per hip, thigh and calf, or one per joint "
     "(N m/rad, N m s/rad).",
-    "pairs": "Delays of the command and of the torque (s), and the mean squared torque error of the pair (N^2 m^2).",
-    "torque_noise": "Variance of the torque noise (N^2 m^2).",
-    "torque_limit": "Largest torque: one number, one per hip, thigh and calf, or one per joint (N m).",
-    "effects": "What the model adds to the PD law: name, joints, parameters, units and intervals of each.",
+    "pairs": "Delays of the command and of the torque (s), and the pair's mean squared torque error (N^2
+    m^2).", "torque_noise": "Variance of the torque noise (N^2 m^2).", "torque_limit": "Largest torque: one
+    number, one per hip, thigh and calf, or one per joint (N m).", "effects": "What the model adds to the PD
+    law: name, joints, parameters, units and intervals of each.",
 }
 
 
@@ -50,7 +50,7 @@ def _number(expected: str, at_least: float = -np.inf, above: float = -np.inf) ->
 
 
 def _per_joint(expected: str, above: float = -np.inf) -> Any:
-    """A validator: a number, or 3 (hip, thigh, calf) or 12 (every joint) of them, each `above` a bound."""
+    """A validator: a number, or a tuple of 3 (hip, thigh, calf) or 12 (every joint), each `above` a bound."""
 
     def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         values = list(value) if isinstance(value, tuple) else [value]
@@ -74,7 +74,7 @@ def _tuple_if_list(value: Any) -> Any:
 
 @attrs.frozen
 class DelayPair:
-    """Input and output delay (s), and the mean squared torque error (N^2 m^2) that identification found with them."""
+    """Input and output delay (s), and the mean squared torque error (N^2 m^2) of a model with them."""
 
     input_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
     output_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
@@ -93,7 +93,7 @@ def _names(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
 
 @attrs.frozen
 class Effect:
-    """One torque effect beyond the PD law: which joints it acts on, its parameters, their units and their intervals."""
+    """One torque effect beyond the PD law: the joints it acts on, its parameters, units and intervals."""
 
     name: str = attrs.field(validator=_text)
     joints: tuple[str, ...] = attrs.field(converter=_tuple_if_list, validator=_names)
@@ -116,21 +116,25 @@ def _record(cls: Any, values: Any) -> Any:
     return cls(**values)
 
 
-def _records(field: str, cls: Any) -> Any:
-    """A converter: a list of mappings (or of instances) as a tuple of `cls`."""
+def _records(field: str, cls: Any, values: Any) -> tuple[Any, ...]:
+    """A list of mappings (or of instances) as a tuple of instances of the attrs class `cls`."""
+    if not isinstance(values, (list, tuple)):
+        raise ValueError(f"{field}: found {values!r}, expected a list")
+    records = []
+    for number, value in enumerate(values):
+        try:
+            records.append(value if isinstance(value, cls) else _record(cls, value))
+        except ValueError as error:
+            raise ValueError(f"{field}[{number}].{error}") from None
+    return tuple(records)
 
-    def convert(values: Any) -> Any:
-        if not isinstance(values, (list, tuple)):
-            raise ValueError(f"{field}: found {values!r}, expected a list")
-        records = []
-        for number, value in enumerate(values):
-            try:
-                records.append(value if isinstance(value, cls) else _record(cls, value))
-            except ValueError as error:
-                raise ValueError(f"{field}[{number}].{error}") from None
-        return tuple(records)
 
-    return convert
+def _pairs(values: Any) -> tuple[DelayPair, ...]:
+    return _records("pairs", DelayPair, values)
+
+
+def _effects(values: Any) -> tuple[Effect, ...]:
+    return _records("effects", Effect, values)
 
 
 def _not_empty(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
@@ -147,22 +151,27 @@ def _known_schema(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
 class ActuatorParameters:
     """The empirical actuator model (Eq. 1 and 2) in numbers; SI units, see `data/aliengo.yaml`.
 
-    The deviations `delta_kp`, `delta_kd` and `torque_limit` are one number, three (hip, thigh, calf) or twelve.
-    Building one with a wrong value raises ValueError that names the field, the value found and what was expected.
+    The deviations `delta_kp`, `delta_kd` and `torque_limit` are one number, three (hip, thigh, calf) or
+    twelve. Building one with a wrong value raises ValueError that names the field, the value found and what
+    was expected.
     """
 
     schema: int = attrs.field(validator=_known_schema)
     name: str = attrs.field(validator=_text)
     kp_ref: float = attrs.field(validator=_number("a gain above 0", above=0.0))
     kd_ref: float = attrs.field(validator=_number("a gain above 0", above=0.0))
-    delta_kp: float | tuple[float, ...] = attrs.field(converter=_tuple_if_list, validator=_per_joint("a finite number"))
-    delta_kd: float | tuple[float, ...] = attrs.field(converter=_tuple_if_list, validator=_per_joint("a finite number"))
-    pairs: tuple[DelayPair, ...] = attrs.field(converter=_records("pairs", DelayPair), validator=_not_empty)
+    delta_kp: float | tuple[float, ...] = attrs.field(
+        converter=_tuple_if_list, validator=_per_joint("a finite number")
+    )
+    delta_kd: float | tuple[float, ...] = attrs.field(
+        converter=_tuple_if_list, validator=_per_joint("a finite number")
+    )
+    pairs: tuple[DelayPair, ...] = attrs.field(converter=_pairs, validator=_not_empty)
     torque_noise: float = attrs.field(validator=_number("a variance of 0 or more", at_least=0.0))
     torque_limit: float | tuple[float, ...] = attrs.field(
         converter=_tuple_if_list, validator=_per_joint("a torque above 0", above=0.0)
     )
-    effects: tuple[Effect, ...] = attrs.field(converter=_records("effects", Effect), default=())
+    effects: tuple[Effect, ...] = attrs.field(converter=_effects, default=())
 
     @property
     def best_pair(self) -> DelayPair:
@@ -177,13 +186,14 @@ class ActuatorParameters:
 
     @classmethod
     def load(cls, path: str | Path) -> ActuatorParameters:
-        """Read a parameter file; ValueError names the file, the field, the value found and what was expected."""
+        """Read a parameter file; ValueError names file, field, the value found and what was expected."""
         try:
-            return _record(cls, yaml.safe_load(Path(path).read_text()))
+            parameters: ActuatorParameters = _record(cls, yaml.safe_load(Path(path).read_text()))
         except yaml.YAMLError as error:
             raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
+        return parameters
 
     def save(self, path: str | Path) -> None:
         """Write the parameters as YAML, with the units in comments; `load` reads them back unchanged."""
@@ -192,7 +202,8 @@ class ActuatorParameters:
             if key in _COMMENTS:
                 lines += ["", f"# {_COMMENTS[key]}"]
             flow = None if isinstance(value, list) else False  # a list: one line for each of its elements
-            lines.append(yaml.safe_dump({key: value}, default_flow_style=flow, sort_keys=False, width=120).rstrip())
+            text = yaml.safe_dump({key: value}, default_flow_style=flow, sort_keys=False, width=110)
+            lines.append(text.rstrip())
         Path(path).write_text("\n".join(lines) + "\n")
 
     @classmethod
@@ -203,6 +214,7 @@ class ActuatorParameters:
     @classmethod
     def ideal(cls) -> ActuatorParameters:
         """A plain PD law: no delay, no deviation, no noise; the torque limit stays."""
+        at_once = DelayPair(0.0, 0.0, 0.0)
         return attrs.evolve(
-            cls.default(), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(DelayPair(0.0, 0.0, 0.0),), torque_noise=0.0
+            cls.default(), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(at_once,), torque_noise=0.0
         )

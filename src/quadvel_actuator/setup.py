@@ -1,0 +1,16 @@
+from setuptools import setup
+
+package = "quadvel_actuator"
+
+setup(
+    name=package,
+    version="0.1.0",
+    packages=[package],
+    package_data={package: ["data/*.yaml"]},
+    data_files=[
+        ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
+        (f"share/{package}", ["package.xml"]),
+    ],
+    license="Apache-2.0",
+    description="How the joints answer: the empirical actuator model and its parameter file.",
+)
