@@ -24,10 +24,10 @@ _COMMENTS = {
     "kp_ref": "Gains at which the deviations were identified (N m/rad, N m s/rad).",
     "delta_kp": "Deviation of the gains, Eq. 2: one number, one per hip, thigh and calf, or one per joint "
     "(N m/rad, N m s/rad).",
-    "pairs": "Delays of the command and of the torque (s), and the pair's mean squared torque error (N^2
-    m^2).", "torque_noise": "Variance of the torque noise (N^2 m^2).", "torque_limit": "Largest torque: one
-    number, one per hip, thigh and calf, or one per joint (N m).", "effects": "What the model adds to the PD
-    law: name, joints, parameters, units and intervals of each.",
+    "pairs": "Delays of command and torque (s), and the pair's mean squared torque error (N^2 m^2).",
+    "torque_noise": "Variance of the torque noise (N^2 m^2).",
+    "torque_limit": "Largest torque: one number, one per hip, thigh and calf, or one per joint (N m).",
+    "effects": "What the model adds to the PD law: name, joints, parameters, units and intervals of each.",
 }
 
 
