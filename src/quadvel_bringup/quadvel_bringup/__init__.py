@@ -1,0 +1,1 @@
+"""Start the nodes together: launch files, parameters and the `quadvel` command line."""
