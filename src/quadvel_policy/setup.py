@@ -12,7 +12,7 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     license="Apache-2.0",
-    description="The controller: observation and action, policy file, modes and their safety, command mux, and their nodes.",
+    description="Observation, action, policy file, modes and their safety, command mux, and the nodes.",
     entry_points={
         "console_scripts": [
             "controller = quadvel_policy.controller:main",

@@ -1,1 +1,1 @@
-"""The controller: observation and action, the policy file, the modes and their safety, the command mux, and their nodes."""
+"""The controller: observation and action, policy file, modes and their safety, command mux, and the nodes."""

@@ -1,19 +1,18 @@
 """The observation and the action of a policy: what its network reads and what its output means.
 
-Training, simulation and the robot all go through this module, and the policy file carries it along as metadata, so that
-none of them can disagree with another. It runs no network; `policy_file` does.
+Training, simulation and the robot all go through this module, and the policy file carries it along as
+metadata, so that none of them can disagree with another. It runs no network; `policy_file` does.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-
 from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
@@ -63,12 +62,13 @@ def build_observation(
     roll_pitch: ArrayLike | None = None,
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """The network's input clip((value - offset) * scale), shape (..., spec.size), float32; written to `out` if given.
+    """The network's input clip((value - offset) * scale), (..., spec.size), float32; into `out` if given.
 
     command (..., 4): vx, vy (m/s), wz (rad/s), stance (0 or 1). q, dq (..., 12): rad, rad/s. linear_velocity,
-    angular_velocity (..., 3): m/s, rad/s, body frame. previous_action (..., 12): the raw network output of the tick
-    before. The attitude as quaternion (..., 4), (w, x, y, z), body to world, or as roll_pitch (..., 2), rad: one of both.
-    All leading axes are the same. NaN stays NaN; infinity may be clipped away, so check inputs before.
+    angular_velocity (..., 3): m/s, rad/s, body frame. previous_action (..., 12): the raw network output of
+    the tick before. The attitude as quaternion (..., 4), (w, x, y, z), body to world, or as roll_pitch (...,
+    2), rad: one of both. All leading axes are the same. NaN stays NaN; infinity may be clipped away, so check
+    before.
     """
     if (quaternion is None) == (roll_pitch is None):
         raise TypeError("build_observation() needs exactly one of quaternion and roll_pitch")
@@ -191,43 +191,60 @@ def _text(field: str, value: Any) -> str:
     return value
 
 
-def _by(check: Any) -> Any:
-    """An attrs converter that calls `check(field name, value)`."""
-    return attrs.Converter(lambda value, field: check(field.name, value), takes_field=True)  # type: ignore[misc]
+_CHECKS: dict[str, Callable[[str, Any], Any]] = {
+    "schema": _schema,
+    "joint_names": _joint_names,
+    "nominal_q": _per_joint,
+    "action_offset": _per_joint,
+    "action_scale": _per_joint,
+    "action_clip": _bounds,
+    "kp": _gains,
+    "kd": _gains,
+    "rate_hz": _rate,
+    "observation": _observation,
+    "command_limits": _command_limits,
+    "state_shape": _state_shape,
+    "commit": _text,
+}
 
 
 @attrs.frozen(kw_only=True, eq=False)
 class PolicyMetadata:
     """All that is needed to run a policy file; the JSON object under the ONNX metadata key `quadvel`.
 
+    Where one value for each joint is asked for, one number for all of them will do.
     Raises MetadataError with the field's name, what was found and what was expected.
     """
 
-    schema: int = attrs.field(default=SCHEMA, converter=_by(_schema))
-    joint_names: tuple[str, ...] = attrs.field(default=JOINT_NAMES, converter=_by(_joint_names))
-    nominal_q: Vector = attrs.field(default=NOMINAL_Q, converter=_by(_per_joint))
+    schema: int = SCHEMA
+    joint_names: tuple[str, ...] = JOINT_NAMES
+    nominal_q: Vector = tuple(NOMINAL_Q)
     """rad"""
-    action_offset: Vector = attrs.field(converter=_by(_per_joint))
+    action_offset: Vector
     """rad; the nominal posture plus the joint torques of standing over kp, so that a zero action stands"""
-    action_scale: Vector = attrs.field(converter=_by(_per_joint))
+    action_scale: Vector
     """rad a unit of the network's output"""
-    action_clip: Bounds | None = attrs.field(default=None, converter=_by(_bounds))
+    action_clip: Bounds | None = None
     """in the unit of the network's output"""
-    kp: Vector = attrs.field(converter=_by(_gains))
+    kp: Vector
     """N m/rad"""
-    kd: Vector = attrs.field(converter=_by(_gains))
+    kd: Vector
     """N m s/rad"""
-    rate_hz: float = attrs.field(default=RATE_HZ, converter=_by(_rate))
-    observation: ObservationSpec = attrs.field(default=DEFAULT_OBSERVATION, converter=_by(_observation))
-    command_limits: dict[str, Bounds] = attrs.field(converter=_by(_command_limits))
+    rate_hz: float = RATE_HZ
+    observation: ObservationSpec = DEFAULT_OBSERVATION
+    command_limits: dict[str, Bounds]
     """what the policy was trained to follow: vx, vy (m/s), wz (rad/s), each (low, high)"""
-    state_shape: tuple[int, ...] = attrs.field(converter=_by(_state_shape))
+    state_shape: tuple[int, ...]
     """of h_in and of c_in"""
     actuator: Any = None
     """the actuator model that it was trained on, as JSON"""
     recipe: Any = None
     """how it was trained, as JSON"""
-    commit: str = attrs.field(default="", converter=_by(_text))
+    commit: str = ""
+
+    def __attrs_post_init__(self) -> None:
+        for field, check in _CHECKS.items():
+            object.__setattr__(self, field, check(field, getattr(self, field)))
 
     @property
     def action(self) -> ActionMap:
@@ -260,10 +277,12 @@ class PolicyMetadata:
             raise MetadataError(f"metadata is {data!r}, expected an object")
         for field in METADATA_FIELDS:
             if field not in data:
-                raise MetadataError(f"metadata field {field} is missing, expected {', '.join(METADATA_FIELDS)}")
+                raise MetadataError(f"metadata field {field} is missing")
         for field in data:
             if field not in METADATA_FIELDS:
-                raise MetadataError(f"metadata field {field} is unknown, expected {', '.join(METADATA_FIELDS)}")
+                raise MetadataError(
+                    f"metadata field {field} is unknown, expected {', '.join(METADATA_FIELDS)}"
+                )
         return cls(**data)
 
 
@@ -271,10 +290,11 @@ METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
 
 
 class ActionMap:
-    """What a network's output means: target = offset + scale * clip(action), rad, held to the range of commands.
+    """What a network's output means: target = offset + scale * clip(action), rad, within the range of commands.
 
-    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. The range is part of
-    the meaning (the robot's own safety layer clamps targets to it), so that training sees what the robot will do.
+    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. The
+    range (COMMAND_LOWER to COMMAND_UPPER) is part of the meaning: the robot's own safety layer clamps targets
+    to it, and training has to see what the robot will do.
     """
 
     def __init__(self, offset: ArrayLike, scale: ArrayLike, clip: float | Bounds | None = None) -> None:
@@ -286,4 +306,5 @@ class ActionMap:
         """Joint targets (..., 12), rad, of the raw network output (..., 12)."""
         if self.clip is not None:
             action = np.clip(action, *self.clip)
-        return np.clip(self.offset + self.scale * np.asarray(action), COMMAND_LOWER, COMMAND_UPPER)
+        targets: NDArray[np.float64] = self.offset + self.scale * np.asarray(action)
+        return np.clip(targets, COMMAND_LOWER, COMMAND_UPPER, out=targets)

@@ -1,0 +1,55 @@
+"""The policy as a file: one ONNX network that carries all that is needed to run it.
+
+What its input and output mean is `observation`'s matter; when it may run is the supervisor's.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
+
+from .observation import JOINTS, METADATA_FIELDS, RATE_HZ, MetadataError, PolicyMetadata
+
+SHIPPED_POLICY = Path(__file__).parent / "policies" / "crl_eam.onnx"
+
+
+class PolicyFile:
+    """A policy with its memory: inputs `obs, h_in, c_in`, outputs `actions, h_out, c_out`, and metadata.
+
+    metadata: PolicyMetadata, checked. Raises NetworkFileError, one sentence with the file's name, where the
+    file is missing or is not a policy for this robot and rate.
+    """
+
+    def __init__(self, path: str | Path = SHIPPED_POLICY) -> None:
+        network = RecurrentNetwork(path, ["actions"], METADATA_FIELDS)
+        try:
+            self.metadata = PolicyMetadata.from_fields(network.metadata)
+        except MetadataError as error:
+            raise NetworkFileError(f"{path}: {error}") from None
+        if self.metadata.rate_hz != RATE_HZ:
+            raise network.refuse("metadata field rate_hz", self.metadata.rate_hz, RATE_HZ)
+        if network.input_size != self.metadata.observation.size:
+            raise network.refuse("length of input obs", network.input_size, self.metadata.observation.size)
+        self._network = network
+        try:
+            trial = self.step(np.zeros(network.input_size, np.float32))  # also warms the session up
+        except FloatingPointError as error:
+            raise NetworkFileError(f"{error} for an input of zeros") from None
+        if trial.shape != (JOINTS,):
+            raise network.refuse("shape of output actions", (1, *trial.shape), (1, JOINTS))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything seen so far."""
+        self._network.reset()
+
+    def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """One tick: the network's input, as `build_observation` makes it, to its raw output (12,).
+
+        Raises FloatingPointError where the output is not finite; the memory then is of no use until `reset`.
+        """
+        (action,) = self._network.step(observation)
+        return action
