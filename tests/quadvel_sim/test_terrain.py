@@ -1,0 +1,94 @@
+"""The ground as a function and as MuJoCo sees it are one; rough ground is what it says it is."""
+
+import mujoco
+import numpy as np
+import pytest
+
+from quadvel_sim import Terrain
+from quadvel_sim.terrain import perlin
+
+TERRAINS = {
+    "flat": Terrain(),
+    "uphill": Terrain("slope", slope=0.3),
+    "downhill": Terrain("slope", slope=-0.2),
+    "rough": Terrain("rough", size=8.0, seed=3),
+    "rough slope": Terrain("rough", slope=0.15, size=8.0, seed=4),
+}
+
+
+def model_of(terrain: Terrain) -> mujoco.MjModel:
+    spec = mujoco.MjSpec()
+    spec.add_material(name="ground")
+    terrain.add_to(spec)
+    return spec.compile()
+
+
+@pytest.mark.parametrize("name", TERRAINS)
+def test_height_is_where_a_vertical_ray_hits_the_ground(name: str) -> None:
+    terrain = TERRAINS[name]
+    model = model_of(terrain)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    points = np.random.default_rng(0).uniform(-3.9, 3.9, (500, 2))
+    geom = np.zeros(1, dtype=np.int32)
+    hits = [
+        20.0 - mujoco.mj_ray(model, data, [x, y, 20.0], [0.0, 0.0, -1.0], None, 1, -1, geom)
+        for x, y in points
+    ]
+    np.testing.assert_allclose(terrain.height(points[:, 0], points[:, 1]), hits, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", TERRAINS)
+def test_tilt_is_the_orientation_of_the_ground_at_the_origin(name: str) -> None:
+    terrain = TERRAINS[name]
+    forward = np.zeros(3)
+    mujoco.mju_rotVecQuat(forward, [1.0, 0.0, 0.0], terrain.tilt)
+    assert forward[2] / forward[0] == pytest.approx(
+        (terrain.height(0.1, 0.0) - terrain.height(0.0, 0.0)) / 0.1
+    )
+
+
+def test_rough_ground_is_bounded_and_fills_its_bound() -> None:
+    terrain = Terrain("rough", roughness=0.08, size=20.0)
+    axis = np.linspace(-10.0, 10.0, 801)
+    heights = terrain.height(*np.meshgrid(axis, axis))
+    assert 0.9 * 0.08 < np.abs(heights).max() <= 0.08
+    assert abs(heights.mean()) < 0.005
+
+
+def test_equal_seeds_give_equal_ground_and_others_another() -> None:
+    x = np.linspace(-3.5, -1.5, 50)
+    heights = [Terrain("rough", size=8.0, seed=seed).height(x, x) for seed in (5, 5, 6)]
+    np.testing.assert_array_equal(heights[0], heights[1])
+    assert np.abs(heights[0] - heights[2]).max() > 0.02
+
+
+def test_rough_ground_is_level_where_the_robot_is_put_down() -> None:
+    angle = np.linspace(0.0, 2.0 * np.pi, 60)
+    heights = Terrain("rough", size=8.0).height(0.42 * np.cos(angle), 0.42 * np.sin(angle))
+    np.testing.assert_array_equal(heights, 0.0)
+
+
+def test_perlin_noise_vanishes_on_its_lattice_and_is_smooth_between() -> None:
+    column, row = np.meshgrid(np.arange(20.0), np.arange(20.0))
+    np.testing.assert_allclose(perlin(0.7 * column, 0.7 * row, 0.7, seed=1), 0.0, atol=1e-12)
+    x = np.linspace(0.0, 10.0, 20001)
+    noise = perlin(x, np.full_like(x, 3.3), 0.7, seed=1)
+    slope = np.gradient(noise, x)
+    assert np.abs(np.diff(slope)).max() < 0.05  # no kink where cells meet
+    assert np.abs(slope).max() > 0.5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        ({"kind": "hilly"}, "Terrain.kind: found 'hilly', expected one of flat, slope, rough"),
+        ({"slope": 0.1}, "Terrain.slope: found 0.1 rad with kind 'flat', expected 0"),
+        ({"kind": "slope", "slope": float("nan")}, "Terrain.slope: found nan, expected -0.8 to 0.8"),
+        ({"kind": "rough", "roughness": 0.0}, "Terrain.roughness: found 0.0, expected 0.001 to 1"),
+        ({"kind": "rough", "seed": -1}, "Terrain.seed: found -1, expected a whole number of 0 or more"),
+    ],
+)
+def test_bad_ground_is_refused_by_name(arguments: dict[str, object], sentence: str) -> None:
+    with pytest.raises(ValueError, match=f"^{sentence}$"):
+        Terrain(**arguments)
