@@ -1,4 +1,4 @@
-"""What a node reports on /diagnostics, in one message. Only node files import this: it needs diagnostic_msgs."""
+"""What a node reports on /diagnostics, in one message. For node files only: it needs diagnostic_msgs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,10 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 def diagnostics(
     stamp: Any, name: str, level: bytes, summary: str, values: Mapping[str, object]
 ) -> DiagnosticArray:
-    """One status: `level` is a constant of DiagnosticStatus, `summary` a sentence that a person can act on."""
+    """One status: `level` is a constant of DiagnosticStatus, `summary` a sentence that a person can act on.
+
+    `stamp` is a builtin_interfaces/Time, `name` the node's.
+    """
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     status = DiagnosticStatus(level=level, name=name, message=summary, hardware_id="quadvel", values=pairs)
     message = DiagnosticArray(status=[status])

@@ -96,7 +96,5 @@ class Refusals:
 
     def values(self) -> dict[str, str]:
         """What `/diagnostics` shows: for each topic how many and the last reason."""
-        return {
-            f"refused {topic}": f"{count}, last: {self._reasons[topic]}"
-            for topic, count in self._counts.items()
-        }
+        counts = self._counts.items()
+        return {f"refused {topic}": f"{count}, last: {self._reasons[topic]}" for topic, count in counts}
