@@ -1,0 +1,40 @@
+"""The error that says what the embedded middleware does not offer, and small helpers that raise it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NoReturn
+
+
+class UnsupportedError(NotImplementedError):
+    """A part of rclpy that the embedded middleware does not offer."""
+
+    def __init__(self, what: str) -> None:
+        super().__init__(f"{what} is not offered by quadvel's embedded middleware (quadvel_dds); use ROS 2 for it")
+
+
+def unsupported(what: str) -> Callable[..., NoReturn]:
+    """A function that raises UnsupportedError however it is called."""
+
+    def refuse(*args: Any, **kwargs: Any) -> NoReturn:
+        raise UnsupportedError(what)
+
+    return refuse
+
+
+def refuse_options(where: str, **options: Any) -> None:
+    """Raise UnsupportedError if any of the options is set."""
+    for name, value in options.items():
+        if value:
+            raise UnsupportedError(f"{where}: option '{name}'")
+
+
+def module_getattr(module: str) -> Callable[[str], NoReturn]:
+    """`__getattr__` of a module: a public name that is not there is said to be unsupported."""
+
+    def getattr_(name: str) -> NoReturn:
+        if name.startswith("_"):
+            raise AttributeError(f"module '{module}' has no attribute '{name}'")
+        raise UnsupportedError(f"{module}.{name}")
+
+    return getattr_

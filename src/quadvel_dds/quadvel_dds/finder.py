@@ -1,0 +1,86 @@
+"""Import of `rclpy` and of message packages from the embedded middleware, where ROS 2 is not importable."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec, spec_from_loader
+from pathlib import Path
+from types import ModuleType
+
+from quadvel_dds.errors import UnsupportedError
+
+EMBEDDED = str(Path(__file__).parent)
+
+
+class InterfaceLoader(Loader):
+    """Makes the modules `PKG`, `PKG.msg` and `PKG.srv`; classes are made when they are first asked for."""
+
+    def exec_module(self, module: ModuleType) -> None:
+        from quadvel_dds import messages
+
+        package, _, kind = module.__name__.partition(".")
+        if not kind:
+            return
+        names = messages.names_in(package, kind)
+
+        def getattr_(name: str) -> type:
+            if name not in names:
+                raise AttributeError(f"package '{package}' has no {kind} '{name}'")
+            is_service = kind == "srv" and not name.endswith(("_Request", "_Response"))
+            make = messages.service_class if is_service else messages.message_class
+            cls = make(f"{package}/{kind}/{name}")
+            setattr(module, name, cls)
+            return cls
+
+        module.__dict__.update(__getattr__=getattr_, __all__=names)
+
+
+class EmbeddedFinder(MetaPathFinder):
+    """Finds `rclpy` beside this file, and message packages in the definitions."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        if fullname == "rclpy":
+            return PathFinder.find_spec(fullname, [EMBEDDED])
+        if fullname.startswith("rclpy."):
+            if PathFinder.find_spec(fullname, path) is None:
+                raise UnsupportedError(f"module {fullname}")
+            return None
+        package, _, kind = fullname.partition(".")
+        if kind not in ("", "msg", "srv"):
+            return None
+        # Only names that look like an interface package make us read the definitions.
+        if not package.endswith(("_msgs", "_interfaces", "_srvs", "_dds_common")):
+            return None
+        from quadvel_dds import messages
+
+        if not messages.is_interface_package(package) or (kind and not messages.names_in(package, kind)):
+            return None
+        return spec_from_loader(fullname, InterfaceLoader(), is_package=not kind)
+
+
+def is_installed() -> bool:
+    """Whether `rclpy` resolves to the embedded middleware in this process."""
+    return any(isinstance(finder, EmbeddedFinder) for finder in sys.meta_path)
+
+
+def install() -> bool:
+    """Make `rclpy` and the message packages resolve to the embedded middleware; returns whether they do.
+
+    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Raises RuntimeError if that
+    rclpy is imported already.
+    """
+    if is_installed():
+        return True
+    embedded = os.environ.get("QUADVEL_MIDDLEWARE") == "embedded"
+    if not embedded and find_spec("rclpy") is not None:
+        return False
+    if "rclpy" in sys.modules:
+        raise RuntimeError("rclpy of ROS 2 is imported already; call quadvel_dds.install() before")
+    sys.meta_path.insert(0, EmbeddedFinder())
+    return True

@@ -1,0 +1,40 @@
+"""Descriptions of our messages for Cyclone DDS.
+
+Cyclone checks incoming samples against them, so that malformed data never arrives; the content itself is written and read in
+`cdr`.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+from cyclonedds.idl import IdlStruct, make_idl_struct, types
+from rosbags.interfaces import Nodetype
+
+from quadvel_dds import messages
+
+BASE = {"bool": bool, "char": types.uint8, "string": str}
+REQUEST_HEADER = {"client_guid_": types.uint64, "sequence_number_": types.int64}
+
+
+@cache
+def struct(typename: str) -> type[IdlStruct]:
+    """Structure of a message, or of a service's request or response with the header of rmw_cyclonedds in front."""
+    fields = {f"{name}_": _field(description) for name, description in messages.describe(typename)[1]}
+    if "/srv/" in typename:
+        fields = REQUEST_HEADER | fields
+    return make_idl_struct(typename.rpartition("/")[2], messages.dds_name(typename), fields)
+
+
+def _field(description: Any) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return struct(detail)
+    if kind == Nodetype.BASE:
+        name, bound = detail
+        return types.bounded_str[bound] if bound else BASE.get(name) or getattr(types, name)
+    item, count = _field(detail[0]), detail[1]
+    if kind == Nodetype.ARRAY:
+        return types.array[item, count]
+    return types.sequence[item, count] if count else types.sequence[item]

@@ -1,0 +1,53 @@
+"""Names of nodes, topics and services: validation, expansion, remapping."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+
+from quadvel_dds.arguments import Rule
+
+TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
+NODE = re.compile(TOKEN)
+ABSOLUTE = re.compile(rf"/|(/{TOKEN})+")
+TOPIC = re.compile(rf"(~|~?/)?({TOKEN}|\{{(node|ns|namespace)\}})((/|(?=\{{)|(?<=\}}))({TOKEN}|\{{(node|ns|namespace)\}}))*|~")
+
+
+def fault(pattern: re.Pattern[str], name: str) -> tuple[str, int] | None:
+    """What is wrong with a name and where, or None."""
+    if pattern.fullmatch(name):
+        return None
+    if not name:
+        return "must not be empty", 0
+    longest = max((i for i in range(len(name)) if pattern.fullmatch(name[:i])), default=0)
+    return "must be made of letters, digits and underscores, in parts that start with no digit", longest
+
+
+def expand(name: str, node: str, namespace: str) -> str:
+    """Full name of a topic or service as seen by a node: absolute, relative, or private (~)."""
+    for key, value in {"{node}": node, "{ns}": namespace, "{namespace}": namespace}.items():
+        name = name.replace(key, value)
+    base = namespace.rstrip("/")
+    if name == "~" or name.startswith("~/"):
+        name = f"{base}/{node}{name[1:]}"
+    return name if name.startswith("/") else f"{base}/{name}"
+
+
+def remap(full_name: str, node: str, namespace: str, rules: Iterable[Rule]) -> str:
+    """The name after the first rule that fits, both sides of which are expanded as names of this node."""
+    for rule in rules:
+        if rule.node in (None, node) and not rule.name.startswith("__"):
+            if expand(rule.name, node, namespace) == full_name:
+                return expand(rule.value, node, namespace)
+    return full_name
+
+
+def remap_node(node: str, namespace: str, rules: Iterable[Rule]) -> tuple[str, str]:
+    """Name and namespace of a node after `__node:=` (or `__name:=`) and `__ns:=`."""
+    for rule in rules:
+        if rule.node in (None, node):
+            if rule.name in ("__node", "__name"):
+                node = rule.value
+            elif rule.name == "__ns":
+                namespace = rule.value
+    return node, namespace

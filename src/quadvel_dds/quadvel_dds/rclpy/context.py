@@ -1,0 +1,128 @@
+"""The state of ROS communication in this process: arguments, domain, and whether it still runs."""
+
+from __future__ import annotations
+
+import atexit
+import os
+import sys
+import weakref
+from collections.abc import Callable, Sequence
+from threading import Lock, RLock
+from typing import Any
+
+from quadvel_dds import arguments, wire
+
+_contexts: weakref.WeakSet[Context] = weakref.WeakSet()
+
+
+def live_contexts() -> list[Context]:
+    return [context for context in list(_contexts) if context.ok()]
+
+
+class Context:
+    def __init__(self) -> None:
+        self._lock = RLock()
+        self._running = self._initialized = False
+        self._participant: wire.Participant | None = None
+        self._participant_lock = Lock()
+        self._nodes: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._shutdown_callbacks: list[Callable[[], None]] = []
+        self._wakers: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._domain_id = 0
+        self.arguments = arguments.RosArguments()
+
+    def init(
+        self,
+        args: Sequence[str] | None = None,
+        *,
+        initialize_logging: bool = True,
+        domain_id: int | None = None,
+    ) -> None:
+        """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
+        from .logging import set_levels
+
+        if self._initialized:
+            raise RuntimeError("Context.init() must only be called once")
+        if domain_id is None:
+            text = os.environ.get("ROS_DOMAIN_ID") or "0"
+            if not text.isdecimal() or int(text) > 232:
+                raise ValueError(f"ROS_DOMAIN_ID is '{text}', expected a number from 0 to 232")
+            domain_id = int(text)
+        self._domain_id = domain_id
+        self.arguments = arguments.parse(sys.argv if args is None else args)
+        if initialize_logging:
+            set_levels(self.arguments.log_levels)
+        self._initialized = self._running = True
+        _contexts.add(self)
+
+    def ok(self) -> bool:
+        return self._running
+
+    def get_domain_id(self) -> int:
+        return self._domain_id
+
+    @property
+    def participant(self) -> wire.Participant:
+        """The process's place on the domain, taken when it is first needed."""
+        with self._participant_lock:
+            if self._participant is None:
+                self._participant = wire.Participant(self._domain_id)
+            return self._participant
+
+    def shutdown(self) -> None:
+        """Stop communication. Raises RuntimeError if that was done before."""
+        if not self._running:
+            raise RuntimeError("Context must be initialized before it can be shutdown")
+        self.try_shutdown()
+
+    def try_shutdown(self) -> None:
+        """Stop communication if it runs. Called by signal handlers, so it only tells others to end."""
+        with self._lock:
+            if not self._running:
+                return
+            self._running = False
+            callbacks, self._shutdown_callbacks = self._shutdown_callbacks, []
+        for callback in callbacks:
+            callback()
+        self._wake()
+        self._leave_if_unused()
+
+    def on_shutdown(self, callback: Callable[[], None]) -> None:
+        with self._lock:
+            if self._running:
+                self._shutdown_callbacks.append(callback)
+                return
+        callback()
+
+    def _forget_shutdown_callback(self, callback: Callable[[], None]) -> None:
+        with self._lock:
+            if callback in self._shutdown_callbacks:
+                self._shutdown_callbacks.remove(callback)
+
+    def _wake(self) -> None:
+        for executor in list(self._wakers):
+            executor.wake()
+
+    def _leave_if_unused(self) -> None:
+        """Leave the domain once the context is shut down and its last node destroyed."""
+        if not self._running and not self._nodes:
+            self._leave()
+
+    def _leave(self) -> None:
+        participant, self._participant = self._participant, None
+        if participant is not None:
+            participant.close()
+
+    def __enter__(self) -> Context:
+        self.init()
+        return self
+
+    def __exit__(self, *exception: Any) -> None:
+        self.try_shutdown()
+
+
+@atexit.register
+def _leave_all() -> None:
+    for context in list(_contexts):
+        context.try_shutdown()
+        context._leave()

@@ -1,0 +1,69 @@
+"""SIGINT and SIGTERM: they shut down the contexts of this process.
+
+SIGINT also raises KeyboardInterrupt in the main thread, as with rclpy. Ctrl-C reaches a node twice under a launcher; later
+SIGINTs are let pass, so that the first one's clean-up is not cut short (SIGTERM and SIGQUIT stay as a way out).
+"""
+
+from __future__ import annotations
+
+import signal
+import socket
+import threading
+from enum import IntFlag
+from types import FrameType
+from typing import Any
+
+from .context import live_contexts
+
+
+class SignalHandlerOptions(IntFlag):
+    NO = 0
+    SIGINT = 1
+    SIGTERM = 2
+    ALL = 3
+
+
+_former: dict[int, Any] = {}
+_interrupted = False
+_waker: socket.socket | None = None
+
+
+def _on_signal(number: int, frame: FrameType | None) -> None:
+    global _interrupted
+    for context in live_contexts():
+        context.try_shutdown()
+    if number == signal.SIGINT and not _interrupted:
+        _interrupted = True
+        raise KeyboardInterrupt
+
+
+def _wake_on_signals(receiver: socket.socket) -> None:
+    """Wake the executors at every signal: Python runs its handlers only after the wait for data returns."""
+    while receiver.recv(1):
+        for context in live_contexts():
+            context._wake()
+
+
+def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
+    """Take over the signals named; does nothing outside the main thread, where Python allows no handlers."""
+    global _waker, _interrupted
+    if threading.current_thread() is not threading.main_thread() or not options:
+        return
+    _interrupted = False
+    for option, number in {SignalHandlerOptions.SIGINT: signal.SIGINT, SignalHandlerOptions.SIGTERM: signal.SIGTERM}.items():
+        if options & option and number not in _former:
+            _former[number] = signal.signal(number, _on_signal)
+    if _waker is None:
+        receiver, _waker = socket.socketpair()
+        _waker.setblocking(False)
+        threading.Thread(target=_wake_on_signals, args=(receiver,), daemon=True, name="signals").start()
+        signal.set_wakeup_fd(_waker.fileno(), warn_on_full_buffer=False)
+
+
+def uninstall_signal_handlers() -> None:
+    """Give the signals back, SIGINT only if it never came (see the module's text)."""
+    if threading.current_thread() is not threading.main_thread():
+        return
+    for number in list(_former):
+        if not (number == signal.SIGINT and _interrupted):
+            signal.signal(number, _former.pop(number))

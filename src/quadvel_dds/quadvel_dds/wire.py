@@ -1,0 +1,285 @@
+"""DDS as ROS 2 uses it: names, types, QoS and user data on the wire, over Cyclone DDS.
+
+Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`; services are the pair `rq/NAMERequest`, `rr/NAMEReply`, each sample led
+by the request header of rmw_cyclonedds (a 64-bit client id and a 64-bit sequence number). rmw_fastrtps matches replies by the
+RTPS sample identity instead, so topics work with both, service calls with rmw_cyclonedds alone.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import struct
+import time
+import uuid
+from collections.abc import Iterator
+from typing import Any
+
+from cyclonedds._clayer import ddspy_take, ddspy_write
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
+from cyclonedds.core import (
+    DDSException,
+    Entity,
+    GuardCondition,
+    InstanceState,
+    ReadCondition,
+    SampleState,
+    ViewState,
+)
+from cyclonedds.core import WaitSet as DdsWaitSet
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+from cyclonedds.util import duration
+
+from quadvel_dds import idl, messages
+
+ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+REQUEST_HEADER = struct.Struct("<Qq")
+MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
+_domains: dict[int, Domain] = {}
+
+
+def domain_configuration() -> str:
+    """Cyclone's configuration for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
+    reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
+    peers = [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
+    if reach not in ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF"):
+        raise ValueError(
+            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected LOCALHOST, SUBNET, SYSTEM_DEFAULT or OFF"
+        )
+    general = discovery = ""
+    if reach == "LOCALHOST":
+        peers.insert(0, "localhost")
+    if reach in ("LOCALHOST", "OFF"):
+        general = "<General><AllowMulticast>false</AllowMulticast></General>"
+    if reach == "OFF":
+        discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
+    elif reach != "SYSTEM_DEFAULT":
+        addresses = "".join(f'<Peer address="{peer}"/>' for peer in peers)
+        discovery = (
+            "<ParticipantIndex>auto</ParticipantIndex>"
+            f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers>"
+        )
+    own = f"<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
+    return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
+
+
+def delete(entity: Entity) -> None:
+    """Delete a DDS entity now. Cyclone's Python layer offers this as the finaliser alone; a second call does nothing."""
+    entity.__del__()
+
+
+class Participant:
+    """One process (context) on the domain: makes readers and writers and tells who else is there."""
+
+    def __init__(self, domain_id: int) -> None:
+        if domain_id not in _domains:
+            _domains[domain_id] = Domain(domain_id, domain_configuration())
+        self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
+        self._topics: dict[tuple[str, str], Topic[Any]] = {}
+        self._builtin = {
+            topic: BuiltinDataReader(self.dds, topic)
+            for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+        }
+
+    def topic(self, name: str, typename: str) -> Topic[Any]:
+        key = (name, typename)
+        if key not in self._topics:
+            self._topics[key] = Topic(self.dds, name, idl.struct(typename))
+        return self._topics[key]
+
+    def writer(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Writer:
+        qos = to_dds_qos(profile, user_data + _hash_text(typename))
+        return Writer(DataWriter(self.dds, self.topic(topic, typename), qos))
+
+    def reader(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Reader:
+        qos = to_dds_qos(profile, user_data + _hash_text(typename))
+        return Reader(DataReader(self.dds, self.topic(topic, typename), qos))
+
+    def endpoints(self, kind: str) -> Iterator[Any]:
+        """All writers ("publication") or readers ("subscription") on the domain, our own included."""
+        topic = BuiltinTopicDcpsPublication if kind == "publication" else BuiltinTopicDcpsSubscription
+        for endpoint in self._builtin[topic].read(N=100_000):
+            if endpoint.sample_info.instance_state == InstanceState.Alive:
+                yield endpoint
+
+    def count(self, kind: str, topic: str) -> int:
+        return sum(endpoint.topic_name == topic for endpoint in self.endpoints(kind))
+
+    def close(self) -> None:
+        delete(self.dds)
+
+
+class Writer:
+    """A DDS writer of ready CDR bytes."""
+
+    def __init__(self, dds: DataWriter[Any]) -> None:
+        self.dds = dds
+        self.handle = dds.get_instance_handle()
+        self.gid = dds.get_guid().bytes
+
+    def write(self, data: bytearray) -> None:
+        code = ddspy_write(self.dds._ref, data)
+        if code < 0:
+            raise DDSException(code, f"while writing to {self.dds.topic.name}")
+
+    def matched(self) -> int:
+        return len(self.dds.get_matched_subscriptions())
+
+    def matches_participant(self, key: Any) -> bool:
+        handles = self.dds.get_matched_subscriptions()
+        matches = [self.dds.get_matched_subscription_data(handle) for handle in handles]
+        return any(match is not None and match.participant_key == key for match in matches)
+
+    def wait_for_acks(self, timeout_ns: int) -> bool:
+        # The Python layer's own wait_for_acks trips over its own time-out (cyclonedds 11.0.1).
+        code = self.dds._wait_for_acks(self.dds._ref, timeout_ns)
+        if code not in (DDSException.DDS_RETCODE_OK, DDSException.DDS_RETCODE_TIMEOUT):
+            raise DDSException(code, f"while waiting for acknowledgements of {self.dds.topic.name}")
+        return bool(code == DDSException.DDS_RETCODE_OK)
+
+    def close(self) -> None:
+        delete(self.dds)
+
+
+class Reader:
+    """A DDS reader of CDR bytes, with the condition that wakes an executor."""
+
+    def __init__(self, dds: DataReader[Any]) -> None:
+        self.dds = dds
+        self.condition = ReadCondition(dds, ANY)
+        self.gid = dds.get_guid().bytes
+        self.is_closed = False
+
+    def take(self) -> tuple[bytes, Any] | None:
+        """The oldest sample that waits and its DDS sample info, or None."""
+        while not self.is_closed:
+            samples = ddspy_take(self.dds._ref, ANY, 1)
+            if isinstance(samples, int):
+                raise DDSException(samples, f"while reading {self.dds.topic.name}")
+            if not samples:
+                return None
+            if samples[0][1].valid_data:  # else: news of a writer that left, which ROS 2 does not tell
+                return samples[0]  # type: ignore[no-any-return]
+        return None
+
+    def matched(self) -> int:
+        return len(self.dds.get_matched_publications())
+
+    def writer_of(self, info: Any) -> Any:
+        """The endpoint that wrote a sample, or None if it left."""
+        return self.dds.get_matched_publication_data(info.publication_handle)
+
+    def close(self) -> None:
+        self.is_closed = True
+        delete(self.condition)
+        delete(self.dds)
+
+
+class WaitSet:
+    """Waits until one of a changing set of readers has data, or until another thread wakes it."""
+
+    def __init__(self, participant: Participant) -> None:
+        self.dds = DdsWaitSet(participant.dds)
+        self.guard = GuardCondition(participant.dds)
+        self.dds._waitset_attach(self.dds._ref, self.guard._ref, 0)
+        self.readers: dict[int, Reader] = {}
+
+    def update(self, readers: dict[int, Reader]) -> None:
+        """Wait for these readers from now on; the keys, all above 0, tell which have data."""
+        if readers.keys() == self.readers.keys():
+            return
+        for key in self.readers.keys() - readers.keys():
+            self.dds._waitset_detach(self.dds._ref, self.readers[key].condition._ref)
+        for key in readers.keys() - self.readers.keys():
+            self.dds._waitset_attach(self.dds._ref, readers[key].condition._ref, key)
+        self.readers = readers
+
+    def wait(self, timeout_ns: int) -> set[int]:
+        """Keys of the readers that have data; empty after the time-out or a wake-up."""
+        size = len(self.readers) + 1
+        triggered = (ctypes.c_void_p * size)()
+        count = self.dds._waitset_wait(self.dds._ref, triggered, size, timeout_ns)
+        if count < 0:
+            raise DDSException(count, "while waiting for data")
+        self.guard.take()
+        return {key for key in triggered[:count] if key}
+
+    def wake(self) -> None:
+        self.guard.set(True)
+
+    def close(self) -> None:
+        delete(self.guard)
+        delete(self.dds)
+
+
+class CallEndpoint:
+    """A client's or a service's pair of writer and reader; every sample starts with (client id, sequence number)."""
+
+    def __init__(self, participant: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
+        # Tells which writer and reader belong together, as in rmw_cyclonedds.
+        identity = ".".join(f"{byte:02x}" for byte in uuid.uuid4().bytes)
+        user_data = f"{'serviceid' if serves else 'clientid'}={identity};"
+        request = (f"rq{name}Request", f"{typename}_Request")
+        reply = (f"rr{name}Reply", f"{typename}_Response")
+        outgoing, incoming = (reply, request) if serves else (request, reply)
+        self.writer = participant.writer(*outgoing, profile, user_data)
+        self.reader = participant.reader(*incoming, profile, user_data)
+        self.client_id = self.writer.handle
+
+    def ask(self, request: Any, number: int) -> None:
+        self.writer.write(messages.serialize(request, REQUEST_HEADER.pack(self.client_id, number)))
+
+    def answer(self, response: Any, request_id: tuple[int, int], client: Any, timeout: float = 0.1) -> bool:
+        """Answer once the client's reader is matched (an answer sent earlier would be lost); False if it never is."""
+        deadline = time.monotonic() + timeout
+        while not self.writer.matches_participant(client.participant_key):
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.002)
+        self.writer.write(messages.serialize(response, REQUEST_HEADER.pack(*request_id)))
+        return True
+
+    def decode(self, data: bytes, typename: str) -> tuple[tuple[int, int], Any]:
+        """((client id, sequence number), message). Raises ValueError on malformed data."""
+        if len(data) < 4 + REQUEST_HEADER.size:
+            raise ValueError(f"{typename}: {len(data)} bytes hold no request header")
+        client_id, number = REQUEST_HEADER.unpack_from(data, 4)
+        return (client_id, number), messages.deserialize(data, typename, REQUEST_HEADER.size)
+
+    def is_matched(self) -> bool:
+        return self.writer.matched() > 0 and self.reader.matched() > 0
+
+    def close(self) -> None:
+        self.writer.close()
+        self.reader.close()
+
+
+def to_dds_qos(profile: Any, user_data: str) -> Qos:
+    """DDS QoS of a `rclpy.qos.QoSProfile`, as rmw_cyclonedds maps it."""
+    depth = max(profile.depth, 1)
+    keep_all = profile.history.name == "KEEP_ALL"
+    history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(depth)
+    best_effort = profile.reliability.name == "BEST_EFFORT"
+    lease = profile.liveliness_lease_duration.nanoseconds or duration(infinite=True)
+    by_topic = profile.liveliness.name == "MANUAL_BY_TOPIC"
+    policies = [
+        history,
+        Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(duration(infinite=True)),
+        Policy.Liveliness.ManualByTopic(lease) if by_topic else Policy.Liveliness.Automatic(lease),
+        Policy.Userdata(user_data.encode()),
+    ]
+    if profile.durability.name == "TRANSIENT_LOCAL":
+        policies += [Policy.Durability.TransientLocal, Policy.DurabilityService(0, history, -1, -1, -1)]
+    if profile.deadline.nanoseconds:
+        policies.append(Policy.Deadline(profile.deadline.nanoseconds))
+    if profile.lifespan.nanoseconds:
+        policies.append(Policy.Lifespan(profile.lifespan.nanoseconds))
+    return Qos(*policies)
+
+
+def _hash_text(typename: str) -> str:
+    return f"typehash={messages.type_hash(typename)};"
