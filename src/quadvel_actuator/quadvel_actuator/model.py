@@ -45,8 +45,8 @@ class ActuatorModel:
     that each environment may differ. Change gain scales together with `reset`: a command under way keeps the
     old ones.
 
-    The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), Eq. 2 at the reference gains. Two models
-    with the same parameters, shape, seed and calls give the same torques bit for bit.
+    The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), Eq. 2 at the reference gains. Two
+    models with the same parameters, shape, seed and calls give the same torques bit for bit.
     """
 
     def __init__(
