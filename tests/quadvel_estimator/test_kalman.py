@@ -6,28 +6,15 @@ import pytest
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS, GRAVITY, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
-from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_trunk, _ground_force, _rolling
 from scipy.spatial.transform import Rotation
+
+from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_trunk, _ground_force, _rolling
+
+from .conftest import sample
 
 DT = 0.005
 NOMINAL_FEET = foot_positions(NOMINAL_Q)
 CONFIG = KalmanConfig()
-
-
-def sample(time: float, **changes: object) -> RobotState:
-    """A robot that stands still, changed by `changes`."""
-    standing = RobotState(
-        time=time,
-        tick=round(1e3 * time),
-        q=NOMINAL_Q,
-        dq=np.zeros(12),
-        tau=np.zeros(12),
-        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-        angular_velocity=np.zeros(3),
-        linear_acceleration=np.array([0.0, 0.0, GRAVITY]),
-        foot_force=np.full(4, 80.0),
-    )
-    return attrs.evolve(standing, **changes)
 
 
 def rolling_stance(speed: float, time: np.ndarray) -> np.ndarray:

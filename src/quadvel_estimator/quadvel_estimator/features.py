@@ -16,6 +16,7 @@ from quadvel_description.state import RobotState
 
 RATE_HZ = 200
 KIND = "velocity_estimator"
+METADATA_FIELDS = ("kind", "nominal_q", "rate_hz", "inputs", "output_scale")
 OUTPUTS = ("velocity", "log_variance")  # and the memory that `recurrent_network` names
 
 # Clips lie beyond anything that walking shows; they only keep a shock from throwing the memory far off.

@@ -1,0 +1,71 @@
+"""The learned velocity estimator at run time: a recurrent network in an ONNX file, one step a sample."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from quadvel_description.network_input import InputLayout
+from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import RobotState
+
+from . import features
+
+SHIPPED_MODEL = Path(__file__).parent / "models" / "estimator.onnx"
+AXES = 3
+
+
+class LearnedEstimator:
+    """Runs a velocity network on samples that come at the rate it was trained for, `features.RATE_HZ`.
+
+    Raises NetworkFileError, one sentence with the file's name, where the file is missing or is not a velocity
+    estimator for this robot and rate.
+    """
+
+    def __init__(self, path: str | Path = SHIPPED_MODEL) -> None:
+        self._network = RecurrentNetwork(path, features.OUTPUTS, features.METADATA_FIELDS)
+        metadata = self._network.metadata
+        self._expect("metadata field kind", metadata["kind"], features.KIND)
+        self._expect("metadata field rate_hz", metadata["rate_hz"], features.RATE_HZ)
+        self._expect("metadata field nominal_q", metadata["nominal_q"], NOMINAL_Q.tolist())
+        try:
+            self._layout = InputLayout.from_metadata(metadata["inputs"], features.KNOWN_INPUTS)
+        except ValueError as error:
+            raise NetworkFileError(f"{path}: metadata field inputs {error}") from None
+        self._expect("length of input obs", self._network.input_size, self._layout.size)
+        self._scale = metadata["output_scale"]
+        if not isinstance(self._scale, int | float) or not 0.0 < self._scale < float("inf"):
+            raise self._network.refuse("metadata field output_scale", self._scale, "a positive number")
+        self._try_out()
+
+    def reset(self) -> None:
+        """Forget what was seen so far."""
+        self._network.reset()
+
+    def update(
+        self, state: RobotState, previous_action: ArrayLike
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Take one sample; returns velocity (3,) in m/s and its covariance (3, 3), body frame.
+
+        `previous_action` as in `features.build`. Raises FloatingPointError where the result is not finite; then
+        the estimator needs a reset.
+        """
+        velocity, log_variance = self._network.step(features.build(state, previous_action, self._layout))
+        variance = np.exp(log_variance.astype(np.float64))
+        return self._scale * velocity.astype(np.float64), np.diag(self._scale**2 * variance)
+
+    def _try_out(self) -> None:
+        """One step on zeros: shows the outputs' true shapes, and is the slow first run of the session."""
+        try:
+            results = self._network.step(np.zeros(self._layout.size, np.float32))
+        except FloatingPointError as error:
+            raise NetworkFileError(f"{error} for an input of zeros") from None
+        for name, result in zip(features.OUTPUTS, results, strict=True):
+            self._expect(f"shape of output {name}", (1, *result.shape), (1, AXES))
+        self.reset()
+
+    def _expect(self, what: str, found: object, expected: object) -> None:
+        if found != expected:
+            raise self._network.refuse(what, found, expected)
