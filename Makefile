@@ -10,7 +10,7 @@ PY := $(VENV)/bin/python
 APT := on Debian 12 and Ubuntu 24.04: sudo apt install
 
 # All installs take their versions from the lock file. A stamp in .venv says that a set is in place.
-LOCKED := pyproject.toml requirements.lock
+LOCKED := pyproject.toml setup.py requirements.lock
 INSTALL = $(PY) -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 
 .PHONY: help setup demo test lint format bench lock clean

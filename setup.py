@@ -1,0 +1,14 @@
+"""All packages as one pip distribution. Each folder in src/ has a setup.py of its own, for colcon."""
+
+from pathlib import Path
+
+from setuptools import find_packages, setup
+
+package_dir = {}
+for folder in [*sorted(Path("src").glob("quadvel_*")), Path("training")]:
+    for package in find_packages(str(folder)):
+        package_dir[package] = str(folder / Path(*package.split(".")))
+# The definitions of our own messages are data that the embedded middleware reads.
+package_dir["quadvel_dds.interfaces"] = "src/quadvel_msgs"
+
+setup(packages=sorted(package_dir), package_dir=package_dir)
