@@ -1,0 +1,277 @@
+"""Stage 2: the recurrent student learns from the teacher, which it needs neither clock nor true state to imitate.
+
+The teacher acts at every tick. Its own steady-state error is taken out first: a command map, found by integral action on
+held commands, says which command it has to be given to walk at the one wanted (docs/decisions/0003). The student sees the
+wanted command. Most environments are driven by the teacher under time-correlated noise, a growing share by the student
+itself, so that it learns to come back from its own states. Eq. 6 and 7 act on the student from the start.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import torch
+from rich.progress import Progress, TextColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from quadvel_description import robot, symmetry
+
+from . import gait, student, teacher
+from .env import TICK, CommandRange, EnvConfig, VelocityEnv
+from .networks import Gaussian, Mlp
+from .ppo import State, select
+from .teacher import GaitState, torch_mirror
+
+
+def load_teacher(path: Path) -> Gaussian:
+    """The teacher's actor from a checkpoint of stage 1."""
+    actor = Gaussian(Mlp(len(teacher.OBSERVATION_MIRROR.index), 12), 12, 0.1)
+    actor.load_state_dict(torch.load(path, weights_only=True)["actor"])
+    return actor.eval()
+
+
+class CommandMap:
+    """Which command the teacher needs to walk at the wanted one: wanted + polynomial of it, odd under mirroring where due."""
+
+    def __init__(self, weights: np.ndarray | None = None) -> None:
+        self.weights = np.zeros((self._features(np.zeros((1, 3))).shape[1], 3)) if weights is None else weights
+
+    @staticmethod
+    def _features(c: np.ndarray) -> np.ndarray:
+        x, y, r = np.moveaxis(c[..., :3], -1, 0)
+        one = np.ones_like(x)
+        even = [one, x, x * x, y * y, r * r, y * r, x**3, x * y * y, x * r * r, x * y * r]
+        odd = [y, r, x * y, x * r, y**3, r**3, y * r * r, y * y * r, x * x * y, x * x * r]
+        return np.stack(even + odd, axis=-1)
+
+    def fit(self, wanted: np.ndarray, given: np.ndarray) -> float:
+        """Ridge regression of given - wanted, (n, 3) each; returns the residual's RMS."""
+        a = self._features(wanted)
+        b = given - wanted
+        half = a.shape[1] // 2
+        self.weights = np.zeros((a.shape[1], 3))
+        for axis, columns in ((0, slice(0, half)), (1, slice(half, None)), (2, slice(half, None))):
+            part = a[:, columns]
+            gram = part.T @ part + 1e-2 * np.eye(part.shape[1])
+            self.weights[columns, axis] = np.linalg.solve(gram, part.T @ b[:, axis])
+        return float(np.sqrt(np.mean((a @ self.weights - b) ** 2)))
+
+    def __call__(self, command: np.ndarray) -> np.ndarray:
+        """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
+        given = command.copy()
+        moving = command[:, 3] < 0.5
+        given[:, :3] += (self._features(command) @ self.weights).clip(-0.6, 0.6) * moving[:, None]
+        return given
+
+
+class Teacher:
+    """The teacher in a batch of environments, evaluated at every tick."""
+
+    def __init__(self, actor: Gaussian, env: VelocityEnv, command_map: CommandMap, gain: float) -> None:
+        self.actor, self.env, self.map, self.gain = actor, env, command_map, gain
+        self.gait = GaitState(env.config.n)
+        self.correction = np.zeros((env.config.n, 3))
+        self._past = [np.zeros((env.config.n, 12)) for _ in range(teacher.HOLD)]
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the past of `ids`."""
+        self.gait.reset(ids)
+        self.correction[ids] = 0.0
+        for past in self._past:
+            past[ids] = 0.0
+
+    def targets(self) -> np.ndarray:
+        """Joint targets (n, 12) for the present state."""
+        env = self.env
+        self.correction[env.changed] = 0.0
+        command = self.map(env.command)
+        command[:, :3] += self.correction * (command[:, 3:] < 0.5)
+        base = gait.targets(self.gait.phase, command, teacher.body_of(env), robot.KP)
+        obs = teacher.observe(env, self.gait, command, self._past[0], base)
+        with torch.no_grad():
+            residual = self.actor(torch.from_numpy(obs))[0].numpy().astype(float).clip(-5, 5)
+        self._past = [*self._past[1:], residual]
+        return base + teacher.RESIDUAL * residual
+
+    def advance(self) -> None:
+        """After the environment's tick: the clock, and integral action on what is left of the velocity error."""
+        self.gait.advance(self.env)
+        error = self.gait.mean_command - self.gait.mean_velocity
+        self.correction = (self.correction + self.gain * TICK * error).clip(-0.5, 0.5)
+
+
+def fit_command_map(actor: Gaussian, config: EnvConfig, seconds: float = 10.0) -> tuple[CommandMap, float]:
+    """Hold commands, let integral action settle, and fit the map on the environments that still walk."""
+    hold = attrs.evolve(config.commands, hold=(1e3, 1e3), stance=0.0)
+    env = VelocityEnv(attrs.evolve(config, commands=hold, episode=1e4))
+    walker = Teacher(actor, env, CommandMap(), gain=0.6)
+    total, ticks, fell = np.zeros((config.n, 3)), round(seconds / TICK), np.zeros(config.n, bool)
+    for tick in range(ticks):
+        env.tick(walker.targets())
+        walker.advance()
+        fell |= env.fallen
+        if tick >= ticks // 2:
+            total += walker.correction / (ticks - ticks // 2)
+    kept = ~fell & (np.abs(total) < 0.45).all(axis=1)
+    command_map = CommandMap()
+    return command_map, command_map.fit(env.command[kept, :3], env.command[kept, :3] + total[kept])
+
+
+@attrs.frozen
+class DistillConfig:
+    """One run of stage 2."""
+
+    samples: float = 1.2e7
+    minutes: float = 20.0
+    n: int = 512
+    length: int = 32  # ticks a sequence
+    learning_rate: float = 1e-3
+    final_learning_rate: float = 1e-4
+    noise: float = 0.12  # rad, stationary std of the time-correlated noise on executed targets
+    noise_time: float = 0.05  # s
+    student_share: float = 0.5  # of the environments driven by the student at the end
+    symmetry: float = 0.5
+    smoothness: float = 0.05
+    correction_gain: float = 0.5  # 1/s, integral action of the teacher on top of the map
+    seed: int = 1
+    commands: CommandRange = CommandRange()
+
+
+class DistillRun:
+    """Teacher, student and environment; resumable."""
+
+    def __init__(self, config: DistillConfig, teacher_file: Path, directory: Path) -> None:
+        self.config, self.directory = config, directory
+        directory.mkdir(parents=True, exist_ok=True)
+        torch.manual_seed(config.seed)
+        env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
+        actor = load_teacher(teacher_file)
+        command_map, left = fit_command_map(actor, env_config)
+        print(f"command map fitted, residual {left:.3f} (m/s, rad/s)")
+        self.env = VelocityEnv(env_config)
+        self.teacher = Teacher(actor, self.env, command_map, config.correction_gain)
+        self.student = student.new_actor()
+        self.map = student.action_map(self.env)
+        self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
+        self.samples = 0
+        self._state: State = self.student.initial_state(config.n)
+        self._mirrored: State = self.student.initial_state(config.n)
+        self._previous = np.zeros((config.n, 12), np.float32)
+        self._noise = np.zeros((config.n, 12))
+        self._mirror_obs, self._mirror_action = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
+        if (directory / "student.pt").exists():
+            content = torch.load(directory / "student.pt", weights_only=True)
+            self.student.load_state_dict(content["student"])
+            self.optimiser.load_state_dict(content["optimiser"])
+            self.samples = content["samples"]
+
+    def save(self) -> None:
+        """Checkpoint, written whole or not at all."""
+        path = self.directory / "student.pt"
+        content = {"student": self.student.state_dict(), "optimiser": self.optimiser.state_dict(), "samples": self.samples}
+        torch.save(content, path.with_suffix(".part"))
+        path.with_suffix(".part").replace(path)
+
+    def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
+        """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N)."""
+        env, c = self.env, self.config
+        own = np.arange(c.n) >= round(c.n * (1 - share))  # driven by the student
+        decay = np.exp(-TICK / c.noise_time)
+        alive = np.ones(c.n, bool)
+        observations, labels, masks = [], [], []
+        state, falls = self._state, 0
+        for _ in range(c.length):
+            obs = student.observe(env, self._previous)
+            target = self.teacher.targets()
+            label = ((target - self.map.offset) / self.map.scale).astype(np.float32)
+            self._noise = decay * self._noise + np.sqrt(1 - decay**2) * c.noise * env.rng.standard_normal((c.n, 12))
+            executed = label + (self._noise / self.map.scale).astype(np.float32)
+            if own.any():
+                with torch.no_grad():
+                    action, state = self.student(torch.from_numpy(obs[None]), state)
+                executed[own] = action[0].numpy()[own]
+            observations.append(obs)
+            labels.append(label)
+            masks.append(alive.copy())
+            self._previous = executed
+            env.tick(self.map.targets(executed))
+            self.teacher.advance()
+            falls += int((env.fallen & alive & own).sum())
+            alive &= ~(env.fallen | env.timed_out)
+        self._over = np.flatnonzero(~alive)
+        self.samples += c.length * c.n
+        lag = (self.teacher.gait.mean_command - self.teacher.gait.mean_velocity)[alive]
+        mine = lag[own[alive]] if own.any() else lag
+        seconds = max(own.sum(), 1) * c.length * TICK
+        seen = {
+            "error_xy": float(np.hypot(mine[:, 0], mine[:, 1]).mean()),
+            "error_wz": float(np.abs(mine[:, 2]).mean()),
+            "falls_per_minute": 60 * falls / seconds,
+        }
+        as_tensor = lambda x: torch.from_numpy(np.array(x, dtype=np.float32))  # noqa: E731
+        return as_tensor(observations), as_tensor(labels), as_tensor(masks), seen
+
+    def learn(self, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor) -> dict[str, float]:
+        """One step on one sequence; carries the memories on and clears those of ended environments."""
+        c = self.config
+        half = torch.arange(0, c.n, 2)  # the symmetry term sees every other environment
+        action, state = self.student(obs, self._state)
+        mirrored, mirrored_state = self.student(self._mirror_obs(obs[:, half]), select(self._mirrored, half))
+        alive = mask.sum().clamp(min=1)
+        clone = (((action - label) ** 2).sum(-1) * mask).sum() / alive
+        gap = ((action[:, half] - self._mirror_action(mirrored)) ** 2).sum(-1)
+        symmetric = (gap * mask[:, half]).sum() / mask[:, half].sum().clamp(min=1)
+        bend = (action[2:] - 2 * action[1:-1] + action[:-2]).norm(dim=-1)
+        smooth = (bend * mask[2:]).sum() / mask[2:].sum().clamp(min=1)
+        loss = clone + c.symmetry * symmetric + c.smoothness * smooth
+        self.optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
+        self.optimiser.step()
+        self._carry(state, mirrored_state, half)
+        return {"clone": float(clone.detach()), "symmetry": float(symmetric.detach()), "smoothness": float(smooth.detach())}
+
+    def _carry(self, state: State, mirrored: State, half: torch.Tensor) -> None:
+        self._state = tuple(s.detach() for s in state)  # type: ignore[assignment]
+        for kept, new in zip(self._mirrored, mirrored, strict=True):
+            kept[:, half] = new.detach()
+        over = self._over
+        if len(over):
+            self.env.reset(over)
+            self.teacher.reset(over)
+            self._noise[over] = 0.0
+            self._previous[over] = 0.0
+            for memory in (*self._state, *self._mirrored):
+                memory[:, over] = 0.0
+
+    def train(self, recipe: dict[str, Any]) -> None:
+        """Until the budget is spent; the policy file is written at every checkpoint."""
+        c = self.config
+        writer = SummaryWriter(str(self.directory))
+        started, first, update = time.monotonic(), self.samples, 0
+        with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[note]}")) as progress:
+            task = progress.add_task("student", total=c.samples, completed=self.samples, note="")
+            while self.samples < c.samples and time.monotonic() - started < 60 * c.minutes:
+                done = max(self.samples / c.samples, (time.monotonic() - started) / (60 * c.minutes))
+                share = c.student_share * min(1.0, max(0.0, (done - 0.1) / 0.3))
+                rate = c.final_learning_rate + 0.5 * (c.learning_rate - c.final_learning_rate) * (1 + np.cos(np.pi * done))
+                for group in self.optimiser.param_groups:
+                    group["lr"] = rate
+                obs, label, mask, seen = self.collect(share)
+                seen |= self.learn(obs, label, mask)
+                for name, value in seen.items():
+                    writer.add_scalar(f"student/{name}", value, self.samples)
+                speed = (self.samples - first) / (time.monotonic() - started)
+                note = f"clone {seen['clone']:.3f}  error {seen['error_xy']:.3f} m/s {seen['error_wz']:.3f} rad/s  {seen['falls_per_minute']:.1f} falls/min  {speed:.0f}/s"
+                progress.update(task, completed=self.samples, note=note)
+                update += 1
+                if update % 40 == 0:
+                    self.save()
+                    progress.console.print(f"{self.samples / 1e6:.2f} M  {note}  sym {seen['symmetry']:.3f} smooth {seen['smoothness']:.3f}")
+        self.save()
+        student.export_policy(self.student, self.env, self.directory / "policy.onnx", recipe)
+        writer.close()

@@ -1,0 +1,199 @@
+"""The batched walking environment: MuJoCo's batch, the actuator model, randomisation and sensing, at 200 Hz.
+
+It knows no reward and no gait: trainers read `VelocityEnv`'s arrays. Frames and joint order as everywhere in quadvel.
+"""
+
+from __future__ import annotations
+
+import attrs
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from quadvel_actuator.model import ActuatorModel
+from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_description import mjcf, robot
+from quadvel_description.kinematics import foot_jacobians, foot_positions, roll_pitch, rotate, rotate_inverse
+from quadvel_sim.terrain import Terrain
+
+from .randomisation import PlantSampler, Randomisation, sample_actuators
+
+TICK = 0.005  # s, one policy sample
+
+
+@attrs.frozen
+class CommandRange:
+    """How velocity commands are drawn. `ellipsoid`: the paper's; otherwise a box."""
+
+    vx: tuple[float, float] = (-1.4, 2.0)
+    vy: float = 0.7
+    wz: float = 1.4
+    ellipsoid: bool = False
+    stance: float = 0.15  # share of stance commands
+    straight: float = 0.2  # share of the walking commands without turning
+    hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        unit = rng.uniform(-1, 1, (n, 3))
+        if self.ellipsoid:
+            unit = rng.normal(size=(n, 3))
+            unit *= (rng.random(n) ** (1 / 3) / np.linalg.norm(unit, axis=1))[:, None]
+        centre, half = np.mean(self.vx), np.ptp(self.vx) / 2
+        command = np.zeros((n, 4))
+        command[:, :3] = unit * [half, self.vy, self.wz] + [centre, 0.0, 0.0]
+        command[rng.random(n) < self.straight, 2] = 0.0
+        still = rng.random(n) < self.stance
+        command[still] = [0.0, 0.0, 0.0, 1.0]
+        return command
+
+
+@attrs.frozen
+class EnvConfig:
+    """One batch of environments."""
+
+    n: int = 512
+    threads: int = 2
+    seed: int = 0
+    timestep: float = 0.0025  # s, of physics
+    kp: float = robot.KP
+    kd: float = robot.KD
+    episode: float = 20.0  # s
+    actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
+    randomisation: Randomisation = Randomisation()
+    commands: CommandRange = CommandRange()
+    terrain: Terrain = Terrain()
+
+
+def training_model(timestep: float, terrain: Terrain) -> mujoco.MjModel:
+    """The AlienGo as it is trained on: feet and trunk collide, no sensors, few solver iterations."""
+    plant = mjcf.Plant(
+        timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False, iterations=6, ls_iterations=8
+    )
+    spec = mjcf.build_spec(plant)
+    terrain.add_to(spec)
+    return spec.compile()
+
+
+class VelocityEnv:
+    """`n` robots. After every `tick` the arrays below describe the new state; `reset(ids)` starts some over.
+
+    command (n, 4); q, dq, torque (n, 12); quaternion (n, 4); velocity, angular_velocity, acceleration (n, 3) in the body
+    frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
+    contact (n, 4) bool; height (n,) of the trunk above ground; fallen, timed_out (n,) bool; changed (n,) bool: command
+    is new.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        self.config = c = config
+        self.model = training_model(c.timestep, c.terrain)
+        self.substeps = round(TICK / c.timestep)
+        self.rng = np.random.default_rng(c.seed)
+        self.batch = Batch(self.model, c.n, c.threads)
+        self.plants = PlantSampler(self.batch, c.randomisation, self.rng)
+        self.actuators = ActuatorModel(c.actuator, (c.n, 12), c.timestep, seed=c.seed + 1)
+        self._qpos, self._qvel, self._ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self.stand_q = robot.NOMINAL_Q + mjcf.gravity_torque(self.model) / c.kp
+
+        n = c.n
+        self.command = np.zeros((n, 4))
+        self.changed = np.zeros(n, bool)
+        self.torque = np.zeros((n, 12))
+        self.acceleration = np.zeros((n, 3))
+        self.time = np.zeros(n)
+        self._next_command = np.zeros(n)
+        self._velocity_drift = np.zeros((n, 3))
+        rough = c.terrain.kind == "rough"
+        self._spawn_radius = 0.4 * c.terrain.size if rough else 0.0  # m
+        self.reset(np.arange(n))
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Start the environments `ids` over: new plant, new actuators, near the standing posture, a new command."""
+        if not len(ids):
+            return
+        n, rng = len(ids), self.rng
+        self.plants.sample(ids)
+        sample_actuators(self.actuators, ids, self.config.randomisation, rng)
+        self.batch.reset(ids.astype(np.int32), stage=mujoco.mjtStage.mjSTAGE_NONE.value)
+        qpos, qvel = np.zeros((n, 19)), rng.normal(0, 0.1, (n, 18))
+        heading = rng.uniform(-np.pi, np.pi, n)
+        qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
+        qpos[:, 3], qpos[:, 6] = np.cos(heading / 2), np.sin(heading / 2)
+        qpos[:, 7:] = robot.NOMINAL_Q + rng.normal(0, 0.08, (n, 12))
+        feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
+        qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
+        self._qpos[ids], self._qvel[ids] = qpos, qvel
+        self.time[ids] = rng.uniform(0, 0.2, n) * self.config.episode
+        self._velocity_drift[ids] = 0.0
+        self._new_commands(ids)
+        self._read()
+        self.torque[ids] = 0.0
+        self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
+
+    def _new_commands(self, ids: np.ndarray) -> None:
+        self.command[ids] = self.config.commands.draw(self.rng, len(ids))
+        self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.config.commands.hold, len(ids))
+        self.changed[ids] = True
+
+    def tick(self, target: np.ndarray) -> None:
+        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start."""
+        self.changed[:] = False
+        self._push()
+        q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
+        for step in range(self.substeps):
+            if step == self.substeps - 1:
+                before = self._qvel[:, :3].copy()
+            self.torque = self.actuators.step(q, dq, target, self.config.kp, self.config.kd)
+            self._ctrl[:] = self.torque
+            self.batch.step()
+        self.time += TICK
+        self._read()
+        proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, robot.GRAVITY]
+        self.acceleration = rotate_inverse(self.quaternion, proper)
+        due = np.flatnonzero(self.time >= self._next_command)
+        if len(due):
+            self._new_commands(due)
+
+    def _ground(self, points: np.ndarray) -> np.ndarray:
+        return self.config.terrain.height(points[..., 0], points[..., 1])
+
+    def _push(self) -> None:
+        r = self.config.randomisation
+        hit = np.flatnonzero(self.rng.random(self.config.n) < TICK / r.push_interval)
+        if len(hit) and (r.push_velocity or r.push_turn):
+            self._qvel[hit, :2] += self.rng.uniform(-1, 1, (len(hit), 2)) * r.push_velocity
+            self._qvel[hit, 3:6] += self.rng.uniform(-1, 1, (len(hit), 3)) * r.push_turn
+
+    def _read(self) -> None:
+        """Derive what rewards and observations need from the state rows."""
+        qpos, qvel = self._qpos, self._qvel
+        self.q, self.dq = qpos[:, 7:].copy(), qvel[:, 6:].copy()
+        self.quaternion, self.angular_velocity = qpos[:, 3:7].copy(), qvel[:, 3:6].copy()
+        self.velocity = rotate_inverse(self.quaternion, qvel[:, :3])
+        self.roll_pitch = roll_pitch(self.quaternion)
+        quaternion = self.quaternion[:, None]
+        local = foot_positions(self.q)
+        self.feet = rotate(quaternion, local) + qpos[:, None, :3]
+        joints = self.dq.reshape(-1, 4, 3, 1)
+        swing = (foot_jacobians(self.q) @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
+        self.foot_velocity = rotate(quaternion, swing) + qvel[:, None, :3]
+        self.clearance = self.feet[..., 2] - self._ground(self.feet) - robot.FOOT_RADIUS
+        self.contact = self.clearance < 0.001
+        self.height = qpos[:, 2] - self._ground(qpos)
+        self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9) | ~np.isfinite(self.height)
+        self.timed_out = self.time >= self.config.episode
+
+    def sense(self) -> dict[str, np.ndarray]:
+        """Noisy readings under the names of the observation's terms (previous action and command apart)."""
+        r, rng, n = self.config.randomisation, self.rng, self.config.n
+        decay = np.exp(-TICK / 0.5)
+        self._velocity_drift *= decay
+        self._velocity_drift += rng.normal(0, r.drift_velocity * np.sqrt(1 - decay**2), (n, 3))
+        noise = rng.standard_normal((n, 32), dtype=np.float32)
+        return {
+            "q": self.q + r.noise_q * noise[:, :12],
+            "dq": self.dq + r.noise_dq * noise[:, 12:24],
+            "roll_pitch": self.roll_pitch + r.noise_roll_pitch * noise[:, 24:26],
+            "angular_velocity": self.angular_velocity + r.noise_angular_velocity * noise[:, 26:29],
+            "linear_velocity": self.velocity + self._velocity_drift + r.noise_velocity * noise[:, 29:32],
+        }

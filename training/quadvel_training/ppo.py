@@ -1,0 +1,170 @@
+"""Proximal policy optimisation with the paper's two constraints (Eq. 6 to 8), for memoryless and recurrent actors alike.
+
+Sequences are cut at fixed lengths and never contain a reset: an environment that ends within a sequence is masked from
+there on and starts over with the next one, so a recurrent pass is one call of the fused LSTM.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import attrs
+import torch
+from torch import Tensor
+
+from .networks import Gaussian, State
+
+
+@attrs.frozen
+class PpoConfig:
+    """Hyperparameters; names and defaults follow Table 3 where it speaks."""
+
+    discount: float = 0.99
+    gae: float = 0.95
+    clip: float = 0.2
+    epochs: int = 4
+    mini_batches: int = 4
+    learning_rate: float = 5e-4
+    max_learning_rate: float = 1e-3
+    target_kl: float = 0.01
+    entropy: float = 0.0
+    symmetry: float = 0.5  # w_sym of Eq. 8
+    smoothness: float = 0.0  # w_smooth of Eq. 8
+    symmetric_share: float = 1.0  # of the sequences that the symmetry term sees
+    max_grad_norm: float = 1.0
+
+
+@attrs.define
+class Rollout:
+    """One stretch of experience; time first. `mask` is 1 while the sequence is alive."""
+
+    obs: Tensor  # (T, N, O)
+    critic_obs: Tensor  # (T, N, C)
+    action: Tensor  # (T, N, A)
+    mean: Tensor  # (T, N, A) of the policy that acted
+    reward: Tensor  # (T, N)
+    ended: Tensor  # (T, N) 1 where the episode failed at the end of the sample
+    cut: Tensor  # (T, N) 1 where it timed out instead
+    mask: Tensor  # (T, N)
+    last_critic_obs: Tensor  # (N, C)
+    state: State | None = None  # of the actor at the start
+    mirrored_state: State | None = None  # of the actor on the mirrored past
+
+
+def select(state: State | None, ids: Tensor) -> State | None:
+    """The state of some environments."""
+    return None if state is None else (state[0][:, ids].contiguous(), state[1][:, ids].contiguous())
+
+
+class Ppo:
+    """One learner: an actor, a critic on the simulator's true state, an optimiser."""
+
+    def __init__(
+        self,
+        actor: Gaussian,
+        critic: torch.nn.Module,
+        config: PpoConfig,
+        mirror_obs: Callable[[Tensor], Tensor],
+        mirror_action: Callable[[Tensor], Tensor],
+    ) -> None:
+        self.actor, self.critic, self.config = actor, critic, config
+        self.mirror_obs, self.mirror_action = mirror_obs, mirror_action
+        self.actor_optimiser = torch.optim.Adam(actor.parameters(), lr=config.learning_rate)
+        self.critic_optimiser = torch.optim.Adam(critic.parameters(), lr=1e-3)
+        self.learning_rate = config.learning_rate
+
+    def advantages(self, r: Rollout) -> tuple[Tensor, Tensor]:
+        """Generalised advantage estimates and value targets, (T, N) each."""
+        c = self.config
+        with torch.no_grad():
+            every = torch.cat([r.critic_obs, r.last_critic_obs[None]])
+            value = self.critic(every)[0][..., 0]
+        advantage = torch.zeros_like(r.reward)
+        running = torch.zeros_like(r.reward[0])
+        for t in reversed(range(len(r.reward))):
+            going = 1.0 - r.ended[t]
+            following = torch.where(r.cut[t] > 0, value[t], value[t + 1])  # a timeout is no failure
+            delta = r.reward[t] + c.discount * following * going - value[t]
+            running = delta + c.discount * c.gae * going * (1.0 - r.cut[t]) * running
+            running = running * r.mask[t]
+            advantage[t] = running
+        return advantage, advantage + value[:-1]
+
+    def update(self, r: Rollout, learn_actor: bool = True) -> dict[str, float]:
+        """Several epochs over one rollout; returns means of the loss terms."""
+        c = self.config
+        advantage, target = self.advantages(r)
+        alive = r.mask.sum().clamp(min=1)
+        mean = (advantage * r.mask).sum() / alive
+        spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
+        advantage = (advantage - mean) / (spread + 1e-6)
+        with torch.no_grad():
+            old_log_prob = self.actor.log_prob(r.mean, r.action)
+        total: dict[str, float] = {}
+        batches = 0
+        for ids in self._mini_batches(r.reward.shape[1]):
+            mask = r.mask[:, ids]
+            terms = self._critic_step(r.critic_obs[:, ids], target[:, ids], mask)
+            if learn_actor:
+                terms |= self._actor_step(r, ids, advantage[:, ids], old_log_prob[:, ids], mask)
+            for name, value in terms.items():
+                total[name] = total.get(name, 0.0) + value
+            batches += 1
+        means = {name: value / batches for name, value in total.items()}
+        if learn_actor:
+            self._adapt_rate(means["kl"])
+        explained = 1 - (((advantage * spread + mean) ** 2) * r.mask).sum() / alive / target[r.mask > 0].var().clamp(min=1e-8)
+        return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
+
+    def _mini_batches(self, n: int) -> Iterator[Tensor]:
+        for _ in range(self.config.epochs):
+            yield from torch.randperm(n).chunk(self.config.mini_batches)
+
+    def _critic_step(self, obs: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+        loss = ((self.critic(obs)[0][..., 0] - target) ** 2 * mask).sum() / mask.sum().clamp(min=1)
+        self._step(self.critic_optimiser, self.critic, loss)
+        return {"value_loss": float(loss.detach())}
+
+    def _actor_step(
+        self, r: Rollout, ids: Tensor, advantage: Tensor, old_log_prob: Tensor, mask: Tensor
+    ) -> dict[str, float]:
+        c, actor = self.config, self.actor
+        alive = mask.sum().clamp(min=1)
+        mean, _ = actor(r.obs[:, ids], select(r.state, ids))
+        ratio = (actor.log_prob(mean, r.action[:, ids]) - old_log_prob).exp()
+        clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
+        surrogate = -(torch.minimum(ratio * advantage, clipped * advantage) * mask).sum() / alive
+        variance = (2 * actor.log_std).exp().detach()
+        kl = (((mean - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1) * mask).sum().detach() / alive
+
+        share = ids[: max(1, round(len(ids) * c.symmetric_share))]
+        mirrored, _ = actor(self.mirror_obs(r.obs[:, share]), select(r.mirrored_state, share))
+        gap = mean[:, : len(share)] - self.mirror_action(mirrored)
+        symmetry = ((gap**2 / (2 * variance)).sum(-1) * mask[:, : len(share)]).sum() / mask[:, : len(share)].sum().clamp(min=1)
+        bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
+        smoothness = (bend.norm(dim=-1) * mask[2:]).sum() / mask[2:].sum().clamp(min=1)
+
+        loss = surrogate + c.symmetry * symmetry + c.smoothness * smoothness - c.entropy * actor.entropy()
+        self._step(self.actor_optimiser, actor, loss)
+        return {
+            "surrogate": float(surrogate.detach()),
+            "kl": float(kl),
+            "symmetry": float(symmetry.detach()),
+            "smoothness": float(smoothness.detach()),
+        }
+
+    def _step(self, optimiser: torch.optim.Optimizer, module: torch.nn.Module, loss: Tensor) -> None:
+        optimiser.zero_grad()
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
+        optimiser.step()
+
+    def _adapt_rate(self, kl: float) -> None:
+        """Keep the KL divergence of an update near its target."""
+        if kl > 2 * self.config.target_kl:
+            self.learning_rate /= 1.5
+        elif kl < 0.5 * self.config.target_kl:
+            self.learning_rate *= 1.2
+        self.learning_rate = min(max(self.learning_rate, 1e-6), self.config.max_learning_rate)
+        for group in self.actor_optimiser.param_groups:
+            group["lr"] = self.learning_rate

@@ -1,0 +1,90 @@
+"""What varies from one training environment to the next (Section 3.4): bodies, friction, actuators, noise, pushes."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from mujoco.batch import Batch
+
+from quadvel_actuator.model import ActuatorModel
+
+
+@attrs.frozen
+class Randomisation:
+    """Ranges (low, high) of uniform draws, and standard deviations of noise."""
+
+    foot_friction: tuple[float, float] = (0.3, 1.0)  # each foot on its own
+    payload: tuple[float, float] = (-1.0, 3.0)  # kg on the trunk
+    com_shift: float = 0.03  # m, each axis, either way
+    mass_scale: tuple[float, float] = (0.9, 1.1)  # legs
+    joint_friction_scale: tuple[float, float] = (0.2, 1.5)
+    joint_damping_scale: tuple[float, float] = (0.2, 1.5)
+    armature_scale: tuple[float, float] = (0.8, 1.2)
+    transmission_delay: tuple[float, float] = (0.0, 0.002)  # s, on top of the actuator's own input delay
+    noise_q: float = 0.01  # rad
+    noise_dq: float = 0.1  # rad/s
+    noise_roll_pitch: float = 0.01  # rad
+    noise_angular_velocity: float = 0.05  # rad/s
+    noise_velocity: float = 0.05  # m/s, white
+    drift_velocity: float = 0.05  # m/s, slow (0.5 s), as an estimator errs
+    push_interval: float = 8.0  # s, mean
+    push_velocity: float = 0.4  # m/s, sudden change of the trunk's velocity
+    push_turn: float = 0.5  # rad/s
+
+    @classmethod
+    def none(cls) -> Randomisation:
+        """The nominal plant without noise or pushes."""
+        one, nil = (1.0, 1.0), (0.0, 0.0)
+        return cls(
+            (0.8, 0.8), nil, 0.0, one, one, one, one, nil, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0
+        )
+
+
+class PlantSampler:
+    """Writes per-environment model fields into a batch; keeps what was drawn for the critic to see."""
+
+    FIELDS = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_frictionloss", "dof_damping", "dof_armature")
+
+    def __init__(self, batch: Batch, ranges: Randomisation, rng: np.random.Generator) -> None:
+        self._batch, self._ranges, self._rng = batch, ranges, rng
+        model = batch.model
+        self._nominal = {name: getattr(model, name).copy() for name in self.FIELDS}
+        self._fields = {name: batch.expand(name) for name in self.FIELDS}
+        self._feet = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_foot")]
+        self._trunk = model.body("trunk").id
+        self.drawn = np.zeros((batch.nsim, 8))  # 4 frictions, payload, com shift (3)
+
+    def sample(self, ids: np.ndarray) -> None:
+        """Draw new plants for the environments `ids`, (n,)."""
+        r, rng, n, f = self._ranges, self._rng, len(ids), self._fields
+        uniform = rng.uniform
+        friction = uniform(*r.foot_friction, (n, len(self._feet)))
+        f["geom_friction"][np.ix_(ids, self._feet, [0])] = friction[..., None]
+
+        scale = uniform(*r.mass_scale, (n, self._batch.model.nbody))
+        scale[:, : self._trunk + 1] = 1.0
+        payload = uniform(*r.payload, n)
+        scale[:, self._trunk] = 1.0 + payload / self._nominal["body_mass"][self._trunk]
+        f["body_mass"][ids] = self._nominal["body_mass"] * scale
+        f["body_inertia"][ids] = self._nominal["body_inertia"] * scale[..., None]
+        shift = uniform(-r.com_shift, r.com_shift, (n, 3))
+        f["body_ipos"][ids] = self._nominal["body_ipos"]
+        f["body_ipos"][ids, self._trunk] += shift
+
+        for name, limits in (
+            ("dof_frictionloss", r.joint_friction_scale),
+            ("dof_damping", r.joint_damping_scale),
+            ("dof_armature", r.armature_scale),
+        ):
+            f[name][ids] = self._nominal[name] * uniform(*limits, (n, 1))
+        self._batch.set_const(ids.astype(np.int32))
+        self.drawn[ids] = np.concatenate([friction, payload[:, None], shift / max(r.com_shift, 1e-3)], axis=1)
+
+
+def sample_actuators(actuators: ActuatorModel, ids: np.ndarray, ranges: Randomisation, rng: np.random.Generator) -> None:
+    """Draw delays and gains as Section 3.1 says, add the transmission delay, and forget the past of `ids`."""
+    actuators.sample(ids, rng)
+    delay = actuators.input_delay
+    delay[ids] += rng.uniform(*ranges.transmission_delay, (len(ids), 1))
+    actuators.input_delay = delay
+    actuators.reset(ids)

@@ -1,0 +1,99 @@
+"""The recurrent student: its network, what it observes of an environment, and its policy file (ONNX)."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import onnx
+import torch
+from torch import Tensor, nn
+
+from quadvel_description import robot
+from quadvel_description.recurrent_network import METADATA_KEY
+from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
+
+from .env import VelocityEnv
+from .networks import Recurrent
+
+ACTION_SCALE = 0.4  # rad a unit of the network's output
+MEMORY = 256
+HIDDEN = (192, 128)
+
+
+def new_actor() -> Recurrent:
+    """The policy of Section 4.1."""
+    return Recurrent(DEFAULT_OBSERVATION.size, 12, MEMORY, HIDDEN)
+
+
+def action_map(env: VelocityEnv) -> ActionMap:
+    """Zero stands: the offset is the nominal posture with the gravity torque fed forward through kp."""
+    return ActionMap(env.stand_q, ACTION_SCALE)
+
+
+def observe(env: VelocityEnv, previous_action: np.ndarray, ids: Sequence[int] | slice = slice(None)) -> np.ndarray:
+    """The student's noisy observation (n, 48)."""
+    return build_observation(DEFAULT_OBSERVATION, command=env.command, previous_action=previous_action, **env.sense())[ids]
+
+
+class _Step(nn.Module):
+    """One time step with the signature of the policy file."""
+
+    def __init__(self, network: Recurrent, outputs: int) -> None:
+        super().__init__()
+        self.network, self.outputs = network, outputs
+
+    def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
+        y, (h, c) = self.network(obs[None], (h, c))
+        return (*y[0].split(y.shape[-1] // self.outputs, dim=-1), h, c)
+
+
+def export(network: Recurrent, path: Path, outputs: Sequence[str], metadata: str) -> None:
+    """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all."""
+    size = network.lstm.input_size
+    state = network.initial_state(1)
+    part = path.with_suffix(".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.onnx.export(
+        _Step(network, len(outputs)).eval(),
+        (torch.zeros(1, size), *state),
+        str(part),
+        input_names=["obs", "h_in", "c_in"],
+        output_names=[*outputs, "h_out", "c_out"],
+        opset_version=17,
+        dynamo=False,
+    )
+    model = onnx.load(part)
+    onnx.helper.set_model_props(model, {METADATA_KEY: metadata})
+    onnx.save(model, part)
+    part.replace(path)
+
+
+def commit() -> str:
+    """The commit that a file was made at, or "unknown" outside a checkout."""
+    result = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    return result.stdout.strip() or "unknown"
+
+
+def export_policy(actor: Recurrent, env: VelocityEnv, path: Path, recipe: dict[str, Any]) -> None:
+    """Write the policy file of `actor` as it was trained in `env`."""
+    c = env.config.commands
+    metadata = PolicyMetadata(
+        action_offset=env.stand_q,
+        action_scale=ACTION_SCALE,
+        kp=env.config.kp,
+        kd=env.config.kd,
+        nominal_q=robot.NOMINAL_Q,
+        command_limits={"vx": c.vx, "vy": c.vy, "wz": c.wz},
+        state_shape=(1, 1, MEMORY),
+        actuator=attrs.asdict(env.config.actuator),
+        recipe=recipe,
+        commit=commit(),
+    )
+    export(actor, path, ["actions"], metadata.to_json())
+    json.loads(metadata.to_json())

@@ -1,0 +1,271 @@
+"""Stage 1: a teacher that knows the true state and a gait clock, and corrects the trotting gait of `gait` 50 times a second.
+
+Why not the recurrent student at once: see docs/decisions/0003-teacher-then-student.md.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import attrs
+import numpy as np
+import torch
+from rich.progress import Progress, TextColumn
+from torch.utils.tensorboard import SummaryWriter
+
+from quadvel_description import robot, symmetry
+from quadvel_description.symmetry import Mirror
+
+from . import gait
+from .env import TICK, CommandRange, EnvConfig, VelocityEnv
+from .networks import Gaussian, Mlp
+from .ppo import Ppo, PpoConfig, Rollout
+
+HOLD = 4  # ticks a residual is held
+RESIDUAL = 0.2  # rad a unit of the network's output
+STRIDE = 0.35  # s, time constant of the low-passed velocity
+
+
+def _signs(*signs: float) -> Mirror:
+    return Mirror(np.arange(len(signs)), np.array(signs, float))
+
+
+OBSERVATION_MIRROR = symmetry.stack(
+    [symmetry.OBSERVATION, _signs(-1, -1), symmetry.JOINTS, symmetry.FEET, _signs(1)]
+)
+CRITIC_MIRROR_FREE = 8 + 6  # plant draws, low-passed errors: seen by the critic alone
+
+
+def torch_mirror(mirror: Mirror) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The same mirror on tensors."""
+    index, sign = torch.as_tensor(mirror.index), torch.as_tensor(mirror.sign, dtype=torch.float32)
+    return lambda x: x[..., index] * sign
+
+
+class GaitState:
+    """The clock, the residual and the low-passed velocity of `n` environments."""
+
+    def __init__(self, n: int) -> None:
+        self.phase = np.zeros(n)
+        self.residual = np.zeros((n, 12))
+        self.residual_before = np.zeros((n, 12))
+        self.mean_velocity = np.zeros((n, 3))  # vx, vy, wz over a stride
+        self.mean_command = np.zeros((n, 3))
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the past of `ids`."""
+        for array in (self.phase, self.residual, self.residual_before, self.mean_velocity, self.mean_command):
+            array[ids] = 0.0
+
+    def advance(self, env: VelocityEnv) -> None:
+        """One tick further; the clock rests at its start while the command is to stand."""
+        moving = env.command[:, 3] < 0.5
+        self.phase = np.where(moving, (self.phase + gait.frequency(env.command) * TICK) % 1.0, 0.0)
+        now = np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1)
+        self.mean_velocity += (now - self.mean_velocity) * TICK / STRIDE
+        self.mean_command += (env.command[:, :3] - self.mean_command) * TICK / STRIDE
+
+
+def body_of(env: VelocityEnv) -> gait.Body:
+    """What the gait reads."""
+    return gait.Body(
+        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, env.height, env.velocity[:, 2]
+    )
+
+
+def observe(env: VelocityEnv, g: GaitState, command: np.ndarray, previous: np.ndarray, base: np.ndarray) -> np.ndarray:
+    """The teacher's input (n, 67): the paper's 48 numbers from the true state, the clock, the gait's targets, contacts."""
+    angle = 2 * np.pi * g.phase[:, None]
+    moving = command[:, 3:] < 0.5
+    return np.concatenate(
+        [
+            command,
+            2 * env.roll_pitch,
+            2 * (env.q - robot.NOMINAL_Q),
+            0.1 * env.dq,
+            env.velocity,
+            0.5 * env.angular_velocity,
+            previous,
+            np.sin(angle) * moving,
+            np.cos(angle) * moving,
+            2 * np.clip(base - env.q, -1, 1),
+            env.contact,
+            5 * (env.height[:, None] - 0.4),
+        ],
+        axis=1,
+    ).astype(np.float32)
+
+
+def critic_extra(env: VelocityEnv, g: GaitState) -> np.ndarray:
+    """What only the critic sees: the drawn plant and the low-passed errors, (n, 14)."""
+    error = g.mean_command - g.mean_velocity
+    return np.concatenate([env.plants.drawn, error, g.mean_velocity], axis=1).astype(np.float32)
+
+
+def reward(env: VelocityEnv, g: GaitState) -> np.ndarray:
+    """Reward of one tick, (n,): tracking at every distance, attitude, effort, smooth residuals, feet on the clock."""
+    c = env.command
+    ev = np.sum((c[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
+    ew = (c[:, 2] - env.angular_velocity[:, 2]) ** 2
+    lag = g.mean_command - g.mean_velocity
+    tracking = 1.0 * np.exp(-ev / 0.25) + 0.5 * np.exp(-ev / 0.02) + 0.5 * np.exp(-ew / 0.25) + 0.25 * np.exp(-ew / 0.05)
+    tracking -= 1.5 * np.hypot(lag[:, 0], lag[:, 1]) + 0.5 * np.abs(lag[:, 2])
+    body = (
+        -0.5 * np.abs(env.roll_pitch).sum(1)
+        - 0.3 * np.abs(env.velocity[:, 2])
+        - 0.08 * np.hypot(env.angular_velocity[:, 0], env.angular_velocity[:, 1])
+        - 3.0 * np.abs(env.height - gait.HEIGHT)
+    )
+    power = np.maximum(0.2 * env.torque**2 + env.torque * env.dq, 0).sum(1)
+    effort = -6e-4 * power - 3e-4 * np.sum(env.dq**2, axis=1) * (1 + 20 * c[:, 3])
+    wanted = gait.wants_contact(g.phase, c)
+    slide = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
+    lift = gait.swing_height(g.phase, c)
+    feet = (
+        -0.15 * (wanted != env.contact).sum(1)
+        - 0.15 * (slide * env.contact).sum(1)
+        - 2.0 * np.maximum(0.7 * lift - env.clearance, 0).sum(1)
+    )
+    step = g.residual - g.residual_before
+    smooth = -0.03 * np.sum(step**2, axis=1) - 0.01 * np.sum(g.residual**2, axis=1)
+    return 0.6 + tracking + body + effort + feet + smooth
+
+
+@attrs.frozen
+class TeacherConfig:
+    """One run of stage 1."""
+
+    samples: float = 2e7
+    minutes: float = 45.0  # stops at whichever comes first
+    n: int = 512
+    length: int = 24  # samples a sequence
+    std: float = 0.5
+    final_std: float = 0.15
+    seed: int = 0
+    commands: CommandRange = CommandRange()
+    ppo: PpoConfig = PpoConfig()
+
+
+class TeacherRun:
+    """Environment, learner and what is needed to resume them."""
+
+    def __init__(self, config: TeacherConfig, directory: Path) -> None:
+        self.config, self.directory = config, directory
+        directory.mkdir(parents=True, exist_ok=True)
+        torch.manual_seed(config.seed)
+        self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands))
+        self.gait = GaitState(config.n)
+        size = len(OBSERVATION_MIRROR.index)
+        self.actor = Gaussian(Mlp(size, 12), 12, config.std)
+        self.critic = Mlp(size + CRITIC_MIRROR_FREE, 1)
+        self.ppo = Ppo(
+            self.actor, self.critic, config.ppo, torch_mirror(OBSERVATION_MIRROR), torch_mirror(symmetry.JOINTS)
+        )
+        self.samples = 0
+        checkpoint = directory / "teacher.pt"
+        if checkpoint.exists():
+            self.load(checkpoint)
+
+    def save(self, path: Path) -> None:
+        """Everything that a resumed run needs, written whole or not at all."""
+        content = {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "actor_optimiser": self.ppo.actor_optimiser.state_dict(),
+            "critic_optimiser": self.ppo.critic_optimiser.state_dict(),
+            "learning_rate": self.ppo.learning_rate,
+            "samples": self.samples,
+        }
+        torch.save(content, path.with_suffix(".part"))
+        path.with_suffix(".part").replace(path)
+
+    def load(self, path: Path) -> None:
+        """Go on from a checkpoint."""
+        content = torch.load(path, weights_only=True)
+        self.actor.load_state_dict(content["actor"])
+        self.critic.load_state_dict(content["critic"])
+        self.ppo.actor_optimiser.load_state_dict(content["actor_optimiser"])
+        self.ppo.critic_optimiser.load_state_dict(content["critic_optimiser"])
+        self.ppo.learning_rate, self.samples = content["learning_rate"], content["samples"]
+
+    def collect(self) -> tuple[Rollout, dict[str, float]]:
+        """One rollout of `length` samples with exploration noise."""
+        env, g, c = self.env, self.gait, self.config
+        keep: dict[str, list[np.ndarray]] = {name: [] for name in ("obs", "extra", "action", "mean", "reward", "ended", "cut")}
+        std = self.actor.log_std.exp().detach().numpy()
+        errors, falls = [], 0
+        base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
+        for _ in range(c.length):
+            obs = observe(env, g, env.command, g.residual, base)
+            with torch.no_grad():
+                mean = self.actor(torch.from_numpy(obs))[0].numpy()
+            action = (mean + std * env.rng.standard_normal(mean.shape)).astype(np.float32)
+            extra = critic_extra(env, g)
+            g.residual_before, g.residual = g.residual, np.clip(action, -5, 5).astype(float)
+            total = np.zeros(c.n)
+            for _ in range(HOLD):
+                env.tick(base + RESIDUAL * g.residual)
+                g.advance(env)
+                base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
+                total += reward(env, g)
+            fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
+            lag = g.mean_command - g.mean_velocity
+            errors.append([np.hypot(lag[:, 0], lag[:, 1]).mean(), np.abs(lag[:, 2]).mean()])
+            falls += int(fell.sum())
+            for name, value in zip(keep, (obs, extra, action, mean, total / HOLD - 4.0 * fell, fell, late), strict=True):
+                keep[name].append(value)
+            over = np.flatnonzero(fell | late)
+            if len(over):
+                env.reset(over)
+                g.reset(over)
+                base[over] = gait.targets(g.phase, env.command, body_of(env), robot.KP)[over]
+        self.samples += c.length * c.n
+        last = np.concatenate([observe(env, g, env.command, g.residual, base), critic_extra(env, g)], axis=1)
+        t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
+        rollout = Rollout(
+            obs=t["obs"],
+            critic_obs=torch.cat([t["obs"], t["extra"]], dim=-1),
+            action=t["action"],
+            mean=t["mean"],
+            reward=t["reward"],
+            ended=t["ended"],
+            cut=t["cut"],
+            mask=torch.ones_like(t["reward"]),
+            last_critic_obs=torch.from_numpy(last),
+        )
+        xy, wz = np.mean(errors, axis=0)
+        seconds = c.length * c.n * HOLD * TICK
+        return rollout, {"error_xy": xy, "error_wz": wz, "falls_per_minute": 60 * falls / seconds, "reward": float(t["reward"].mean())}
+
+    def train(self) -> None:
+        """Until the budget is spent; saves as it goes."""
+        c = self.config
+        started, first = time.monotonic(), self.samples
+        writer = SummaryWriter(str(self.directory))
+        columns = [*Progress.get_default_columns(), TextColumn("{task.fields[note]}")]
+        with Progress(*columns) as progress:
+            task = progress.add_task("teacher", total=c.samples, completed=self.samples, note="")
+            update = 0
+            while self.samples < c.samples and time.monotonic() - started < 60 * c.minutes:
+                rollout, seen = self.collect()
+                done = self.samples / c.samples
+                with torch.no_grad():
+                    bound = float(np.log(c.std + (c.final_std - c.std) * min(1.0, 1.3 * done)))
+                    self.actor.log_std.clamp_(max=bound)
+                seen |= self.ppo.update(rollout)
+                for name, value in seen.items():
+                    writer.add_scalar(f"teacher/{name}", value, self.samples)
+                rate = (self.samples - first) / (time.monotonic() - started)
+                note = f"error {seen['error_xy']:.3f} m/s {seen['error_wz']:.3f} rad/s, {seen['falls_per_minute']:.2f} falls/min, {rate:.0f}/s"
+                progress.update(task, completed=self.samples, note=note)
+                update += 1
+                if update % 25 == 0:
+                    self.save(self.directory / "teacher.pt")
+                    progress.console.print(
+                        f"{self.samples / 1e6:.2f} M  {note}  reward {seen['reward']:.2f}  kl {seen['kl']:.4f}  rate {self.ppo.learning_rate:.1e}"
+                        f"  ev {seen['explained_variance']:.2f}  sym {seen['symmetry']:.3f}"
+                    )
+        self.save(self.directory / "teacher.pt")
+        writer.close()
