@@ -1,0 +1,66 @@
+"""What every node does in the same way: its parameters, and its main. For node files only: it needs rclpy."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import attrs
+import rclpy
+from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+
+Config = TypeVar("Config")
+
+
+class StartError(ValueError):
+    """Why a node cannot start, in one sentence."""
+
+
+def read_parameters(node: Node, config: type[Config]) -> Config:
+    """Declare each field of the attrs class `config` as a parameter and return what was set for them.
+
+    A field's default is the parameter's and decides its type, its metadata `description` says what it means
+    and in which unit; tuples are lists. Parameters are fixed once the node runs. Raises StartError for a
+    parameter that the node does not have, one of another type, and one that the class refuses.
+    """
+    fields = attrs.fields(config)  # type: ignore[arg-type]
+    names = [field.name for field in fields]
+    values: dict[str, Any] = {}
+    for field in fields:
+        default = list(field.default) if isinstance(field.default, tuple) else field.default
+        descriptor = ParameterDescriptor(description=field.metadata["description"], read_only=True)
+        try:
+            value = node.declare_parameter(field.name, default, descriptor).value
+        except ParameterException as error:
+            raise StartError(f"parameter {field.name}: {error}") from error
+        values[field.name] = tuple(value) if isinstance(field.default, tuple) else value
+    for name in node._parameter_overrides:  # rclpy keeps silent about parameters that nobody declares
+        if not node.has_parameter(name) and not name.startswith("qos_overrides."):
+            raise StartError(f"unknown parameter {name}, expected one of {', '.join(names)}")
+    try:
+        return config(**values)
+    except ValueError as error:
+        raise StartError(f"parameters: {error}") from error
+
+
+def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
+    """Start a node, serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1."""
+    try:
+        rclpy.spin(_start(make_node, args))
+    except (KeyboardInterrupt, ExternalShutdownException):
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C comes twice where a launcher forwards it
+    finally:
+        rclpy.try_shutdown()
+
+
+def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
+    try:
+        rclpy.init(args=args)
+        return make_node()
+    except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
+        sys.exit(" ".join(str(error).split()))
