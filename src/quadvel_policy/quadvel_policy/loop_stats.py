@@ -1,4 +1,4 @@
-"""How well a periodic loop keeps time: which samples are due, and percentiles of its times since the start.
+"""How well a periodic loop keeps time: percentiles of its times since the start.
 
 It measures nothing itself; the controller hands it what it measured.
 """
@@ -10,6 +10,7 @@ from collections import deque
 
 import attrs
 import numpy as np
+from quadvel_description.tick_grid import TickGrid as TickGrid
 
 
 class Histogram:
@@ -33,28 +34,6 @@ class Histogram:
             return math.nan
         bin = int(np.searchsorted(cumulated, math.ceil(percent / 100.0 * cumulated[-1])))
         return self._SHORTEST * math.exp((bin + 0.5) * self._WIDTH)
-
-
-class TickGrid:
-    """Picks the samples to answer: one each `period` (s) of the samples' own clock, however often they come.
-
-    Deadlines are absolute: neither jitter nor the time that the work takes adds up.
-    """
-
-    def __init__(self, period: float) -> None:
-        self._period = period
-        self._next: float | None = None
-        self._last = -math.inf
-
-    def periods(self, stamp: float) -> int:
-        """Periods since the last answer: 0 means not due, 1 on time, more that some were missed. stamp: s."""
-        if self._next is None or stamp < self._last:
-            self._next = stamp
-        due = math.floor((stamp - self._next) / self._period + 0.5) + 1
-        if due > 0:
-            self._next += due * self._period
-            self._last = stamp
-        return max(due, 0)
 
 
 @attrs.frozen
