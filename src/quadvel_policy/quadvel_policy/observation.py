@@ -290,7 +290,7 @@ METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
 
 
 class ActionMap:
-    """What a network's output means: target = offset + scale * clip(action), rad, within the range of commands.
+    """What an output means: target = offset + scale * clip(action), rad, within the range of commands.
 
     offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. The
     range (COMMAND_LOWER to COMMAND_UPPER) is part of the meaning: the robot's own safety layer clamps targets
