@@ -1,0 +1,116 @@
+"""The AlienGo as a URDF for `robot_state_publisher` and RViz; `python -m quadvel_description.urdf` prints it.
+
+Links, inertials and limits come from `robot`, shapes from the MJCF. Simulation uses the MJCF, not this.
+"""
+
+from __future__ import annotations
+
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+
+from . import robot
+from .mjcf import Plant, load_model
+
+ROOT = "base"
+"""Link that carries the trunk: KDL, which robot_state_publisher uses, wants a root without inertia."""
+
+
+def _text(*values: float) -> str:
+    return " ".join(repr(float(value) + 0.0) for value in values)  # + 0.0: no negative zeros
+
+
+def _rpy(quaternion: np.ndarray) -> np.ndarray:
+    """Roll, pitch, yaw (rad) of a quaternion wxyz, URDF's fixed-axis angles."""
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    r = matrix.reshape(3, 3)
+    pitch = np.arctan2(-r[2, 0], np.hypot(r[0, 0], r[1, 0]))
+    return np.array([np.arctan2(r[2, 1], r[2, 2]), pitch, np.arctan2(r[1, 0], r[0, 0])])
+
+
+def _add_inertial(element: ElementTree.Element, inertial: robot.Inertial) -> None:
+    node = ElementTree.SubElement(element, "inertial")
+    ElementTree.SubElement(node, "origin", xyz=_text(*inertial.com), rpy="0 0 0")
+    ElementTree.SubElement(node, "mass", value=_text(inertial.mass))
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    tensor = {name: _text(value) for name, value in zip(names, inertial.full(), strict=True)}
+    ElementTree.SubElement(node, "inertia", tensor)
+
+
+def _add_shape(element: ElementTree.Element, model: mujoco.MjModel, geom: int, origin: np.ndarray) -> None:
+    """The MJCF shape `geom` as visual and collision of a link that lies at `origin` in the geom's body."""
+    size = model.geom_size[geom]
+    shape: tuple[str, dict[str, str]]
+    match int(model.geom_type[geom]):
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            shape = "box", {"size": _text(*(2 * size))}
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            shape = "cylinder", {"radius": _text(size[0]), "length": _text(2 * size[1])}
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            shape = "sphere", {"radius": _text(size[0])}
+        case other:
+            raise ValueError(
+                f"geom {model.geom(geom).name!r}: found type {other}, expected box, cylinder or sphere"
+            )
+    for role in ("visual", "collision"):
+        node = ElementTree.SubElement(element, role)
+        position = model.geom_pos[geom] - origin
+        ElementTree.SubElement(node, "origin", xyz=_text(*position), rpy=_text(*_rpy(model.geom_quat[geom])))
+        ElementTree.SubElement(ElementTree.SubElement(node, "geometry"), shape[0], shape[1])
+        if role == "visual":
+            colour = _text(*np.round(model.geom_rgba[geom].astype(float), 3))
+            material = ElementTree.SubElement(node, "material", name=f"rgba {colour}")
+            ElementTree.SubElement(material, "color", rgba=colour)
+
+
+def _add_link(parent: ElementTree.Element, link: robot.Link, model: mujoco.MjModel) -> None:
+    element = ElementTree.SubElement(parent, "link", name=link.name)
+    _add_inertial(element, link.inertial)
+    for geom in range(model.ngeom):
+        body = model.body(model.geom_bodyid[geom]).name
+        owner = (
+            model.geom(geom).name or body
+        )  # a foot is a link of its own here, and a named geom of the calf there
+        if owner == link.name:
+            _add_shape(element, model, geom, np.zeros(3) if body == owner else np.array(link.origin))
+
+
+def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
+    """What holds `link` to its parent: a joint of the joint table, or a fixed one."""
+    name = f"{link.name}_joint" if link.axis else f"{link.name}_fixed"
+    element = ElementTree.SubElement(parent, "joint", name=name, type="revolute" if link.axis else "fixed")
+    ElementTree.SubElement(element, "parent", link=link.parent or ROOT)
+    ElementTree.SubElement(element, "child", link=link.name)
+    ElementTree.SubElement(element, "origin", xyz=_text(*link.origin), rpy="0 0 0")
+    if link.axis:
+        i = robot.JOINT_NAMES.index(name)
+        ElementTree.SubElement(element, "axis", xyz={"x": "1 0 0", "y": "0 1 0"}[link.axis])
+        ElementTree.SubElement(
+            element,
+            "limit",
+            lower=_text(robot.LOWER[i]),
+            upper=_text(robot.UPPER[i]),
+            effort=_text(robot.TORQUE_LIMIT[i]),
+            velocity=_text(robot.VELOCITY_LIMIT[i]),
+        )
+        ElementTree.SubElement(
+            element, "dynamics", damping=_text(robot.DAMPING[i]), friction=_text(robot.FRICTION[i])
+        )
+
+
+def urdf() -> str:
+    """The URDF as text: root link `base`, the trunk fixed to it, joints named as in `robot.JOINT_NAMES`."""
+    model = load_model(Plant(plane=False))
+    root = ElementTree.Element("robot", name="aliengo")
+    ElementTree.SubElement(root, "link", name=ROOT)
+    for link in robot.LINKS:
+        _add_link(root, link, model)
+        _add_joint(root, link)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+if __name__ == "__main__":
+    print(urdf(), end="")

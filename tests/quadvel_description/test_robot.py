@@ -1,0 +1,79 @@
+"""The joint and link tables against Unitree's own numbers."""
+
+import numpy as np
+import pytest
+
+from quadvel_description import robot
+
+# mass (kg), centre of mass (m) and inertia (ixx iyy izz ixy ixz iyz, kg mm^2), worked out apart
+LUMPED = {
+    "FL_hip": (
+        2.139,
+        (-0.020676, 0.016144, -0.000014),
+        (2559.307, 4131.567, 4327.706, -642.293, 1.900, 1.254),
+    ),
+    "FL_thigh": (
+        0.771,
+        (-0.004647, -0.020282, -0.039947),
+        (5577.995, 4734.426, 1493.562, 69.063, -348.440, 614.508),
+    ),
+    "FL_calf": (0.267, (0.002156, 0.000049, -0.166671), (2683.514, 2696.057, 54.797, 0.031, -8.147, -0.831)),
+}
+
+
+def test_the_robot_weighs_what_its_links_weigh():
+    assert abs(robot.MASS - (24.936 + 0.001)) < 1e-9  # the IMU is the last gram
+
+
+def test_the_trunk_carries_its_hip_rotors_and_the_imu():
+    trunk = robot.lumped("trunk")
+    assert trunk.mass == pytest.approx(12.228 + 0.001)
+    np.testing.assert_allclose(trunk.com, (0.008390, 0.003656, 0.000260), atol=1e-6)
+    inertia = (0.054026921, 0.258759810, 0.284296015, 0.001684806, 0.000234603, 0.000119200)
+    imu = (1e-4, 1e-4, 1e-4, 0, 0, 0)
+    np.testing.assert_allclose(trunk.full(), np.add(inertia, imu), atol=2e-7)
+
+
+@pytest.mark.parametrize("name", LUMPED)
+def test_links_carry_their_rotors(name):
+    mass, com, micro = LUMPED[name]
+    lumped = robot.lumped(name)
+    assert lumped.mass == pytest.approx(mass, abs=1e-9)
+    np.testing.assert_allclose(lumped.com, com, atol=1e-6)
+    np.testing.assert_allclose(np.array(lumped.full()) * 1e6, micro, atol=1e-3)
+
+
+def test_every_inertia_is_that_of_a_real_body():
+    for link in robot.LINKS:
+        moments = np.linalg.eigvalsh(link.inertial.tensor)
+        assert (moments > 0).all(), link.name
+        assert moments[2] <= moments[0] + moments[1] + 1e-12, link.name
+
+
+def test_joints_stand_in_the_order_of_the_robot():
+    assert robot.JOINT_NAMES[:4] == ("FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint")
+    assert [name[:2] for name in robot.JOINT_NAMES[::3]] == ["FR", "FL", "RR", "RL"]
+    assert robot.joint_index(robot.JOINT_NAMES) == list(range(12))
+    assert robot.joint_index(["RL_calf", "FR_hip_joint"]) == [11, 0]
+
+
+def test_an_unknown_joint_is_refused_by_name():
+    with pytest.raises(ValueError, match="found 'FR_knee', expected one of FR_hip_joint"):
+        robot.joint_index(["FR_hip", "FR_knee"])
+
+
+def test_postures_and_commands_lie_within_the_mechanical_range():
+    for q in (robot.NOMINAL_Q, robot.LIE_Q, robot.COMMAND_LOWER, robot.COMMAND_UPPER):
+        assert (q >= robot.LOWER).all()
+        assert (q <= robot.UPPER).all()
+
+
+def test_hips_may_be_commanded_further_outward_than_inward():
+    hips = robot.joint_index(["FR_hip", "FL_hip"])  # positive: right foot inward, left foot outward
+    np.testing.assert_array_equal(robot.COMMAND_LOWER[hips], [-1.047, -0.873])
+    np.testing.assert_array_equal(robot.COMMAND_UPPER[hips], [0.873, 1.047])
+
+
+def test_tables_cannot_be_changed_by_accident():
+    with pytest.raises(ValueError, match="read-only"):
+        robot.NOMINAL_Q[0] = 1.0

@@ -1,0 +1,106 @@
+"""The URDF says the same as the MJCF; MuJoCo reads both."""
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import mujoco
+import numpy as np
+import pytest
+
+from quadvel_description import kinematics, mjcf, robot
+from quadvel_description.urdf import ROOT, urdf
+
+INSTALLED = Path(__file__).parents[2] / "src" / "quadvel_description" / "urdf" / "aliengo.urdf"
+KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
+
+
+@pytest.fixture(scope="module")
+def imported() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(urdf().replace("</robot>", f"{KEEP_FIXED_LINKS}</robot>"))
+
+
+@pytest.fixture(scope="module")
+def simulated() -> mujoco.MjModel:
+    return mjcf.load_model(mjcf.Plant(plane=False))
+
+
+def _postures(imported: mujoco.MjModel, simulated: mujoco.MjModel, count: int):
+    """Postures, and the URDF's and the MJCF's MjData in them, with the trunk at the origin."""
+    first, second = mujoco.MjData(imported), mujoco.MjData(simulated)
+    for q in np.random.default_rng(0).uniform(robot.LOWER, robot.UPPER, size=(count, 12)):
+        for name, angle in zip(robot.JOINT_NAMES, q, strict=True):
+            first.joint(name).qpos = angle
+        second.qpos[:] = [0, 0, 0, 1, 0, 0, 0, *q]
+        for model, data in ((imported, first), (simulated, second)):
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+        yield q, first, second
+
+
+def test_urdf_and_mjcf_weigh_the_same(imported, simulated):
+    assert imported.body_mass.sum() == pytest.approx(robot.MASS, abs=1e-9)
+    assert simulated.body_mass.sum() == pytest.approx(robot.MASS, abs=1e-9)
+
+
+def test_urdf_and_mjcf_have_the_same_centre_of_mass(imported, simulated):
+    for _, first, second in _postures(imported, simulated, 20):
+        np.testing.assert_allclose(first.body(ROOT).subtree_com, second.body("trunk").subtree_com, atol=1e-9)
+
+
+def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulated):
+    rows = [imported.joint(name).dofadr[0] for name in robot.JOINT_NAMES]
+    for _, first, second in _postures(imported, simulated, 5):
+        inertia = []
+        for model, data in ((imported, first), (simulated, second)):
+            mujoco.mj_crb(model, data)
+            full = np.zeros((model.nv, model.nv))
+            mujoco.mj_fullM(model, data, full)
+            inertia.append(full - np.diag(model.dof_armature))
+        np.testing.assert_allclose(inertia[0][np.ix_(rows, rows)], inertia[1][6:, 6:], atol=1e-9)
+
+
+def test_urdf_and_mjcf_put_every_foot_at_the_same_place(imported, simulated):
+    for q, first, second in _postures(imported, simulated, 50):
+        for leg, foot in zip(robot.LEGS, kinematics.foot_positions(q), strict=True):
+            np.testing.assert_allclose(
+                first.body(f"{leg}_foot").xpos, second.geom(f"{leg}_foot").xpos, atol=1e-9
+            )
+            np.testing.assert_allclose(first.body(f"{leg}_foot").xpos, foot, atol=1e-9)
+
+
+def test_urdf_and_mjcf_show_the_same_shapes(imported, simulated):
+    def shapes(model: mujoco.MjModel, data: mujoco.MjData, collide: bool) -> np.ndarray:
+        rows = [
+            [model.geom_type[i], *model.geom_size[i], *data.geom_xpos[i], *np.abs(data.geom_xmat[i])]
+            for i in range(model.ngeom)
+            if not collide or model.geom_conaffinity[i]
+        ]
+        return np.array(sorted(rows))
+
+    _, first, second = next(_postures(imported, simulated, 1))
+    expected = shapes(simulated, second, False)
+    np.testing.assert_allclose(shapes(imported, first, True), expected, atol=1e-9)
+    assert imported.ngeom == 2 * len(expected)  # a visual and a collision shape each
+
+
+def test_limits_in_the_urdf_are_those_of_the_joint_table():
+    joints = {joint.get("name"): joint for joint in ElementTree.fromstring(urdf()).iter("joint")}
+    for i, name in enumerate(robot.JOINT_NAMES):
+        limit = joints[name].find("limit")
+        found = [float(limit.get(key)) for key in ("lower", "upper", "effort", "velocity")]
+        assert found == [robot.LOWER[i], robot.UPPER[i], robot.TORQUE_LIMIT[i], robot.VELOCITY_LIMIT[i]]
+
+
+def test_links_form_one_tree_below_a_root_without_inertia():
+    tree = ElementTree.fromstring(urdf())
+    links = [link.get("name") for link in tree.iter("link")]
+    children = [joint.find("child").get("link") for joint in tree.iter("joint")]
+    parents = [joint.find("parent").get("link") for joint in tree.iter("joint")]
+    assert len(set(links)) == len(links)
+    assert sorted([ROOT, *children]) == sorted(links)
+    assert set(parents) <= set(links)
+    assert tree.find(f"link[@name='{ROOT}']/inertial") is None
+
+
+def test_the_installed_file_is_the_present_urdf():
+    assert INSTALLED.read_text() == urdf(), f"write it anew: python -m quadvel_description.urdf > {INSTALLED}"
