@@ -71,6 +71,7 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
             name="payload",
             pos=config.payload_position,
             mass=config.payload,
+            ipos=np.zeros(3),
             inertia=np.full(3, 0.4 * config.payload * _PAYLOAD_RADIUS**2),
             explicitinertial=True,
         )
@@ -178,7 +179,7 @@ class Simulator:
     def push(
         self, body: str, force: ArrayLike, torque: ArrayLike = (0.0, 0.0, 0.0), duration: float = 0.1
     ) -> None:
-        """Push `body` at its centre of mass: `force` (N), `torque` (N m), world frame; for `duration` (s) from now.
+        """Push `body` at its centre of mass for `duration` (s): `force` (N), `torque` (N m), world frame.
 
         Pushes add up. ValueError names an unknown body, a wrench that is not finite, a duration under 1 ms.
         """
