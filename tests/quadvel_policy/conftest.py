@@ -114,8 +114,14 @@ def metadata() -> PolicyMetadata:
 
 
 @pytest.fixture
-def policy(metadata: PolicyMetadata) -> StubPolicy:
-    return StubPolicy(metadata)
+def make_policy() -> Callable[..., StubPolicy]:
+    """make_policy(**changes of the metadata)."""
+    return lambda **changes: StubPolicy(make_metadata(**changes))
+
+
+@pytest.fixture
+def policy(make_policy: Callable[..., StubPolicy]) -> StubPolicy:
+    return make_policy()
 
 
 @pytest.fixture

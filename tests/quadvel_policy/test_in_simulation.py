@@ -1,0 +1,68 @@
+"""The supervisor on the simulated robot: it stands up, hands over to a policy that stands, and lies down."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from quadvel_description.robot import KP, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_policy.supervisor import Supervisor, SupervisorConfig
+from quadvel_sim.simulator import Simulator
+
+from quadvel_description import mjcf
+
+STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
+
+
+class Stand:
+    """A simulated robot that lies, and a supervisor whose policy holds the nominal posture."""
+
+    def __init__(self, make_policy: Any) -> None:
+        sag = mjcf.gravity_torque(mjcf.load_model(mjcf.Plant())) / KP
+        self.simulator = Simulator()
+        self.supervisor = Supervisor(
+            make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=True)
+        )
+        self.torques: list[np.ndarray] = []
+
+    def run(self, seconds: float, command: Any = STILL) -> None:
+        for _ in range(round(seconds / 0.005)):
+            state, velocity = self.simulator.state(), self.simulator.truth().linear_velocity
+            asked = self.supervisor.tick(self.simulator.time, state, velocity, command)
+            self.torques.append(asked.kp * (asked.q - state.q) + asked.kd * (asked.dq - state.dq))
+            self.simulator.command(asked)
+            self.simulator.step(5)
+
+    @property
+    def height(self) -> float:
+        return float(self.simulator.truth().position[2])
+
+
+@pytest.fixture
+def stand(make_policy: Any) -> Stand:
+    return Stand(make_policy)
+
+
+def test_it_stands_up_walks_on_command_and_lies_down_without_a_jump_of_torque(stand: Stand) -> None:
+    stand.run(2.5)
+    assert stand.supervisor.mode == "stance", stand.supervisor.reason
+    assert stand.height == pytest.approx(NOMINAL_HEIGHT, abs=0.03)
+    stand.run(1.0, STEP_IN_PLACE)
+    assert stand.supervisor.mode == "walk", stand.supervisor.reason
+    assert stand.height > 0.3  # soft gains, and drives that give less than they are asked for
+    stand.run(0.2)
+    assert stand.supervisor.request("lie_down")[0]
+    stand.run(1.5)
+    assert stand.supervisor.mode == "passive", stand.supervisor.reason
+    assert stand.height < 0.2
+    jumps = np.abs(np.diff(stand.torques[: -round(0.55 / 0.005)], axis=0))  # until it goes limp, lying
+    assert jumps.max() < 4.0, f"{jumps.max():.1f} N m between two ticks"
+
+
+def test_a_robot_that_is_pushed_over_goes_to_damping(stand: Stand) -> None:
+    stand.run(2.5)
+    stand.simulator.push("trunk", np.array([0.0, 500.0, 0.0]), np.zeros(3), 0.4)
+    stand.run(1.5, STEP_IN_PLACE)
+    assert stand.supervisor.mode == "fault"
+    assert stand.supervisor.reason

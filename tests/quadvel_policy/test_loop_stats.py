@@ -1,0 +1,86 @@
+"""Which samples a loop answers, and the percentiles of what it took."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from quadvel_policy.loop_stats import Histogram, LoopStats, TickGrid
+
+PERIOD = 0.005
+
+
+def answered(stamps: np.ndarray) -> list[int]:
+    grid = TickGrid(PERIOD)
+    return [grid.periods(stamp) for stamp in stamps]
+
+
+def test_every_sample_at_the_loops_own_rate_is_answered() -> None:
+    assert answered(1e9 + PERIOD * np.arange(1000)) == [1] * 1000
+
+
+def test_jitter_loses_no_sample_and_does_not_add_up() -> None:
+    jitter = np.random.default_rng(0).uniform(-0.002, 0.002, 1000)
+    jitter[0] = 0.0
+    assert answered(PERIOD * np.arange(1000) + jitter) == [1] * 1000
+
+
+@pytest.mark.parametrize("rate", [1000, 500, 400, 333])
+def test_of_faster_samples_as_many_are_answered_as_periods_passed(rate: int) -> None:
+    stamps = np.arange(10 * rate) / rate
+    counts = answered(stamps)
+    assert set(counts) == {0, 1}
+    assert sum(counts) == pytest.approx(2000, abs=1)
+
+
+def test_missed_periods_are_counted_and_the_grid_goes_on() -> None:
+    grid = TickGrid(PERIOD)
+    assert [grid.periods(t) for t in (0.0, 0.005, 0.030, 0.035)] == [1, 1, 5, 1]
+
+
+def test_a_clock_that_is_set_back_starts_a_new_grid() -> None:
+    grid = TickGrid(PERIOD)
+    assert [grid.periods(t) for t in (100.0, 100.005, 3.0, 3.005)] == [1, 1, 1, 1]
+
+
+def test_percentiles_are_those_of_the_samples_within_one_percent() -> None:
+    samples = np.random.default_rng(1).lognormal(math.log(2e-4), 0.7, 20000)
+    histogram = Histogram()
+    for sample in samples:
+        histogram.add(sample)
+    for percent in (1, 50, 99, 99.9):
+        expected = np.percentile(samples, percent, method="inverted_cdf")
+        assert histogram.percentile(percent) == pytest.approx(expected, rel=0.011)
+
+
+def test_percentiles_of_nothing_are_nan_and_extremes_are_counted() -> None:
+    histogram = Histogram()
+    assert math.isnan(histogram.percentile(50))
+    for sample in (0.0, 100.0):
+        histogram.add(sample)
+    assert histogram.percentile(50) == pytest.approx(1e-6, rel=0.01)
+    assert histogram.percentile(100) == pytest.approx(10.0, rel=0.02)
+
+
+def test_the_summary_is_in_the_messages_units() -> None:
+    stats = LoopStats()
+    for i in range(400):
+        stats.add(PERIOD * i, compute=3e-4, inference=math.nan if i < 100 else 4e-5, missed=0)
+    summary = stats.summary(now=PERIOD * 399)
+    assert summary.rate_hz == 200
+    assert summary.period_p99_ms == pytest.approx(5.0, rel=0.01)
+    assert summary.inference_p50_us == pytest.approx(40.0, rel=0.01)
+    assert summary.compute_p50_us == pytest.approx(300.0, rel=0.01)
+    assert summary.compute_p99_us == pytest.approx(300.0, rel=0.01)
+    assert summary.overruns == 0
+    assert stats.summary(now=PERIOD * 399 + 5.0).rate_hz == 0
+
+
+def test_missed_deadlines_in_a_row_end_with_one_that_is_kept() -> None:
+    stats = LoopStats()
+    for i, missed in enumerate((0, 1, 2, 1)):
+        stats.add(PERIOD * i, compute=1e-3, inference=math.nan, missed=missed)
+    assert (stats.overruns, stats.in_a_row) == (4, 4)
+    stats.add(1.0, compute=1e-3, inference=math.nan, missed=0)
+    assert (stats.overruns, stats.in_a_row) == (4, 0)
