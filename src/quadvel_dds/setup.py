@@ -6,7 +6,6 @@ setup(
     name=package,
     version="0.1.0",
     packages=[package, f"{package}.rclpy", f"{package}.rclpy.impl"],
-    package_data={package: ["definitions/*/srv/*.srv"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{package}"]),
         (f"share/{package}", ["package.xml"]),

@@ -76,7 +76,14 @@ def parse(args: Sequence[str]) -> RosArguments:
 def _parse_one(flag: str, following: Iterable[str], found: RosArguments) -> None:
     if flag in IGNORED_FLAGS:
         return
-    takers = {"-p": "-p", "--param": "-p", "-r": "-r", "--remap": "-r", "--params-file": "file", "--log-level": "log"}
+    takers = {
+        "-p": "-p",
+        "--param": "-p",
+        "-r": "-r",
+        "--remap": "-r",
+        "--params-file": "file",
+        "--log-level": "log",
+    }
     kind = takers.get(flag)
     if kind is None and ":=" in flag and not flag.startswith("-"):
         found.remappings.append(parse_rule(flag, flag))  # a bare rule, the old way to remap
@@ -91,7 +98,9 @@ def _parse_one(flag: str, following: Iterable[str], found: RosArguments) -> None
     if kind == "-p":
         rule = parse_rule(flag, value)
         pattern = f"/**/{rule.node}" if rule.node else "/**"
-        found.overrides.append(ParameterOverride(pattern, rule.name, parse_value(f"{flag} {value}", rule.value)))
+        found.overrides.append(
+            ParameterOverride(pattern, rule.name, parse_value(f"{flag} {value}", rule.value))
+        )
     elif kind == "-r":
         found.remappings.append(parse_rule(flag, value))
     elif kind == "file":
@@ -165,7 +174,9 @@ def _walk_nodes(path: Path, prefix: str, tree: Any) -> Iterable[ParameterOverrid
         if key != SCOPE_KEY:
             yield from _walk_nodes(path, f"{prefix}/{str(key).strip('/')}", branch)
         elif not isinstance(branch, dict):
-            raise InvalidROSArgsError(f"parameter file '{path}': '{prefix}' {SCOPE_KEY}: expected names and values")
+            raise InvalidROSArgsError(
+                f"parameter file '{path}': '{prefix}' {SCOPE_KEY}: expected names and values"
+            )
         else:
             yield from (
                 ParameterOverride(prefix, name, check_value(f"parameter file '{path}', '{name}'", value))

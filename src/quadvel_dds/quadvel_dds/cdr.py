@@ -268,14 +268,14 @@ def length_error(target: str, expected: int, found: int) -> ValueError:
     return ValueError(f"field '{target[3:].replace('._', '.')}' holds {found} values, expected {expected}")
 
 
-def make_writer(typename: str, describe: Describe) -> Callable[[Any, bytearray, int], None]:
+def make_writer(typename: str, describe: Describe) -> Callable[..., None]:
     """Function `write(m, b, o=4)` for a type, see `_Writer`."""
     generator = _Writer(describe)
     generator.message(typename, "m")
     return generator.compile("write(m, b, o=4)", "return")
 
 
-def make_reader(typename: str, describe: Describe) -> Callable[[bytes, int], Any]:
+def make_reader(typename: str, describe: Describe) -> Callable[..., Any]:
     """Function `read(d, p=4, o=4)` for a type, see `_Reader`. Raises struct.error or ValueError on malformed data."""
     generator = _Reader(describe)
     variable = generator.local()

@@ -10,7 +10,9 @@ class UnsupportedError(NotImplementedError):
     """A part of rclpy that the embedded middleware does not offer."""
 
     def __init__(self, what: str) -> None:
-        super().__init__(f"{what} is not offered by quadvel's embedded middleware (quadvel_dds); use ROS 2 for it")
+        super().__init__(
+            f"{what} is not offered by quadvel's embedded middleware (quadvel_dds); use ROS 2 for it"
+        )
 
 
 def unsupported(what: str) -> Callable[..., NoReturn]:

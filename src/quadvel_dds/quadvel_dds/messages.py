@@ -20,15 +20,12 @@ from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from quadvel_dds import cdr
+from quadvel_dds.definitions import SERVICES
 
 HERE = Path(__file__).parent
-# Our own messages: `interfaces` where pip installed us, else beside us in the source tree.
-OWN = next(d for d in (HERE / "interfaces", HERE.parents[1] / "quadvel_msgs") if (d / "msg").is_dir())
-SOURCES = {
-    "std_srvs": HERE / "definitions/std_srvs",
-    "rcl_interfaces": HERE / "definitions/rcl_interfaces",
-    "quadvel_msgs": OWN,
-}
+# Our own definitions: `interfaces` where pip installed us, else beside us in the source tree.
+OWN_PACKAGE = "quadvel_msgs"
+OWN_FILES = next(d for d in (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE) if (d / "msg").is_dir())
 # Default values, which the definitions carried by rosbags leave out.
 DEFAULTS = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
@@ -40,20 +37,18 @@ Describe = tuple[type, cdr.Fields]
 
 
 def _load_store() -> Any:
+    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it were a message."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    files = ((p, f) for p, d in SOURCES.items() for f in sorted([*d.glob("msg/*.msg"), *d.glob("srv/*.srv")]))
-    for package, file in files:
-        if file.suffix == ".msg":
-            texts = {f"{package}/msg/{file.stem}": file.read_text()}
-        else:
-            # Line breaks around: the "---" may start the file or end it, where a request or a response is empty.
-            request, _, response = f"\n{file.read_text()}\n".partition("\n---\n")
-            name = f"{package}/srv/{file.stem}"
-            texts = {f"{name}_Request": request, f"{name}_Response": response}
-        for name, text in texts.items():
-            # rosbags knows no services: each half is parsed as if it were a message of that package.
-            (definition,) = get_types_from_msg(text, f"{package}/msg/{file.stem}").values()
-            store.register({name: definition})
+    for file in sorted(OWN_FILES.glob("msg/*.msg")):
+        store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
+    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(OWN_FILES.glob("srv/*.srv"))}
+    for name, text in {**SERVICES, **own}.items():
+        package, _, short = name.split("/")
+        # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.
+        request, _, response = f"\n{text}\n".partition("\n---\n")
+        for part, definition in {"Request": request, "Response": response}.items():
+            (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
+            store.register({f"{name}_{part}": parsed})
     return store
 
 
@@ -131,7 +126,7 @@ def describe(typename: str) -> Describe:
 
 
 @cache
-def writer(typename: str) -> Callable[[Any, bytearray], None]:
+def writer(typename: str) -> Callable[..., None]:
     return cdr.make_writer(typename, describe)
 
 
@@ -159,7 +154,9 @@ def serialize(message: Message, prefix: bytes = b"") -> bytearray:
 def deserialize(data: bytes, typename: str, prefix_size: int = 0) -> Any:
     """Message from its CDR bytes. Raises ValueError where they do not hold one."""
     if data[:2] != cdr.HEADER[:2]:
-        raise ValueError(f"{typename}: encapsulation {data[:2].hex()} found, expected 0001 (little-endian CDR)")
+        raise ValueError(
+            f"{typename}: encapsulation {data[:2].hex()} found, expected 0001 (little-endian CDR)"
+        )
     try:
         return reader(typename)(data, 4 + prefix_size)
     except Exception as error:
@@ -185,7 +182,13 @@ def type_text(description: Any) -> str:
         return f"{package}/{name}"
     if kind == Nodetype.BASE:
         name, bound = detail
-        renamed = {"bool": "boolean", "byte": "octet", "char": "uint8", "float32": "float", "float64": "double"}
+        renamed = {
+            "bool": "boolean",
+            "byte": "octet",
+            "char": "uint8",
+            "float32": "float",
+            "float64": "double",
+        }
         return f"string<{bound}>" if bound else renamed.get(name, name)
     inner, count = type_text(detail[0]), detail[1]
     if kind == Nodetype.ARRAY:
@@ -249,7 +252,10 @@ def _make_init(cls: type, typename: str, fields: cdr.Fields) -> Callable[..., No
     lines = [f"def __init__(self, *, {', '.join(f'{field}=None' for field, _ in fields)}):"]
     for field, description in fields:
         names[f"make_{field}"] = _default(typename, field, description)
-        lines += [f"    if {field} is None: self._{field} = make_{field}()", f"    else: self.{field} = {field}"]
+        lines += [
+            f"    if {field} is None: self._{field} = make_{field}()",
+            f"    else: self.{field} = {field}",
+        ]
     exec("\n".join(lines), names)
     return names["__init__"]  # type: ignore[no-any-return]
 

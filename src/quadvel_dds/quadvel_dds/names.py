@@ -10,7 +10,9 @@ from quadvel_dds.arguments import Rule
 TOKEN = r"[A-Za-z_][A-Za-z0-9_]*"
 NODE = re.compile(TOKEN)
 ABSOLUTE = re.compile(rf"/|(/{TOKEN})+")
-TOPIC = re.compile(rf"(~|~?/)?({TOKEN}|\{{(node|ns|namespace)\}})((/|(?=\{{)|(?<=\}}))({TOKEN}|\{{(node|ns|namespace)\}}))*|~")
+TOPIC = re.compile(
+    rf"(~|~?/)?({TOKEN}|\{{(node|ns|namespace)\}})((/|(?=\{{)|(?<=\}}))({TOKEN}|\{{(node|ns|namespace)\}}))*|~"
+)
 
 
 def fault(pattern: re.Pattern[str], name: str) -> tuple[str, int] | None:

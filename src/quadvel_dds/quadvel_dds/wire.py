@@ -79,6 +79,7 @@ class Participant:
         if domain_id not in _domains:
             _domains[domain_id] = Domain(domain_id, domain_configuration())
         self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
+        self.gid = self.dds.get_guid().bytes
         self._topics: dict[tuple[str, str], Topic[Any]] = {}
         self._builtin = {
             topic: BuiltinDataReader(self.dds, topic)
@@ -118,7 +119,7 @@ class Writer:
 
     def __init__(self, dds: DataWriter[Any]) -> None:
         self.dds = dds
-        self.handle = dds.get_instance_handle()
+        self.handle = dds.get_instance_handle() % 2**64  # Cyclone's Python layer gives it a sign
         self.gid = dds.get_guid().bytes
 
     def write(self, data: bytearray) -> None:
@@ -219,7 +220,9 @@ class WaitSet:
 class CallEndpoint:
     """A client's or a service's pair of writer and reader; every sample starts with (client id, sequence number)."""
 
-    def __init__(self, participant: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
+    def __init__(
+        self, participant: Participant, typename: str, name: str, profile: Any, serves: bool
+    ) -> None:
         # Tells which writer and reader belong together, as in rmw_cyclonedds.
         identity = ".".join(f"{byte:02x}" for byte in uuid.uuid4().bytes)
         user_data = f"{'serviceid' if serves else 'clientid'}={identity};"
@@ -268,9 +271,13 @@ def to_dds_qos(profile: Any, user_data: str) -> Qos:
     by_topic = profile.liveliness.name == "MANUAL_BY_TOPIC"
     policies = [
         history,
-        Policy.Reliability.BestEffort if best_effort else Policy.Reliability.Reliable(duration(infinite=True)),
+        Policy.Reliability.BestEffort
+        if best_effort
+        else Policy.Reliability.Reliable(duration(infinite=True)),
         Policy.Liveliness.ManualByTopic(lease) if by_topic else Policy.Liveliness.Automatic(lease),
         Policy.Userdata(user_data.encode()),
+        Policy.WriterDataLifecycle(autodispose=False),
+        Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
     ]
     if profile.durability.name == "TRANSIENT_LOCAL":
         policies += [Policy.Durability.TransientLocal, Policy.DurabilityService(0, history, -1, -1, -1)]

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent, SetParametersResult
+from rcl_interfaces.msg import ListParametersResult, ParameterDescriptor, ParameterEvent, SetParametersResult
 
 from quadvel_dds.errors import unsupported
 
@@ -51,7 +51,11 @@ class ParameterMixin:
         """
         if name in self._parameters:
             raise ParameterAlreadyDeclaredException(name)
-        if not name or name.startswith(PARAMETER_SEPARATOR_STRING) or name.endswith(PARAMETER_SEPARATOR_STRING):
+        if (
+            not name
+            or name.startswith(PARAMETER_SEPARATOR_STRING)
+            or name.endswith(PARAMETER_SEPARATOR_STRING)
+        ):
             raise InvalidParameterException(name)
         descriptor = ParameterDescriptor() if descriptor is None else descriptor
         descriptor.name = name
@@ -90,10 +94,11 @@ class ParameterMixin:
     ) -> list[Parameter]:
         """Declare (name), (name, type or value) or (name, value, descriptor), each below `namespace`."""
         prefix = f"{namespace}{PARAMETER_SEPARATOR_STRING}" if namespace else ""
-        return [
-            self.declare_parameter(f"{prefix}{name}", *rest, ignore_override=ignore_override)
-            for name, *rest in parameters
-        ]
+        declared = []
+        for name, *rest in parameters:
+            value, descriptor = (*rest, None, None)[:2]
+            declared.append(self.declare_parameter(f"{prefix}{name}", value, descriptor, ignore_override))
+        return declared
 
     def undeclare_parameter(self, name: str) -> None:
         self._require_declared(name)
@@ -148,6 +153,20 @@ class ParameterMixin:
     def describe_parameters(self, names: list[str]) -> list[Any]:
         return [self.describe_parameter(name) for name in names]
 
+    def list_parameters(self, prefixes: list[str], depth: int) -> Any:
+        """Names below any of `prefixes` (all, if there are none), at most `depth` parts below (0: any), and their prefixes."""
+        result = ListParametersResult()
+        for name in self._parameters:
+            below = [name, *(name[len(p) + 1 :] for p in prefixes if name.startswith(f"{p}{PARAMETER_SEPARATOR_STRING}"))]
+            candidates = below[1:] if prefixes else below
+            is_near = any(not depth or n.count(PARAMETER_SEPARATOR_STRING) < depth for n in candidates)
+            if is_near or name in prefixes:
+                result.names.append(name)
+                prefix = name.rpartition(PARAMETER_SEPARATOR_STRING)[0]
+                if prefix and prefix not in result.prefixes:
+                    result.prefixes.append(prefix)
+        return result
+
     def set_parameters(self, parameter_list: list[Parameter]) -> list[Any]:
         """Set parameters one by one; the results say which were refused and why."""
         return [self.set_parameters_atomically([parameter]) for parameter in parameter_list]
@@ -155,9 +174,13 @@ class ParameterMixin:
     def set_parameters_atomically(self, parameter_list: list[Parameter]) -> Any:
         """Set all parameters or, if one of them is refused, none. Raises ParameterNotDeclaredException."""
         if self._pre_set_parameters_callbacks:
-            parameter_list = [p for callback in self._pre_set_parameters_callbacks for p in callback(parameter_list)]
+            parameter_list = [
+                p for callback in self._pre_set_parameters_callbacks for p in callback(parameter_list)
+            ]
             if not parameter_list:
-                return SetParametersResult(successful=False, reason="the pre-set callbacks left no parameter to set")
+                return SetParametersResult(
+                    successful=False, reason="the pre-set callbacks left no parameter to set"
+                )
         for parameter in parameter_list:
             if not self._allow_undeclared_parameters:
                 self._require_declared(parameter.name)
@@ -174,7 +197,11 @@ class ParameterMixin:
             expected = Parameter.Type(descriptor.type)
             if descriptor.read_only:
                 yield f"Trying to set a read-only parameter: {parameter.name}."
-            elif not descriptor.dynamic_typing and parameter.type_ != expected and not _is_empty_list(parameter, expected):
+            elif (
+                not descriptor.dynamic_typing
+                and parameter.type_ != expected
+                and not _is_empty_list(parameter, expected)
+            ):
                 yield (
                     f"Wrong parameter type, expected '{expected.name}' got '{parameter.type_.name}' "
                     f"for parameter '{parameter.name}'"
@@ -200,7 +227,9 @@ class ParameterMixin:
             changes = event.new_parameters if is_new else event.changed_parameters
             changes.append(parameter.to_parameter_msg())
             self._parameters[parameter.name] = parameter
-            self._descriptors.setdefault(parameter.name, ParameterDescriptor(name=parameter.name, dynamic_typing=True))
+            self._descriptors.setdefault(
+                parameter.name, ParameterDescriptor(name=parameter.name, dynamic_typing=True)
+            )
         self._publish_parameter_event(event)  # type: ignore[attr-defined]
         for callback in self._post_set_parameters_callbacks:
             callback(parameters)
@@ -223,7 +252,6 @@ class ParameterMixin:
     def remove_post_set_parameters_callback(self, callback: PostSet) -> None:
         self._post_set_parameters_callbacks.remove(callback)
 
-    list_parameters = unsupported("Node.list_parameters")
     set_descriptor = unsupported("Node.set_descriptor")
 
 

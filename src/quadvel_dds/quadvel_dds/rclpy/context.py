@@ -12,6 +12,8 @@ from typing import Any
 
 from quadvel_dds import arguments, wire
 
+from ._graph import GraphAnnouncer
+
 _contexts: weakref.WeakSet[Context] = weakref.WeakSet()
 
 
@@ -25,7 +27,8 @@ class Context:
         self._running = self._initialized = False
         self._participant: wire.Participant | None = None
         self._participant_lock = Lock()
-        self._nodes: weakref.WeakSet[Any] = weakref.WeakSet()
+        self._announcer: GraphAnnouncer | None = None
+        self._nodes: list[Any] = []
         self._shutdown_callbacks: list[Callable[[], None]] = []
         self._wakers: weakref.WeakSet[Any] = weakref.WeakSet()
         self._domain_id = 0
@@ -67,7 +70,12 @@ class Context:
         with self._participant_lock:
             if self._participant is None:
                 self._participant = wire.Participant(self._domain_id)
+                self._announcer = GraphAnnouncer(self._participant)
             return self._participant
+
+    def _announce_nodes(self) -> None:
+        if self._announcer is not None and self._running:
+            self._announcer.announce(self._nodes)
 
     def shutdown(self) -> None:
         """Stop communication. Raises RuntimeError if that was done before."""
@@ -109,7 +117,7 @@ class Context:
             self._leave()
 
     def _leave(self) -> None:
-        participant, self._participant = self._participant, None
+        participant, self._participant, self._announcer = self._participant, None, None
         if participant is not None:
             participant.close()
 

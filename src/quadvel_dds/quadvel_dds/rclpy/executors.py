@@ -199,7 +199,9 @@ class MultiThreadedExecutor(Executor):
 
     def _spin_once(self, deadline_ns: int, until: Callable[[], bool]) -> None:
         try:
-            work = self._next_work(deadline_ns, lambda: until() or any(future.done() for future in self._running))
+            work = self._next_work(
+                deadline_ns, lambda: until() or any(future.done() for future in self._running)
+            )
         except ExternalShutdownException:
             return
         if work is not None:

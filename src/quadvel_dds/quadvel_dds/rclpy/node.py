@@ -6,12 +6,13 @@ import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rcl_interfaces.msg import ParameterEvent
+from rcl_interfaces.msg import Log, ParameterEvent
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from quadvel_dds import arguments, names, wire
 from quadvel_dds.errors import refuse_options, unsupported
 
+from ._parameter_services import ParameterServices
 from ._parameters import ParameterMixin
 from .callback_groups import CallbackGroup, MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
 from .client import Client
@@ -23,17 +24,20 @@ from .exceptions import (
     InvalidTopicNameException,
     NotInitializedException,
 )
+from .impl import rcutils_logger
 from .logging import get_logger
 from .parameter import Parameter
 from .publisher import Publisher
 from .qos import (
     QoSProfile,
     qos_profile_parameter_events,
+    qos_profile_rosout_default,
     qos_profile_sensor_data,
     qos_profile_services_default,
 )
 from .service import Service
 from .subscription import Subscription
+from .time import Time
 from .timer import Rate, Timer
 from .utilities import get_default_context
 
@@ -71,7 +75,7 @@ class Node(ParameterMixin):
         self._executor: Callable[[], Any] = lambda: None
         self._default_callback_group = MutuallyExclusiveCallbackGroup()
         self._clock = ROSClock()
-        self._context._nodes.add(self)
+        self._context._nodes.append(self)
 
         overrides: dict[str, Any] = {}
         for source in reversed(sources):
@@ -79,11 +83,18 @@ class Node(ParameterMixin):
         given = {name: Parameter(name, value=value) for name, value in overrides.items()}
         given.update({parameter.name: parameter for parameter in parameter_overrides or []})
         self._init_parameters(given, allow_undeclared_parameters)
-        self._parameter_events = self.create_publisher(ParameterEvent, "/parameter_events", qos_profile_parameter_events)
+        if enable_rosout:
+            self._rosout = self.create_publisher(Log, "/rosout", qos_profile_rosout_default)
+            rcutils_logger.sinks[self._logger.name] = self._publish_log
+        self._parameter_events = self.create_publisher(
+            ParameterEvent, "/parameter_events", qos_profile_parameter_events
+        )
         if automatically_declare_parameters_from_overrides:
             for parameter in given.values():
                 self.declare_parameter(parameter.name, parameter.value)
         self._start_time_source()
+        if start_parameter_services:
+            ParameterServices(self)
 
     def _resolve_own_name(self, name: str, namespace: str) -> tuple[str, str]:
         name, namespace = names.remap_node(name, namespace, self._rules)
@@ -125,7 +136,16 @@ class Node(ParameterMixin):
 
     def _publish_parameter_event(self, event: Any) -> None:
         event.stamp = self._clock.now().to_msg()
-        self._parameter_events.publish(event)
+        if self._context.ok():
+            self._parameter_events.publish(event)
+
+    def _publish_log(self, level: int, name: str, message: str, stamp_ns: int, frame: Any) -> None:
+        if self._context.ok():
+            stamp = Time(nanoseconds=stamp_ns).to_msg()
+            code = frame.f_code
+            log = Log(stamp=stamp, level=level, name=name, msg=message, file=code.co_filename)
+            log.function, log.line = code.co_name, frame.f_lineno
+            self._rosout.publish(log)
 
     # Who the node is.
     def get_name(self) -> str:
@@ -193,6 +213,10 @@ class Node(ParameterMixin):
 
     def _added(self, entity: Any) -> None:
         entity.callback_group.add_entity(entity)
+        self._changed()
+
+    def _changed(self) -> None:
+        self._context._announce_nodes()
         self._wake_executor()
 
     def _wake_executor(self) -> None:
@@ -204,7 +228,7 @@ class Node(ParameterMixin):
             return False
         entities.remove(entity)
         entity.destroy()
-        self._wake_executor()
+        self._changed()
         return True
 
     # Topics.
@@ -233,7 +257,9 @@ class Node(ParameterMixin):
         qos_overriding_options: Any = None,
         publisher_class: type[Publisher] = Publisher,
     ) -> Publisher:
-        refuse_options("create_publisher", event_callbacks=event_callbacks, qos_overriding_options=qos_overriding_options)
+        refuse_options(
+            "create_publisher", event_callbacks=event_callbacks, qos_overriding_options=qos_overriding_options
+        )
         profile = _profile(qos_profile)
         name = self.resolve_topic_name(topic)
         writer = self._context.participant.writer(f"rt{name}", _typename(msg_type), profile)
@@ -241,6 +267,7 @@ class Node(ParameterMixin):
         publisher = publisher_class(writer, msg_type, name, profile, None, group)
         publisher._is_valid = self._context.ok
         self._publishers.append(publisher)
+        self._changed()
         return publisher
 
     def create_subscription(
@@ -255,7 +282,11 @@ class Node(ParameterMixin):
         qos_overriding_options: Any = None,
         raw: bool = False,
     ) -> Subscription:
-        refuse_options("create_subscription", event_callbacks=event_callbacks, qos_overriding_options=qos_overriding_options)
+        refuse_options(
+            "create_subscription",
+            event_callbacks=event_callbacks,
+            qos_overriding_options=qos_overriding_options,
+        )
         profile = _profile(qos_profile)
         name = self.resolve_topic_name(topic)
         reader = self._context.participant.reader(f"rt{name}", _typename(msg_type), profile)
@@ -276,7 +307,9 @@ class Node(ParameterMixin):
         callback_group: CallbackGroup | None = None,
     ) -> Service:
         name = self.resolve_service_name(srv_name)
-        endpoint = wire.CallEndpoint(self._context.participant, _typename(srv_type), name, qos_profile, serves=True)
+        endpoint = wire.CallEndpoint(
+            self._context.participant, _typename(srv_type), name, qos_profile, serves=True
+        )
         group = callback_group or self._default_callback_group
         service = Service(endpoint, srv_type, name, callback, group, qos_profile)
         self._services.append(service)
@@ -292,7 +325,9 @@ class Node(ParameterMixin):
         callback_group: CallbackGroup | None = None,
     ) -> Client:
         name = self.resolve_service_name(srv_name)
-        endpoint = wire.CallEndpoint(self._context.participant, _typename(srv_type), name, qos_profile, serves=False)
+        endpoint = wire.CallEndpoint(
+            self._context.participant, _typename(srv_type), name, qos_profile, serves=False
+        )
         group = callback_group or self._default_callback_group
         client = Client(self._context, endpoint, srv_type, name, qos_profile, group)
         self._clients.append(client)
@@ -310,7 +345,9 @@ class Node(ParameterMixin):
     ) -> Timer:
         group = callback_group or self._default_callback_group
         period = int(float(timer_period_sec) * 10**9)
-        timer = Timer(callback, group, period, clock or self._clock, context=self._context, autostart=autostart)
+        timer = Timer(
+            callback, group, period, clock or self._clock, context=self._context, autostart=autostart
+        )
         timer._on_change = self._wake_executor
         self._timers.append(timer)
         self._added(timer)
@@ -345,10 +382,14 @@ class Node(ParameterMixin):
         """Destroy the node and all that was created under it. A second call does nothing."""
         if self.executor is not None:
             self.executor.remove_node(self)
+        rcutils_logger.sinks.pop(self._logger.name, None)
         for entities in (self._timers, self._subscriptions, self._services, self._clients, self._publishers):
-            for entity in list(entities):
-                self._removed(entity, entities)
-        self._context._nodes.discard(self)
+            for entity in entities:
+                entity.destroy()
+            entities.clear()
+        if self in self._context._nodes:
+            self._context._nodes.remove(self)
+            self._context._announce_nodes()
         self._context._leave_if_unused()
 
     # Who else is there.
@@ -356,7 +397,9 @@ class Node(ParameterMixin):
         return int(self._context.participant.count("publication", f"rt{self.resolve_topic_name(topic_name)}"))
 
     def count_subscribers(self, topic_name: str) -> int:
-        return int(self._context.participant.count("subscription", f"rt{self.resolve_topic_name(topic_name)}"))
+        return int(
+            self._context.participant.count("subscription", f"rt{self.resolve_topic_name(topic_name)}")
+        )
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         refuse_options("get_topic_names_and_types", no_demangle=no_demangle)
@@ -388,7 +431,7 @@ def _profile(qos_profile: QoSProfile | int) -> QoSProfile:
 def _typename(interface: Any) -> str:
     typename = getattr(interface, "TYPENAME", None)
     if not isinstance(typename, str):
-        raise TypeError(f"expected a message or service class of the embedded middleware, found {interface!r}")
+        raise TypeError(
+            f"expected a message or service class of the embedded middleware, found {interface!r}"
+        )
     return typename
-
-

@@ -16,7 +16,13 @@ PARAMETER_SEPARATOR_STRING = "."
 
 # Scalar and element types in the order in which a value is tried: a bool is an int too.
 _SCALARS = {"BOOL": bool, "INTEGER": int, "DOUBLE": float, "STRING": str}
-_ELEMENTS = {"BYTE_ARRAY": bytes, "BOOL_ARRAY": bool, "INTEGER_ARRAY": int, "DOUBLE_ARRAY": float, "STRING_ARRAY": str}
+_ELEMENTS = {
+    "BYTE_ARRAY": bytes,
+    "BOOL_ARRAY": bool,
+    "INTEGER_ARRAY": int,
+    "DOUBLE_ARRAY": float,
+    "STRING_ARRAY": str,
+}
 
 
 class Parameter:
@@ -44,7 +50,9 @@ class Parameter:
                 for name, element in _ELEMENTS.items():
                     if all(isinstance(value, element) for value in parameter_value):
                         return cls[name]
-            raise TypeError(f"The given value is not of a type that a parameter can hold: {parameter_value!r}")
+            raise TypeError(
+                f"The given value is not of a type that a parameter can hold: {parameter_value!r}"
+            )
 
         def check(self, parameter_value: Any) -> bool:
             """Whether a value is of this type."""

@@ -36,7 +36,9 @@ class Service:
     def send_response(self, response: Any, header: Any) -> None:
         """Send the answer to the request that came with `header`."""
         if not isinstance(response, self.srv_type.Response):
-            raise TypeError(f"service {self.srv_name}: the callback returned {response!r}, expected a {self.srv_type.Response}")
+            raise TypeError(
+                f"service {self.srv_name}: the callback returned {response!r}, expected a {self.srv_type.Response}"
+            )
         request_id, client = header
         if client is None:
             return  # the client left before its answer
@@ -61,5 +63,3 @@ class Service:
             return None
         header = (request_id, self._reader.writer_of(info))
         return lambda: self.send_response(self.callback(request, self.srv_type.Response()), header)
-
-

@@ -50,7 +50,10 @@ def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions
     if threading.current_thread() is not threading.main_thread() or not options:
         return
     _interrupted = False
-    for option, number in {SignalHandlerOptions.SIGINT: signal.SIGINT, SignalHandlerOptions.SIGTERM: signal.SIGTERM}.items():
+    for option, number in {
+        SignalHandlerOptions.SIGINT: signal.SIGINT,
+        SignalHandlerOptions.SIGTERM: signal.SIGTERM,
+    }.items():
         if options & option and number not in _former:
             _former[number] = signal.signal(number, _on_signal)
     if _waker is None:

@@ -67,7 +67,9 @@ class Subscription:
         try:
             message = data if self.raw else messages.deserialize(data, self.msg_type.TYPENAME)
         except ValueError as error:
-            get_logger("rclpy").error(f"dropped a message on {self.topic}: {error}", throttle_duration_sec=1.0)
+            get_logger("rclpy").error(
+                f"dropped a message on {self.topic}: {error}", throttle_duration_sec=1.0
+            )
             return None
         if self._callback_type == Subscription.CallbackType.MessageOnly:
             return lambda: self.callback(message)
@@ -76,10 +78,15 @@ class Subscription:
 
 def callback_type(callback: Callable[..., Any]) -> Subscription.CallbackType:
     """Whether a callback takes the message alone or its information too."""
-    for number, type_ in ((1, Subscription.CallbackType.MessageOnly), (2, Subscription.CallbackType.WithMessageInfo)):
+    for number, type_ in (
+        (1, Subscription.CallbackType.MessageOnly),
+        (2, Subscription.CallbackType.WithMessageInfo),
+    ):
         try:
             inspect.signature(callback).bind(*range(number))
             return type_
         except TypeError:
             continue
-    raise RuntimeError("Expected a callback that takes one argument (the message) or two (message and its information)")
+    raise RuntimeError(
+        "Expected a callback that takes one argument (the message) or two (message and its information)"
+    )

@@ -52,7 +52,9 @@ class Future:
                 return
         self._schedule(callback)
 
-    def _finish(self, result: Any = None, exception: BaseException | None = None, cancelled: bool = False) -> None:
+    def _finish(
+        self, result: Any = None, exception: BaseException | None = None, cancelled: bool = False
+    ) -> None:
         with self._lock:
             self._result, self._exception = result, exception
             self._done, self._cancelled = not cancelled, cancelled
@@ -70,7 +72,9 @@ class Future:
 class Task(Future):
     """A callback that runs in an executor; its return value is the result."""
 
-    def __init__(self, handler: Callable[..., Any], args: Any = None, kwargs: Any = None, executor: Any = None) -> None:
+    def __init__(
+        self, handler: Callable[..., Any], args: Any = None, kwargs: Any = None, executor: Any = None
+    ) -> None:
         if inspect.iscoroutine(handler) or inspect.iscoroutinefunction(handler):
             raise UnsupportedError("a coroutine as a callback")
         super().__init__(executor=executor)

@@ -9,7 +9,9 @@ from typing import Any
 
 NAMES = {10: "DEBUG", 20: "INFO", 30: "WARN", 40: "ERROR", 50: "FATAL"}
 levels: dict[str, int] = {"": 20}  # by logger name; "" is the default
-sinks: dict[str, Callable[[int, str, str, int, Any], None]] = {}  # by logger name: who else is told (topic /rosout)
+sinks: dict[
+    str, Callable[[int, str, str, int, Any], None]
+] = {}  # by logger name: who else is told (topic /rosout)
 
 
 class RcutilsLogger:
@@ -87,7 +89,9 @@ class RcutilsLogger:
         stamp = time.time_ns()
         name = name or self.name
         seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
-        print(f"[{NAMES.get(severity, severity)}] [{seconds}] [{name}]: {message}", file=sys.stderr, flush=True)
+        print(
+            f"[{NAMES.get(severity, severity)}] [{seconds}] [{name}]: {message}", file=sys.stderr, flush=True
+        )
         if sink := sinks.get(self.name.partition(".")[0]) or sinks.get(self.name):
             sink(severity, name, str(message), stamp, frame)
         return True

@@ -1,0 +1,37 @@
+"""What a process tells about its nodes on `ros_discovery_info`, so that `ros2 node list` and `ros2 node info` know them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rmw_dds_common.msg import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
+
+from quadvel_dds import messages, wire
+
+from .qos import DurabilityPolicy, QoSProfile
+
+
+class GraphAnnouncer:
+    def __init__(self, participant: wire.Participant) -> None:
+        self._gid = participant.gid
+        profile = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+        self._writer = participant.writer("ros_discovery_info", ParticipantEntitiesInfo.TYPENAME, profile)
+
+    def announce(self, nodes: Iterable[Any]) -> None:
+        """Publish names and endpoints of all nodes of this process; called whenever one of them changes."""
+        message = ParticipantEntitiesInfo(gid=Gid(data=list(self._gid)))
+        message.node_entities_info_seq = [_node_info(node) for node in nodes]
+        self._writer.write(messages.serialize(message))
+
+
+def _node_info(node: Any) -> Any:
+    calls = [entity._endpoint for entity in (*node.clients, *node.services)]
+    readers = [*(subscription._reader for subscription in node.subscriptions), *(call.reader for call in calls)]
+    writers = [*(publisher._writer for publisher in node.publishers), *(call.writer for call in calls)]
+    return NodeEntitiesInfo(
+        node_namespace=node.get_namespace(),
+        node_name=node.get_name(),
+        reader_gid_seq=[Gid(data=list(reader.gid)) for reader in readers],
+        writer_gid_seq=[Gid(data=list(writer.gid)) for writer in writers],
+    )

@@ -1,0 +1,209 @@
+"""Message classes, and their bytes against the reference serialisation of rosbags."""
+
+import array
+import subprocess
+import sys
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.interfaces import Nodetype
+from rosbags.typesys import Stores, get_typestore
+
+from quadvel_dds import messages
+
+
+def filled(typename: str, random: np.random.Generator) -> Any:
+    """A message with random content in every field, sequences of random length."""
+    message = messages.message_class(typename)()
+    for name, description in messages.STORE.fielddefs[typename][1]:
+        setattr(message, name, value(description, random))
+    return message
+
+
+def value(description: Any, random: np.random.Generator) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return filled(detail, random)
+    if kind == Nodetype.BASE:
+        return scalar(detail[0], random)
+    count = detail[1] if kind == Nodetype.ARRAY else int(random.integers(0, min(detail[1] or 4, 4) + 1))
+    return [value(detail[0], random) for _ in range(count)]
+
+
+def scalar(base: str, random: np.random.Generator) -> Any:
+    if base == "string":
+        return "".join(random.choice(list("abcä"), size=random.integers(0, 9)))
+    if base == "bool":
+        return bool(random.integers(2))
+    if base == "byte":
+        return bytes([random.integers(128)])  # rosbags takes an octet for a signed number
+    if base in ("float32", "float64"):
+        return float(np.float32(random.normal()))
+    limits = np.iinfo("uint8" if base == "char" else base)
+    return int(random.integers(limits.min, limits.max, endpoint=True, dtype=limits.dtype))
+
+
+@cache
+def reference_store() -> Any:
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register({name: d for name, d in messages.STORE.fielddefs.items() if name not in store.fielddefs})
+    return store
+
+
+def reference(message: Any) -> Any:
+    """The same content in the plain form that rosbags serialises."""
+    store = reference_store()
+
+    def plain(description: Any, content: Any) -> Any:
+        kind, detail = description
+        if kind == Nodetype.NAME:
+            fields = store.fielddefs[detail][1]
+            return store.types[detail](**{n: plain(d, getattr(content, n)) for n, d in fields})
+        if kind == Nodetype.BASE:
+            return content[0] if detail[0] == "byte" else content
+        item = detail[0]
+        if item[0] == Nodetype.BASE and item[1][0] != "string":
+            dtype = {"byte": "uint8", "char": "uint8"}.get(item[1][0], item[1][0])
+            return np.array([plain(item, v) for v in content], dtype)
+        return [plain(item, v) for v in content]
+
+    return store.serialize_cdr(plain((Nodetype.NAME, message.TYPENAME), message), message.TYPENAME)
+
+
+NAMES = sorted(name for name in messages.STORE.fielddefs if not name.startswith("rosbag2_interfaces"))
+
+
+@pytest.mark.parametrize("typename", NAMES)
+def test_bytes_equal_the_reference_and_read_back(typename: str) -> None:
+    random = np.random.default_rng(5)
+    for _ in range(4):
+        message = filled(typename, random)
+        data = bytes(messages.serialize(message))
+        expected = bytes(reference(message))
+        assert data[: len(expected)] == expected
+        assert len(data) - len(expected) < 4
+        assert messages.deserialize(data, typename) == message
+
+
+def test_truncated_or_foreign_bytes_are_refused() -> None:
+    from std_msgs.msg import String
+
+    data = bytes(messages.serialize(String(data="walk and stand")))
+    with pytest.raises(ValueError, match=r"std_msgs/msg/String cannot be read"):
+        messages.deserialize(data[:12], "std_msgs/msg/String")
+    with pytest.raises(ValueError, match=r"encapsulation 0007 found"):
+        messages.deserialize(b"\x00\x07" + data[2:], "std_msgs/msg/String")
+
+
+def test_defaults_and_keyword_arguments() -> None:
+    from geometry_msgs.msg import Pose, Quaternion
+    from quadvel_msgs.msg import LowCmd
+
+    assert Pose().orientation == Quaternion(x=0.0, y=0.0, z=0.0, w=1.0)
+    command = LowCmd(tick=7, q=range(12))
+    assert command.q.dtype == np.float32
+    assert list(command.q) == list(range(12))
+    assert not command.kd.any()
+    with pytest.raises(TypeError, match="torque"):
+        LowCmd(torque=1.0)
+
+
+def test_messages_share_no_default() -> None:
+    from nav_msgs.msg import Odometry
+
+    first, second = Odometry(), Odometry()
+    first.pose.pose.position.x = 1.0
+    first.pose.covariance[0] = 1.0
+    assert second == Odometry()
+
+
+def test_assignment_converts_numbers_to_one_block() -> None:
+    from quadvel_msgs.msg import LowState
+    from sensor_msgs.msg import JointState
+
+    source = np.arange(12.0)
+    state, joints = LowState(), JointState()
+    state.q = source
+    joints.position = source
+    source[0] = 9.0
+    assert state.q.dtype == np.float32
+    assert state.q[0] == 0.0
+    assert joints.position == array.array("d", range(12))
+
+
+def test_constants_are_class_attributes() -> None:
+    from diagnostic_msgs.msg import DiagnosticStatus
+    from quadvel_msgs.msg import ControllerState, LowCmd
+
+    assert LowCmd.MODE_SERVO == 10
+    assert ControllerState.FAULT == 5
+    assert DiagnosticStatus.ERROR == b"\x02"
+
+
+def test_services_have_request_and_response() -> None:
+    from quadvel_msgs.srv import Push
+    from std_srvs.srv import SetBool, Trigger
+
+    assert SetBool.Request(data=True).data is True
+    assert Trigger.Response(message="done").message == "done"
+    assert Push.Request().wrench.force.z == 0.0
+
+
+def test_unknown_message_is_an_import_error() -> None:
+    with pytest.raises(ImportError, match="Twister"):
+        from geometry_msgs.msg import Twister  # noqa: F401
+
+
+def test_wrong_length_is_accepted_on_assignment_and_named_when_sent() -> None:
+    from quadvel_msgs.msg import LowCmd
+
+    command = LowCmd()
+    command.q = [0.0] * 11
+    with pytest.raises(ValueError, match=r"LowCmd cannot be sent: .*'q' .*12"):
+        messages.serialize(command)
+
+
+def test_wrong_type_is_named_when_sent() -> None:
+    from geometry_msgs.msg import Twist
+
+    twist = Twist()
+    twist.linear.x = "fast"
+    with pytest.raises(ValueError, match="field 'x' must be of type float64, found 'fast'"):
+        messages.serialize(twist)
+
+
+def test_fields_are_checked_on_assignment_where_asked_for() -> None:
+    program = """
+import numpy as np, quadvel_dds
+quadvel_dds.install()
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import Twist, Vector3
+from quadvel_msgs.msg import LowCmd
+for cls, field, bad, good in [
+    (LowCmd, "q", [0.0] * 11, [0.0] * 12), (LowCmd, "q", np.zeros(12), np.zeros(12, np.float32)),
+    (LowCmd, "tick", -1, 2**32 - 1), (LowCmd, "tick", 1.0, 1), (Vector3, "x", 1, float("nan")),
+    (Twist, "linear", Twist(), Vector3(x=1.0)), (DiagnosticStatus, "level", 0, b"\\x00"),
+]:
+    message = cls()
+    setattr(message, field, good)
+    try:
+        setattr(message, field, bad)
+    except AssertionError as error:
+        assert f"'{field}'" in str(error)
+    else:
+        raise SystemExit(f"{cls.__name__}.{field} took {bad!r}")
+"""
+    import os
+
+    environment = {**os.environ, "ROS_PYTHON_CHECK_FIELDS": "1"}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True)
+
+
+def test_type_hash_and_dds_name_are_those_of_ros() -> None:
+    # As `ros2 topic info -v /cmd_vel` of Jazzy prints it.
+    assert messages.type_hash("geometry_msgs/msg/Twist") == (
+        "RIHS01_9c45bf16fe0983d80e3cfe750d6835843d265a9a6c46bd2e609fcddde6fb8d2a"
+    )
+    assert messages.dds_name("quadvel_msgs/srv/Push_Request") == "quadvel_msgs::srv::dds_::Push_Request_"
