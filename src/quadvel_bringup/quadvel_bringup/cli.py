@@ -1,0 +1,147 @@
+"""The command line `quadvel`. A command imports what it needs when it runs, so that --help answers at once."""
+
+from __future__ import annotations
+
+import os
+import sys
+from importlib import import_module
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+
+from .nodes import NODES
+from .stack import PARAMETERS, Stack
+
+# A line with only \b keeps the lines that follow it as they are, up to the next empty one.
+EXAMPLES = """
+A quadruped that follows velocity commands: in simulation, and as ROS 2 nodes.
+
+\b
+Try, one after the other:
+  quadvel doctor              what this machine can run
+  quadvel demo                walk in all directions; results in out/demo
+  quadvel up                  the same robot, waiting for your commands
+  quadvel eval --grid quick --out out/eval
+
+\b
+Where ROS 2 is sourced, the nodes talk to it:
+  ros2 topic pub -r 20 /cmd_vel geometry_msgs/msg/Twist "{linear: {x: 0.5}}"
+"""
+
+NODE_LIST = "\n".join(f"  {name:12} {entry.about}" for name, entry in NODES.items())
+RUN_HELP = f"""
+Run one node in this process.
+
+\b
+Nodes:
+{NODE_LIST}
+
+\b
+What follows the name are arguments of ROS 2:
+  quadvel run sim_node --ros-args -p terrain:=rough
+  quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel
+"""
+
+PLAIN = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
+app = typer.Typer(help=EXAMPLES, no_args_is_help=True, **PLAIN)
+# Commands whose arguments belong to somebody else: handed on as they are, --help too.
+HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+
+@app.command()
+def doctor() -> None:
+    """Say what this machine has and what it can run."""
+    from .doctor import abilities, examine
+
+    findings = []
+    for finding in examine():
+        findings.append(finding)
+        print(f"{'ok  ' if finding.good else 'note'} {finding.subject:12} {finding.text}", flush=True)
+    for ability, possible in abilities(findings):
+        print(f"{'can run' if possible else 'cannot '} {ability}")
+
+
+@app.command(help=RUN_HELP, context_settings=HANDED_ON)
+def run(context: typer.Context, node: Annotated[str, typer.Argument(metavar="NODE")]) -> None:
+    from . import nodes
+
+    nodes.run(node, context.args)
+
+
+@app.command()
+def up(
+    low_level: Annotated[Literal["sim"], typer.Option(help="What serves low_state and low_cmd.")] = "sim",
+    policy: Annotated[
+        Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
+    ] = None,
+    terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    estimator: Annotated[str | None, typer.Option(help="learned or kalman.", show_default="learned")] = None,
+    params: Annotated[
+        Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
+    ] = PARAMETERS,
+) -> None:
+    """Start simulator, estimator, controller and command mux, each as a process; Ctrl-C stops them.
+
+    \b
+    Then, from another terminal where ROS 2 is sourced:
+      ros2 topic pub -r 20 /cmd_vel geometry_msgs/msg/Twist "{linear: {x: 0.5}}"
+    """
+    from .up import up as run_up
+
+    stack = Stack(low_level=low_level, policy=policy, terrain=terrain, estimator=estimator, parameters=params)
+    raise typer.Exit(run_up(stack))
+
+
+@app.command()
+def record(
+    topics: Annotated[list[str] | None, typer.Argument(help="Topics to record.", show_default="all")] = None,
+    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("out/record.mcap"),
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after these.")] = None,
+) -> None:
+    """Record running topics to an MCAP file for Foxglove and ros2 bag.
+
+    \b
+    For example:
+      quadvel record low_state low_cmd --out walk.mcap
+    """
+    from .record import record as run_record
+
+    run_record(out, topics or [], seconds)
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def demo(context: typer.Context) -> None:
+    """Walk a simulated robot through all directions, in real time, through the nodes."""
+    _hand_on(context, "quadvel_eval.cli:demo_command")
+
+
+@app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)
+def evaluate(context: typer.Context) -> None:
+    """Measure how well a policy tracks a grid of commands, faster than real time."""
+    _hand_on(context, "quadvel_eval.cli:eval_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def bench(context: typer.Context) -> None:
+    """Measure the speed of simulator, policy and loop on this machine."""
+    _hand_on(context, "quadvel_eval.cli:bench_command")
+
+
+def _hand_on(context: typer.Context, where: str) -> None:
+    """Run a function of another package as this command, with the arguments that came."""
+    module, _, name = where.partition(":")
+    command = typer.Typer(**PLAIN)
+    command.command()(getattr(import_module(module), name))
+    command(context.args, prog_name=context.command_path)
+
+
+def main() -> None:
+    """A wrong argument or file ends in one sentence and exit code 2, without a traceback."""
+    try:
+        app()
+    except (OSError, ValueError) as error:
+        if os.environ.get("QUADVEL_TRACEBACK"):
+            raise
+        print(f"quadvel: {error}", file=sys.stderr)
+        sys.exit(2)

@@ -1,0 +1,61 @@
+"""Which nodes there are, and how to start one: in this process, or as a process of its own.
+
+The one table of nodes; the entry points in the packages' setup.py files name the same modules.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+import attrs
+
+
+@attrs.frozen
+class NodeEntry:
+    """The module with the node's `main`, and what the node does, in a few words."""
+
+    module: str
+    about: str
+
+
+NODES = {
+    "sim_node": NodeEntry("quadvel_sim.sim_node", "the stand-in robot: MuJoCo behind low_state and low_cmd"),
+    "estimator": NodeEntry("quadvel_estimator.estimator", "linear velocity from IMU and encoders"),
+    "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
+    "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
+}
+
+
+def entry(name: str) -> NodeEntry:
+    """The node's entry. Raises ValueError that lists the known ones."""
+    if name not in NODES:
+        raise ValueError(f"there is no node '{name}'; known are {', '.join(NODES)}")
+    return NODES[name]
+
+
+def run(name: str, arguments: Sequence[str]) -> None:
+    """Run a node in this process until it ends, as `ros2 run` would.
+
+    `arguments` are those of ROS 2 ("--ros-args", "-p", "terrain:=rough", ...). Without ROS 2 it runs on the
+    embedded middleware. Raises ValueError on an unknown node, or an argument that is not one of ROS 2.
+    """
+    module = entry(name).module
+    if arguments and arguments[0] != "--ros-args":
+        raise ValueError(f"unexpected argument '{arguments[0]}'; parameters go as --ros-args -p NAME:=VALUE")
+    import quadvel_dds
+
+    quadvel_dds.install()
+    sys.argv = [name, *arguments]
+    import_module(module).main()
+
+
+def command(name: str, arguments: Sequence[str] = ()) -> list[str]:
+    """The command line that runs a node as a process of its own."""
+    entry(name)
+    return [sys.executable, "-m", "quadvel_bringup.nodes", name, *arguments]
+
+
+if __name__ == "__main__":
+    run(sys.argv[1], sys.argv[2:])

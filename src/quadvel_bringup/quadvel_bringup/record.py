@@ -1,0 +1,57 @@
+"""`quadvel record`: the topics that are there, into an MCAP file, until Ctrl-C."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+
+import quadvel_dds
+
+from .processes import StopSignals
+
+LOOK = 0.5  # s, between two looks for new topics
+
+
+def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
+    """Record the topics named, or all, until Ctrl-C or for some seconds; returns the number of messages.
+
+    Raises FileExistsError if the file is there already.
+    """
+    if path.exists():
+        raise FileExistsError(f"{path} exists already; name another file")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    quadvel_dds.install()
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    from .recorder import Recorder
+
+    console = Console(stderr=True)
+    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    node = rclpy.create_node("recorder")
+    wanted = [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
+    started = looked = time.monotonic()
+    with StopSignals() as signals, console.status("recording; Ctrl-C stops") as status:
+        with Recorder(node, path) as recorder:
+            recorder.record_all(wanted)
+            while not signals.received and (seconds is None or time.monotonic() - started < seconds):
+                rclpy.spin_once(node, timeout_sec=0.05)
+                if time.monotonic() - looked > LOOK:
+                    looked = time.monotonic()
+                    recorder.record_all(wanted)
+                    status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
+        node.destroy_node()
+        rclpy.try_shutdown()
+    for topic in wanted:
+        if topic not in recorder.counts:
+            console.print(f"nothing came on {topic}")
+    console.print(f"{path}: {_summary(recorder.counts)}")
+    return recorder.counts.total()
+
+
+def _summary(counts: Counter[str]) -> str:
+    return f"{counts.total()} messages on {len(counts)} topics"

@@ -1,0 +1,106 @@
+"""Record topics to an MCAP file that Foxglove and `ros2 bag` read. Messages are kept as they came, in CDR.
+
+Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from importlib import import_module
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+from mcap.writer import CompressionType, Writer
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from quadvel_dds.messages import STORE
+
+ANY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Hears every publisher, a reliable one too."""
+LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = ("/tf_static", "/robot_description")
+"""Topics that are published once and kept for those who come later."""
+HIDDEN = ("/parameter_events", "/rosout")
+
+
+class Recorder:
+    """Writes what the given node receives on some topics until it is closed; the file is whole only then."""
+
+    def __init__(self, node: Node, path: Path) -> None:
+        self._node = node
+        self._writer = Writer(str(path), compression=CompressionType.LZ4)
+        self._writer.start(profile="ros2", library="quadvel")
+        self._open = True
+        self._schemas: dict[str, int] = {}
+        self._subscriptions: dict[str, Any] = {}
+        self._unknown: set[str] = set()
+        self.counts: Counter[str] = Counter()
+        """Messages written so far, by topic."""
+
+    def record(self, topic: str, typename: str) -> None:
+        """Record a topic of a type such as "geometry_msgs/msg/Twist". Raises ValueError if it is unknown."""
+        if topic in self._subscriptions:
+            return
+        if typename not in STORE.fielddefs:
+            raise ValueError(f"topic {topic} has the type '{typename}', whose definition is not known")
+        package, kind, name = typename.split("/")
+        # An empty list: rosbag2 wants the key, and its versions disagree about what stands in it.
+        channel = self._writer.register_channel(
+            topic, "cdr", self._schema(typename), {"offered_qos_profiles": "[]"}
+        )
+        self._subscriptions[topic] = self._node.create_subscription(
+            getattr(import_module(f"{package}.{kind}"), name),
+            topic,
+            self._writes(topic, channel),
+            LATCHED_QOS if topic in LATCHED else ANY_QOS,
+            raw=True,
+        )
+
+    def record_all(self, only: Iterable[str] = ()) -> None:
+        """Record every topic that is there now, or those of `only`; to be called again as topics come."""
+        wanted = set(only)
+        for topic, typenames in self._node.get_topic_names_and_types():
+            if topic in self._unknown or (topic not in wanted if wanted else topic in HIDDEN):
+                continue
+            try:
+                self.record(topic, typenames[0])
+            except ValueError as error:
+                self._unknown.add(topic)
+                self._node.get_logger().warning(f"not recorded: {error}")
+
+    def close(self) -> None:
+        """Finish the file. A second call does nothing."""
+        for subscription in self._subscriptions.values():
+            self._node.destroy_subscription(subscription)
+        self._subscriptions.clear()
+        if self._open:
+            self._open = False
+            self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def __enter__(self) -> Recorder:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def _schema(self, typename: str) -> int:
+        if typename not in self._schemas:
+            text, _ = STORE.generate_msgdef(typename, ros_version=2)
+            self._schemas[typename] = self._writer.register_schema(typename, "ros2msg", text.encode())
+        return self._schemas[typename]
+
+    def _writes(self, topic: str, channel: int) -> Callable[[bytes, dict[str, int]], None]:
+        clock = self._node.get_clock()
+
+        def write(data: bytes, info: dict[str, int]) -> None:
+            now = clock.now().nanoseconds
+            sent = info["source_timestamp"]
+            self._writer.add_message(channel, now, data, publish_time=sent, sequence=self.counts[topic])
+            self.counts[topic] += 1
+
+        return write

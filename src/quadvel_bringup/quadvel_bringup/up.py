@@ -1,0 +1,60 @@
+"""`quadvel up`: the whole robot as processes that start together and end together."""
+
+from __future__ import annotations
+
+import threading
+
+from rich.console import Console
+from rich.text import Text
+
+from .nodes import command
+from .processes import ProcessGroup, StopSignals
+from .stack import Stack
+
+COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
+
+
+class PrefixedOutput:
+    """Prints each line behind the name of the process that wrote it, a colour each."""
+
+    def __init__(self, names: list[str]) -> None:
+        self._console = Console(soft_wrap=True, highlight=False)
+        self._width = max(map(len, names))
+        self._colours = dict(zip(names, COLOURS, strict=False))
+        self._lock = threading.Lock()
+
+    def __call__(self, name: str, line: str) -> None:
+        label = Text(f"{name:>{self._width}} | ", style=self._colours[name])
+        with self._lock:
+            self._console.print(label + Text.from_ansi(line))
+
+
+def up(stack: Stack) -> int:
+    """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
+
+    It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others are
+    stopped, and its exit code is ours (1 if that was 0).
+    """
+    nodes = stack.nodes()
+    say = PrefixedOutput(["quadvel", *nodes])
+    with StopSignals() as signals, ProcessGroup(say) as group:
+        for name, arguments in nodes.items():
+            group.start(name, command(name, arguments))
+        say("quadvel", f"started {', '.join(nodes)}; Ctrl-C stops them")
+        ended: dict[str, int] = {}
+        while not ended and not signals.wait(0.1):
+            ended = group.ended()
+        for name, code in ended.items():
+            say("quadvel", f"{name} ended with exit code {code}; stopping the others")
+        codes = group.stop()
+        if ended:
+            return next((_positive(code) for code in ended.values() if code), 1)
+        for name, code in codes.items():
+            if code:
+                say("quadvel", f"{name} did not stop cleanly: exit code {code}")
+    return 1 if any(codes.values()) else 0
+
+
+def _positive(code: int) -> int:
+    """As a shell reports it: 128 + n for a process that signal n ended."""
+    return code if code > 0 else 128 - code
