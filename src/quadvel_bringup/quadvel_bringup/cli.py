@@ -1,4 +1,4 @@
-"""The command line `quadvel`. A command imports what it needs when it runs, so that --help answers at once."""
+"""The command line `quadvel`. A command imports what it needs when it runs: --help answers at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import sys
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -43,7 +43,7 @@ What follows the name are arguments of ROS 2:
   quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel
 """
 
-PLAIN = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
+PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
 app = typer.Typer(help=EXAMPLES, no_args_is_help=True, **PLAIN)
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}

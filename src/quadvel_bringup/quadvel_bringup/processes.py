@@ -55,7 +55,7 @@ class ProcessGroup:
         return {name: code for name, code in codes.items() if code is not None}
 
     def stop(self, patience: float = 4.0) -> dict[str, int]:
-        """End all: SIGINT, after `patience` s SIGTERM, after as long again SIGKILL. Returns the exit codes."""
+        """End all: SIGINT, after `patience` s SIGTERM, then SIGKILL. Returns the exit codes."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             for process in self._processes.values():
                 _send(process, number)

@@ -32,8 +32,8 @@ class PrefixedOutput:
 def up(stack: Stack) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
 
-    It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others are
-    stopped, and its exit code is ours (1 if that was 0).
+    It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
+    are stopped, and its exit code is ours (1 if that was 0).
     """
     nodes = stack.nodes()
     say = PrefixedOutput(["quadvel", *nodes])
