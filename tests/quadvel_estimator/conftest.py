@@ -12,10 +12,13 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+
+import quadvel_dds
 from quadvel_description.robot import GRAVITY, NOMINAL_Q
 from quadvel_description.state import RobotState
-
 from quadvel_estimator import features
+
+quadvel_dds.install()  # before a test module imports rclpy
 
 MEMORY = (1, 1, 3)
 WEIGHTS = np.random.default_rng(0).normal(size=(45, 3)).astype(np.float32)

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+
 from quadvel_description.network_input import InputLayout
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
 from quadvel_description.state import RobotState
-
 from quadvel_estimator import features
 
 

@@ -3,11 +3,11 @@
 import attrs
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
+
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS, GRAVITY, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
-from scipy.spatial.transform import Rotation
-
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_trunk, _ground_force, _rolling
 
 from .conftest import sample

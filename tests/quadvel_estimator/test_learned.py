@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_description.robot import JOINT_NAMES
-
 from quadvel_estimator import features
 from quadvel_estimator.learned import LearnedEstimator
 

@@ -45,7 +45,7 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
     try:
         return config(**values)
     except ValueError as error:
-        raise StartError(f"parameters: {error}") from error
+        raise StartError(f"parameters: {error.args[0]}") from error
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.kinematics import rotate_inverse
 from quadvel_description.network_input import InputLayout, InputTerm
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
-from quadvel_description.state import RobotState
+from quadvel_description.state import MODE_SERVO, RobotState
 
 RATE_HZ = 200
 KIND = "velocity_estimator"
@@ -53,6 +54,11 @@ def build(
             "previous_action": previous_action,
         }
     )
+
+
+def previous_action(q_target: ArrayLike, mode: int) -> NDArray[np.float64]:
+    """What `build` takes, from joint targets (12,) and mode of the last command; zeros while damping."""
+    return np.asarray(q_target, np.float64) - NOMINAL_Q if mode == MODE_SERVO else np.zeros(12)
 
 
 def metadata(

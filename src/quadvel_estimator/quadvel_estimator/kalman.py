@@ -15,6 +15,7 @@ from typing import Any, Literal
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.kinematics import foot_jacobians, foot_positions, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS, GRAVITY
 from quadvel_description.state import RobotState

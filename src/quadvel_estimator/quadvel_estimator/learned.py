@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
 from quadvel_description.robot import NOMINAL_Q
@@ -49,8 +50,8 @@ class LearnedEstimator:
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Take one sample; returns velocity (3,) in m/s and its covariance (3, 3), body frame.
 
-        `previous_action` as in `features.build`. Raises FloatingPointError where the result is not finite; then
-        the estimator needs a reset.
+        `previous_action` as in `features.build`. Raises FloatingPointError where the result is not finite; a
+        reset is needed then.
         """
         velocity, log_variance = self._network.step(features.build(state, previous_action, self._layout))
         variance = np.exp(log_variance.astype(np.float64))

@@ -1,0 +1,185 @@
+"""The node `estimator`: low_state and low_cmd to velocity_estimate, odom and tf.
+
+How velocity is estimated is `learned`'s and `kalman`'s matter, which states are fit for it `tracker`'s.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import attrs
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point, TransformStamped, TwistWithCovarianceStamped, Vector3
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from tf2_msgs.msg import TFMessage
+
+from quadvel_description.diagnostics import diagnostics
+from quadvel_description.messages import MessageError, Refusals, numbers, read_low_state
+from quadvel_description.node import read_parameters, run
+from quadvel_description.state import RobotState
+from quadvel_msgs.msg import LowCmd, LowState
+
+from . import features
+from .kalman import KalmanEstimator
+from .learned import SHIPPED_MODEL, LearnedEstimator
+from .tracker import Estimate, Estimator, VelocityTracker
+
+KINDS = ("learned", "kalman")
+ODOM_EVERY = 4  # estimates, which makes 50 Hz
+GYRO_VARIANCE = 1e-4  # (rad/s)^2, of the angular velocity that is passed on
+ORIENTATION_VARIANCE = 1e-4  # rad^2, of the orientation that is passed on
+
+
+def _parameter(default: Any, description: str) -> Any:
+    return attrs.field(default=default, metadata={"description": description})
+
+
+@attrs.frozen
+class EstimatorParameters:
+    """The node's parameters."""
+
+    kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
+    model: str = _parameter("", "file of the learned estimator's network, ONNX; empty: the shipped one")
+    reset_gap: float = _parameter(0.1, "time without a state after which the estimator starts anew, s")
+    odom_frame: str = _parameter("odom", "frame of the odometry's pose")
+    body_frame: str = _parameter("trunk", "frame of the velocities, the odometry's child")
+    publish_tf: bool = _parameter(True, "whether to publish the transform from odom_frame to body_frame")
+
+    def __attrs_post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind is {self.kind!r}, expected {' or '.join(KINDS)}")
+        if not self.reset_gap > 0.0:
+            raise ValueError(f"reset_gap is {self.reset_gap}, expected a time above 0 s")
+
+    def make_estimator(self) -> Estimator:
+        """The estimator asked for. Raises NetworkFileError."""
+        if self.kind == "kalman":
+            return KalmanEstimator()
+        return LearnedEstimator(Path(self.model) if self.model else SHIPPED_MODEL)
+
+
+class EstimatorNode(Node):
+    """Estimates in the callback of each state, so that the controller's next tick has the newest velocity."""
+
+    def __init__(self) -> None:
+        super().__init__("estimator")
+        self._settings = read_parameters(self, EstimatorParameters)
+        self._tracker = VelocityTracker(self._settings.make_estimator(), self._settings.reset_gap)
+        self._refusals = Refusals()
+        self._reported = _Report()
+        self._count = 0
+        self._busy = 0.0  # s spent on estimates
+        self._velocity = self.create_publisher(TwistWithCovarianceStamped, "velocity_estimate", 10)
+        self._odom = self.create_publisher(Odometry, "odom", 10)
+        self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # The command first: where both wait, it is the answer to the state before the one that waits.
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
+        self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
+        self.create_timer(1.0, self._report)
+
+    def _on_command(self, message: Any) -> None:
+        try:
+            self._tracker.command(features.previous_action(numbers(message, "q", 12), message.mode))
+        except MessageError as error:
+            self._refusals.add("low_cmd", error)
+
+    def _on_state(self, message: Any) -> None:
+        start = perf_counter()
+        try:
+            state = read_low_state(message)
+            estimate = self._tracker.take(state)
+        except (MessageError, FloatingPointError) as error:
+            self._refusals.add("low_state", error)
+            return
+        if estimate is None:
+            return
+        self._publish_velocity(message.stamp, state, estimate)
+        self._count += 1
+        self._busy += perf_counter() - start
+        if self._count % ODOM_EVERY == 0:
+            self._publish_odometry(message.stamp, state, estimate)
+
+    def _publish_velocity(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
+        message = TwistWithCovarianceStamped()
+        message.header.stamp = stamp
+        message.header.frame_id = self._settings.body_frame
+        _fill_twist(message.twist, state, estimate)
+        self._velocity.publish(message)
+
+    def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
+        """Position by dead reckoning, orientation as the IMU tells it."""
+        message = Odometry(child_frame_id=self._settings.body_frame)
+        message.header.stamp = stamp
+        message.header.frame_id = self._settings.odom_frame
+        message.pose.pose.position = _vector(Point, estimate.position)
+        orientation = message.pose.pose.orientation
+        orientation.w, orientation.x, orientation.y, orientation.z = (float(x) for x in state.quaternion)
+        message.pose.covariance = _covariance(np.diag(estimate.position_deviation**2), ORIENTATION_VARIANCE)
+        _fill_twist(message.twist, state, estimate)
+        self._odom.publish(message)
+        if self._settings.publish_tf:
+            transform = TransformStamped(header=message.header, child_frame_id=message.child_frame_id)
+            transform.transform.translation = _vector(Vector3, estimate.position)
+            transform.transform.rotation = orientation
+            self._tf.publish(TFMessage(transforms=[transform]))
+
+    def _report(self) -> None:
+        """Once a second: how the last second went."""
+        count, refused = self._count - self._reported.count, self._refusals.total - self._reported.refused
+        busy = self._busy - self._reported.busy
+        self._reported = _Report(self._count, self._refusals.total, self._busy)
+        if count == 0:
+            level, summary = DiagnosticStatus.WARN, "no low_state fit to use in the last second"
+        elif refused:
+            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+        else:
+            level, summary = DiagnosticStatus.OK, "estimating"
+        values = {
+            "kind": self._settings.kind,
+            "rate_hz": count,
+            "compute_mean_us": f"{1e6 * busy / count:.0f}" if count else "",
+            "restarts": self._tracker.restarts,
+            **self._refusals.values(),
+        }
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+
+
+@attrs.frozen
+class _Report:
+    """What had been counted when the last report was made."""
+
+    count: int = 0
+    refused: int = 0
+    busy: float = 0.0
+
+
+def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
+    """A TwistWithCovariance: the velocity estimated, the angular velocity measured."""
+    twist.twist.linear = _vector(Vector3, estimate.velocity)
+    twist.twist.angular = _vector(Vector3, state.angular_velocity)
+    twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
+
+
+def _vector(kind: Any, xyz: NDArray[np.float64]) -> Any:
+    x, y, z = xyz.tolist()
+    return kind(x=x, y=y, z=z)
+
+
+def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:
+    """The 36 numbers, row by row, of x, y, z and the rotations about them."""
+    matrix = angular_variance * np.eye(6)
+    matrix[:3, :3] = linear
+    return matrix.ravel()
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the node."""
+    run(EstimatorNode, args)
