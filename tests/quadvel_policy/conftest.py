@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
+
 from quadvel_description.robot import KD, KP, NOMINAL_Q
 from quadvel_policy.observation import PolicyMetadata
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 
 TELEOP, PLANNER = MuxInput("teleop", 100, 0.5), MuxInput("planner", 10, 0.3)

@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+
+from quadvel_description import mjcf
 from quadvel_description.robot import KP, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_policy.supervisor import Supervisor, SupervisorConfig
 from quadvel_sim.simulator import Simulator
-
-from quadvel_description import mjcf
 
 STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
 

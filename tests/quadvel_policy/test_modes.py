@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+
 from quadvel_description.robot import LIE_Q, NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_policy.modes import Posture, Tick, blend

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+
 from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, NOMINAL_Q
 from quadvel_description.symmetry import mirror_observation
-
 from quadvel_policy.observation import (
     DEFAULT_OBSERVATION,
     ActionMap,

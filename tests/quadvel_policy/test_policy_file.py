@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import onnx
 import pytest
+
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import PolicyFile

@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 import pytest
+
 from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, UPPER
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_policy.observation import PolicyMetadata
@@ -209,7 +210,7 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
 
 
 def test_the_permission_to_walk_ends_with_passive_and_with_a_fault(policy: Any) -> None:
-    rig = Rig(policy, require_operator=True)
+    rig = Rig(policy, require_operator=True).stand()
     rig.supervisor.enable_walking(True)
     rig.supervisor.fail("a test")
     assert not rig.supervisor.walk_allowed
@@ -381,6 +382,12 @@ def test_a_fault_from_outside_is_latched_and_the_first_reason_stays(rig: Rig) ->
     rig.supervisor.fail("another")
     assert_damping(rig.tick(FORWARD))
     assert rig.supervisor.reason == "20 deadlines were missed in a row"
+
+
+def test_a_limp_robot_is_not_brought_into_fault(rig: Rig) -> None:
+    rig.tick()
+    rig.supervisor.fail("20 deadlines were missed in a row")
+    assert rig.mode == "passive"
 
 
 def test_passive_clears_a_fault_and_nothing_else_does(rig: Rig) -> None:

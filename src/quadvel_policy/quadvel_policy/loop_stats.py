@@ -10,7 +10,6 @@ from collections import deque
 
 import attrs
 import numpy as np
-from quadvel_description.tick_grid import TickGrid as TickGrid
 
 
 class Histogram:

@@ -12,6 +12,7 @@ from typing import Protocol
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+
 from quadvel_description.state import JointCommand, RobotState
 
 from .observation import JOINTS, PolicyMetadata, build_observation

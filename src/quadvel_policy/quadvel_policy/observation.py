@@ -13,6 +13,7 @@ from typing import Any
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
 from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
 
 from .observation import JOINTS, METADATA_FIELDS, RATE_HZ, MetadataError, PolicyMetadata

@@ -11,6 +11,7 @@ from typing import Any
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike
+
 from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, LIE_Q, LOWER, UPPER
 from quadvel_description.state import JointCommand, RobotState
 
@@ -128,8 +129,8 @@ class Supervisor:
         return True, f"mode is {mode}"
 
     def fail(self, reason: str) -> None:
-        """Latch damping until "passive" is requested; the first reason stays."""
-        if self.mode != "fault":
+        """Latch damping until "passive" is requested. The first reason stays; a limp robot stays as it is."""
+        if self.mode not in LIMP:
             self._switch("fault", reason)
 
     def tick(

@@ -1,0 +1,136 @@
+"""The node `command_mux`: one command out of several velocity topics; `command_mux` decides which one wins."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+import attrs
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Twist, TwistStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_msgs.msg import Bool
+from std_srvs.srv import SetBool
+
+from quadvel_description.diagnostics import diagnostics
+from quadvel_description.messages import MessageError, Refusals, seconds
+from quadvel_description.node import read_parameters, run
+from quadvel_msgs.msg import VelocityCommand
+
+from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
+from .received import StampCheck, planar_velocity
+
+PERIOD = 0.02  # s, of command
+
+
+def _listed(default: tuple[Any, ...], description: str) -> Any:
+    return attrs.field(default=default, metadata={"description": description})
+
+
+@attrs.frozen(kw_only=True)
+class MuxParameters(MuxConfig):
+    """The mux's settings and its inputs; the lists of the inputs have one entry for each."""
+
+    names: tuple[str, ...] = _listed(("teleop", "follow", "planner"), "name of each input")
+    topics: tuple[str, ...] = _listed(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
+    priorities: tuple[int, ...] = _listed((100, 50, 10), "priority of each input, the highest wins")
+    timeouts: tuple[float, ...] = _listed((0.5, 0.5, 0.5), "silence after which each input is out, s")
+    lock_topics: tuple[str, ...] = _listed(("command_lock",), "std_msgs/Bool topics: true stops the robot")
+    stamped: bool = attrs.field(
+        default=False, metadata={"description": "inputs are TwistStamped instead of Twist"}
+    )
+
+    def __attrs_post_init__(self) -> None:
+        for field in ("topics", "priorities", "timeouts"):
+            found = len(getattr(self, field))
+            if found != len(self.names):
+                raise ValueError(f"{field} has {found} entries, expected {len(self.names)} as names has")
+
+    def inputs(self) -> list[MuxInput]:
+        """The inputs, in the order of the lists. Raises ValueError for a timeout that makes no sense."""
+        lists = zip(self.names, self.priorities, self.timeouts, strict=True)
+        return [MuxInput(name, priority, timeout) for name, priority, timeout in lists]
+
+
+class CommandMuxNode(Node):
+    """Topics and services around a CommandMux."""
+
+    def __init__(self) -> None:
+        super().__init__("command_mux")
+        settings = read_parameters(self, MuxParameters)
+        inputs = settings.inputs()
+        self._mux = CommandMux(inputs, settings)
+        self._refusals, self._refused_before = Refusals(), 0
+        self._output: MuxOutput | None = None
+        kind = TwistStamped if settings.stamped else Twist
+        for source, topic in zip(inputs, settings.topics, strict=True):
+            check = StampCheck(source.timeout) if settings.stamped else None
+            self.create_subscription(kind, topic, partial(self._on_velocity, source.name, topic, check), 10)
+        for topic in settings.lock_topics:
+            self.create_subscription(Bool, topic, partial(self._on_lock, topic), 10)
+        self.create_service(SetBool, "~/stance", self._on_stance)
+        self._command = self.create_publisher(VelocityCommand, "command", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_timer(PERIOD, self._update)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _now(self) -> float:
+        return float(1e-9 * self.get_clock().now().nanoseconds)
+
+    def _on_velocity(self, name: str, topic: str, check: StampCheck | None, message: Any) -> None:
+        try:
+            if check is not None:
+                check.check(seconds(message.header.stamp), self._now())
+            twist = message if check is None else message.twist
+            self._mux.receive(name, self._now(), planar_velocity(twist))
+        except MessageError as error:
+            self._refusals.add(topic, error)
+
+    def _on_lock(self, topic: str, message: Any) -> None:
+        if message.data:
+            self._mux.locks.add(topic)
+        else:
+            self._mux.locks.discard(topic)
+
+    def _on_stance(self, request: Any, response: Any) -> Any:
+        self._mux.stance_requested = request.data
+        response.success = True
+        response.message = "the robot is asked to stand still" if request.data else "commands are followed"
+        return response
+
+    def _update(self) -> None:
+        self._output = output = self._mux.update(self._now())
+        message = VelocityCommand(
+            stamp=self.get_clock().now().to_msg(), stance=output.stance, source=output.source
+        )
+        twist = message.twist
+        twist.linear.x, twist.linear.y, twist.angular.z = output.velocity.tolist()
+        self._command.publish(message)
+
+    def _report(self) -> None:
+        """Once a second: /diagnostics."""
+        refused = self._refusals.total - self._refused_before
+        self._refused_before = self._refusals.total
+        source = self._output.source if self._output else "none"
+        if refused:
+            level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+        elif self._mux.locks:
+            level, summary = DiagnosticStatus.OK, f"locked by {', '.join(sorted(self._mux.locks))}"
+        elif self._mux.stance_requested:
+            level, summary = DiagnosticStatus.OK, "stance was requested"
+        else:
+            level, summary = DiagnosticStatus.OK, f"source: {source}"
+        values = {
+            "source": source,
+            "locks": ", ".join(sorted(self._mux.locks)) or "none",
+            "stance_requested": self._mux.stance_requested,
+            **self._refusals.values(),
+        }
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the node."""
+    run(CommandMuxNode, args)

@@ -1,0 +1,217 @@
+"""The node `controller`: answers the robot's states with joint commands, 200 times a second.
+
+It is locked to the phase of the states: a tick runs when the state that is due arrives, so that the latency is
+small and constant. What is due lies on an absolute grid in the states' own time (`TickGrid`), so that states may
+come faster than 200 Hz; the deadline of a tick is one period after its state held. When states stop, a timer
+notices. With simulated time the same holds on that time. What a tick decides is the supervisor's matter.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from typing import Any
+
+import attrs
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from std_srvs.srv import SetBool
+
+from quadvel_description.diagnostics import diagnostics
+from quadvel_description.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
+from quadvel_description.node import read_parameters, run
+from quadvel_description.state import JointCommand, RobotState
+from quadvel_description.tick_grid import TickGrid
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
+from quadvel_msgs.srv import SetMode
+
+from .loop_stats import LoopStats
+from .observation import RATE_HZ
+from .policy_file import SHIPPED_POLICY, PolicyFile
+from .received import Array, StampCheck, linear_velocity, planar_velocity
+from .supervisor import MODES, STILL, Supervisor, SupervisorConfig, setting
+
+PERIOD = 1.0 / RATE_HZ
+STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
+NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
+
+
+@attrs.frozen(kw_only=True)
+class ControllerParameters(SupervisorConfig):
+    """The supervisor's settings, and what the node adds to them."""
+
+    policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped", positive=False)
+    max_velocity_age: float = setting(
+        0.05, "oldest velocity estimate that walking may use before it is a fault, s"
+    )
+    command_timeout: float = setting(0.5, "oldest command that is followed; after that the robot stands, s")
+    max_overruns: int = setting(20, "deadlines missed in a row before a fault")
+
+
+class Controller(Node):
+    """Topics, services and timing around a Supervisor."""
+
+    def __init__(self) -> None:
+        super().__init__("controller")
+        self._settings = read_parameters(self, ControllerParameters)
+        self._supervisor = Supervisor(PolicyFile(self._settings.policy or SHIPPED_POLICY), self._settings)
+        self._sim_time: bool = self.get_parameter("use_sim_time").value
+        self._stats, self._refusals = LoopStats(), Refusals()
+        self._refused_before = self._overruns_before = 0
+        self._grid = TickGrid(PERIOD)
+        self._state: RobotState | None = None
+        self._answer = JointCommand.damping()
+        self._velocity: tuple[float, Array] | None = None  # stamp and value
+        self._command: tuple[float, Array] | None = None
+        self._checks = {
+            "low_state": StampCheck(self._settings.max_state_age),
+            "velocity_estimate": StampCheck(self._settings.max_velocity_age),
+            "command": StampCheck(self._settings.command_timeout),
+        }
+        self._create_interfaces()
+        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a tick
+
+    def _create_interfaces(self) -> None:
+        self._low_cmd = self.create_publisher(LowCmd, "low_cmd", 1)
+        self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_subscription(LowState, "low_state", self._on_state, NEWEST)
+        self.create_subscription(TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, NEWEST)
+        self.create_subscription(VelocityCommand, "command", self._on_command, NEWEST)
+        self.create_service(SetMode, "~/set_mode", self._on_set_mode)
+        self.create_service(SetBool, "~/enable_walking", self._on_enable_walking)
+        self.create_timer(STATE_PERIOD, self._watch)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def _now(self, stamp: float = 0.0) -> float:
+        """The clock of the stamps, s. Simulated time may reach this node after what was stamped with it."""
+        now = float(1e-9 * self.get_clock().now().nanoseconds)
+        return max(now, stamp) if self._sim_time else now
+
+    def _accept(self, topic: str, stamp: Any) -> float:
+        """The stamp in s. Raises MessageError where it is not fit."""
+        value = seconds(stamp)
+        self._checks[topic].check(value, self._now(value))
+        return value
+
+    def _on_state(self, message: Any) -> None:
+        start = time.perf_counter()
+        try:
+            state = read_low_state(message)
+            self._accept("low_state", message.stamp)
+        except MessageError as error:
+            self._refusals.add("low_state", error)
+            return
+        periods = self._grid.periods(state.time)
+        if periods:
+            self._tick(state)
+            late = self._now(state.time) - state.time > PERIOD
+            compute = time.perf_counter() - start
+            self._stats.add(start, compute, self._supervisor.inference_seconds, periods - 1 + late)
+        elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
+            self._answer.tick = state.tick
+            self._publish()
+
+    def _tick(self, state: RobotState) -> None:
+        if self._stats.in_a_row > self._settings.max_overruns:
+            self._supervisor.fail(f"{self._stats.in_a_row} deadlines were missed in a row")
+        self._state = state
+        now = self._now(state.time)
+        velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age)
+        command = _fresh(self._command, now, self._settings.command_timeout)
+        self._answer = self._supervisor.tick(now, state, velocity, STILL if command is None else command)
+        self._publish()
+
+    def _publish(self) -> None:
+        message = LowCmd(stamp=self.get_clock().now().to_msg())
+        write_low_cmd(self._answer, message)
+        self._low_cmd.publish(message)
+
+    def _on_velocity(self, message: Any) -> None:
+        try:
+            stamp = self._accept("velocity_estimate", message.header.stamp)
+            self._velocity = stamp, linear_velocity(message.twist.twist)
+        except MessageError as error:
+            self._refusals.add("velocity_estimate", error)
+
+    def _on_command(self, message: Any) -> None:
+        try:
+            stamp = self._accept("command", message.stamp)
+            self._command = stamp, np.append(planar_velocity(message.twist), float(message.stance))
+        except MessageError as error:
+            self._refusals.add("command", error)
+
+    def _on_set_mode(self, request: Any, response: Any) -> Any:
+        response.success, response.message = self._supervisor.request(request.mode)
+        return response
+
+    def _on_enable_walking(self, request: Any, response: Any) -> Any:
+        response.success, response.message = self._supervisor.enable_walking(request.data)
+        return response
+
+    def _watch(self) -> None:
+        """50 times a second: the supervisor learns when states stop, and controller/state is published."""
+        if self._state is not None and self._now() - self._state.time > self._settings.max_state_age:
+            self._tick(self._state)
+        self._controller_state.publish(self._describe())
+
+    def _describe(self) -> Any:
+        supervisor, stats = self._supervisor, self._stats.summary(time.perf_counter())
+        message = ControllerState(
+            stamp=self.get_clock().now().to_msg(),
+            mode=MODES.index(supervisor.mode),
+            mode_name=supervisor.mode,
+            reason=supervisor.reason,
+            walk_allowed=supervisor.walk_allowed,
+            stance=bool(supervisor.command[3]),
+            refused=self._refusals.total,
+            **attrs.asdict(stats),
+        )
+        twist = message.command
+        twist.linear.x, twist.linear.y, twist.angular.z = supervisor.command[:3].tolist()
+        return message
+
+    def _report(self) -> None:
+        """Once a second: /diagnostics."""
+        level, summary = self._judge()
+        values = {
+            "mode": self._supervisor.mode,
+            "reason": self._supervisor.reason,
+            **{
+                name: f"{value:.4g}"
+                for name, value in attrs.asdict(self._stats.summary(time.perf_counter())).items()
+            },
+            **self._refusals.values(),
+        }
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+
+    def _judge(self) -> tuple[bytes, str]:
+        """Level and summary of the last second."""
+        refused = self._refusals.total - self._refused_before
+        missed = self._stats.overruns - self._overruns_before
+        self._refused_before, self._overruns_before = self._refusals.total, self._stats.overruns
+        status = f"{self._supervisor.mode}: {self._supervisor.reason}"
+        if self._supervisor.mode == "fault":
+            return DiagnosticStatus.ERROR, status
+        if self._state is None:
+            return DiagnosticStatus.WARN, "no message on low_state yet"
+        if refused:
+            return DiagnosticStatus.WARN, f"{refused} messages refused in the last second; {status}"
+        if missed:
+            return DiagnosticStatus.WARN, f"{missed} deadlines missed in the last second; {status}"
+        return DiagnosticStatus.OK, status
+
+
+def _fresh(stamped: tuple[float, Array] | None, now: float, limit: float) -> Array | None:
+    """The value, unless it is older than `limit` (s)."""
+    return stamped[1] if stamped is not None and now - stamped[0] <= limit else None
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the node."""
+    run(Controller, args)

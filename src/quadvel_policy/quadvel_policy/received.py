@@ -1,0 +1,52 @@
+"""What the nodes accept of the velocities and time stamps that they receive."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description.messages import MessageError
+
+Array = NDArray[np.float64]
+
+
+class StampCheck:
+    """Refuses a stamp that is off the clock by more than `limit` (s), or older than the one before."""
+
+    def __init__(self, limit: float) -> None:
+        self._limit = limit
+        self._stamp = self._now = -math.inf
+
+    def check(self, stamp: float, now: float) -> None:
+        """Raises MessageError. stamp, now: s on the same clock; where that was set back, it starts over."""
+        if now < self._now:
+            self._stamp = -math.inf
+        self._now = now
+        if not abs(now - stamp) <= self._limit:
+            ago = f"{now - stamp:.3f} s old" if stamp < now else f"{stamp - now:.3f} s ahead of the clock"
+            raise MessageError(f"stamp is {ago}, expected at most {self._limit:.3f} s")
+        if stamp < self._stamp:
+            raise MessageError(f"stamp is {self._stamp - stamp:.3f} s older than the one before")
+        self._stamp = stamp
+
+
+def linear_velocity(twist: Any) -> Array:
+    """The linear part of a geometry_msgs/Twist, (3,) m/s. Raises MessageError if it is not finite."""
+    return _finite("linear", [twist.linear.x, twist.linear.y, twist.linear.z])
+
+
+def planar_velocity(twist: Any) -> Array:
+    """vx, vy (m/s) and wz (rad/s) of a geometry_msgs/Twist. Raises MessageError if a number is not finite."""
+    linear = linear_velocity(twist)
+    angular = _finite("angular", [twist.angular.x, twist.angular.y, twist.angular.z])
+    return np.array([linear[0], linear[1], angular[2]])
+
+
+def _finite(field: str, values: list[float]) -> Array:
+    value = np.array(values, float)
+    if not np.isfinite(value).all():
+        raise MessageError(f"{field} is {value.tolist()}, expected finite numbers")
+    return value
