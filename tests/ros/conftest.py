@@ -1,7 +1,8 @@
 """What these tests need of ROS 2: its environment, our workspace, and processes that end with the test.
 
-ROS 2 is taken from the environment where it is sourced, else from the setup file that QUADVEL_ROS_SETUP names;
-where neither is there the tests skip. colcon is looked for beside the interpreter that runs them, then on PATH.
+ROS 2 is taken from the environment where it is sourced, or from the setup file that QUADVEL_ROS_SETUP names;
+where neither is there the tests skip. colcon is looked for beside the interpreter that runs
+them, then on PATH.
 """
 
 from __future__ import annotations
@@ -130,7 +131,7 @@ class Ros:
         self.wait_until(all_there, seconds, lambda: f"expected the nodes {names}, found {found}")
 
     def wait_until(self, predicate: Callable[[], bool], seconds: float, fault: Callable[[], str]) -> None:
-        """Wait for a predicate. When time is up the test fails with `fault` and what the processes wrote last."""
+        """Wait for a predicate, or fail the test with `fault` and what the processes wrote last."""
         deadline = time.monotonic() + seconds
         while not predicate():
             if time.monotonic() > deadline:

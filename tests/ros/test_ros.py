@@ -15,7 +15,7 @@ from quadvel_bringup.nodes import NODES
 
 pytestmark = pytest.mark.ros
 
-# The embedded middleware's services are Cyclone DDS's: vendors differ in how a reply is matched to its request.
+# Embedded nodes answer calls by Cyclone DDS alone: vendors differ in how a reply is matched to its request.
 CYCLONE = "rmw_cyclonedds_cpp"
 with_cyclone = pytest.mark.parametrize("ros", [CYCLONE], indirect=True)
 
