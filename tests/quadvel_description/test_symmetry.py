@@ -38,6 +38,15 @@ def _mirror_state(model: mujoco.MjModel, data: mujoco.MjData) -> tuple[np.ndarra
     return qpos, qvel
 
 
+def _observation(data: mujoco.MjData, command: np.ndarray, action: np.ndarray) -> np.ndarray:
+    """The paper's 48-vector, unscaled, of the robot in `data`."""
+    quaternion = data.qpos[3:7]
+    linear_velocity = kinematics.rotate_inverse(quaternion, data.qvel[:3])
+    roll_pitch = kinematics.roll_pitch(quaternion)
+    state = [roll_pitch, data.qpos[7:], data.qvel[6:], linear_velocity, data.qvel[3:6]]
+    return np.concatenate([command, *state, action])
+
+
 @pytest.mark.parametrize(
     "mirror", [symmetry.OBSERVATION, symmetry.JOINTS, symmetry.FEET, *symmetry.PARTS.values()]
 )
@@ -103,5 +112,8 @@ def test_the_mirrored_robot_moves_as_the_mirror_image(seed):
         qpos, qvel = _mirror_state(model, data)
         np.testing.assert_allclose(image.qpos, qpos, atol=1e-9)
         np.testing.assert_allclose(image.qvel, qvel, atol=1e-7)
+        seen = _observation(image, np.array([1.0, 0.5, -0.7, 0.0]), symmetry.mirror_action(torque))
+        expected = symmetry.mirror_observation(_observation(data, np.array([1.0, -0.5, 0.7, 0.0]), torque))
+        np.testing.assert_allclose(seen, expected, atol=1e-7)
     assert touching > 200
     assert np.abs(data.qpos[1]) > 1e-3  # it did not stay in the plane of symmetry
