@@ -1,0 +1,53 @@
+"""The commands `quadvel eval` and `quadvel bench`, as functions for a typer application."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from .grid import evaluate
+from .report import evaluation_table, output_folder, write_evaluation
+from .walk import Setup
+
+
+def eval_command(
+    out: Annotated[Path, typer.Option(help="Folder for eval.json, eval.csv and eval.png.")],
+    grid: Annotated[Literal["quick", "paper"], typer.Option(help="Which commands are tried.")],
+    policy: Annotated[Path, typer.Option(help="ONNX file of the policy.")] = SHIPPED_POLICY,
+    estimator: Annotated[
+        Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
+    ] = "learned",
+    estimator_file: Annotated[Path, typer.Option(help="ONNX file of the learned one.")] = SHIPPED_MODEL,
+    terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
+    randomised: Annotated[
+        bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")
+    ] = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each command, with seeds 0, 1, ...")] = 1,
+) -> None:
+    """Measure how well a policy tracks velocities: many walks in parallel, faster than real time."""
+    setup = Setup(
+        policy=policy,
+        estimator=estimator,
+        estimator_file=estimator_file,
+        terrain=terrain,
+        randomised=randomised,
+    )
+    PolicyFile(policy)  # what is wrong with the files shows here, once, before any run
+    LearnedEstimator(estimator_file)
+    folder = output_folder(out)
+    messages = Console(stderr=True)
+    columns = (TextColumn("walks"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=messages) as bar:
+        task = bar.add_task("walks", total=None)
+        result = evaluate(setup, grid, seeds, lambda done, total: bar.update(task, completed=done, total=total))
+    description = {"grid": grid, "policy": str(policy), "estimator_in_loop": estimator, "seeds": seeds}
+    write_evaluation(folder, result | {"setup": description | {"terrain": terrain, "randomised": randomised}})
+    console = Console()
+    console.print(evaluation_table(result))
+    console.print(f"written: {folder}/eval.json, eval.csv, eval.png")

@@ -1,0 +1,171 @@
+"""Velocity tracking over a grid of commands, in parallel processes: what `quadvel eval` computes.
+
+Files and pictures are `report`'s matter.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
+from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record
+
+Array = NDArray[np.float64]
+
+SCHEMA = 1
+DURATION = 6.0  # s of each command, of which the last 4 are evaluated
+GRIDS: dict[str, tuple[Array, Array, Array]] = {  # vx, vy (m/s), wz (rad/s): every combination
+    "quick": (np.arange(-2, 4) / 2, np.array([-0.4, 0.0, 0.4]), np.array([-1.0, 0.0, 1.0])),
+    "paper": (np.arange(-5, 6) / 2, np.arange(-5, 6) / 5, np.array([0.0])),
+}
+STANCE_WALK = [((0.5, 0.0, 0.0), 2.0), ((0.0, 0.0, 0.0), 2.0)]  # how the robot comes to stand
+STANCE_SECONDS = 10.0
+
+
+@attrs.frozen
+class Cell:
+    """One run of the grid."""
+
+    command: tuple[float, float, float]
+    seed: int
+
+
+@attrs.frozen
+class CellResult:
+    """What came of it; a robot that fell has nothing but that."""
+
+    cell: Cell
+    segment: Segment | None = None
+    jitter: float | None = None
+    cot: float | None = None
+    estimator_mse: dict[str, Array] = attrs.Factory(dict)  # (3,) (m/s)^2, over the whole walk
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry of `eval.json`."""
+        s = self.segment
+        return {
+            "command": rounded(self.cell.command),
+            "seed": self.cell.seed,
+            "mean": rounded(s.mean) if s else None,
+            "error_xy": rounded(s.error_xy) if s else None,
+            "error_wz": rounded(s.error_wz) if s else None,
+            "fell": s is None,
+        }
+
+
+def cells(grid: str, seeds: int) -> list[Cell]:
+    """Every command of the grid with every seed 0, 1, ..."""
+    vx, vy, wz = GRIDS[grid]
+    commands = [(float(x), float(y), float(z)) for x in vx for y in vy for z in wz]
+    return [Cell(command, seed) for seed in range(seeds) for command in commands]
+
+
+def run_cell(setup: Setup, cell: Cell) -> CellResult:
+    """One robot from standing through `DURATION` of one command."""
+    loop = make_loop(setup, cell.seed)
+    walk = record(loop, [(cell.command, DURATION)])
+    return judge(walk, cell, float(loop.simulator.model.body_subtreemass[1])) if walk else CellResult(cell)
+
+
+def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
+    """The figures of a walk under `cell.command`; mass: of the robot, kg."""
+    segment = measure(walk.time, walk.velocity, cell.command, SETTLE, DURATION)
+    late = walk.time >= SETTLE
+    return CellResult(
+        cell,
+        segment,
+        jitter(walk.targets[late]),
+        cost_of_transport(float(walk.power[late].mean()), mass, segment.command, segment.mean),
+        {name: np.square(error).mean(axis=0) for name, error in walk.estimate_errors.items()},
+    )
+
+
+def run_stance(setup: Setup, seed: int) -> float | None:
+    """Largest distance (m) from where the robot came to stand, in 10 s of standing; None where it fell.
+
+    The policy stands all the while, after a short walk.
+    """
+    loop = make_loop(setup, seed)
+    if record(loop, STANCE_WALK) is None:
+        return None
+    walk = record(loop, [((0.0, 0.0, 0.0), STANCE_SECONDS)])
+    return None if walk is None else drift(walk.position)
+
+
+def drift(position: Array) -> float:
+    """Largest horizontal distance from the first of the positions (n, 3), m."""
+    return float(np.linalg.norm(position[:, :2] - position[0, :2], axis=1).max())
+
+
+def summarise(results: Sequence[CellResult], drifts: Sequence[float | None]) -> dict[str, Any]:
+    """`eval.json` without the description of the run: cells in the order given, aggregates that are numbers.
+
+    Aggregates are taken over the cells that did not fall. Where all did, the errors are those of a robot that
+    does not move, and jitter is zero. `cot` has one entry a cell, null where that has no number.
+    """
+    stood = [r for r in results if r.segment is not None]
+    segments = [r.segment for r in stood if r.segment is not None]
+    still = [Segment(np.array(r.cell.command), np.zeros(3)) for r in results]
+    max_error, mean_error = max_and_mean_error_xy(segments or still)
+    return {
+        "schema": SCHEMA,
+        "cells": [r.to_json() for r in results],
+        "max_error_xy": rounded(max_error),
+        "mean_error_xy": rounded(mean_error),
+        "falls": len(results) - len(stood),
+        "jitter": rounded(np.mean([r.jitter for r in stood])) if stood else 0.0,
+        "cot": [None if r.cot is None else rounded(r.cot) for r in results],
+        "stance": {"drift_10s_m": None if None in drifts else rounded(max(d for d in drifts if d is not None))},
+        "estimator": _estimator_errors(stood),
+    }
+
+
+def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:
+    """Root mean square over all walks, m/s an axis; every walk has the same number of ticks."""
+    names = stood[0].estimator_mse if stood else ()
+    return {
+        name: {"rmse": rounded(np.sqrt(np.mean([r.estimator_mse[name] for r in stood], axis=0)))}
+        for name in names
+    }
+
+
+def evaluate(
+    setup: Setup, grid: str, seeds: int, progress: Callable[[int, int], None] = lambda done, total: None
+) -> dict[str, Any]:
+    """Run the whole grid over all cores; `progress` hears how many runs of how many are done.
+
+    A KeyboardInterrupt ends it once the runs under way are through.
+    """
+    todo = cells(grid, seeds)
+    jobs: list[tuple[Callable[..., Any], Setup, Any]] = [(run_cell, setup, cell) for cell in todo]
+    jobs += [(run_stance, setup, seed) for seed in range(seeds)]
+    results: list[Any] = [None] * len(jobs)
+    for done, (i, result) in enumerate(_in_parallel(jobs), start=1):
+        results[i] = result
+        progress(done, len(jobs))
+    return summarise(results[: len(todo)], results[len(todo) :])
+
+
+def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterator[tuple[int, Any]]:
+    """Number and result of each job as they are done."""
+    with ProcessPoolExecutor(
+        len(os.sched_getaffinity(0)),
+        multiprocessing.get_context("spawn"),  # forking a process with threads is not safe
+        initializer=signal.signal,
+        initargs=(signal.SIGINT, signal.SIG_IGN),  # Ctrl-C reaches the whole group: only the parent answers
+    ) as pool:
+        futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
+        try:
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        finally:
+            pool.shutdown(wait=False, cancel_futures=True)

@@ -1,0 +1,118 @@
+"""Results as files and tables: JSON, CSV, pictures. Nothing is computed here.
+
+A file is replaced as a whole once its content is complete; other files of a folder are never touched.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """A file to write in `path`'s place, with its suffix; it takes the place only if the block succeeds."""
+    draft = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
+    try:
+        yield draft
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def output_folder(path: Path) -> Path:
+    """`path` as a folder that exists and can be written to. Raises OSError, one sentence."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise NotADirectoryError(f"{path}: is or lies below a file, expected a folder for the results") from None
+    if not os.access(path, os.W_OK | os.X_OK):
+        raise PermissionError(f"{path}: the folder can't be written to")
+    return path
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """`content` as JSON text; NaN and infinity are refused with a ValueError."""
+    with replacing(path) as draft:
+        draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_figure(path: Path, figure: Figure) -> None:
+    """`figure` in the format of the suffix."""
+    with replacing(path) as draft:
+        figure.savefig(draft, dpi=120)
+
+
+def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
+    """eval.json, eval.csv and eval.png."""
+    write_json(folder / "eval.json", evaluation)
+    with replacing(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["vx", "vy", "wz", "seed", "mean_vx", "mean_vy", "mean_wz", "error_xy", "error_wz", "fell"])
+        for cell in evaluation["cells"]:
+            mean = cell["mean"] or [None] * 3
+            writer.writerow(
+                [*cell["command"], cell["seed"], *mean, cell["error_xy"], cell["error_wz"], int(cell["fell"])]
+            )
+    write_figure(folder / "eval.png", heatmap(evaluation["cells"]))
+
+
+def heatmap(cells: Sequence[Mapping[str, Any]]) -> Figure:
+    """Tracking error over vx and vy, a panel a yaw rate, mean over the seeds; a cross where a robot fell."""
+    vx, vy, wz = (sorted({cell["command"][axis] for cell in cells}) for axis in range(3))
+    errors = [cell["error_xy"] for cell in cells if not cell["fell"]]
+    figure = Figure(figsize=(1.5 + 4.0 * len(wz), 1.6 + 0.32 * len(vx)), layout="constrained")
+    panels = figure.subplots(1, len(wz), sharey=True, squeeze=False)[0]
+    for panel, rate in zip(panels, wz, strict=True):
+        image = np.full((len(vx), len(vy)), np.nan)
+        for i, x in enumerate(vx):
+            for j, y in enumerate(vy):
+                here = [cell for cell in cells if cell["command"] == [x, y, rate]]
+                stood = [cell["error_xy"] for cell in here if not cell["fell"]]
+                if stood:
+                    image[i, j] = np.mean(stood)
+                if len(stood) < len(here):
+                    panel.text(j, i, "×", ha="center", va="center", color="tab:red", size="large")
+        shown = panel.imshow(image, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=max(errors, default=1.0))
+        panel.set_xticks(range(len(vy)), [f"{y:g}" for y in vy])
+        panel.set_yticks(range(len(vx)), [f"{x:g}" for x in vx])
+        panel.set_xlabel("vy, m/s")
+        panel.set_title(f"wz = {rate:g} rad/s")
+    panels[0].set_ylabel("vx, m/s")
+    figure.colorbar(shown, ax=panels, label="error of the mean velocity, m/s")
+    return figure
+
+
+def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
+    """The aggregates, for people."""
+    table = Table("", "", title="Velocity tracking", show_header=False)
+    cells = evaluation["cells"]
+    table.add_row("runs, of these fallen", f"{len(cells)}, {evaluation['falls']}")
+    table.add_row("error, mean and largest", f"{evaluation['mean_error_xy']:.3f}, {evaluation['max_error_xy']:.3f} m/s")
+    worst = [cell for cell in cells if not cell["fell"] and cell["error_xy"] == evaluation["max_error_xy"]]
+    if worst:
+        table.add_row("largest at (vx, vy, wz)", ", ".join(f"{x:g}" for x in worst[0]["command"]))
+    table.add_row("jitter", f"{evaluation['jitter']:.5f} rad")
+    drift = evaluation["stance"]["drift_10s_m"]
+    table.add_row("drift in 10 s of standing", "fell" if drift is None else f"{100 * drift:.2f} cm")
+    for name, figures in evaluation["estimator"].items():
+        table.add_row(f"{name} estimator, RMSE x, y, z", ", ".join(f"{x:.3f}" for x in figures["rmse"]) + " m/s")
+    return table
+
+
+def segment_table(segments: Sequence[Mapping[str, Any]]) -> Table:
+    """Commanded and measured velocity of each segment of a demo."""
+    table = Table("command vx, vy, wz", "measured vx, vy, wz", "error xy, m/s", "error wz, rad/s", title="Segments")
+    for segment in segments:
+        command, mean = (", ".join(f"{x:+.2f}" for x in segment[key]) for key in ("command", "mean"))
+        table.add_row(command, mean, f"{segment['error_xy']:.3f}", f"{segment['error_wz']:.3f}")
+    return table

@@ -1,0 +1,69 @@
+"""How well a stretch of walking followed its command: means and errors, for the grid and for the demo alike.
+
+Plain arrays; where they come from is the caller's matter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+SETTLE = 2.0  # s at the start of each stretch that belong to the change of command and are not evaluated
+DIGITS = 6  # of numbers in files
+
+
+@attrs.frozen(eq=False)
+class Segment:
+    """A constant command and the mean true velocity under it: vx, vy (m/s), wz (rad/s), body frame, (3,)."""
+
+    command: Array
+    mean: Array
+
+    @property
+    def error_xy(self) -> float:
+        """Length of commanded minus mean velocity, m/s."""
+        return float(np.hypot(*(self.command - self.mean)[:2]))
+
+    @property
+    def error_wz(self) -> float:
+        """Absolute commanded minus mean yaw rate, rad/s."""
+        return float(abs(self.command[2] - self.mean[2]))
+
+    def to_json(self) -> dict[str, Any]:
+        """The entry of `summary.json`."""
+        return {
+            "command": rounded(self.command),
+            "mean": rounded(self.mean),
+            "error_xy": rounded(self.error_xy),
+            "error_wz": rounded(self.error_wz),
+        }
+
+
+def measure(time: ArrayLike, velocity: ArrayLike, command: ArrayLike, start: float, end: float) -> Segment:
+    """The segment with the samples of `start` <= time < `end`.
+
+    time (n,): s, evenly spaced. velocity (n, 3): vx, vy, wz, true, body frame. ValueError where none falls
+    into the stretch.
+    """
+    time, velocity = np.asarray(time, float), np.asarray(velocity, float)
+    within = (start <= time) & (time < end)
+    if not within.any():
+        raise ValueError(f"no velocity was measured between {start:.2f} and {end:.2f} s")
+    return Segment(np.asarray(command, float), velocity[within].mean(axis=0))
+
+
+def max_and_mean_error_xy(segments: Sequence[Segment]) -> tuple[float, float]:
+    """Largest and mean error_xy, m/s, of at least one segment."""
+    errors = [segment.error_xy for segment in segments]
+    return max(errors), float(np.mean(errors))
+
+
+def rounded(value: ArrayLike) -> Any:
+    """`value` as JSON keeps it: a number or nested lists of numbers, with as many digits as make sense."""
+    return np.round(np.asarray(value, float), DIGITS).tolist()
