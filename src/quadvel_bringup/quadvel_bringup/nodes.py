@@ -19,6 +19,11 @@ class NodeEntry:
     module: str
     about: str
 
+    @property
+    def package(self) -> str:
+        """The ROS 2 package that the node belongs to."""
+        return self.module.partition(".")[0]
+
 
 NODES = {
     "sim_node": NodeEntry("quadvel_sim.sim_node", "the stand-in robot: MuJoCo behind low_state and low_cmd"),

@@ -29,7 +29,7 @@ class Stack:
         """The ROS 2 arguments of each node to start, by the node's name."""
         chosen: dict[str, dict[str, object]] = {
             LOW_LEVELS[self.low_level]: {"terrain": self.terrain},
-            "estimator": {"method": self.estimator},
+            "estimator": {"kind": self.estimator},
             "controller": {"policy": self.policy and self.policy.resolve()},
             "command_mux": {},
         }

@@ -1,0 +1,59 @@
+"""What all tests share: one thread a process, a DDS domain of the test's own, and nothing left running."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+# Before anything imports numpy or torch: tests run side by side, one on each core.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# Processes that a test starts inherit this, wherever they end up in the process tree.
+MARK = f"QUADVEL_TEST={os.getpid()}"
+os.environ.update([MARK.split("=")])
+
+# Python's own helpers, which live as long as the process that runs the tests.
+HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
+FIRST_DOMAIN = 51
+
+
+@pytest.fixture
+def domain_id(monkeypatch: pytest.MonkeyPatch) -> int:
+    """A DDS domain that no other worker uses; set as ROS_DOMAIN_ID here and for child processes."""
+    base = int(os.environ.get("ROS_DOMAIN_ID", FIRST_DOMAIN))
+    number = base + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
+    return number
+
+
+@pytest.fixture(autouse=True)
+def nothing_left_running() -> Iterator[None]:
+    """Fails a test that leaves processes behind, and ends them. What wider fixtures started may stay."""
+    before = _marked()
+    yield
+    until = time.monotonic() + 2.0
+    while (left := _marked().items() - before.items()) and time.monotonic() < until:
+        time.sleep(0.05)
+    for pid, _ in left:
+        os.kill(pid, signal.SIGKILL)
+    assert not left, f"left running: {', '.join(sorted(text for _, text in left))}"
+
+
+def _marked() -> dict[int, str]:
+    """Command lines, by process id, of the processes that this one started, their children included."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            environment = (folder / "environ").read_bytes().split(b"\0")
+            text = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+        except OSError:  # it has ended meanwhile, or is not ours to look at
+            continue
+        if MARK.encode() in environment and text and not any(helper in text for helper in HELPERS):
+            found[int(folder.name)] = text
+    return found

@@ -1,0 +1,128 @@
+"""Processes that live and die together."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from quadvel_bringup.processes import ProcessGroup, StopSignals
+
+SLEEPER = [sys.executable, "-c", "import time; print('up'); time.sleep(60)"]
+# Deaf to the gentle ways, as a node that hangs.
+STUBBORN = """
+import signal, time
+for number in (signal.SIGINT, signal.SIGTERM):
+    signal.signal(number, signal.SIG_IGN)
+print("up")
+time.sleep(60)
+"""
+# Ends with 7 at the first Ctrl-C and would end with 8 at a second one.
+COUNTING = """
+import signal, sys, time
+def stop(number, frame):
+    signal.signal(signal.SIGINT, lambda *_: sys.exit(8))
+    time.sleep(0.3)
+    sys.exit(7)
+signal.signal(signal.SIGINT, stop)
+print("up")
+time.sleep(60)
+"""
+
+
+class Lines:
+    """Output that remembers what was written."""
+
+    def __init__(self) -> None:
+        self.seen: list[tuple[str, str]] = []
+
+    def __call__(self, name: str, line: str) -> None:
+        self.seen.append((name, line))
+
+
+def wait_until(holds: Callable[[], bool], seconds: float = 20.0) -> None:
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until, "waited in vain"
+        time.sleep(0.02)
+
+
+def test_output_comes_line_by_line_under_the_name_of_its_process() -> None:
+    lines = Lines()
+    with ProcessGroup(lines) as group:
+        group.start(
+            "talker", [sys.executable, "-c", "import sys; print('one'); print('two', file=sys.stderr)"]
+        )
+        wait_until(lambda: bool(group.ended()))
+    assert sorted(lines.seen) == [("talker", "one"), ("talker", "two")]
+
+
+def test_a_process_that_ended_is_named_with_its_exit_code() -> None:
+    with ProcessGroup(Lines()) as group:
+        group.start("stays", SLEEPER)
+        group.start("leaves", [sys.executable, "-c", "raise SystemExit(3)"])
+        wait_until(lambda: bool(group.ended()))
+        assert group.ended() == {"leaves": 3}
+
+
+def test_stop_sends_one_interrupt() -> None:
+    lines = Lines()
+    with ProcessGroup(lines) as group:
+        group.start("counting", [sys.executable, "-c", COUNTING])
+        wait_until(lambda: ("counting", "up") in lines.seen)
+        assert group.stop() == {"counting": 7}
+
+
+def test_stop_kills_what_does_not_listen() -> None:
+    lines = Lines()
+    with ProcessGroup(lines) as group:
+        group.start("stubborn", [sys.executable, "-c", STUBBORN])
+        wait_until(lambda: ("stubborn", "up") in lines.seen)
+        assert group.stop(patience=0.2) == {"stubborn": -signal.SIGKILL}
+
+
+def test_an_error_in_the_block_stops_the_processes() -> None:
+    group = ProcessGroup(Lines())
+    group.start("sleeper", SLEEPER)
+    with pytest.raises(RuntimeError, match="on purpose"), group:
+        raise RuntimeError("on purpose")
+    assert group.ended().keys() == {"sleeper"}
+
+
+def test_a_name_is_given_once() -> None:
+    with ProcessGroup(Lines()) as group:
+        group.start("sleeper", SLEEPER)
+        with pytest.raises(ValueError, match="'sleeper' runs already"):
+            group.start("sleeper", SLEEPER)
+
+
+def test_processes_end_when_the_one_that_started_them_is_killed(tmp_path: Path) -> None:
+    program = f"""
+import os
+from quadvel_bringup.processes import ProcessGroup
+with ProcessGroup(lambda name, line: None) as group:
+    group.start("sleeper", {SLEEPER!r})
+    print(group._processes["sleeper"].pid, flush=True)
+    os.kill(os.getpid(), 9)
+"""
+    parent = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert parent.returncode == -signal.SIGKILL
+    child = Path("/proc") / parent.stdout.strip()
+    wait_until(lambda: not (child / "cmdline").exists() or not (child / "cmdline").read_bytes())
+
+
+def test_stop_signals_are_noted_and_not_raised_however_often_they_come() -> None:
+    former = signal.getsignal(signal.SIGINT)
+    with StopSignals() as signals:
+        assert not signals.wait(0.0)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+            os.kill(os.getpid(), number)
+        assert signals.wait(1.0)
+        assert signals.received == signal.SIGTERM
+    assert signal.getsignal(signal.SIGINT) is former
