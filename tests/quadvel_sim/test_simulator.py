@@ -1,6 +1,7 @@
 """The simulated robot against closed form: flight, pushes, drives, sensors, watchdog, reproducibility."""
 
 from itertools import pairwise
+from pathlib import Path
 
 import attrs
 import mujoco
@@ -453,7 +454,8 @@ def test_bad_orders_are_refused_by_name() -> None:
         sim.push("trunk", [1.0, 0.0, 0.0], duration=0.0)
 
 
-def test_a_diverged_run_is_an_error() -> None:
+def test_a_diverged_run_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it stands
     sim = simulator()
     sim.reset("stand")
     sim.data.qvel[0] = np.nan

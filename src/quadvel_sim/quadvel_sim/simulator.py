@@ -89,7 +89,8 @@ class Simulator:
 
     Reading (`state`, `truth`, `fallen`) does not alter the run, the sensor noise of later samples apart. The
     first reading at an instant settles it: a command or push given after that shows from the next step on.
-    `model` and `data` are MuJoCo's own, to be drawn and measured, not to be written to.
+    `model` and `data` are MuJoCo's own, to be drawn and measured, not to be written to. `steps` counts the ms
+    since the reset, `actuator` is the drives' model.
     """
 
     def __init__(self, config: SimulatorConfig | None = None) -> None:
@@ -125,7 +126,7 @@ class Simulator:
         self.data.qpos[:3] = rotate(tilt, self.data.qpos[:3])
         self.data.qpos[3:7] = tilt
         self._pushes: list[_Push] = []
-        self._steps = 0
+        self.steps = 0
         self._sampled = False
         self._law = self._brake
         self._command_left = 0
@@ -133,12 +134,12 @@ class Simulator:
     @property
     def time(self) -> float:
         """Simulated time since the reset, s."""
-        return self._steps * DT
+        return self.steps * DT
 
     @property
     def tick(self) -> int:
-        """The same in ms, wrapping at 2^32."""
-        return self._steps % _TICKS
+        """`steps` as the board's counter shows it: it wraps at 2^32."""
+        return self.steps % _TICKS
 
     @property
     def braking(self) -> bool:
@@ -172,7 +173,7 @@ class Simulator:
                 mujoco.mj_step(model, data)
             if self._pushes:
                 self._end_pushes()
-        self._steps += n
+        self.steps += n
         if not np.isfinite(data.qpos).all():
             raise FloatingPointError(f"simulation: the robot's state is not finite at {self.time:.3f} s")
 

@@ -1,0 +1,234 @@
+"""A `Simulator` that runs by itself, as the robot does: in real time, in lockstep with a controller, or fast.
+
+Commands come in from any thread (`submit`), samples of the state go out through a callback every `period` ms.
+No ROS: `sim_node` puts topics around it.
+
+In real time the loop wakes once a period, at absolute deadlines, and then simulates the period that has just
+passed. A command takes effect at the simulated millisecond that follows its arrival: the robot behaves as if
+the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted.
+"""
+
+from __future__ import annotations
+
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+
+import attrs
+from numpy.typing import ArrayLike
+
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_sim.simulator import DT, Simulator
+
+REALTIME, LOCKSTEP, FAST = MODES = ("realtime", "lockstep", "fast")
+MAX_LAG = 0.1  # s
+MAX_AGE = 100  # ms, of the state that a command answers
+_BREATH = 1e-4  # s that the fast mode leaves to other threads each period
+_WRAP = 2**32
+
+
+@attrs.frozen
+class LoopReport:
+    """How the loop did since the report before, and what it counted since the start."""
+
+    realtime_factor: float
+    worst_lateness: float  # s, of waking up
+    given_up: float  # s of real time that were not simulated, since the start
+    unanswered: int  # times that lockstep waited in vain, since the start
+    braking: bool  # now
+    fallen: bool  # now
+
+
+class SimulationLoop:
+    """Runs `simulator`; all methods may be called from any thread.
+
+    `publish(state, instant)` is called with the lock held, so that samples leave in order. `state.tick` and
+    `state.time` go on over resets. `instant` (s) is when the sample holds: on `clock` in real time, else in
+    simulated time.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        publish: Callable[[RobotState, float], None],
+        mode: str = REALTIME,
+        period: int = 5,
+        answer_timeout: float = 1.0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.simulator = simulator
+        self.mode = mode
+        self.period = period
+        self._publish = publish
+        self._answer_timeout = answer_timeout
+        self._clock = clock
+        self._condition = threading.Condition()
+        self._inbox: deque[tuple[float, JointCommand]] = deque()
+        self._before_reset = 0  # ms that passed before the last reset
+        self._answered = self._paused = self._stopped = False
+        self._given_up = 0.0
+        self._unanswered = 0
+        self._anchor()
+        self._begin_report()
+
+    @property
+    def tick(self) -> int:
+        """Simulated ms since the start, resets included, without wrapping."""
+        return self._before_reset + self.simulator.steps
+
+    @property
+    def paused(self) -> bool:
+        """Whether time stands still."""
+        return self._paused
+
+    def run(self) -> None:
+        """Run until `stop`. The simulator's FloatingPointError comes out here."""
+        with self._condition:
+            self._anchor()
+            self._sample()
+            while not self._stopped:
+                if self._ready():
+                    self.advance()
+
+    def stop(self) -> None:
+        """End `run`."""
+        with self._condition:
+            self._stopped = True
+            self._condition.notify_all()
+
+    def advance(self) -> None:
+        """Simulate one period and publish the state at its end."""
+        with self._condition:
+            self._answered = False
+            self._step(self.period)
+            self._sample()
+
+    def submit(self, command: JointCommand) -> None:
+        """Give a command that arrives now. ValueError says why it is refused."""
+        arrival = self._clock()
+        with self._condition:
+            self._check(command)
+            self._inbox.append((arrival, command))
+            if self.mode == LOCKSTEP:
+                self._answered = True
+                self._condition.notify_all()
+
+    def reset(self, keyframe: str) -> None:
+        """Put the robot back; time goes on. ValueError where the keyframe is unknown."""
+        with self._condition:
+            tick = self.tick
+            self.simulator.reset(keyframe)
+            self._before_reset = tick
+            self._inbox.clear()
+            self._answered = False
+            self._sample()
+            self._condition.notify_all()
+
+    def pause(self, paused: bool) -> None:
+        """Let time stand still, or go on."""
+        with self._condition:
+            self._paused = paused
+            self._anchor()
+            self._begin_report()
+            self._condition.notify_all()
+
+    def step(self, steps: int) -> None:
+        """Advance a paused simulation by `steps` ms and publish. ValueError where it is not paused."""
+        with self._condition:
+            if not self._paused:
+                raise ValueError("the simulation runs; pause it first")
+            self._answered = False
+            self._step(steps)
+            self._sample()
+
+    def push(self, body: str, force: ArrayLike, torque: ArrayLike, duration: float) -> None:
+        """As `Simulator.push`."""
+        with self._condition:
+            self.simulator.push(body, force, torque, duration)
+
+    def report(self) -> LoopReport:
+        """What happened since the last report."""
+        with self._condition:
+            elapsed = max(self._clock() - self._report_time, 1e-9)
+            report = LoopReport(
+                realtime_factor=(self.tick - self._report_tick) * DT / elapsed,
+                worst_lateness=self._worst_lateness,
+                given_up=self._given_up,
+                unanswered=self._unanswered,
+                braking=self.simulator.braking,
+                fallen=self.simulator.fallen,
+            )
+            self._begin_report()
+            return report
+
+    def _begin_report(self) -> None:
+        self._report_time, self._report_tick, self._worst_lateness = self._clock(), self.tick, 0.0
+
+    def _anchor(self) -> None:
+        """Tie the present simulated time to the present real time."""
+        self._anchor_time, self._anchor_tick = self._clock(), self.tick
+
+    def _real_time(self, tick: int) -> float:
+        """When `tick` is due on the clock, s."""
+        return self._anchor_time + (tick - self._anchor_tick) * DT
+
+    def _ready(self) -> bool:
+        """Whether the next period may be simulated; if not, waits a while or until something happens."""
+        if self._paused:
+            self._condition.wait()
+            return False
+        if self.mode == FAST:
+            self._condition.wait(_BREATH)
+            return not (self._paused or self._stopped)
+        if self.mode == LOCKSTEP:
+            if not self._answered and not self._condition.wait(self._answer_timeout):
+                self._unanswered += 1
+                self._sample()  # for a controller that has come late
+            return self._answered and not (self._paused or self._stopped)
+        lateness = self._clock() - self._real_time(self.tick + self.period)
+        if lateness < 0.0:
+            self._condition.wait(-lateness)
+            return False
+        self._worst_lateness = max(self._worst_lateness, lateness)
+        if lateness > MAX_LAG:
+            self._given_up += lateness
+            self._anchor_time += lateness
+        return True
+
+    def _step(self, steps: int) -> None:
+        """Simulate `steps` ms; each command takes effect when it is due."""
+        while steps > 0:
+            chunk = self._deliver(steps)
+            self.simulator.step(chunk)
+            steps -= chunk
+
+    def _deliver(self, steps: int) -> int:
+        """Hand over the commands that are due; how many ms, `steps` at most, lie before the next one."""
+        while self._inbox:
+            arrival, command = self._inbox[0]
+            due = self._anchor_tick + math.ceil((arrival - self._anchor_time) / DT)
+            if self.mode == REALTIME and due > self.tick:
+                return min(steps, due - self.tick)
+            self._inbox.popleft()
+            self.simulator.command(command)
+        return steps
+
+    def _sample(self) -> None:
+        state = self.simulator.state()
+        state.tick = self.tick % _WRAP
+        state.time = self.tick * DT
+        self._publish(state, self._real_time(self.tick) if self.mode == REALTIME else state.time)
+
+    def _check(self, command: JointCommand) -> None:
+        if command.mode not in (MODE_DAMPING, MODE_SERVO):
+            raise ValueError(f"mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
+        age = (self.tick - command.tick + _WRAP // 2) % _WRAP - _WRAP // 2  # ms
+        if self.mode == LOCKSTEP and age != 0:
+            raise ValueError(f"it answers tick {command.tick}, expected {self.tick % _WRAP}")
+        if age < 0:
+            raise ValueError(f"it answers tick {command.tick}, which is to come: now is {self.tick % _WRAP}")
+        if age > min(MAX_AGE, self.tick - self._before_reset):
+            expected = f"expected at most {MAX_AGE} ms, and none from before a reset"
+            raise ValueError(f"it answers tick {command.tick}, {age} ms ago: {expected}")

@@ -1,0 +1,95 @@
+"""The parameters of the node `sim_node`, and the simulation that they ask for. Knows no ROS."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_actuator import ActuatorParameters
+from quadvel_sim.config import SensorNoise, SimulatorConfig
+from quadvel_sim.loop import MODES
+from quadvel_sim.terrain import KINDS, Terrain
+
+_NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
+
+
+def _parameter(default: Any, description: str) -> Any:
+    return attrs.field(default=default, metadata={"description": description})
+
+
+@attrs.frozen
+class SimParameters:
+    """The node's parameters; what each record of the simulation may hold is that record's own matter."""
+
+    mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
+    keyframe: str = _parameter("lie", "posture at the start: lie or stand")
+    state_rate: int = _parameter(200, "rate of low_state, Hz: a divisor of 1000, 50 at least")
+    answer_timeout: float = _parameter(1.0, "lockstep: s after which a state without answer is sent again")
+    publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to trunk")
+    seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
+    actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
+    terrain: str = _parameter(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
+    slope: float = _parameter(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
+    roughness: float = _parameter(_TERRAIN.roughness, "rough ground: bound of its heights, m")
+    wavelength: float = _parameter(_TERRAIN.wavelength, "rough ground: distance from hump to hollow, m")
+    terrain_seed: int = _parameter(_TERRAIN.seed, "rough ground: its seed")
+    friction: tuple[float, ...] = _parameter(
+        tuple(_CONFIG.friction.tolist()), "sliding friction of the feet: one number, or FR, FL, RR, RL"
+    )
+    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg")
+    payload_position: tuple[float, ...] = _parameter(
+        tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
+    )
+    watchdog: float = _parameter(_CONFIG.watchdog, "s without a command after which the drives brake")
+    watchdog_kd: float = _parameter(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
+    noise_q: float = _parameter(_NOISE.q, "standard deviation of q, rad")
+    noise_dq: float = _parameter(_NOISE.dq, "standard deviation of dq, rad/s")
+    noise_angular_velocity: float = _parameter(_NOISE.angular_velocity, "of the gyroscope, rad/s")
+    noise_linear_acceleration: float = _parameter(_NOISE.linear_acceleration, "of the accelerometer, m/s^2")
+    noise_orientation: float = _parameter(_NOISE.orientation, "of the orientation, rad an axis")
+
+    def __attrs_post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise ValueError(f"mode is {self.mode!r}, expected one of {', '.join(MODES)}")
+        if not 50 <= self.state_rate <= 1000 or 1000 % self.state_rate:
+            raise ValueError(f"state_rate is {self.state_rate} Hz, expected a divisor of 1000, 50 at least")
+        if not 0.0 < self.answer_timeout < 3600.0:
+            raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
+
+    @property
+    def period(self) -> int:
+        """Simulated ms from state to state."""
+        return 1000 // self.state_rate
+
+    def config(self) -> SimulatorConfig:
+        """The simulation asked for. ValueError names what it cannot be."""
+        return SimulatorConfig(
+            actuator=self._actuator(),
+            terrain=self._terrain(),
+            noise=SensorNoise(
+                self.noise_q,
+                self.noise_dq,
+                self.noise_angular_velocity,
+                self.noise_linear_acceleration,
+                self.noise_orientation,
+            ),
+            seed=self.seed,
+            friction=np.array(self.friction),
+            payload=self.payload,
+            payload_position=np.array(self.payload_position),
+            watchdog=self.watchdog,
+            watchdog_kd=self.watchdog_kd,
+        )
+
+    def _terrain(self) -> Terrain:
+        return Terrain(self.terrain, self.slope, self.roughness, self.wavelength, seed=self.terrain_seed)
+
+    def _actuator(self) -> ActuatorParameters:
+        if not self.actuator_file:
+            return ActuatorParameters.default()
+        try:
+            return ActuatorParameters.load(self.actuator_file)
+        except OSError as error:
+            raise ValueError(f"actuator_file: cannot read {self.actuator_file}: {error.strerror}") from error

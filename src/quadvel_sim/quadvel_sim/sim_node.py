@@ -1,0 +1,234 @@
+"""The node `sim_node`: the simulated robot on the topics of the real one. How it runs is `loop`'s matter."""
+
+from __future__ import annotations
+
+import sys
+import time
+from threading import Thread
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TransformStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from rclpy.qos import qos_profile_sensor_data
+from rosgraph_msgs.msg import Clock as ClockMessage
+from sensor_msgs.msg import Imu, JointState
+from std_srvs.srv import SetBool
+from tf2_msgs.msg import TFMessage
+
+from quadvel_description import robot
+from quadvel_description.diagnostics import diagnostics
+from quadvel_description.messages import Refusals, read_low_cmd, write_low_state
+from quadvel_description.node import read_parameters, run
+from quadvel_description.state import RobotState
+from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_msgs.srv import Push, ResetSim, StepSim
+from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
+from quadvel_sim.parameters import SimParameters
+from quadvel_sim.simulator import Simulator, Truth
+
+TRUTH_PERIOD = 5  # ms
+VIEW_PERIOD = 20  # ms, of what is there for people's tools: imu, joint_states, tf
+STAMP_TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart before the stamps follow
+
+
+class SimNode(Node):  # type: ignore[misc]
+    """Topics and services around a SimulationLoop, which runs in a thread of its own."""
+
+    def __init__(self) -> None:
+        super().__init__("sim_node")
+        self._settings = read_parameters(self, SimParameters)
+        simulator = Simulator(self._settings.config())
+        simulator.reset(self._settings.keyframe)
+        self._noise = simulator.config.noise
+        self._refusals = Refusals()
+        self._refused_before = self._unanswered_before = 0
+        self._given_up_before = 0.0
+        self._to_system_time = time.time_ns() - time.monotonic_ns()
+        self._samples = 0
+        self._failure = ""
+        mode, period, timeout = self._settings.mode, self._settings.period, self._settings.answer_timeout
+        self._loop = SimulationLoop(simulator, self._publish, mode, period, timeout)
+        self._create_publishers()
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
+        self.create_service(ResetSim, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        self.create_service(StepSim, "~/step", self._on_step)
+        self.create_service(Push, "~/push", self._on_push)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._thread = Thread(target=self._simulate, name="simulation")
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Stop the simulation, then the node."""
+        self._loop.stop()
+        self._thread.join()
+        super().destroy_node()
+
+    def _create_publishers(self) -> None:
+        self._low_state = self.create_publisher(LowState, "low_state", 10)
+        self._imu = self.create_publisher(Imu, "imu", 10)
+        self._joint_states = self.create_publisher(JointState, "joint_states", 10)
+        self._truth = self.create_publisher(Odometry, "ground_truth/odom", 10)
+        self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    # In the simulation's thread.
+
+    def _simulate(self) -> None:
+        try:
+            self._loop.run()
+        except Exception as error:  # whatever it was, the node must not go on without its robot
+            self._failure = f"{type(error).__name__}: {error}"
+
+    def _publish(self, state: RobotState, instant: float) -> None:
+        if not self.context.ok():
+            self._loop.stop()
+            return
+        stamp = self._stamp(instant)
+        if self._settings.mode != REALTIME:
+            self._clock_publisher.publish(ClockMessage(clock=stamp))
+        message = LowState(stamp=stamp)
+        write_low_state(state, message)
+        self._low_state.publish(message)
+        view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
+        if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
+            self._publish_truth(stamp, self._loop.simulator.truth(), view and self._settings.publish_tf)
+        if view:
+            self._publish_view(stamp, state)
+        self._samples += 1
+
+    def _stamp(self, instant: float) -> Any:
+        """The instant of a sample as a message; in real time in the time of the system clock."""
+        nanoseconds = round(instant * 1e9)
+        if self._settings.mode == REALTIME:
+            shift = time.time_ns() - time.monotonic_ns()
+            if abs(shift - self._to_system_time) > STAMP_TOLERANCE:  # else stamps would inherit its jitter
+                self._to_system_time = shift
+            nanoseconds += self._to_system_time
+        return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+
+    def _publish_truth(self, stamp: Any, truth: Truth, transform: bool) -> None:
+        message = Odometry(child_frame_id="trunk")
+        message.header.stamp = stamp
+        message.header.frame_id = "odom"
+        _fill(message.pose.pose.position, truth.position)
+        _fill_quaternion(message.pose.pose.orientation, truth.quaternion)
+        _fill(message.twist.twist.linear, truth.linear_velocity)
+        _fill(message.twist.twist.angular, truth.angular_velocity)
+        self._truth.publish(message)
+        if transform:
+            odom_to_trunk = TransformStamped(header=message.header, child_frame_id="trunk")
+            _fill(odom_to_trunk.transform.translation, truth.position)
+            _fill_quaternion(odom_to_trunk.transform.rotation, truth.quaternion)
+            self._tf.publish(TFMessage(transforms=[odom_to_trunk]))
+
+    def _publish_view(self, stamp: Any, state: RobotState) -> None:
+        joints = JointState(name=list(robot.JOINT_NAMES))
+        joints.header.stamp = stamp
+        joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
+        joints.effort = state.tau.tolist()
+        self._joint_states.publish(joints)
+        imu = Imu()
+        imu.header.stamp = stamp
+        imu.header.frame_id = "imu_link"
+        _fill_quaternion(imu.orientation, state.quaternion)
+        _fill(imu.angular_velocity, state.angular_velocity)
+        _fill(imu.linear_acceleration, state.linear_acceleration)
+        imu.orientation_covariance = _covariance(self._noise.orientation)
+        imu.angular_velocity_covariance = _covariance(self._noise.angular_velocity)
+        imu.linear_acceleration_covariance = _covariance(self._noise.linear_acceleration)
+        self._imu.publish(imu)
+
+    # In the executor's thread.
+
+    def _on_command(self, message: Any) -> None:
+        try:
+            self._loop.submit(read_low_cmd(message))
+        except ValueError as error:
+            self._refusals.add("low_cmd", error)
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        keyframe = request.keyframe or "lie"
+        return _answer(response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe)
+
+    def _on_pause(self, request: Any, response: Any) -> Any:
+        done = "paused" if request.data else "running"
+        return _answer(response, done, self._loop.pause, request.data)
+
+    def _on_step(self, request: Any, response: Any) -> Any:
+        return _answer(response, f"advanced by {request.steps} ms", self._loop.step, request.steps)
+
+    def _on_push(self, request: Any, response: Any) -> Any:
+        force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))
+        body = request.body or "trunk"
+        return _answer(response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration)
+
+    def _report(self) -> None:
+        """Once a second: how the simulation does."""
+        if self._failure:
+            sys.exit(f"sim_node: {self._failure}")
+        report = self._loop.report()
+        level, summary = self._judge(report)
+        values = {
+            "mode": self._settings.mode,
+            "realtime_factor": f"{report.realtime_factor:.3f}",
+            "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
+            "given_up_s": f"{report.given_up:.3f}",
+            "unanswered": report.unanswered,
+            "braking": report.braking,
+            "fallen": report.fallen,
+            **self._refusals.values(),
+        }
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+
+    def _judge(self, report: LoopReport) -> tuple[bytes, str]:
+        """Level and summary of the last second."""
+        refused = self._refusals.total - self._refused_before
+        unanswered = report.unanswered - self._unanswered_before
+        given_up = report.given_up - self._given_up_before
+        self._refused_before, self._unanswered_before = self._refusals.total, report.unanswered
+        self._given_up_before = report.given_up
+        if refused:
+            return DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+        if unanswered:
+            return DiagnosticStatus.WARN, "waiting for the LowCmd that answers the last state"
+        if given_up:
+            return DiagnosticStatus.WARN, f"this machine is too slow: {given_up:.2f} s of real time given up"
+        if self._loop.paused:
+            return DiagnosticStatus.OK, "paused"
+        return DiagnosticStatus.OK, "no command: the drives brake" if report.braking else "running"
+
+
+def _answer(response: Any, done: str, order: Any, *arguments: Any) -> Any:
+    """Carry out an order and tell how it went."""
+    try:
+        order(*arguments)
+        response.success, response.message = True, done
+    except ValueError as error:
+        response.success, response.message = False, str(error)
+    return response
+
+
+def _fill(message: Any, vector: NDArray[np.float64]) -> None:
+    message.x, message.y, message.z = vector.tolist()
+
+
+def _fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
+    message.w, message.x, message.y, message.z = wxyz.tolist()
+
+
+def _covariance(deviation: float) -> NDArray[np.float64]:
+    return np.diag(np.full(3, deviation**2)).ravel()
+
+
+def main(args: list[str] | None = None) -> None:
+    """Entry point of the node."""
+    run(SimNode, args)

@@ -1,0 +1,249 @@
+"""How simulated time follows real time, answers and orders; commands take effect when they are due."""
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quadvel_actuator import ActuatorParameters
+from quadvel_description import robot
+from quadvel_description.state import MODE_SERVO, JointCommand, RobotState
+from quadvel_sim.loop import SimulationLoop
+from quadvel_sim.simulator import SensorNoise, Simulator, SimulatorConfig
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Bench:
+    """A loop with a clock of the test's own, and what it published."""
+
+    def __init__(self, mode: str, period: int = 5, **fields: object) -> None:
+        config = SimulatorConfig(noise=SensorNoise.none(), actuator=ActuatorParameters.ideal(), armature=1e9)
+        self.clock = Clock()
+        self.samples: list[tuple[RobotState, float]] = []
+        self.loop = SimulationLoop(Simulator(config), self.note, mode, period, clock=self.clock, **fields)
+
+    def note(self, state: RobotState, instant: float) -> None:
+        self.samples.append((state, instant))
+
+    def torque(self) -> float:
+        return float(self.samples[-1][0].tau[0])
+
+
+def command(torque: float, tick: int, mode: int = MODE_SERVO) -> JointCommand:
+    return JointCommand(q=robot.LIE_Q, tau=np.full(12, torque), tick=tick, mode=mode)
+
+
+def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.002)
+
+
+@contextmanager
+def running(loop: SimulationLoop) -> Iterator[None]:
+    thread = threading.Thread(target=loop.run)
+    thread.start()
+    try:
+        yield
+    finally:
+        loop.stop()
+        thread.join(10.0)
+        assert not thread.is_alive()
+
+
+def test_a_command_takes_effect_at_the_millisecond_after_its_arrival() -> None:
+    bench = Bench("realtime", period=1)
+    torques = []
+    for tick in range(12):
+        for torque, arrival in ((2.0, 0.0032), (3.0, 0.0080)):
+            if arrival < 0.001 * (tick + 1) <= arrival + 0.001:
+                bench.clock.now = 100.0 + arrival
+                bench.loop.submit(command(torque, 0))
+        bench.loop.advance()
+        torques.append(bench.torque())
+    # It came after 3 ms and counts from 4 ms on; the sample of that instant is the last with the old torque.
+    assert torques == pytest.approx([0.0] * 4 + [2.0] * 4 + [3.0] * 4, abs=1e-9)
+
+
+def test_that_millisecond_is_the_same_however_rarely_the_loop_wakes() -> None:
+    positions = []
+    for period in (1, 5, 20):
+        bench = Bench("realtime", period=period)
+        bench.loop.simulator.actuator.reset()
+        bench.clock.now = 100.0
+        for k in range(40):
+            bench.clock.now = 100.0 + 0.001 * k + 0.0004
+            if k in (3, 11, 24):
+                bench.loop.submit(command(1.0 + k, 0))
+            if (k + 1) % period == 0:
+                bench.loop.advance()
+        positions.append(bench.loop.simulator.data.qvel.copy())
+    np.testing.assert_array_equal(positions[0], positions[1])
+    np.testing.assert_array_equal(positions[0], positions[2])
+    assert positions[0].any()
+
+
+def test_samples_tell_the_real_time_at_which_they_hold_without_drift() -> None:
+    bench = Bench("realtime")
+    for k in range(100):
+        bench.clock.now = 100.0 + 0.005 * (k + 1) + 0.0007 * (k % 3)  # wakes late, by another time each time
+        bench.loop.advance()
+    np.testing.assert_allclose([instant for _, instant in bench.samples], 100.0 + 0.005 * np.arange(1, 101))
+    assert [state.tick for state, _ in bench.samples] == [5 * k for k in range(1, 101)]
+
+
+def test_realtime_keeps_pace_with_the_clock() -> None:
+    samples: list[tuple[float, float]] = []
+    loop = SimulationLoop(
+        Simulator(), lambda state, instant: samples.append((state.time, time.monotonic() - instant))
+    )
+    with running(loop):
+        wait_for(lambda: len(samples) > 60)
+        report = loop.report()
+    simulated, late = np.array(samples).T
+    np.testing.assert_allclose(np.diff(simulated), 0.005)
+    assert late.min() >= 0.0  # never published before it holds
+    assert report.realtime_factor == pytest.approx(1.0, abs=0.5)  # whatever else this machine does
+
+
+def test_what_is_too_late_is_given_up_and_counted() -> None:
+    bench = Bench("realtime")
+    with running(bench.loop):
+        wait_for(lambda: len(bench.samples) == 1)
+        bench.clock.now += 2.0  # the machine slept
+        wait_for(lambda: bench.loop.report().given_up > 1.0)
+    assert bench.loop.report().given_up == pytest.approx(2.0, abs=0.01)
+    assert bench.samples[-1][1] == pytest.approx(102.0)
+    assert len(bench.samples) == 2
+
+
+def test_lockstep_waits_for_the_command_that_answers_its_tick() -> None:
+    bench = Bench("lockstep")
+    with running(bench.loop):
+        for k in range(20):
+            wait_for(lambda: len(bench.samples) == k + 1)  # noqa: B023
+            state, instant = bench.samples[-1]
+            assert (state.tick, instant) == (5 * k, pytest.approx(0.005 * k))
+            if k == 7:
+                with pytest.raises(ValueError, match="it answers tick 30, expected 35"):
+                    bench.loop.submit(command(0.0, 30))
+                time.sleep(0.02)
+                assert len(bench.samples) == k + 1
+            bench.loop.submit(command(float(k), state.tick))
+        wait_for(lambda: len(bench.samples) == 21)
+    assert bench.torque() == 19.0
+
+
+def test_lockstep_without_answer_stands_still_and_sends_its_state_again() -> None:
+    bench = Bench("lockstep", answer_timeout=0.01)
+    with running(bench.loop):
+        wait_for(lambda: bench.loop.report().unanswered >= 3)
+        assert {state.tick for state, _ in bench.samples} == {0}
+        bench.loop.submit(command(0.0, 0))
+        wait_for(lambda: bench.samples[-1][0].tick == 5)
+
+
+def test_fast_goes_on_by_itself_and_takes_commands() -> None:
+    bench = Bench("fast")
+    with running(bench.loop):
+        wait_for(lambda: len(bench.samples) > 50)
+        bench.loop.pause(True)
+        bench.loop.submit(command(4.0, bench.samples[-1][0].tick))
+        bench.loop.step(10)
+        assert bench.torque() == 4.0
+    assert bench.clock.now == 100.0
+
+
+def test_a_pause_stops_time_and_steps_advance_it() -> None:
+    bench = Bench("fast")
+    with pytest.raises(ValueError, match="the simulation runs; pause it first"):
+        bench.loop.step(5)
+    with running(bench.loop):
+        bench.loop.pause(True)
+        tick = bench.loop.tick
+        time.sleep(0.03)
+        assert bench.loop.tick == tick
+        bench.loop.step(7)
+        assert (bench.loop.tick, bench.samples[-1][0].tick) == (tick + 7, tick + 7)
+        bench.loop.pause(False)
+        wait_for(lambda: bench.loop.tick > tick + 7)
+
+
+def test_after_a_pause_realtime_does_not_catch_up() -> None:
+    bench = Bench("realtime")
+    with running(bench.loop):
+        wait_for(lambda: len(bench.samples) == 1)
+        bench.loop.pause(True)
+        bench.clock.now += 60.0
+        bench.loop.pause(False)
+        bench.clock.now += 0.0051
+        wait_for(lambda: len(bench.samples) == 2)
+        time.sleep(0.02)
+    assert len(bench.samples) == 2
+    assert bench.samples[-1][1] == pytest.approx(160.005)
+    assert bench.loop.report().given_up == 0.0
+
+
+def test_a_reset_puts_the_robot_back_while_its_clock_goes_on() -> None:
+    bench = Bench("realtime")
+    bench.loop.submit(command(5.0, 0))
+    for _ in range(3):
+        bench.loop.advance()
+    bench.loop.reset("stand")
+    state, instant = bench.samples[-1]
+    assert (state.tick, state.time, instant) == (15, 0.015, pytest.approx(100.015))
+    np.testing.assert_array_equal(state.q, robot.NOMINAL_Q)
+    assert bench.loop.simulator.braking
+    bench.loop.advance()
+    assert bench.samples[-1][0].tick == 20
+    with pytest.raises(ValueError, match="it answers tick 10, 10 ms ago: expected at most 100 ms, and none"):
+        bench.loop.submit(command(0.0, 10))
+
+
+def test_lockstep_publishes_anew_after_a_reset() -> None:
+    bench = Bench("lockstep")
+    with running(bench.loop):
+        wait_for(lambda: len(bench.samples) == 1)
+        bench.loop.submit(command(0.0, 0))
+        wait_for(lambda: len(bench.samples) == 2)
+        bench.loop.reset("stand")
+        assert bench.samples[-1][0].tick == 5
+        bench.loop.submit(command(0.0, 5))
+        wait_for(lambda: len(bench.samples) == 4)
+
+
+@pytest.mark.parametrize(
+    ("tick", "mode", "sentence"),
+    [
+        (301, MODE_SERVO, "it answers tick 301, which is to come: now is 300"),
+        (199, MODE_SERVO, "it answers tick 199, 101 ms ago: expected at most 100 ms"),
+        (300, 7, "mode is 7, expected 0 or 10"),
+    ],
+)
+def test_a_command_that_cannot_be_an_answer_is_refused(tick: int, mode: int, sentence: str) -> None:
+    bench = Bench("realtime")
+    for _ in range(60):
+        bench.loop.advance()
+    with pytest.raises(ValueError, match=sentence):
+        bench.loop.submit(command(0.0, tick, mode))
+    bench.loop.submit(command(0.0, 200))
+
+
+def test_a_diverged_simulation_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it stands
+    bench = Bench("fast")
+    bench.loop.simulator.data.qvel[0] = np.nan
+    with pytest.raises(FloatingPointError):
+        bench.loop.run()
