@@ -1,8 +1,9 @@
 """The nodes' classes in one process, a control tick at a time: what every evaluation runs.
 
-Simulator, estimator, command mux and supervisor follow each other as the messages between the nodes make them;
-transport takes no time, the actuator model's input delay stands for it. As fast as the machine allows, the same
-to the bit for equal seeds. What is made of the samples is the caller's matter.
+Simulator, estimator, command mux and supervisor follow each other as the messages between the nodes make them:
+estimator and supervisor take up a state at the same time, so that the supervisor works with the velocity of the
+state before. Transport itself takes no time, the actuator model's input delay stands for it. As fast as the
+machine allows, the same to the bit for equal seeds. What is made of the samples is the caller's matter.
 """
 
 from __future__ import annotations
@@ -89,6 +90,7 @@ class RobotLoop:
         self._estimator = estimator
         self._beside = dict(beside)
         self._mux = CommandMux([_PLANNER])
+        self._velocity: Array | None = None
         self._previous_action = np.zeros(12)
 
     def tick(self, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> Sample:
@@ -98,11 +100,11 @@ class RobotLoop:
         """
         simulator = self.simulator
         now, state, truth, fallen = simulator.time, simulator.state(), simulator.truth(), simulator.fallen
-        estimate, _ = self._estimator.update(state, self._previous_action)
         estimates = {name: e.update(state, self._previous_action)[0] for name, e in self._beside.items()}
         self._mux.receive(_PLANNER.name, now, velocity)
         asked = self._mux.update(now)
-        command = self.supervisor.tick(now, state, estimate, [*asked.velocity, asked.stance])
+        command = self.supervisor.tick(now, state, self._velocity, [*asked.velocity, asked.stance])
+        self._velocity, _ = self._estimator.update(state, self._previous_action)
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)
         simulator.step(_STEPS)

@@ -1,0 +1,84 @@
+"""Pictures of a demo: how velocity followed the command, how the loop kept time. Arrays in, figures out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+
+from .demo_summary import commands
+from .recording import Recording, Series
+from .robot_loop import PERIOD
+
+Array = NDArray[np.float64]
+
+STRIDE = 0.4  # s, over which a velocity is averaged to be seen without the sway of each step
+AXES = ("vx, m/s", "vy, m/s", "wz, rad/s")
+
+
+def tracking_figure(recording: Recording, frames: Sequence[NDArray[np.uint8]] = ()) -> Figure:
+    """Commanded, true and estimated velocity over time; above them the `frames` (h, w, 3) as a strip."""
+    strip = 1.4 if frames else 0.0
+    figure = Figure(figsize=(11, 6 + strip), layout="constrained")
+    if frames:
+        top, below = figure.subfigures(2, 1, height_ratios=(strip, 6))
+        for panel, frame in zip(top.subplots(1, len(frames), squeeze=False)[0], frames, strict=True):
+            panel.imshow(frame)
+            panel.set_axis_off()
+    else:
+        below = figure
+    _tracking_panels(below.subplots(3, 1, sharex=True), recording)
+    return figure
+
+
+def _tracking_panels(panels: Any, recording: Recording) -> None:
+    start, end = _span(recording)
+    planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])
+    for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
+        for series, label, style in (
+            (recording.commanded, "commanded", {"color": "black", "linewidth": 1.2}),
+            (_smooth(planar), f"true, mean over {STRIDE} s", {"color": "tab:blue"}),
+            (_smooth(recording.estimate), f"estimated, mean over {STRIDE} s", {"color": "tab:orange", "linestyle": "--"}),
+        ):
+            if axis == 2 and series.value is recording.estimate.value:
+                continue
+            within = (start - 1.0 <= series.time) & (series.time <= end + 1.0)
+            panel.plot(series.time[within] - start, series.value[within, axis], label=label, **style)
+        panel.set_ylabel(name)
+        panel.grid(alpha=0.3)
+    panels[0].legend(loc="upper right", fontsize="small", ncols=3)
+    panels[-1].set_xlabel("time, s")
+
+
+def _span(recording: Recording) -> tuple[float, float]:
+    stretches = commands(recording.planned.time, recording.planned.value)
+    return stretches[0][0], stretches[-1][1]
+
+
+def _smooth(series: Series) -> Series:
+    """Mean over a stride, of evenly spaced samples."""
+    return Series(series.time, uniform_filter1d(series.value, round(STRIDE / PERIOD), axis=0, mode="nearest"))
+
+
+def loop_figure(recording: Recording) -> Figure:
+    """Time from a state to its answer, and the period between answers, as distributions."""
+    sent = recording.answer_time.time + recording.answer_time.value[:, 0]
+    figure = Figure(figsize=(11, 4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    _distribution(left, 1e3 * recording.answer_time.value[:, 0], "from state to command, ms")
+    _distribution(right, 1e3 * np.diff(sent), "period of the commands, ms")
+    return figure
+
+
+def _distribution(panel: Any, values: Array, name: str) -> None:
+    median, p99 = np.quantile(values, (0.5, 0.99))
+    panel.hist(values, bins=np.linspace(0.0, max(10.0, 1.5 * p99), 120), log=True, color="tab:blue")
+    for value, label in ((median, "median"), (p99, "99 %")):
+        panel.axvline(value, color="black", linestyle="--", linewidth=1.0)
+        panel.annotate(f" {label} {value:.2f}", (value, 0.97), xycoords=("data", "axes fraction"), va="top")
+    panel.set_xlabel(name)
+    panel.set_ylabel("ticks")

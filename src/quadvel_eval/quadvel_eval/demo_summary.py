@@ -1,0 +1,97 @@
+"""`summary.json` from the recording of a demo: tracking of each segment, falls, timing, the estimator's errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .recording import Recording
+from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
+
+Array = NDArray[np.float64]
+
+GAP = 0.3  # s, a planner that was silent for so long had stopped
+SHORTEST = SETTLE + 0.5  # s, of a segment that can be judged
+MAX_TILT = 1.0  # rad
+MIN_HEIGHT = 0.2  # m, of the trunk; it stands at 0.43 and lies at 0.14
+UPRIGHT_MODES = ("stance", "walk", "fault")  # in which a robot that lies has fallen
+
+
+def commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Array]]:
+    """Start, end (s) and velocity of each stretch over which the planner sent the same, if long enough to judge.
+
+    planned (n, 3): what it sent at the times (n,).
+    """
+    if not len(planned_time):
+        return []
+    changed = np.any(np.diff(planned, axis=0) != 0.0, axis=1) | (np.diff(planned_time) > GAP)
+    runs = np.split(np.arange(len(planned_time)), np.flatnonzero(changed) + 1)
+    found = [(float(planned_time[r[0]]), float(planned_time[r[-1]]), planned[r[0]]) for r in runs]
+    return [(start, end, velocity) for start, end, velocity in found if end - start >= SHORTEST]
+
+
+def count_falls(height: Array, quaternion: Array, upright: Sequence[bool]) -> int:
+    """How often the robot went from standing to lying: trunk height (n,) m, quaternion (n, 4).
+
+    upright (n,): whether the robot should be on its feet; only the tilt tells a fall where it should not.
+    """
+    tilt_cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
+    down = (tilt_cosine < np.cos(MAX_TILT)) | ((height < MIN_HEIGHT) & np.asarray(upright, bool))
+    return int(np.count_nonzero(down[1:] & ~down[:-1]) + (down[0] if len(down) else 0))
+
+
+def segments(recording: Recording) -> list[Segment]:
+    """Every stretch of constant command, its first two seconds left out of the means."""
+    truth = recording.velocity
+    planar = truth.value[:, [0, 1, 5]]
+    return [
+        measure(truth.time, planar, velocity, start + SETTLE, end)
+        for start, end, velocity in commands(recording.planned.time, recording.planned.value)
+    ]
+
+
+def summarise(recording: Recording) -> dict[str, Any]:
+    """The content of `summary.json`. Raises ValueError where no segment was walked."""
+    walked = segments(recording)
+    if not walked:
+        raise ValueError("no command was held for long enough to be judged")
+    max_error, mean_error = max_and_mean_error_xy(walked)
+    return {
+        "segments": [segment.to_json() for segment in walked],
+        "falls": _falls(recording),
+        "max_error_xy": rounded(max_error),
+        "mean_error_xy": rounded(mean_error),
+        "loop": _loop_figures(recording),
+        "estimator": {"rmse": rounded(_estimator_rmse(recording))},
+        "realtime_factor": rounded(recording.realtime_factor.value.mean()),
+    }
+
+
+def _falls(recording: Recording) -> int:
+    loop = recording.loop
+    upright = np.array([mode in UPRIGHT_MODES for mode in loop.mode])
+    now = np.maximum(np.searchsorted(loop.time, recording.position.time, side="right") - 1, 0)
+    return count_falls(recording.position.value[:, 2], recording.quaternion.value, upright[now])
+
+
+def _loop_figures(recording: Recording) -> dict[str, float]:
+    """The controller's own figures at the end, since its start; the rate as the median over the walk."""
+    loop = recording.loop
+    rates = [f["rate_hz"] for f, mode in zip(loop.figures, loop.mode, strict=True) if mode == "walk"]
+    last = loop.figures[-1]
+    figures = {**last, "rate_hz": float(np.median(rates)) if rates else last["rate_hz"]}
+    return {name: int(value) if name == "overruns" else rounded(value) for name, value in figures.items()}
+
+
+def _estimator_rmse(recording: Recording) -> Array:
+    """Root mean square of estimate minus truth, (3,) m/s, over the samples of the same instant in the segments."""
+    estimate, truth = recording.estimate, recording.velocity
+    stretches = commands(recording.planned.time, recording.planned.value)
+    _, i, j = np.intersect1d(estimate.time, truth.time, return_indices=True)
+    walking = (stretches[0][0] <= estimate.time[i]) & (estimate.time[i] < stretches[-1][1])
+    error = estimate.value[i[walking]] - truth.value[j[walking], :3]
+    rmse: Array = np.sqrt(np.square(error).mean(axis=0))
+    return rmse

@@ -1,0 +1,92 @@
+"""Pictures of the robot of a recording, drawn by MuJoCo: a video, and frames for a strip.
+
+A program of its own, `python -m quadvel_eval.video RECORDING FOLDER`, because MuJoCo reads MUJOCO_GL when it is
+imported, and a broken GL library must not take the caller down.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from quadvel_description.mjcf import load_model
+
+from .demo_figures import tracking_figure
+from .demo_summary import commands
+from .recording import Recording, read_recording
+from .report import replacing, write_figure
+
+Image = NDArray[np.uint8]
+
+RATE = 20  # frames a second
+SIZE = (640, 360)
+STRIP = 6  # frames
+STRIP_SIZE = (360, 270)
+
+
+class Film:
+    """Draws the robot of `recording` at given times, with a camera that goes along."""
+
+    def __init__(self, recording: Recording, width: int, height: int) -> None:
+        self._recording = recording
+        self._model = load_model()
+        self._data = mujoco.MjData(self._model)
+        self._renderer = mujoco.Renderer(self._model, height, width)
+        self._camera = mujoco.MjvCamera()
+        self._camera.distance, self._camera.azimuth, self._camera.elevation = 1.9, 130.0, -18.0
+
+    def __enter__(self) -> Film:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._renderer.close()
+
+    def frames(self, times: ArrayLike) -> Iterator[Image]:
+        """One image (height, width, 3) for each of the times (n,), s on the recording's clock."""
+        times = np.asarray(times, float)
+        r = self._recording
+        poses = np.hstack([r.position.at(times), r.quaternion.at(times), r.joints.at(times)])
+        for pose in poses:
+            self._data.qpos[:] = pose
+            mujoco.mj_kinematics(self._model, self._data)
+            self._camera.lookat[:] = [pose[0], pose[1], 0.25]
+            self._renderer.update_scene(self._data, self._camera)
+            yield self._renderer.render().copy()
+
+
+def strip_times(recording: Recording) -> NDArray[np.float64]:
+    """Some times (n,) in the middle of segments in which the robot moves."""
+    moving = [c for c in commands(recording.planned.time, recording.planned.value) if c[2].any()]
+    picked = np.unique(np.linspace(0, len(moving) - 1, STRIP).round().astype(int))
+    return np.array([0.5 * (moving[i][0] + moving[i][1]) for i in picked])
+
+
+def write_video(path: Path, recording: Recording) -> None:
+    """The whole recording as an MP4 in real time."""
+    import imageio.v2 as imageio
+
+    start, end = recording.position.time[[0, -1]]
+    with (
+        replacing(path) as draft,
+        Film(recording, *SIZE) as film,
+        imageio.get_writer(draft, fps=RATE, codec="libx264", quality=7, macro_block_size=8) as video,
+    ):
+        for frame in film.frames(np.arange(start, end, 1.0 / RATE)):
+            video.append_data(frame)
+
+
+def main(arguments: Sequence[str]) -> None:
+    """`demo.png` with a strip of frames, then `demo.mp4`."""
+    recording, folder = read_recording(Path(arguments[0])), Path(arguments[1])
+    with Film(recording, *STRIP_SIZE) as film:
+        frames = list(film.frames(strip_times(recording)))
+    write_figure(folder / "demo.png", tracking_figure(recording, frames))
+    write_video(folder / "demo.mp4", recording)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
