@@ -22,6 +22,7 @@ Try, one after the other:
   quadvel doctor              what this machine can run
   quadvel demo                walk in all directions; results in out/demo
   quadvel up                  the same robot, waiting for your commands
+  quadvel drive --vx 0.5      one of them, from another terminal
   quadvel eval --grid quick --out out/eval
 
 \b
@@ -84,13 +85,34 @@ def up(
     """Start simulator, estimator, controller and command mux, each as a process; Ctrl-C stops them.
 
     \b
-    Then, from another terminal where ROS 2 is sourced:
+    Then, from another terminal:
+      quadvel drive --vx 0.5
+    or, where ROS 2 is sourced:
       ros2 topic pub -r 20 /cmd_vel geometry_msgs/msg/Twist "{linear: {x: 0.5}}"
     """
     from .up import up as run_up
 
     stack = Stack(low_level=low_level, policy=policy, terrain=terrain, estimator=estimator, parameters=params)
     raise typer.Exit(run_up(stack))
+
+
+@app.command()
+def drive(
+    vx: Annotated[float, typer.Option(help="Forward, m/s.")] = 0.0,
+    vy: Annotated[float, typer.Option(help="To the left, m/s.")] = 0.0,
+    wz: Annotated[float, typer.Option(help="Turn to the left, rad/s.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="For how long.")] = 3.0,
+    topic: Annotated[str, typer.Option(help="An input of the command mux.")] = "cmd_vel_teleop",
+) -> None:
+    """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop.
+
+    \b
+    For example:
+      quadvel drive --vx 0.5 --wz 0.3 --seconds 5
+    """
+    from .drive import drive as run_drive
+
+    run_drive(vx, vy, wz, seconds, topic)
 
 
 @app.command()
@@ -113,7 +135,7 @@ def record(
 @app.command(context_settings=HANDED_ON, add_help_option=False)
 def demo(context: typer.Context) -> None:
     """Walk a simulated robot through all directions, in real time, through the nodes."""
-    _hand_on(context, "quadvel_eval.cli:demo_command")
+    _hand_on(context, "quadvel_bringup.demo:demo_command")
 
 
 @app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)

@@ -1,4 +1,4 @@
-"""The nodes that make a walking robot, and the arguments that each of them gets."""
+"""The nodes that make a walking robot, and the parameters that each of them gets."""
 
 from __future__ import annotations
 
@@ -10,13 +10,27 @@ import attrs
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
 
-LOW_LEVELS = {"sim": "sim_node"}
-"""What may serve low_state and low_cmd, and the node that does."""
+Parameters = dict[str, bool | str]
+
+
+@attrs.frozen
+class LowLevel:
+    """What serves low_state and low_cmd: its node, and what it wants of the controller."""
+
+    node: str
+    controller: Parameters
+
+
+LOW_LEVELS = {"sim": LowLevel("sim_node", {"auto_stand": True})}
 
 
 @attrs.frozen(kw_only=True)
 class Stack:
-    """What may be chosen; None leaves a node's own default, or what the parameter file says."""
+    """What may be chosen; None leaves what the parameter file says.
+
+    use_sim_time: the simulator sets the pace, waiting for the answer to each of its states; all others follow
+    its clock.
+    """
 
     low_level: str = attrs.field(default="sim", validator=attrs.validators.in_(LOW_LEVELS))
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
@@ -25,22 +39,32 @@ class Stack:
     estimator: str | None = None
     use_sim_time: bool = False
 
-    def nodes(self) -> dict[str, list[str]]:
-        """The ROS 2 arguments of each node to start, by the node's name."""
-        chosen: dict[str, dict[str, object]] = {
-            LOW_LEVELS[self.low_level]: {"terrain": self.terrain},
-            "estimator": {"kind": self.estimator},
-            "controller": {"policy": self.policy and self.policy.resolve()},
-            "command_mux": {},
+    def overrides(self) -> dict[str, Parameters]:
+        """For each node to start, by name, the parameters that stand above those of the file."""
+        low_level = LOW_LEVELS[self.low_level]
+        policy = None if self.policy is None else str(self.policy.resolve())
+        followers = {
+            "estimator": _given(kind=self.estimator),
+            "controller": low_level.controller | _given(policy=policy),
+            "command_mux": _given(),
         }
-        return {name: self._arguments(values) for name, values in chosen.items()}
-
-    def _arguments(self, values: dict[str, object]) -> list[str]:
-        arguments = ["--ros-args", "--params-file", str(self.parameters.resolve())]
+        served = _given(terrain=self.terrain)
         if self.use_sim_time:
-            arguments += ["-p", "use_sim_time:=true"]
+            served |= {"mode": "lockstep"}
+            followers = {name: values | {"use_sim_time": True} for name, values in followers.items()}
+        return {low_level.node: served, **followers}
+
+    def arguments(self) -> dict[str, list[str]]:
+        """The same as arguments of ROS 2."""
+        return {name: self._arguments(values) for name, values in self.overrides().items()}
+
+    def _arguments(self, values: Parameters) -> list[str]:
+        arguments = ["--ros-args", "--params-file", str(self.parameters.resolve())]
         for name, value in values.items():
-            if value is not None:
-                # Quoted, because ROS 2 reads values as YAML and a file may be named "1" or "on".
-                arguments += ["-p", f"{name}:={json.dumps(str(value))}"]
+            # JSON is YAML with quotes, and without them a file named "1" would be a number.
+            arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
+
+
+def _given(**values: str | None) -> Parameters:
+    return {name: value for name, value in values.items() if value is not None}

@@ -35,7 +35,7 @@ def up(stack: Stack) -> int:
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
     are stopped, and its exit code is ours (1 if that was 0).
     """
-    nodes = stack.nodes()
+    nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])
     with StopSignals() as signals, ProcessGroup(say) as group:
         for name, arguments in nodes.items():

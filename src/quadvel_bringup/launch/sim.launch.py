@@ -1,0 +1,85 @@
+"""The whole robot under ROS 2: what serves low_state and low_cmd, estimator, controller, command mux.
+
+ros2 launch quadvel_bringup sim.launch.py terrain:=rough
+"""
+
+from pathlib import Path
+
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
+from launch import LaunchContext, LaunchDescription
+from launch.action import Action
+from launch.actions import DeclareLaunchArgument, EmitEvent, LogInfo, OpaqueFunction
+from launch.events import Shutdown
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
+
+from quadvel_bringup.nodes import NODES
+from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
+from quadvel_description.urdf import urdf
+
+ARGUMENTS = [
+    DeclareLaunchArgument(
+        "low_level", default_value="sim", choices=list(LOW_LEVELS), description="the robot"
+    ),
+    DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
+    DeclareLaunchArgument("terrain", default_value="flat", description="flat, slope or rough"),
+    DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
+    DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="show it"),
+    DeclareLaunchArgument(
+        "use_sim_time",
+        default_value="false",
+        choices=["true", "false"],
+        description="true: in lockstep with the simulator's clock; false: in real time",
+    ),
+]
+NAMES = [argument.name for argument in ARGUMENTS]
+
+
+def is_there(package: str) -> bool:
+    try:
+        get_package_prefix(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def start(context: LaunchContext) -> list[Action]:
+    chosen = {name: LaunchConfiguration(name).perform(context) for name in NAMES}
+    stack = Stack(
+        low_level=chosen["low_level"],
+        policy=Path(chosen["policy"]) if chosen["policy"] else None,
+        terrain=chosen["terrain"],
+        parameters=Path(chosen["params"]),
+        use_sim_time=chosen["use_sim_time"] == "true",
+    )
+    actions: list[Action] = [
+        Node(
+            package=NODES[name].package,
+            executable=name,
+            name=name,
+            output="screen",
+            parameters=[str(stack.parameters), overrides],
+            on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
+        )
+        for name, overrides in stack.overrides().items()
+    ]
+    shared = {"use_sim_time": stack.use_sim_time}
+    if is_there("robot_state_publisher"):
+        description = ParameterValue(urdf(), value_type=str)
+        parameters = [{"robot_description": description, **shared}]
+        actions.append(
+            Node(package="robot_state_publisher", executable="robot_state_publisher", parameters=parameters)
+        )
+    else:
+        actions.append(LogInfo(msg="robot_state_publisher is not installed: no transforms of the links"))
+    if chosen["rviz"] == "true":
+        config = str(PARAMETERS.parent / "robot.rviz")
+        actions.append(
+            Node(package="rviz2", executable="rviz2", arguments=["-d", config], parameters=[shared])
+        )
+    return actions
+
+
+def generate_launch_description() -> LaunchDescription:
+    return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=start)])
