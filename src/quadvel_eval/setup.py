@@ -11,6 +11,6 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     license="Apache-2.0",
-    description="Whole runs in one process, faster than real time; segments, reports, scripted planner, benchmark.",
+    description="Evaluation in one process, faster than real time; reports, scripted planner, benchmark.",
     entry_points={"console_scripts": ["planner = quadvel_eval.scripted_planner:main"]},
 )

@@ -52,8 +52,8 @@ def demo_command(
 ) -> None:
     """Walk a simulated robot through all directions, in real time, through the nodes.
 
-    Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to each
-    other is recorded. Exit code 0 if the robot went through the whole script without a fall.
+    Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
+    each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
     folder, console = output_folder(out), Console(soft_wrap=True)
     with replacing(folder / "demo.mcap") as draft:

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from .grid import evaluate
 from .report import evaluation_table, output_folder, write_evaluation
@@ -45,9 +46,8 @@ def eval_command(
     columns = (TextColumn("walks"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=messages) as bar:
         task = bar.add_task("walks", total=None)
-        result = evaluate(setup, grid, seeds, lambda done, total: bar.update(task, completed=done, total=total))
-    description = {"grid": grid, "policy": str(policy), "estimator_in_loop": estimator, "seeds": seeds}
-    write_evaluation(folder, result | {"setup": description | {"terrain": terrain, "randomised": randomised}})
+        result = evaluate(setup, grid, seeds, lambda done, of: bar.update(task, completed=done, total=of))
+    write_evaluation(folder, {**result, "setup": {**setup.to_json(), "grid": grid, "seeds": seeds}})
     console = Console()
     console.print(evaluation_table(result))
     console.print(f"written: {folder}/eval.json, eval.csv, eval.png")

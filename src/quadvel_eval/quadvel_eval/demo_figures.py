@@ -25,13 +25,13 @@ def tracking_figure(recording: Recording, frames: Sequence[NDArray[np.uint8]] = 
     strip = 1.4 if frames else 0.0
     figure = Figure(figsize=(11, 6 + strip), layout="constrained")
     if frames:
-        top, below = figure.subfigures(2, 1, height_ratios=(strip, 6))
+        top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(strip, 6))[:, 0]
         for panel, frame in zip(top.subplots(1, len(frames), squeeze=False)[0], frames, strict=True):
             panel.imshow(frame)
             panel.set_axis_off()
+        _tracking_panels(below.subplots(3, 1, sharex=True), recording)
     else:
-        below = figure
-    _tracking_panels(below.subplots(3, 1, sharex=True), recording)
+        _tracking_panels(figure.subplots(3, 1, sharex=True), recording)
     return figure
 
 
@@ -39,19 +39,16 @@ def _tracking_panels(panels: Any, recording: Recording) -> None:
     start, end = _span(recording)
     planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])
     for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
-        for series, label, style in (
-            (recording.commanded, "commanded", {"color": "black", "linewidth": 1.2}),
-            (_smooth(planar), f"true, mean over {STRIDE} s", {"color": "tab:blue"}),
-            (_smooth(recording.estimate), f"estimated, mean over {STRIDE} s", {"color": "tab:orange", "linestyle": "--"}),
-        ):
-            if axis == 2 and series.value is recording.estimate.value:
-                continue
+        lines = [("commanded", recording.commanded, "black"), ("true", _smooth(planar), "tab:blue")]
+        if axis < 2:  # the yaw rate is measured, not estimated
+            lines.append(("estimated", _smooth(recording.estimate), "tab:orange"))
+        for label, series, colour in lines:
             within = (start - 1.0 <= series.time) & (series.time <= end + 1.0)
-            panel.plot(series.time[within] - start, series.value[within, axis], label=label, **style)
+            panel.plot(series.time[within] - start, series.value[within, axis], colour, label=label, lw=1.2)
         panel.set_ylabel(name)
         panel.grid(alpha=0.3)
     panels[0].legend(loc="upper right", fontsize="small", ncols=3)
-    panels[-1].set_xlabel("time, s")
+    panels[-1].set_xlabel(f"time, s (true and estimated: means over {STRIDE} s)")
 
 
 def _span(recording: Recording) -> tuple[float, float]:

@@ -1,8 +1,7 @@
-"""`summary.json` from the recording of a demo: tracking of each segment, falls, timing, the estimator's errors."""
+"""`summary.json` from the recording of a demo: tracking by segments, falls, timing, estimator errors."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,9 @@ UPRIGHT_MODES = ("stance", "walk", "fault")  # in which a robot that lies has fa
 
 
 def commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Array]]:
-    """Start, end (s) and velocity of each stretch over which the planner sent the same, if long enough to judge.
+    """Start, end (s) and velocity of each stretch over which the planner sent the same.
 
-    planned (n, 3): what it sent at the times (n,).
+    planned (n, 3): what it sent at the times (n,). Stretches too short to be judged are left out.
     """
     if not len(planned_time):
         return []
@@ -33,13 +32,13 @@ def commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Ar
     return [(start, end, velocity) for start, end, velocity in found if end - start >= SHORTEST]
 
 
-def count_falls(height: Array, quaternion: Array, upright: Sequence[bool]) -> int:
+def count_falls(height: Array, quaternion: Array, upright: NDArray[np.bool_]) -> int:
     """How often the robot went from standing to lying: trunk height (n,) m, quaternion (n, 4).
 
     upright (n,): whether the robot should be on its feet; only the tilt tells a fall where it should not.
     """
     tilt_cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
-    down = (tilt_cosine < np.cos(MAX_TILT)) | ((height < MIN_HEIGHT) & np.asarray(upright, bool))
+    down = (tilt_cosine < np.cos(MAX_TILT)) | ((height < MIN_HEIGHT) & upright)
     return int(np.count_nonzero(down[1:] & ~down[:-1]) + (down[0] if len(down) else 0))
 
 
@@ -87,7 +86,7 @@ def _loop_figures(recording: Recording) -> dict[str, float]:
 
 
 def _estimator_rmse(recording: Recording) -> Array:
-    """Root mean square of estimate minus truth, (3,) m/s, over the samples of the same instant in the segments."""
+    """Root mean square of estimate minus truth, (3,) m/s, at the instants of both within the segments."""
     estimate, truth = recording.estimate, recording.velocity
     stretches = commands(recording.planned.time, recording.planned.value)
     _, i, j = np.intersect1d(estimate.time, truth.time, return_indices=True)

@@ -124,9 +124,15 @@ def summarise(results: Sequence[CellResult], drifts: Sequence[float | None]) -> 
         "falls": len(results) - len(stood),
         "jitter": rounded(np.mean([r.jitter for r in stood])) if stood else 0.0,
         "cot": [None if r.cot is None else rounded(r.cot) for r in results],
-        "stance": {"drift_10s_m": None if None in drifts else rounded(max(d for d in drifts if d is not None))},
+        "stance": {"drift_10s_m": _largest(drifts)},
         "estimator": _estimator_errors(stood),
     }
+
+
+def _largest(drifts: Sequence[float | None]) -> Any:
+    """The largest, or None where a robot fell."""
+    known = [drift for drift in drifts if drift is not None]
+    return rounded(max(known)) if len(known) == len(drifts) else None
 
 
 def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:

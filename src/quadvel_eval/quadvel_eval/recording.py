@@ -14,6 +14,7 @@ import attrs
 import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
+
 from quadvel_dds.messages import STORE
 from quadvel_description.messages import seconds
 

@@ -17,6 +17,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
+CSV_COLUMNS = (
+    *("vx", "vy", "wz", "seed"),
+    *("mean_vx", "mean_vy", "mean_wz"),
+    *("error_xy", "error_wz", "fell"),
+)
+
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -34,7 +40,7 @@ def output_folder(path: Path) -> Path:
     try:
         path.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):
-        raise NotADirectoryError(f"{path}: is or lies below a file, expected a folder for the results") from None
+        raise NotADirectoryError(f"{path}: is a file or lies below one, expected a folder") from None
     if not os.access(path, os.W_OK | os.X_OK):
         raise PermissionError(f"{path}: the folder can't be written to")
     return path
@@ -57,12 +63,11 @@ def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
     write_json(folder / "eval.json", evaluation)
     with replacing(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
         writer = csv.writer(file)
-        writer.writerow(["vx", "vy", "wz", "seed", "mean_vx", "mean_vy", "mean_wz", "error_xy", "error_wz", "fell"])
+        writer.writerow(CSV_COLUMNS)
         for cell in evaluation["cells"]:
             mean = cell["mean"] or [None] * 3
-            writer.writerow(
-                [*cell["command"], cell["seed"], *mean, cell["error_xy"], cell["error_wz"], int(cell["fell"])]
-            )
+            errors = cell["error_xy"], cell["error_wz"]
+            writer.writerow([*cell["command"], cell["seed"], *mean, *errors, int(cell["fell"])])
     write_figure(folder / "eval.png", heatmap(evaluation["cells"]))
 
 
@@ -82,7 +87,7 @@ def heatmap(cells: Sequence[Mapping[str, Any]]) -> Figure:
                     image[i, j] = np.mean(stood)
                 if len(stood) < len(here):
                     panel.text(j, i, "×", ha="center", va="center", color="tab:red", size="large")
-        shown = panel.imshow(image, origin="lower", aspect="auto", cmap="viridis", vmin=0.0, vmax=max(errors, default=1.0))
+        shown = panel.imshow(image, origin="lower", aspect="auto", vmin=0.0, vmax=max(errors, default=1.0))
         panel.set_xticks(range(len(vy)), [f"{y:g}" for y in vy])
         panel.set_yticks(range(len(vx)), [f"{x:g}" for x in vx])
         panel.set_xlabel("vy, m/s")
@@ -97,21 +102,24 @@ def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
     table = Table("", "", title="Velocity tracking", show_header=False)
     cells = evaluation["cells"]
     table.add_row("runs, of these fallen", f"{len(cells)}, {evaluation['falls']}")
-    table.add_row("error, mean and largest", f"{evaluation['mean_error_xy']:.3f}, {evaluation['max_error_xy']:.3f} m/s")
-    worst = [cell for cell in cells if not cell["fell"] and cell["error_xy"] == evaluation["max_error_xy"]]
+    mean, largest = evaluation["mean_error_xy"], evaluation["max_error_xy"]
+    table.add_row("error, mean and largest", f"{mean:.3f}, {largest:.3f} m/s")
+    worst = [cell for cell in cells if not cell["fell"] and cell["error_xy"] == largest]
     if worst:
         table.add_row("largest at (vx, vy, wz)", ", ".join(f"{x:g}" for x in worst[0]["command"]))
     table.add_row("jitter", f"{evaluation['jitter']:.5f} rad")
     drift = evaluation["stance"]["drift_10s_m"]
     table.add_row("drift in 10 s of standing", "fell" if drift is None else f"{100 * drift:.2f} cm")
     for name, figures in evaluation["estimator"].items():
-        table.add_row(f"{name} estimator, RMSE x, y, z", ", ".join(f"{x:.3f}" for x in figures["rmse"]) + " m/s")
+        rmse = ", ".join(f"{x:.3f}" for x in figures["rmse"])
+        table.add_row(f"{name} estimator, RMSE x, y, z", f"{rmse} m/s")
     return table
 
 
 def segment_table(segments: Sequence[Mapping[str, Any]]) -> Table:
     """Commanded and measured velocity of each segment of a demo."""
-    table = Table("command vx, vy, wz", "measured vx, vy, wz", "error xy, m/s", "error wz, rad/s", title="Segments")
+    columns = ("command vx, vy, wz", "measured vx, vy, wz", "error xy, m/s", "error wz, rad/s")
+    table = Table(*columns, title="Segments")
     for segment in segments:
         command, mean = (", ".join(f"{x:+.2f}" for x in segment[key]) for key in ("command", "mean"))
         table.add_row(command, mean, f"{segment['error_xy']:.3f}", f"{segment['error_wz']:.3f}")

@@ -1,9 +1,10 @@
 """The nodes' classes in one process, a control tick at a time: what every evaluation runs.
 
-Simulator, estimator, command mux and supervisor follow each other as the messages between the nodes make them:
-estimator and supervisor take up a state at the same time, so that the supervisor works with the velocity of the
-state before. Transport itself takes no time, the actuator model's input delay stands for it. As fast as the
-machine allows, the same to the bit for equal seeds. What is made of the samples is the caller's matter.
+Simulator, estimator, command mux and supervisor follow each other as the messages between the nodes make
+them: estimator and supervisor take up a state at the same time, so that the supervisor works with the
+velocity of the state before. Transport itself takes no time, the actuator model's input delay stands for it.
+As fast as the machine allows, the same to the bit for equal seeds. What is made of the samples is the
+caller's matter.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from types import MappingProxyType
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator

@@ -104,7 +104,8 @@ class ScriptRunner:
         if isinstance(step, Drive):
             return elapsed >= step.seconds
         if mode != step.until and elapsed > step.patience:
-            raise ScriptError(f"'{step.name}' took more than {step.patience:g} s; the mode is {mode or 'unknown'}")
+            found = mode or "unknown"
+            raise ScriptError(f"'{step.name}' took more than {step.patience:g} s; the mode is {found}")
         return mode == step.until
 
     def _is_due(self, order: Order, now: float, mode: str) -> bool:

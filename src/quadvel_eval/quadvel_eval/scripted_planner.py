@@ -1,4 +1,4 @@
-"""The node `planner`: walks the robot through a script by velocities on cmd_vel. What it plans is `script`'s matter."""
+"""The node `planner`: walks the robot through a script with velocities on cmd_vel. `script` holds scripts."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class PlannerParameters:
             raise ValueError(f"script is {self.script!r}, expected {' or '.join(SCRIPTS)}")
 
 
-class ScriptedPlanner(Node):
+class ScriptedPlanner(Node):  # type: ignore[misc]
     """Orders modes from the controller and publishes velocities; ends with 0 when the script is through."""
 
     def __init__(self) -> None:

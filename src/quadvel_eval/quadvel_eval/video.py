@@ -1,7 +1,7 @@
 """Pictures of the robot of a recording, drawn by MuJoCo: a video, and frames for a strip.
 
-A program of its own, `python -m quadvel_eval.video RECORDING FOLDER`, because MuJoCo reads MUJOCO_GL when it is
-imported, and a broken GL library must not take the caller down.
+A program of its own, `python -m quadvel_eval.video RECORDING FOLDER`, because MuJoCo reads MUJOCO_GL when it
+is imported, and a broken GL library must not take the caller down.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description.mjcf import load_model
 
 from .demo_figures import tracking_figure

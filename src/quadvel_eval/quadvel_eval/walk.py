@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
 from quadvel_description import robot
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
@@ -31,13 +33,18 @@ DIAGONAL = 0.555  # m, l_c of Eq. 10: the distance between two diagonal feet
 
 @attrs.frozen(kw_only=True)
 class Setup:
-    """What a walk is made with. `estimator`: the one in the loop; `randomised`: draw the plant by the seed."""
+    """What a walk is made with. estimator: the one in the loop. randomised: draw the plant by the seed."""
 
     policy: Path = SHIPPED_POLICY
     estimator: str = "learned"
     estimator_file: Path = SHIPPED_MODEL
     terrain: str = attrs.field(default="flat", validator=attrs.validators.in_(TERRAINS))
     randomised: bool = False
+
+    def to_json(self) -> dict[str, Any]:
+        """As `eval.json` keeps it."""
+        fields = attrs.asdict(self)
+        return {name: str(value) if isinstance(value, Path) else value for name, value in fields.items()}
 
 
 def make_simulator(setup: Setup, seed: int) -> Simulator:
@@ -53,7 +60,7 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     return simulator
 
 
-def _draw_plant(rng: np.random.Generator) -> dict[str, ArrayLike]:
+def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
     return {
         "friction": rng.uniform(0.3, 1.0, 4),
         "payload": rng.uniform(0.0, 3.0),
