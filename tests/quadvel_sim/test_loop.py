@@ -196,20 +196,43 @@ def test_after_a_pause_realtime_does_not_catch_up() -> None:
     assert bench.loop.report().given_up == 0.0
 
 
+def test_samples_stay_in_order_of_time_however_one_steps_pauses_and_resets() -> None:
+    bench = Bench("realtime")
+    with running(bench.loop):
+        for order in (
+            lambda: bench.loop.step(500),
+            lambda: bench.loop.reset("lie"),
+            lambda: bench.loop.step(1),
+        ):
+            bench.loop.pause(True)
+            bench.clock.now += 0.003
+            order()
+            bench.loop.pause(False)
+            count = len(bench.samples)
+            bench.clock.now += 0.0075
+            wait_for(lambda: len(bench.samples) > count)  # noqa: B023
+    ticks, instants = zip(*((state.tick, instant) for state, instant in bench.samples), strict=True)
+    assert np.diff(ticks).min() > 0
+    assert np.diff(instants).min() > 0.0
+    assert max(instants) <= bench.clock.now
+
+
 def test_a_reset_puts_the_robot_back_while_its_clock_goes_on() -> None:
     bench = Bench("realtime")
     bench.loop.submit(command(5.0, 0))
     for _ in range(3):
         bench.loop.advance()
+    bench.clock.now = 100.016
     bench.loop.reset("stand")
     state, instant = bench.samples[-1]
-    assert (state.tick, state.time, instant) == (15, 0.015, pytest.approx(100.015))
+    assert (state.tick, state.time, instant) == (20, 0.02, 100.016)  # later than the sample before
     np.testing.assert_array_equal(state.q, robot.NOMINAL_Q)
     assert bench.loop.simulator.braking
     bench.loop.advance()
-    assert bench.samples[-1][0].tick == 20
-    with pytest.raises(ValueError, match="it answers tick 10, 10 ms ago: expected at most 100 ms, and none"):
-        bench.loop.submit(command(0.0, 10))
+    assert bench.samples[-1][0].tick == 25
+    assert bench.samples[-1][1] == pytest.approx(100.021)
+    with pytest.raises(ValueError, match="it answers tick 15, 10 ms ago: expected at most 100 ms, and none"):
+        bench.loop.submit(command(0.0, 15))
 
 
 def test_lockstep_publishes_anew_after_a_reset() -> None:
@@ -219,8 +242,8 @@ def test_lockstep_publishes_anew_after_a_reset() -> None:
         bench.loop.submit(command(0.0, 0))
         wait_for(lambda: len(bench.samples) == 2)
         bench.loop.reset("stand")
-        assert bench.samples[-1][0].tick == 5
-        bench.loop.submit(command(0.0, 5))
+        assert bench.samples[-1][0].tick == 10
+        bench.loop.submit(command(0.0, 10))
         wait_for(lambda: len(bench.samples) == 4)
 
 

@@ -49,12 +49,16 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Start a node, serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1."""
+    """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1."""
+    node = None
     try:
-        rclpy.spin(_start(make_node, args))
+        node = _start(make_node, args)
+        rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C comes twice where a launcher forwards it
     finally:
+        if node is not None:
+            node.destroy_node()
         rclpy.try_shutdown()
 
 

@@ -66,7 +66,7 @@ class SimulationLoop:
         self._clock = clock
         self._condition = threading.Condition()
         self._inbox: deque[tuple[float, JointCommand]] = deque()
-        self._before_reset = 0  # ms that passed before the last reset
+        self._before_reset = 0  # tick of the last reset
         self._answered = self._paused = self._stopped = False
         self._given_up = 0.0
         self._unanswered = 0
@@ -116,11 +116,12 @@ class SimulationLoop:
                 self._condition.notify_all()
 
     def reset(self, keyframe: str) -> None:
-        """Put the robot back; time goes on. ValueError where the keyframe is unknown."""
+        """Put the robot back, which takes a period; time goes on. ValueError where `keyframe` is unknown."""
         with self._condition:
-            tick = self.tick
+            after = self.tick + self.period
             self.simulator.reset(keyframe)
-            self._before_reset = tick
+            self._before_reset = after
+            self._anchor()
             self._inbox.clear()
             self._answered = False
             self._sample()
@@ -141,6 +142,7 @@ class SimulationLoop:
                 raise ValueError("the simulation runs; pause it first")
             self._answered = False
             self._step(steps)
+            self._anchor()
             self._sample()
 
     def push(self, body: str, force: ArrayLike, torque: ArrayLike, duration: float) -> None:

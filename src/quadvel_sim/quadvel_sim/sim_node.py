@@ -15,7 +15,6 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import qos_profile_sensor_data
 from rosgraph_msgs.msg import Clock as ClockMessage
 from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool
@@ -55,7 +54,7 @@ class SimNode(Node):  # type: ignore[misc]
         mode, period, timeout = self._settings.mode, self._settings.period, self._settings.answer_timeout
         self._loop = SimulationLoop(simulator, self._publish, mode, period, timeout)
         self._create_publishers()
-        self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
+        self.create_subscription(LowCmd, "low_cmd", self._on_command, 10)
         self.create_service(ResetSim, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(StepSim, "~/step", self._on_step)

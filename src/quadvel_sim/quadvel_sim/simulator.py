@@ -16,12 +16,12 @@ import attrs
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from quadvel_description.kinematics import rotate, rotate_inverse
-from quadvel_description.mjcf import Plant, build_spec
-from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
 from quadvel_actuator import ActuatorModel
 from quadvel_description import robot
+from quadvel_description.kinematics import rotate, rotate_inverse
+from quadvel_description.mjcf import Plant, build_spec
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 
 __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
