@@ -1,0 +1,39 @@
+"""What the doctor concludes from what it finds."""
+
+from __future__ import annotations
+
+import pytest
+
+from quadvel_bringup import doctor
+from quadvel_bringup.doctor import Finding
+
+GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.NEEDED, "GL")]
+
+
+def test_without_torch_all_but_training_can_run() -> None:
+    abilities = dict(doctor.abilities([*GOOD, Finding("torch", True, "not installed")]))
+    assert [name for name, possible in abilities.items() if not possible] == ["training"]
+
+
+def test_without_the_simulator_nothing_can_run() -> None:
+    findings = [Finding("mujoco", False, "missing") if f.subject == "mujoco" else f for f in GOOD]
+    findings.append(Finding("torch", True, "2.13.0: training can run"))
+    assert not any(possible for _, possible in doctor.abilities(findings))
+
+
+def test_a_backend_that_cannot_draw_is_not_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("MUJOCO_GL", "no such backend")
+    assert doctor.gl_backend() is None
+
+
+def test_a_missing_gl_library_is_named_with_its_package(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "gl_backend", lambda: None)
+    finding = next(f for f in doctor.examine() if f.subject == "GL")
+    assert (finding.good, "apt install libegl1" in finding.text) == (False, True)
+
+
+def test_ros_is_found_where_rclpy_is_importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.util, "find_spec", lambda name: object())
+    monkeypatch.setenv("ROS_DISTRO", "jazzy")
+    finding = next(f for f in doctor.examine() if f.subject == "ROS 2")
+    assert finding.text.startswith("jazzy with ")

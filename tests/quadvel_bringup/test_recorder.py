@@ -1,0 +1,135 @@
+"""Recording over the embedded middleware, read back by libraries that know nothing of it."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+import quadvel_dds
+
+quadvel_dds.install()
+
+import rclpy  # noqa: E402
+from geometry_msgs.msg import Twist  # noqa: E402
+from rclpy.node import Node  # noqa: E402
+
+from quadvel_bringup.recorder import Recorder  # noqa: E402
+from quadvel_msgs.msg import LowState  # noqa: E402
+
+
+@pytest.fixture
+def node(domain_id: int) -> Iterator[Node]:
+    rclpy.init(args=[], domain_id=domain_id)
+    node = rclpy.create_node("tester")
+    yield node
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+def spin_until(node: Node, holds: Callable[[], bool], what: str, seconds: float = 20.0) -> None:
+    until = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < until, f"{what}: waited in vain"
+        rclpy.spin_once(node, timeout_sec=0.02)
+
+
+def low_state(tick: int) -> Any:
+    message = LowState(tick=tick)
+    message.q = [0.1 * i for i in range(12)]
+    return message
+
+
+def record_low_states(node: Node, path: Path, number: int) -> None:
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    with Recorder(node, path) as recorder:
+        recorder.record("/low_state", "quadvel_msgs/msg/LowState")
+        spin_until(node, lambda: publisher.get_subscription_count() > 0, "discovery")
+        for tick in range(number):
+            publisher.publish(low_state(tick))
+        spin_until(node, lambda: recorder.counts["/low_state"] == number, "messages")
+
+
+def test_a_recording_is_read_by_rosbags_as_it_was_sent(node: Node, tmp_path: Path) -> None:
+    record_low_states(node, tmp_path / "walk.mcap", 5)
+    with AnyReader([tmp_path / "walk.mcap"], default_typestore=get_typestore(Stores.EMPTY)) as reader:
+        found = [reader.deserialize(data, c.msgtype) for c, _, data in reader.messages()]
+    assert [message.tick for message in found] == list(range(5))
+    assert found[0].q == pytest.approx([0.1 * i for i in range(12)])
+
+
+def test_a_recording_follows_the_ros2_profile_of_mcap(node: Node, tmp_path: Path) -> None:
+    started = time.time_ns()
+    record_low_states(node, tmp_path / "walk.mcap", 1)
+    with (tmp_path / "walk.mcap").open("rb") as stream:
+        reader = make_reader(stream)
+        ((schema, channel, message),) = reader.iter_messages()
+        assert reader.get_header().profile == "ros2"
+    assert schema is not None
+    assert (schema.name, schema.encoding) == ("quadvel_msgs/msg/LowState", "ros2msg")
+    assert b"MSG: builtin_interfaces/Time" in schema.data
+    assert (channel.topic, channel.message_encoding) == ("/low_state", "cdr")
+    assert started <= message.publish_time <= message.log_time <= time.time_ns()
+
+
+def test_a_type_without_definition_is_refused_by_name(node: Node, tmp_path: Path) -> None:
+    recorder = Recorder(node, tmp_path / "x.mcap")
+    with recorder, pytest.raises(ValueError, match=r"topic /scan2 has the type 'laser_msgs/msg/Scan'"):
+        recorder.record("/scan2", "laser_msgs/msg/Scan")
+
+
+def test_recording_all_takes_topics_as_they_come(node: Node, tmp_path: Path) -> None:
+    with Recorder(node, tmp_path / "all.mcap") as recorder:
+        recorder.record_all()
+        publisher = node.create_publisher(Twist, "cmd_vel", 10)
+
+        def heard() -> bool:
+            recorder.record_all()
+            publisher.publish(Twist())
+            return recorder.counts["/cmd_vel"] > 0
+
+        spin_until(node, heard, "cmd_vel")
+        assert "/parameter_events" not in recorder.counts
+
+
+def test_ctrl_c_leaves_a_whole_file(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    program = "from quadvel_bringup.cli import main; main()"
+    recording = subprocess.Popen([sys.executable, "-c", program, "record", "low_state", "--out", str(path)])
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    spin_until(node, lambda: publisher.get_subscription_count() > 0, "recorder", 60.0)
+    for tick in range(20):
+        publisher.publish(low_state(tick))
+        time.sleep(0.01)
+    time.sleep(0.5)
+    recording.send_signal(signal.SIGINT)
+    recording.send_signal(signal.SIGINT)
+    assert recording.wait(30) == 0
+    with path.open("rb") as stream:
+        summary = make_reader(stream).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_count == 20
+
+
+def test_drive_repeats_one_velocity_and_ends_with_zero(node: Node) -> None:
+    heard: list[tuple[float, float, float]] = []
+    node.create_subscription(
+        Twist, "cmd_vel_teleop", lambda m: heard.append((m.linear.x, m.linear.y, m.angular.z)), 50
+    )
+    program = "import sys; from quadvel_bringup.cli import main; main()"
+    arguments = ["drive", "--vx", "0.5", "--vy", "-0.25", "--wz", "1", "--seconds", "2"]
+    driving = subprocess.Popen([sys.executable, "-c", program, *arguments])
+    spin_until(node, lambda: (0.0, 0.0, 0.0) in heard, "the stop", 60.0)
+    assert driving.wait(30) == 0
+    assert set(heard[:-1]) == {(0.5, -0.25, 1.0)}
+    assert heard[-1] == (0.0, 0.0, 0.0)

@@ -1,0 +1,95 @@
+"""Which nodes a robot is made of, where they live, and with what parameters they start."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+import yaml
+
+import quadvel_dds
+from quadvel_bringup import nodes
+from quadvel_bringup.stack import PARAMETERS, Stack
+
+SRC = Path(__file__).parents[2] / "src"
+
+
+def console_scripts(setup_file: Path) -> list[str]:
+    """The "name = module:function" of a setup.py, read without running it."""
+    strings = [
+        node.value for node in ast.walk(ast.parse(setup_file.read_text())) if isinstance(node, ast.Constant)
+    ]
+    return [text for text in strings if isinstance(text, str) and ":main" in text]
+
+
+def declared_parameters() -> dict[str, dict[str, Any]]:
+    """The defaults of all parameters, by node, as the nodes' own classes have them."""
+    quadvel_dds.install()
+    from quadvel_estimator.estimator import EstimatorParameters
+    from quadvel_policy.command_mux_node import MuxParameters
+    from quadvel_policy.controller import ControllerParameters
+    from quadvel_sim.parameters import SimParameters
+
+    classes: dict[str, type[attrs.AttrsInstance]] = {
+        "sim_node": SimParameters,
+        "estimator": EstimatorParameters,
+        "controller": ControllerParameters,
+        "command_mux": MuxParameters,
+    }
+    return {
+        name: {
+            field.name: list(field.default) if isinstance(field.default, tuple) else field.default
+            for field in attrs.fields(kind)
+        }
+        for name, kind in classes.items()
+    }
+
+
+@pytest.mark.parametrize("name", nodes.NODES)
+def test_the_table_of_nodes_agrees_with_the_entry_points_for_ros(name: str) -> None:
+    entry = nodes.NODES[name]
+    assert f"{name} = {entry.module}:main" in console_scripts(SRC / entry.package / "setup.py")
+
+
+def test_every_node_of_the_stack_is_in_the_table() -> None:
+    assert set(Stack().overrides()) <= set(nodes.NODES)
+
+
+def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
+    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, estimator"):
+        nodes.command("simnode")
+
+
+def test_arguments_that_ros_would_overlook_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"unexpected argument 'terrain:=rough'; .* --ros-args -p"):
+        nodes.run("sim_node", ["terrain:=rough"])
+
+
+def test_the_parameter_file_holds_every_parameter_of_every_node_with_its_default() -> None:
+    document = yaml.safe_load(PARAMETERS.read_text())
+    assert {name: part["ros__parameters"] for name, part in document.items()} == declared_parameters()
+
+
+def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None:
+    stack = Stack(policy=tmp_path / "1", terrain="rough", estimator="kalman", parameters=tmp_path / "my.yaml")
+    file = ["--ros-args", "--params-file", str(tmp_path / "my.yaml")]
+    assert stack.arguments() == {
+        "sim_node": [*file, "-p", 'terrain:="rough"'],
+        "estimator": [*file, "-p", 'kind:="kalman"'],
+        "controller": [*file, "-p", "auto_stand:=true", "-p", f'policy:="{tmp_path}/1"'],
+        "command_mux": file,
+    }
+
+
+def test_in_simulated_time_the_simulator_waits_and_the_others_follow_its_clock() -> None:
+    overrides = Stack(use_sim_time=True).overrides()
+    assert overrides.pop("sim_node") == {"mode": "lockstep"}
+    assert all(values["use_sim_time"] is True for values in overrides.values())
+
+
+def test_another_robot_is_refused_by_name() -> None:
+    with pytest.raises(ValueError, match="low_level"):
+        Stack(low_level="spot")

@@ -1,0 +1,78 @@
+"""`quadvel up` with small programs in the place of the nodes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import pytest
+
+from quadvel_bringup import up
+from quadvel_bringup.stack import Stack
+
+NODE = """
+import sys, time
+try:
+    print("ready", flush=True)
+    time.sleep(60)
+except KeyboardInterrupt:
+    time.sleep(0.2)  # as a node that needs a moment to end
+    print("clean", flush=True)
+"""
+
+
+def use_programs(monkeypatch: pytest.MonkeyPatch, program: Callable[[str], str]) -> None:
+    def command(name: str, arguments: Sequence[str]) -> list[str]:
+        return [sys.executable, "-S", "-c", program(name)]
+
+    monkeypatch.setattr(up, "command", command)
+
+
+def interrupt_when_ready(monkeypatch: pytest.MonkeyPatch, times: int) -> None:
+    """Send Ctrl-C, `times` times, once all four programs said that they are ready."""
+    ready = []
+
+    class Output(up.PrefixedOutput):
+        def __call__(self, name: str, line: str) -> None:
+            super().__call__(name, line)
+            if line == "ready":
+                ready.append(name)
+            if len(ready) == 4:
+                ready.clear()
+                threading.Thread(target=press).start()
+
+    def press() -> None:
+        for _ in range(times):
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+
+    monkeypatch.setattr(up, "PrefixedOutput", Output)
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_ctrl_c_lets_every_node_end_by_itself(
+    times: int, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    use_programs(monkeypatch, lambda name: NODE)
+    interrupt_when_ready(monkeypatch, times)
+    assert up.up(Stack()) == 0
+    output = capfd.readouterr().out
+    assert "   sim_node | clean\n" in output
+    assert output.count("| clean\n") == 4
+
+
+def test_when_a_node_dies_the_others_are_stopped_and_its_exit_code_is_returned(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    use_programs(monkeypatch, lambda name: "raise SystemExit(3)" if name == "controller" else NODE)
+    assert up.up(Stack()) == 3
+    assert "controller ended with exit code 3; stopping the others" in capfd.readouterr().out
+
+
+def test_a_node_that_ends_by_itself_is_a_fault_even_with_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:
+    use_programs(monkeypatch, lambda name: "pass" if name == "sim_node" else NODE)
+    assert up.up(Stack()) == 1
