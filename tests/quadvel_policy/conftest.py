@@ -1,8 +1,13 @@
-"""A policy without training: a tiny LSTM written with onnx.helper, and a stub that says what it was asked."""
+"""A policy without training, and a ROS graph of one node under test and a peer that moves time.
+
+The policy is a tiny LSTM written with onnx.helper, or a stub that says what it was asked.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +16,18 @@ import onnx
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
+import quadvel_dds
 from quadvel_description.robot import KD, KP, NOMINAL_Q
 from quadvel_policy.observation import PolicyMetadata
 
+quadvel_dds.install()  # before a test module imports rclpy
+
+import rclpy  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rosgraph_msgs.msg import Clock  # noqa: E402
+
+DOMAIN = 71 + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw")) % 9
 HIDDEN = 8
 
 
@@ -134,3 +148,99 @@ def write_policy(tmp_path: Path, metadata: PolicyMetadata) -> Callable[..., Path
         return write_policy_file(tmp_path / "policy.onnx", stored, **changes)
 
     return write
+
+
+class Graph:
+    """The node under test and a peer, served by one executor, on simulated time that the peer moves."""
+
+    def __init__(self, make_node: Callable[[], Any], *arguments: str) -> None:
+        rclpy.init(args=["--ros-args", "-p", "use_sim_time:=true", *arguments], domain_id=DOMAIN)
+        self._executor = SingleThreadedExecutor()
+        self.node = make_node()
+        self.peer = rclpy.create_node("peer", use_global_arguments=False)
+        for node in (self.node, self.peer):
+            self._executor.add_node(node)
+        self.now = 1000.0  # s
+        self._clock = self.peer.create_publisher(Clock, "/clock", 10)
+        self.diagnostics = self.listen(DiagnosticArray, "/diagnostics")
+        self.wait(lambda: self._clock.get_subscription_count())
+
+    def listen(self, kind: Any, topic: str) -> list[Any]:
+        """The list of what arrives on a topic from now on."""
+        heard: list[Any] = []
+        self.peer.create_subscription(kind, topic, heard.append, 100)
+        self.wait(lambda: self.peer.count_publishers(topic))
+        return heard
+
+    def speak(self, kind: Any, topic: str) -> Any:
+        """A publisher that the node already hears."""
+        publisher = self.peer.create_publisher(kind, topic, 10)
+        self.wait(publisher.get_subscription_count)
+        return publisher
+
+    def call(self, kind: Any, service: str, **fields: Any) -> Any:
+        """A service's response."""
+        client = self.peer.create_client(kind, service)
+        self.wait(client.service_is_ready)
+        future = client.call_async(kind.Request(**fields))
+        self.wait(future.done)
+        return future.result()
+
+    def wait(self, is_so: Callable[[], Any], seconds: float = 30.0) -> None:
+        """Serve until the predicate holds; fail when the time is up."""
+        end = time.monotonic() + seconds
+        while not is_so():
+            assert time.monotonic() < end, (
+                f"waited {seconds} s in vain; /diagnostics: {self.diagnostics[-1:]}"
+            )
+            self._executor.spin_once(timeout_sec=0.02)
+
+    def pass_time(self, seconds: float) -> None:
+        """Move the clock on; returns once the node has it."""
+        self.now += seconds
+        self._clock.publish(Clock(clock=self.stamp()))
+        self.wait(lambda: abs(1e-9 * self.node.get_clock().now().nanoseconds - self.now) < 1e-6)
+
+    def stamp(self, ahead: float = 0.0) -> Any:
+        """The time in `ahead` s as a message."""
+        message = Clock().clock
+        nanoseconds = round(1e9 * (self.now + ahead))
+        message.sec, message.nanosec = nanoseconds // 10**9, nanoseconds % 10**9
+        return message
+
+    def diagnosed(self, text: str) -> Any:
+        """Wait until the node's /diagnostics says `text` in its message or a value; returns that status."""
+
+        def said() -> Any:
+            for array in self.diagnostics:
+                for status in array.status:
+                    if any(
+                        text in said
+                        for said in (status.message, *(f"{p.key}: {p.value}" for p in status.values))
+                    ):
+                        return status
+            return None
+
+        self.wait(said)
+        return said()
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        rclpy.shutdown()
+
+
+@pytest.fixture
+def graph() -> Iterator[Callable[..., Graph]]:
+    """graph(NodeClass, *ROS arguments) -> Graph."""
+    graphs: list[Graph] = []
+
+    def start(make_node: Callable[[], Any], *arguments: str) -> Graph:
+        graphs.append(Graph(make_node, *arguments))
+        return graphs[-1]
+
+    yield start
+    for graph in graphs:
+        graph.close()
+    rclpy.try_shutdown()

@@ -123,5 +123,6 @@ class CommandMux:
         way = target - self._velocity
         if (np.abs(way) <= step).all():
             return target
-        share: float = np.min(step[way != 0.0] / np.abs(way[way != 0.0]))
-        return self._velocity + share * way
+        if not step.all():  # no time has passed
+            return self._velocity
+        return self._velocity + way / np.max(np.abs(way) / step)

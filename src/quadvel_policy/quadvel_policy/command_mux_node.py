@@ -1,4 +1,4 @@
-"""The node `command_mux`: one command out of several velocity topics; `command_mux` decides which one wins."""
+"""The node `command_mux`: topics and services around `command_mux`, which decides."""
 
 from __future__ import annotations
 

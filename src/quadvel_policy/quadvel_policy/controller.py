@@ -1,9 +1,10 @@
 """The node `controller`: answers the robot's states with joint commands, 200 times a second.
 
-It is locked to the phase of the states: a tick runs when the state that is due arrives, so that the latency is
-small and constant. What is due lies on an absolute grid in the states' own time (`TickGrid`), so that states may
-come faster than 200 Hz; the deadline of a tick is one period after its state held. When states stop, a timer
-notices. With simulated time the same holds on that time. What a tick decides is the supervisor's matter.
+It is locked to the phase of the states: a tick runs when the state that is due arrives, so that the latency
+is small and constant. What is due lies on an absolute grid in the states' own time (`TickGrid`), so that
+states may come faster than 200 Hz; the deadline of a tick is one period after its state held. When states
+stop, a timer notices. With simulated time the same holds on that time. What a tick decides is the
+supervisor's matter.
 """
 
 from __future__ import annotations

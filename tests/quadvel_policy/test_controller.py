@@ -1,0 +1,304 @@
+"""The node `controller` over DDS: it answers states, refuses what is unfit, and says why."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+import rclpy
+from diagnostic_msgs.msg import DiagnosticStatus
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from std_srvs.srv import SetBool
+
+from quadvel_description.messages import write_low_state
+from quadvel_description.node import StartError
+from quadvel_description.recurrent_network import NetworkFileError
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
+from quadvel_msgs.srv import SetMode
+from quadvel_policy.controller import Controller
+
+PERIOD = 0.005
+
+
+class Robot:
+    """A standing robot in lockstep with the controller: each state waits for its answer."""
+
+    def __init__(self, graph: Any) -> None:
+        self.graph = graph
+        zeros = np.zeros(12)
+        self.state = RobotState(
+            0.0,
+            0,
+            NOMINAL_Q.copy(),
+            zeros,
+            zeros,
+            np.array([1.0, 0, 0, 0]),
+            np.zeros(3),
+            zeros[:3],
+            zeros[:4],
+        )
+        self.answers = graph.listen(LowCmd, "low_cmd")
+        self.reports = graph.listen(ControllerState, "controller/state")
+        self._states = graph.speak(LowState, "low_state")
+        self._velocity = graph.speak(TwistWithCovarianceStamped, "velocity_estimate")
+        self._command = graph.speak(VelocityCommand, "command")
+
+    def message(self, ahead: float = 0.0, **changes: Any) -> Any:
+        message = LowState(stamp=self.graph.stamp(ahead))
+        write_low_state(attrs.evolve(self.state, **changes), message)
+        return message
+
+    def send(self, message: Any) -> None:
+        self._states.publish(message)
+
+    def step(self, n: int = 1, **changes: Any) -> Any:
+        """Let `n` periods pass, each with a state and its answer; returns the last answer."""
+        for _ in range(n):
+            self.graph.pass_time(PERIOD)
+            self.state.tick += 5
+            self.send(self.message(**changes))
+            self.graph.wait(lambda: self.answers and self.answers[-1].tick == self.state.tick)
+        return self.answers[-1]
+
+    def estimate(self, x: float = 0.0, ahead: float = 0.0) -> None:
+        message = TwistWithCovarianceStamped()
+        message.header.stamp = self.graph.stamp(ahead)
+        message.twist.twist.linear.x = x
+        self._velocity.publish(message)
+
+    def order(self, vx: float, stance: bool = False, ahead: float = 0.0) -> None:
+        message = VelocityCommand(stamp=self.graph.stamp(ahead), stance=stance, source="test")
+        message.twist.linear.x = vx
+        self._command.publish(message)
+
+    def stand(self) -> Any:
+        self.step(2)
+        assert self.graph.call(SetMode, "controller/set_mode", mode="stance").success
+        return self.step(2)
+
+    def report(self, mode: str) -> Any:
+        """Wait for a controller/state in `mode`."""
+        self.graph.wait(lambda: self.reports and self.reports[-1].mode_name == mode)
+        return self.reports[-1]
+
+
+@pytest.fixture
+def robot(graph: Callable[..., Any], write_policy: Callable[..., Path]) -> Robot:
+    return Robot(graph(Controller, "-p", f"policy:={write_policy()}"))
+
+
+def test_each_state_is_answered_by_its_tick(robot: Robot) -> None:
+    assert robot.step().mode == MODE_DAMPING
+    answer = robot.stand()
+    assert answer.mode == MODE_SERVO
+    np.testing.assert_allclose(answer.kp, np.full(12, 100.0))
+    np.testing.assert_allclose(answer.q, NOMINAL_Q, atol=1e-6)
+    assert len(robot.answers) == 5
+
+
+def test_a_simulator_that_sends_a_state_again_gets_its_answer_again(robot: Robot) -> None:
+    robot.step(3)
+    robot.send(robot.message())
+    robot.graph.wait(lambda: len(robot.answers) == 4)
+    assert robot.answers[-1].tick == robot.answers[-2].tick
+
+
+def test_faster_states_do_not_make_the_controller_faster(robot: Robot) -> None:
+    robot.state.q = NOMINAL_Q + 0.1
+    robot.stand()  # on the way to the nominal posture each tick has another target
+    robot.answers.clear()
+    for _ in range(50):
+        robot.graph.pass_time(0.001)
+        robot.state.tick += 1
+        robot.send(robot.message())
+        robot.graph.wait(lambda: robot.answers and robot.answers[-1].tick == robot.state.tick)
+    assert len(robot.answers) == 50
+    assert len({answer.q[0] for answer in robot.answers}) in (10, 11)
+    assert robot.report("stance").overruns == 0
+
+
+def test_a_command_starts_walking_once_the_operator_allows_it(
+    graph: Callable[..., Any], write_policy: Callable[..., Path]
+) -> None:
+    robot = Robot(graph(Controller, "-p", f"policy:={write_policy()}", "-p", "require_operator:=true"))
+    robot.stand()
+    robot.step(65)
+    for _ in range(3):
+        robot.order(0.5)
+        robot.estimate()
+        robot.step(5)
+    report = robot.report("stance")
+    assert not report.walk_allowed
+    refused = robot.graph.call(SetMode, "controller/set_mode", mode="walk")
+    assert not refused.success
+    assert "enable_walking" in refused.message
+    assert robot.graph.call(SetBool, "controller/enable_walking", data=True).success
+    robot.order(0.5)
+    robot.estimate()
+    robot.step(5)
+    report = robot.report("walk")
+    assert report.mode == ControllerState.WALK
+    assert report.walk_allowed
+    assert report.command.linear.x == pytest.approx(0.5)
+    assert not report.stance
+    assert report.inference_p50_us > 0
+
+
+def walk(robot: Robot) -> None:
+    robot.stand()
+    robot.step(65)
+    robot.order(0.5)
+    robot.estimate()
+    robot.step(5)
+    robot.report("walk")
+
+
+def test_a_robot_whose_commands_stop_stands_still(robot: Robot) -> None:
+    walk(robot)
+    for _ in range(21):
+        robot.estimate()
+        robot.step(5)
+    assert robot.report("walk").stance
+
+
+def test_walking_on_an_old_velocity_is_a_fault(robot: Robot) -> None:
+    walk(robot)
+    robot.step(12)
+    assert robot.report("fault").reason == "there is no fresh velocity estimate"
+    assert robot.step().mode == MODE_DAMPING
+    status = robot.graph.diagnosed("fault: there is no fresh velocity estimate")
+    assert status.level == DiagnosticStatus.ERROR
+    assert status.name == "controller"
+
+
+def test_states_that_stop_are_a_fault(robot: Robot) -> None:
+    robot.stand()
+    answers = len(robot.answers)
+    for _ in range(4):
+        robot.graph.pass_time(0.02)
+    report = robot.report("fault")
+    assert report.mode == ControllerState.FAULT
+    assert "ms old, limit 50 ms" in report.reason
+    robot.graph.wait(lambda: len(robot.answers) > answers)
+    assert robot.answers[-1].mode == MODE_DAMPING
+
+
+def unfit_states(robot: Robot) -> dict[str, Any]:
+    short = robot.message(tick=1)
+    short.q = np.zeros(11, np.float32)
+    quaternion = np.zeros(4)
+    return {
+        "dq holds nan": robot.message(tick=1, dq=np.full(12, np.nan)),
+        "q has 11 numbers, expected 12": short,
+        "stamp is 1.000 s old": robot.message(-1.0, tick=1),
+        "orientation_wxyz has norm 0": robot.message(tick=1, quaternion=quaternion),
+    }
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        "dq holds nan",
+        "q has 11 numbers, expected 12",
+        "stamp is 1.000 s old",
+        "orientation_wxyz has norm 0",
+    ],
+)
+def test_an_unfit_state_is_refused_counted_and_named_and_the_node_goes_on(robot: Robot, what: str) -> None:
+    robot.stand()
+    robot.graph.node._on_state(unfit_states(robot)[what])  # as real rclpy hands it over: nothing is checked
+    assert robot.step().mode == MODE_SERVO
+    assert all(answer.tick != 1 for answer in robot.answers)
+    status = robot.graph.diagnosed(f"refused low_state: 1, last: {what}")
+    assert status.level == DiagnosticStatus.WARN
+    assert "1 messages refused in the last second" in status.message
+    robot.graph.pass_time(0.02)
+    robot.graph.wait(lambda: robot.reports[-1].refused == 1)
+
+
+def test_unfit_velocities_and_commands_are_refused_and_the_last_fit_ones_stay(robot: Robot) -> None:
+    walk(robot)
+    robot.estimate(np.nan)
+    robot.order(np.inf)
+    robot.step()
+    robot.estimate(ahead=-1.0)
+    robot.order(0.1, ahead=-1.0)
+    robot.step(3)
+    assert robot.report("walk").command.linear.x == pytest.approx(0.5)
+    robot.graph.diagnosed("refused velocity_estimate: 2, last: stamp is")
+    robot.graph.diagnosed("refused command: 2, last: stamp is")
+
+
+def test_set_mode_says_why_it_refuses(robot: Robot) -> None:
+    response = robot.graph.call(SetMode, "controller/set_mode", mode="stand_up")
+    assert (response.success, response.message) == (False, "the robot has not reported yet")
+    response = robot.graph.call(SetMode, "controller/set_mode", mode="jump")
+    assert response.message.startswith("mode is 'jump', expected one of")
+
+
+def start(*parameters: str) -> None:
+    arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
+    rclpy.init(args=["--ros-args", *arguments], domain_id=79)
+    try:
+        Controller().destroy_node()
+    finally:
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize(
+    ("parameter", "sentence"),
+    [
+        ("policy:=/nowhere/policy.onnx", r"/nowhere/policy\.onnx: no such file"),
+        ("max_tilt:=-1.0", "max_tilt"),
+        ("max_tilt:=steep", "max_tilt"),
+        ("max_tild:=1.0", "unknown parameter max_tild, expected one of"),
+    ],
+)
+def test_what_can_not_work_is_refused_at_the_start_in_one_sentence(parameter: str, sentence: str) -> None:
+    with pytest.raises((StartError, NetworkFileError), match=sentence):
+        start(parameter)
+
+
+PROGRAM = "import quadvel_dds; quadvel_dds.install(); from quadvel_policy.controller import main; main()"
+
+
+def process(*arguments: str) -> subprocess.Popen[str]:
+    return subprocess.Popen(
+        [sys.executable, "-c", PROGRAM, *arguments],
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"ROS_DOMAIN_ID": "78"},
+    )
+
+
+def test_a_bad_start_ends_the_process_with_one_sentence() -> None:
+    with process("--ros-args", "-p", "policy:=/nowhere/policy.onnx") as child:
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == 1
+    assert errors.strip() == "/nowhere/policy.onnx: no such file, expected an ONNX network"
+
+
+def test_ctrl_c_twice_ends_the_process_with_exit_code_0(write_policy: Callable[..., Path]) -> None:
+    with process("--ros-args", "-p", f"policy:={write_policy()}") as child:
+        rclpy.init(args=[], domain_id=78)
+        peer = rclpy.create_node("peer")
+        while not peer.count_publishers("low_cmd"):
+            rclpy.spin_once(peer, timeout_sec=0.05)
+            assert child.poll() is None
+        peer.destroy_node()
+        rclpy.shutdown()
+        child.send_signal(signal.SIGINT)
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == 0
+    assert "Traceback" not in errors
