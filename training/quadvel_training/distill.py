@@ -8,20 +8,18 @@ itself, so that it learns to come back from its own states. Eq. 6 and 7 act on t
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
 import attrs
 import numpy as np
 import torch
-from rich.progress import Progress, TextColumn
-from torch.utils.tensorboard import SummaryWriter
 
 from quadvel_description import robot, symmetry
 
 from . import gait, student, teacher
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
+from .loop import Budget, cosine, load, set_rate
 from .networks import Gaussian, Mlp
 from .ppo import State, select
 from .teacher import GaitState, torch_mirror
@@ -30,7 +28,7 @@ from .teacher import GaitState, torch_mirror
 def load_teacher(path: Path) -> Gaussian:
     """The teacher's actor from a checkpoint of stage 1."""
     actor = Gaussian(Mlp(len(teacher.OBSERVATION_MIRROR.index), 12), 12, 0.1)
-    actor.load_state_dict(torch.load(path, weights_only=True)["actor"])
+    actor.load_state_dict(load(path)["actor"])
     return actor.eval()
 
 
@@ -125,8 +123,7 @@ def fit_command_map(actor: Gaussian, config: EnvConfig, seconds: float = 10.0) -
 class DistillConfig:
     """One run of stage 2."""
 
-    samples: float = 1.2e7
-    minutes: float = 20.0
+    budget: Budget = Budget(samples=1.6e7, minutes=30.0)
     n: int = 512
     length: int = 32  # ticks a sequence
     learning_rate: float = 1e-3
@@ -142,11 +139,10 @@ class DistillConfig:
 
 
 class DistillRun:
-    """Teacher, student and environment; resumable."""
+    """Teacher, student and environment of stage 2."""
 
-    def __init__(self, config: DistillConfig, teacher_file: Path, directory: Path) -> None:
-        self.config, self.directory = config, directory
-        directory.mkdir(parents=True, exist_ok=True)
+    def __init__(self, config: DistillConfig, teacher_file: Path) -> None:
+        self.config = config
         torch.manual_seed(config.seed)
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
@@ -163,18 +159,27 @@ class DistillRun:
         self._previous = np.zeros((config.n, 12), np.float32)
         self._noise = np.zeros((config.n, 12))
         self._mirror_obs, self._mirror_action = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
-        if (directory / "student.pt").exists():
-            content = torch.load(directory / "student.pt", weights_only=True)
-            self.student.load_state_dict(content["student"])
-            self.optimiser.load_state_dict(content["optimiser"])
-            self.samples = content["samples"]
 
-    def save(self) -> None:
-        """Checkpoint, written whole or not at all."""
-        path = self.directory / "student.pt"
-        content = {"student": self.student.state_dict(), "optimiser": self.optimiser.state_dict(), "samples": self.samples}
-        torch.save(content, path.with_suffix(".part"))
-        path.with_suffix(".part").replace(path)
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return {
+            "student": self.student.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "samples": self.samples,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.student.load_state_dict(state["student"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.samples = state["samples"]
+
+    def step(self, done: float) -> dict[str, float]:
+        """One sequence and one step of the optimiser."""
+        c = self.config
+        set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
+        obs, label, mask, seen = self.collect(c.student_share * min(1.0, max(0.0, (done - 0.1) / 0.3)))
+        return seen | self.learn(obs, label, mask)
 
     def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
         """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N)."""
@@ -247,31 +252,3 @@ class DistillRun:
             self._previous[over] = 0.0
             for memory in (*self._state, *self._mirrored):
                 memory[:, over] = 0.0
-
-    def train(self, recipe: dict[str, Any]) -> None:
-        """Until the budget is spent; the policy file is written at every checkpoint."""
-        c = self.config
-        writer = SummaryWriter(str(self.directory))
-        started, first, update = time.monotonic(), self.samples, 0
-        with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[note]}")) as progress:
-            task = progress.add_task("student", total=c.samples, completed=self.samples, note="")
-            while self.samples < c.samples and time.monotonic() - started < 60 * c.minutes:
-                done = max(self.samples / c.samples, (time.monotonic() - started) / (60 * c.minutes))
-                share = c.student_share * min(1.0, max(0.0, (done - 0.1) / 0.3))
-                rate = c.final_learning_rate + 0.5 * (c.learning_rate - c.final_learning_rate) * (1 + np.cos(np.pi * done))
-                for group in self.optimiser.param_groups:
-                    group["lr"] = rate
-                obs, label, mask, seen = self.collect(share)
-                seen |= self.learn(obs, label, mask)
-                for name, value in seen.items():
-                    writer.add_scalar(f"student/{name}", value, self.samples)
-                speed = (self.samples - first) / (time.monotonic() - started)
-                note = f"clone {seen['clone']:.3f}  error {seen['error_xy']:.3f} m/s {seen['error_wz']:.3f} rad/s  {seen['falls_per_minute']:.1f} falls/min  {speed:.0f}/s"
-                progress.update(task, completed=self.samples, note=note)
-                update += 1
-                if update % 40 == 0:
-                    self.save()
-                    progress.console.print(f"{self.samples / 1e6:.2f} M  {note}  sym {seen['symmetry']:.3f} smooth {seen['smoothness']:.3f}")
-        self.save()
-        student.export_policy(self.student, self.env, self.directory / "policy.onnx", recipe)
-        writer.close()

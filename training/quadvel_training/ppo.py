@@ -7,11 +7,13 @@ there on and starts over with the next one, so a recurrent pass is one call of t
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import attrs
 import torch
 from torch import Tensor
 
+from .loop import set_rate
 from .networks import Gaussian, State
 
 
@@ -30,7 +32,7 @@ class PpoConfig:
     entropy: float = 0.0
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8
-    symmetric_share: float = 1.0  # of the sequences that the symmetry term sees
+    symmetric_share: float = 1.0  # of the environments, the first ones, that the symmetry term sees
     max_grad_norm: float = 1.0
 
 
@@ -42,13 +44,14 @@ class Rollout:
     critic_obs: Tensor  # (T, N, C)
     action: Tensor  # (T, N, A)
     mean: Tensor  # (T, N, A) of the policy that acted
+    offset: Tensor  # (T, N, A) what time-correlated exploration added to the mean, known before the draw
     reward: Tensor  # (T, N)
     ended: Tensor  # (T, N) 1 where the episode failed at the end of the sample
     cut: Tensor  # (T, N) 1 where it timed out instead
     mask: Tensor  # (T, N)
     last_critic_obs: Tensor  # (N, C)
     state: State | None = None  # of the actor at the start
-    mirrored_state: State | None = None  # of the actor on the mirrored past
+    mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
 
 
 def select(state: State | None, ids: Tensor) -> State | None:
@@ -73,12 +76,29 @@ class Ppo:
         self.critic_optimiser = torch.optim.Adam(critic.parameters(), lr=1e-3)
         self.learning_rate = config.learning_rate
 
+    def mirrored(self, n: int) -> int:
+        """How many of `n` environments the symmetry term sees."""
+        return max(1, round(n * self.config.symmetric_share))
+
+    def state(self) -> dict[str, Any]:
+        """The optimisers, for a checkpoint."""
+        return {
+            "actor_optimiser": self.actor_optimiser.state_dict(),
+            "critic_optimiser": self.critic_optimiser.state_dict(),
+            "learning_rate": self.learning_rate,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self.actor_optimiser.load_state_dict(state["actor_optimiser"])
+        self.critic_optimiser.load_state_dict(state["critic_optimiser"])
+        self.learning_rate = state["learning_rate"]
+
+    @torch.no_grad()
     def advantages(self, r: Rollout) -> tuple[Tensor, Tensor]:
         """Generalised advantage estimates and value targets, (T, N) each."""
         c = self.config
-        with torch.no_grad():
-            every = torch.cat([r.critic_obs, r.last_critic_obs[None]])
-            value = self.critic(every)[0][..., 0]
+        value = self.critic(torch.cat([r.critic_obs, r.last_critic_obs[None]]))[0][..., 0]
         advantage = torch.zeros_like(r.reward)
         running = torch.zeros_like(r.reward[0])
         for t in reversed(range(len(r.reward))):
@@ -92,14 +112,13 @@ class Ppo:
 
     def update(self, r: Rollout, learn_actor: bool = True) -> dict[str, float]:
         """Several epochs over one rollout; returns means of the loss terms."""
-        c = self.config
         advantage, target = self.advantages(r)
         alive = r.mask.sum().clamp(min=1)
         mean = (advantage * r.mask).sum() / alive
         spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
         advantage = (advantage - mean) / (spread + 1e-6)
         with torch.no_grad():
-            old_log_prob = self.actor.log_prob(r.mean, r.action)
+            old_log_prob = self.actor.log_prob(r.mean + r.offset, r.action)
         total: dict[str, float] = {}
         batches = 0
         for ids in self._mini_batches(r.reward.shape[1]):
@@ -131,16 +150,16 @@ class Ppo:
         c, actor = self.config, self.actor
         alive = mask.sum().clamp(min=1)
         mean, _ = actor(r.obs[:, ids], select(r.state, ids))
-        ratio = (actor.log_prob(mean, r.action[:, ids]) - old_log_prob).exp()
+        ratio = (actor.log_prob(mean + r.offset[:, ids], r.action[:, ids]) - old_log_prob).exp()
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
         surrogate = -(torch.minimum(ratio * advantage, clipped * advantage) * mask).sum() / alive
         variance = (2 * actor.log_std).exp().detach()
         kl = (((mean - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1) * mask).sum().detach() / alive
 
-        share = ids[: max(1, round(len(ids) * c.symmetric_share))]
-        mirrored, _ = actor(self.mirror_obs(r.obs[:, share]), select(r.mirrored_state, share))
-        gap = mean[:, : len(share)] - self.mirror_action(mirrored)
-        symmetry = ((gap**2 / (2 * variance)).sum(-1) * mask[:, : len(share)]).sum() / mask[:, : len(share)].sum().clamp(min=1)
+        seen = ids < self.mirrored(r.reward.shape[1])
+        mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), select(r.mirrored_state, ids[seen]))
+        gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
+        symmetry = (gap.sum(-1) * mask[:, seen]).sum() / mask[:, seen].sum().clamp(min=1)
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
         smoothness = (bend.norm(dim=-1) * mask[2:]).sum() / mask[2:].sum().clamp(min=1)
 
@@ -166,5 +185,4 @@ class Ppo:
         elif kl < 0.5 * self.config.target_kl:
             self.learning_rate *= 1.2
         self.learning_rate = min(max(self.learning_rate, 1e-6), self.config.max_learning_rate)
-        for group in self.actor_optimiser.param_groups:
-            group["lr"] = self.learning_rate
+        set_rate(self.actor_optimiser, self.learning_rate)

@@ -5,21 +5,19 @@ Why not the recurrent student at once: see docs/decisions/0003-teacher-then-stud
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
 import attrs
 import numpy as np
 import torch
-from rich.progress import Progress, TextColumn
-from torch.utils.tensorboard import SummaryWriter
 
 from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 
 from . import gait
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
+from .loop import Budget
 from .networks import Gaussian, Mlp
 from .ppo import Ppo, PpoConfig, Rollout
 
@@ -137,8 +135,7 @@ def reward(env: VelocityEnv, g: GaitState) -> np.ndarray:
 class TeacherConfig:
     """One run of stage 1."""
 
-    samples: float = 2e7
-    minutes: float = 45.0  # stops at whichever comes first
+    budget: Budget = Budget(samples=2e7, minutes=45.0)
     n: int = 512
     length: int = 24  # samples a sequence
     std: float = 0.5
@@ -149,11 +146,10 @@ class TeacherConfig:
 
 
 class TeacherRun:
-    """Environment, learner and what is needed to resume them."""
+    """Environment and learner of stage 1."""
 
-    def __init__(self, config: TeacherConfig, directory: Path) -> None:
-        self.config, self.directory = config, directory
-        directory.mkdir(parents=True, exist_ok=True)
+    def __init__(self, config: TeacherConfig) -> None:
+        self.config = config
         torch.manual_seed(config.seed)
         self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands))
         self.gait = GaitState(config.n)
@@ -164,31 +160,30 @@ class TeacherRun:
             self.actor, self.critic, config.ppo, torch_mirror(OBSERVATION_MIRROR), torch_mirror(symmetry.JOINTS)
         )
         self.samples = 0
-        checkpoint = directory / "teacher.pt"
-        if checkpoint.exists():
-            self.load(checkpoint)
 
-    def save(self, path: Path) -> None:
-        """Everything that a resumed run needs, written whole or not at all."""
-        content = {
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
-            "actor_optimiser": self.ppo.actor_optimiser.state_dict(),
-            "critic_optimiser": self.ppo.critic_optimiser.state_dict(),
-            "learning_rate": self.ppo.learning_rate,
+            "learner": self.ppo.state(),
             "samples": self.samples,
         }
-        torch.save(content, path.with_suffix(".part"))
-        path.with_suffix(".part").replace(path)
 
-    def load(self, path: Path) -> None:
+    def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint."""
-        content = torch.load(path, weights_only=True)
-        self.actor.load_state_dict(content["actor"])
-        self.critic.load_state_dict(content["critic"])
-        self.ppo.actor_optimiser.load_state_dict(content["actor_optimiser"])
-        self.ppo.critic_optimiser.load_state_dict(content["critic_optimiser"])
-        self.ppo.learning_rate, self.samples = content["learning_rate"], content["samples"]
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        self.ppo.restore(state["learner"])
+        self.samples = state["samples"]
+
+    def step(self, done: float) -> dict[str, float]:
+        """Collect one rollout and learn from it; the exploration noise falls as the budget is spent."""
+        rollout, seen = self.collect()
+        with torch.no_grad():
+            bound = np.log(self.config.std + (self.config.final_std - self.config.std) * min(1.0, 1.3 * done))
+            self.actor.log_std.clamp_(max=float(bound))
+        return seen | self.ppo.update(rollout)
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One rollout of `length` samples with exploration noise."""
@@ -229,6 +224,7 @@ class TeacherRun:
             critic_obs=torch.cat([t["obs"], t["extra"]], dim=-1),
             action=t["action"],
             mean=t["mean"],
+            offset=torch.zeros_like(t["mean"]),
             reward=t["reward"],
             ended=t["ended"],
             cut=t["cut"],
@@ -238,34 +234,3 @@ class TeacherRun:
         xy, wz = np.mean(errors, axis=0)
         seconds = c.length * c.n * HOLD * TICK
         return rollout, {"error_xy": xy, "error_wz": wz, "falls_per_minute": 60 * falls / seconds, "reward": float(t["reward"].mean())}
-
-    def train(self) -> None:
-        """Until the budget is spent; saves as it goes."""
-        c = self.config
-        started, first = time.monotonic(), self.samples
-        writer = SummaryWriter(str(self.directory))
-        columns = [*Progress.get_default_columns(), TextColumn("{task.fields[note]}")]
-        with Progress(*columns) as progress:
-            task = progress.add_task("teacher", total=c.samples, completed=self.samples, note="")
-            update = 0
-            while self.samples < c.samples and time.monotonic() - started < 60 * c.minutes:
-                rollout, seen = self.collect()
-                done = self.samples / c.samples
-                with torch.no_grad():
-                    bound = float(np.log(c.std + (c.final_std - c.std) * min(1.0, 1.3 * done)))
-                    self.actor.log_std.clamp_(max=bound)
-                seen |= self.ppo.update(rollout)
-                for name, value in seen.items():
-                    writer.add_scalar(f"teacher/{name}", value, self.samples)
-                rate = (self.samples - first) / (time.monotonic() - started)
-                note = f"error {seen['error_xy']:.3f} m/s {seen['error_wz']:.3f} rad/s, {seen['falls_per_minute']:.2f} falls/min, {rate:.0f}/s"
-                progress.update(task, completed=self.samples, note=note)
-                update += 1
-                if update % 25 == 0:
-                    self.save(self.directory / "teacher.pt")
-                    progress.console.print(
-                        f"{self.samples / 1e6:.2f} M  {note}  reward {seen['reward']:.2f}  kl {seen['kl']:.4f}  rate {self.ppo.learning_rate:.1e}"
-                        f"  ev {seen['explained_variance']:.2f}  sym {seen['symmetry']:.3f}"
-                    )
-        self.save(self.directory / "teacher.pt")
-        writer.close()

@@ -1,0 +1,170 @@
+"""The training environment, its rewards and the teacher's parts."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_description import robot, symmetry  # noqa: E402
+from quadvel_training import gait, loop  # noqa: E402
+from quadvel_training.distill import CommandMap  # noqa: E402
+from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.randomisation import Randomisation  # noqa: E402
+from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
+
+STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
+QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
+
+
+def body(env):
+    return gait.Body(
+        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, env.height, env.velocity[:, 2]
+    )
+
+
+def test_the_gait_stands_still_on_command():
+    env = VelocityEnv(QUIET)
+    for _ in range(300):
+        env.tick(gait.targets(np.zeros(4), env.command, body(env), robot.KP))
+    assert not env.fallen.any()
+    assert np.abs(env.velocity).max() < 0.05
+    assert np.abs(env.height - gait.HEIGHT).max() < 0.03
+    assert env.contact.all()
+
+
+def test_equal_seeds_give_equal_runs_and_other_seeds_do_not():
+    def run(seed):
+        env = VelocityEnv(attrs.evolve(QUIET, seed=seed, randomisation=Randomisation()))
+        for _ in range(20):
+            env.tick(np.tile(env.stand_q, (4, 1)))
+            env.sense()
+        return env.q
+
+    assert np.array_equal(run(5), run(5))
+    assert not np.array_equal(run(5), run(6))
+
+
+def test_commands_of_the_ellipsoid_lie_in_it():
+    commands = CommandRange(vx=(-4.5, 4.5), vy=2.0, wz=4.0, ellipsoid=True, stance=0.2, straight=0.0)
+    drawn = commands.draw(np.random.default_rng(0), 5000)
+    assert np.sum((drawn[:, :3] / [4.5, 2.0, 4.0]) ** 2, axis=1).max() <= 1.0
+    assert np.mean(drawn[:, 3]) == pytest.approx(0.2, abs=4 * np.sqrt(0.2 * 0.8 / 5000))
+    assert (drawn[drawn[:, 3] == 1, :3] == 0).all()
+
+
+def test_acceleration_at_rest_is_gravity_upwards():
+    env = VelocityEnv(QUIET)
+    seen = []
+    for _ in range(400):
+        env.tick(gait.targets(np.zeros(4), env.command, body(env), robot.KP))
+        seen.append(env.acceleration)
+    assert np.mean(seen[200:], axis=(0, 1)) == pytest.approx([0.0, 0.0, robot.GRAVITY], abs=0.15)
+
+
+def test_velocity_is_the_derivative_of_position_in_the_body_frame():
+    env = VelocityEnv(attrs.evolve(QUIET, timestep=0.001))
+    for _ in range(10):
+        env.tick(np.tile(env.stand_q, (4, 1)))
+    before = env.batch.qpos[:, :3].copy()
+    slow = env.velocity.copy()
+    env.tick(np.tile(env.stand_q, (4, 1)))
+    mean = 0.5 * (slow + env.velocity)
+    moved = (env.batch.qpos[:, :3] - before) / TICK
+    from quadvel_description.kinematics import rotate
+
+    assert np.abs(rotate(env.quaternion, mean) - moved).max() < 0.05
+
+
+def test_rewards_of_table_2_at_a_state_computed_by_hand():
+    env = VelocityEnv(QUIET)
+    table = Table2(env, RewardWeights())
+    env.command[:] = [[0.5, -0.3, 0.2, 0.0]] * 4
+    env.velocity = np.tile([0.2, -0.4, 0.1], (4, 1))
+    env.angular_velocity = np.tile([0.3, 0.4, 0.1], (4, 1))
+    env.roll_pitch = np.tile([0.1, -0.2], (4, 1))
+    env.torque, env.dq = np.full((4, 12), 2.0), np.full((4, 12), -0.1)
+    env.contact = np.ones((4, 4), bool)
+    env.foot_velocity = np.tile([0.1, 0.0, 0.5], (4, 4, 1))
+    table._dq = np.full((4, 12), -0.2)
+    table._air_time[:, 0] = 0.3
+    terms = {name: value[0] for name, value in table.terms(np.full((4, 12), 0.1)).items()}
+    assert terms["linear_tracking"] == pytest.approx(np.exp(-(0.09 + 0.01)))
+    assert terms["angular_tracking"] == pytest.approx(np.exp(-0.01))
+    assert terms["orientation"] == pytest.approx(-0.3)
+    assert terms["torso_stability"] == pytest.approx(-0.5 - 0.1)
+    assert terms["joint_velocity"] == pytest.approx(-0.12)
+    assert terms["joint_acceleration"] == pytest.approx(-12 * (0.1 / TICK) ** 2)
+    assert terms["slippage"] == pytest.approx(-0.04)
+    assert terms["energy"] == pytest.approx(-12 * (0.2 * 4.0 - 0.2))
+    assert terms["velocity_compensation"] == pytest.approx(np.hypot(0.2, 0.3))
+    assert terms["foot_lift_time"] == pytest.approx((0.3 - 0.2) * (1 - 0.34))
+    assert terms["foot_clearance"] == 0.0
+    assert terms["action_smoothness"] == pytest.approx(-1.2)
+
+
+def test_lifting_feet_pays_only_while_walking():
+    env = VelocityEnv(QUIET)
+    table = Table2(env, RewardWeights())
+    env.contact = np.zeros((4, 4), bool)
+    env.clearance = np.full((4, 4), 0.03)
+    env.command[:] = [0.0, 0.0, 0.0, 1.0]
+    assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == 0.0
+    env.command[:] = 0.0
+    assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == pytest.approx(0.12)
+
+
+def test_the_command_map_finds_a_map_of_its_own_kind():
+    rng = np.random.default_rng(0)
+    wanted = rng.uniform(-1, 1, (2000, 3))
+    x, y, r = wanted.T
+    given = wanted + np.stack([0.1 * x + 0.02, 0.2 * x * r, 0.3 * r], axis=1)
+    command_map = CommandMap()
+    assert command_map.fit(wanted, given) < 1e-4
+    out = command_map(np.column_stack([wanted, np.zeros(2000)]))
+    assert np.abs(out[:, :3] - given).max() < 1e-3
+    still = np.array([[0.0, 0.0, 0.0, 1.0]])
+    assert np.array_equal(command_map(still), still)
+
+
+def test_the_command_map_treats_left_and_right_alike():
+    rng = np.random.default_rng(1)
+    wanted = rng.uniform(-1, 1, (500, 3))
+    command_map = CommandMap()
+    command_map.fit(wanted, wanted + rng.normal(0, 0.1, (500, 3)))
+    command = np.column_stack([wanted, np.zeros(500)])
+    mirror = symmetry.PARTS["command"]
+    assert np.allclose(command_map(mirror(command)), mirror(command_map(command)))
+
+
+class Counter:
+    """A run that counts."""
+
+    def __init__(self) -> None:
+        self.samples = 0
+
+    def step(self, done):
+        self.samples += 10
+        return {"count": float(self.samples)}
+
+    def state(self):
+        return {"samples": self.samples}
+
+    def restore(self, state):
+        self.samples = state["samples"]
+
+
+def test_a_run_resumes_where_its_checkpoint_stands(tmp_path):
+    path = tmp_path / "run.pt"
+    loop.train(Counter(), loop.Budget(samples=50, minutes=1.0), path)
+    again = Counter()
+    loop.train(again, loop.Budget(samples=80, minutes=1.0), path)
+    assert again.samples == 80
+    assert loop.load(path) == {"samples": 80}
+
+
+def test_a_missing_checkpoint_is_named(tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere.pt: no such checkpoint"):
+        loop.load(tmp_path / "nowhere.pt")

@@ -1,0 +1,49 @@
+"""The exported policy is the trained network."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_policy.policy_file import PolicyFile  # noqa: E402
+from quadvel_training import student  # noqa: E402
+from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    torch.manual_seed(0)
+    actor = student.new_actor()
+    env = VelocityEnv(EnvConfig(n=2, threads=1, commands=CommandRange(vx=(-1.0, 1.5), vy=0.5, wz=1.2)))
+    path = tmp_path_factory.mktemp("policy") / "policy.onnx"
+    student.export_policy(actor, env, path, {"stage": "test"})
+    return actor, env, path
+
+
+def test_onnx_and_torch_agree_over_500_steps_with_a_reset(exported):
+    actor, _, path = exported
+    policy = PolicyFile(path)
+    rng = np.random.default_rng(1)
+    state = actor.initial_state(1)
+    worst = 0.0
+    for step in range(500):
+        if step == 250:
+            policy.reset()
+            state = actor.initial_state(1)
+        obs = rng.normal(size=48).astype(np.float32)
+        with torch.no_grad():
+            expected, state = actor(torch.from_numpy(obs)[None, None], state)
+        worst = max(worst, float(np.abs(policy.step(obs) - expected.numpy()[0, 0]).max()))
+    assert worst < 1e-5
+
+
+def test_metadata_says_how_to_run_it(exported):
+    _, env, path = exported
+    metadata = PolicyFile(path).metadata
+    assert metadata.command_limits == {"vx": (-1.0, 1.5), "vy": (-0.5, 0.5), "wz": (-1.2, 1.2)}
+    assert np.allclose(metadata.action_offset, env.stand_q)
+    assert metadata.kp == (30.0,) * 12 and metadata.kd == (0.5,) * 12
+    assert metadata.rate_hz == 200.0
+    assert metadata.actuator["delta_kp"] == pytest.approx(-0.706)

@@ -1,0 +1,119 @@
+"""The learner against closed form."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_description import symmetry  # noqa: E402
+from quadvel_training.networks import Gaussian, Mlp, Recurrent  # noqa: E402
+from quadvel_training.ppo import Ppo, PpoConfig, Rollout, select  # noqa: E402
+from quadvel_training.teacher import torch_mirror  # noqa: E402
+
+MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
+
+
+def rollout(reward, ended=None, cut=None, mask=None, t=6, n=1, network=None):
+    zeros = torch.zeros(t, n)
+    state = network.initial_state(n) if network else None
+    return Rollout(
+        obs=torch.randn(t, n, 48),
+        critic_obs=torch.zeros(t, n, 5),
+        action=torch.zeros(t, n, 12),
+        mean=torch.zeros(t, n, 12),
+        offset=torch.zeros(t, n, 12),
+        reward=zeros + torch.as_tensor(reward, dtype=torch.float32),
+        ended=zeros if ended is None else ended,
+        cut=zeros if cut is None else cut,
+        mask=torch.ones(t, n) if mask is None else mask,
+        last_critic_obs=torch.zeros(n, 5),
+        state=state,
+        mirrored_state=state,
+    )
+
+
+class ConstantCritic(torch.nn.Module):
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        self.value = torch.nn.Parameter(torch.tensor(value))
+
+    def forward(self, x):
+        return self.value.expand(*x.shape[:-1], 1), None
+
+
+def learner(critic_value=2.0, network=None, **config):
+    actor = Gaussian(network or Mlp(48, 12), 12, 0.3)
+    return Ppo(actor, ConstantCritic(critic_value), PpoConfig(**config), MIRROR_OBS, MIRROR_ACTION)
+
+
+def test_advantage_is_the_discounted_sum_of_temporal_differences():
+    ppo = learner(discount=0.9, gae=0.8)
+    advantage, target = ppo.advantages(rollout(1.0))
+    delta = 1.0 + 0.9 * 2.0 - 2.0
+    expected = [sum((0.9 * 0.8) ** k * delta for k in range(6 - i)) for i in range(6)]
+    assert advantage[:, 0].tolist() == pytest.approx(expected, rel=1e-5)
+    assert target[:, 0].tolist() == pytest.approx([e + 2.0 for e in expected], rel=1e-5)
+
+
+def test_a_fall_ends_the_future_and_a_timeout_does_not():
+    last = torch.zeros(6, 1)
+    last[5] = 1.0
+    fell, _ = learner(discount=0.9).advantages(rollout(1.0, ended=last))
+    late, _ = learner(discount=0.9).advantages(rollout(1.0, cut=last))
+    assert fell[5, 0].item() == pytest.approx(1.0 - 2.0)
+    assert late[5, 0].item() == pytest.approx(1.0 + 0.9 * 2.0 - 2.0)
+
+
+def test_masked_samples_have_no_advantage():
+    mask = torch.ones(6, 1)
+    mask[3:] = 0.0
+    advantage, _ = learner().advantages(rollout(1.0, mask=mask))
+    assert (advantage[3:] == 0).all() and (advantage[:3] != 0).all()
+
+
+def test_an_update_makes_the_better_action_likelier():
+    torch.manual_seed(0)
+    ppo = learner(critic_value=0.0, symmetry=0.0, discount=0.0, learning_rate=1e-3)
+    r = rollout(0.0, t=8, n=32)
+    r.action = 0.3 * torch.randn(8, 32, 12)
+    r.reward = r.action[..., 0]
+    before = ppo.actor(r.obs)[0][..., 0].mean()
+    for _ in range(5):
+        ppo.update(r)
+    assert ppo.actor(r.obs)[0][..., 0].mean() > before + 0.02
+
+
+def test_the_symmetry_term_makes_a_recurrent_policy_symmetric():
+    torch.manual_seed(0)
+    network = Recurrent(48, 12, memory=16, hidden=(16,))
+    for parameter in network.body[-1].parameters():
+        parameter.data.mul_(10.0)
+    ppo = learner(network=network, symmetry=1.0, max_learning_rate=3e-3, learning_rate=3e-3, target_kl=1e3)
+    r = rollout(0.0, t=8, n=32, network=network)
+    r.mean = ppo.actor(r.obs, r.state)[0].detach()
+    first = ppo.update(r)["symmetry"]
+    for _ in range(30):
+        last = ppo.update(r)["symmetry"]
+    assert last < 0.2 * first
+
+
+def test_the_mirrored_sequence_of_a_mirrored_memory_is_the_mirror_of_the_past():
+    """Running the mirror of a whole sequence equals carrying the mirrored memory over a cut."""
+    torch.manual_seed(0)
+    network = Recurrent(48, 12, memory=16, hidden=(16,))
+    obs = torch.randn(10, 3, 48)
+    whole, _ = network(MIRROR_OBS(obs), network.initial_state(3))
+    _, memory = network(MIRROR_OBS(obs[:6]), network.initial_state(3))
+    rest, _ = network(MIRROR_OBS(obs[6:, [0, 2]]), select(memory, torch.tensor([0, 2])))
+    assert torch.allclose(rest, whole[6:, [0, 2]], atol=1e-6)
+
+
+def test_smoothness_is_the_mean_norm_of_the_second_difference():
+    torch.manual_seed(0)
+    ppo = learner(epochs=1, mini_batches=1)
+    r = rollout(0.0, t=5, n=4)
+    mean = ppo.actor(r.obs)[0].detach().numpy()
+    expected = np.linalg.norm(np.diff(mean, n=2, axis=0), axis=-1).mean()
+    assert ppo.update(r)["smoothness"] == pytest.approx(expected, rel=1e-4)

@@ -1,0 +1,111 @@
+"""`python -m quadvel_training`: the stages of training, each resumable, and what makes policy files of them."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated, Any
+
+import attrs
+import cattrs
+import torch
+import typer
+import yaml
+
+from . import crl, distill, estimator, loop, student, teacher
+
+app = typer.Typer(
+    no_args_is_help=True,
+    help="Train quadvel's policy and estimator. The order: teacher, distill, estimator, crl. Every command resumes where "
+    "its run directory stands; Ctrl-C saves.",
+)
+
+Out = Annotated[Path, typer.Option(help="Run directory: checkpoint, TensorBoard curves, ONNX.")]
+Recipe = Annotated[Path | None, typer.Option(help="YAML file whose fields replace the defaults; see training/recipes.")]
+Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
+
+
+def _configured(kind: type[Any], recipe: Path | None, minutes: float | None) -> Any:
+    """A configuration of `kind` from its defaults, the recipe's fields and the command line's budget."""
+    fields = yaml.safe_load(recipe.read_text()) if recipe else {}
+    fields = {key: value for key, value in (fields or {}).items() if key != "stage"}
+    converter = cattrs.Converter(forbid_extra_keys=True)
+    try:
+        config = converter.structure(fields, kind)
+    except cattrs.BaseValidationError as error:
+        raise typer.BadParameter(f"{recipe}: " + "; ".join(cattrs.transform_error(error))) from None
+    if minutes is not None:
+        config = attrs.evolve(config, budget=attrs.evolve(config.budget, minutes=minutes))
+    return config
+
+
+def _actor(path: Path) -> Any:
+    """A recurrent policy from a checkpoint of `distill` or `crl`."""
+    content = loop.load(path)
+    actor = student.new_actor()
+    if "student" in content:
+        actor.load_state_dict(content["student"])
+    else:
+        weights = {k.removeprefix("network."): v for k, v in content["actor"].items() if k.startswith("network.")}
+        actor.load_state_dict(weights)
+    return actor
+
+
+def _recipe(config: Any, run: Any, stage: str) -> dict[str, Any]:
+    return {"stage": stage, "samples": run.samples, "configuration": attrs.asdict(config)}
+
+
+@app.command("teacher")
+def train_teacher(out: Out = Path("out/training/teacher"), recipe: Recipe = None, minutes: Minutes = None) -> None:
+    """Stage 1: the teacher with a clock and the true state."""
+    config = _configured(teacher.TeacherConfig, recipe, minutes)
+    loop.train(teacher.TeacherRun(config), config.budget, out / "teacher.pt")
+
+
+@app.command("distill")
+def train_student(
+    teacher_file: Annotated[Path, typer.Option("--teacher")] = Path("out/training/teacher/teacher.pt"),
+    out: Out = Path("out/training/student"),
+    recipe: Recipe = None,
+    minutes: Minutes = None,
+) -> None:
+    """Stage 2: the recurrent student learns from the teacher."""
+    config = _configured(distill.DistillConfig, recipe, minutes)
+    run = distill.DistillRun(config, teacher_file)
+    loop.train(run, config.budget, out / "student.pt")
+    student.export_policy(run.student, run.env, out / "policy.onnx", _recipe(config, run, "distill"))
+
+
+@app.command("crl")
+def train_crl(
+    start: Annotated[Path | None, typer.Option(help="Checkpoint of a student; without it, random weights.")] = None,
+    out: Out = Path("out/training/crl"),
+    recipe: Recipe = None,
+    minutes: Minutes = None,
+) -> None:
+    """Stage 3: constrained reinforcement learning with the rewards of Table 2."""
+    config = _configured(crl.CrlConfig, recipe, minutes)
+    run = crl.CrlRun(config, _actor(start) if start else None)
+    loop.train(run, config.budget, out / "crl.pt")
+    student.export_policy(run.actor.network, run.env, out / "policy.onnx", _recipe(config, run, "crl"))  # type: ignore[arg-type]
+
+
+@app.command("estimator")
+def train_estimator(
+    policy: Annotated[Path, typer.Option(help="Checkpoint of the policy whose walks it learns on.")] = Path(
+        "out/training/student/student.pt"
+    ),
+    out: Out = Path("out/training/estimator"),
+    recipe: Recipe = None,
+    minutes: Minutes = None,
+) -> None:
+    """The linear-velocity estimator, on the policy's own walks."""
+    config = _configured(estimator.EstimatorConfig, recipe, minutes)
+    run = estimator.EstimatorRun(config, _actor(policy))
+    loop.train(run, config.budget, out / "estimator.pt")
+    run.export(out / "estimator.onnx", _recipe(config, run, "estimator"))
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(os.cpu_count() or 1)
+    app()

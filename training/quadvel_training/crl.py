@@ -1,0 +1,166 @@
+"""Constrained reinforcement learning of the recurrent policy (Section 3.3) with the rewards of Table 2.
+
+Starts from random weights or from a student. Exploration is time-correlated: white noise at 200 Hz is filtered away by
+the soft gains. The symmetry term runs the mirrored sequence from the memory of the mirrored past.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+import numpy as np
+import torch
+
+from quadvel_description import symmetry
+
+from . import student
+from .env import CommandRange, EnvConfig, VelocityEnv
+from .loop import Budget
+from .networks import Gaussian, Mlp, Recurrent
+from .ppo import Ppo, PpoConfig, Rollout
+from .randomisation import Randomisation
+from .rewards import RewardWeights, Table2
+from .teacher import torch_mirror
+
+PRIVILEGED = 8 + 3 + 4 + 1 + 12  # plant, true velocity, contacts, height, torque
+
+
+@attrs.frozen
+class CrlConfig:
+    """One run; a recipe file sets these fields."""
+
+    budget: Budget = Budget(samples=6e7, minutes=600.0)
+    n: int = 512
+    threads: int = 2
+    length: int = 64  # ticks a sequence, 0.32 s
+    std: float = 0.1  # of the exploration, in the network's unit
+    correlation: float = 0.9  # of the exploration from tick to tick
+    critic_first: int = 40  # updates of the critic alone
+    timestep: float = 0.0025
+    seed: int = 3
+    commands: CommandRange = CommandRange()
+    randomisation: Randomisation = Randomisation()
+    rewards: RewardWeights = RewardWeights()
+    ppo: PpoConfig = PpoConfig(
+        discount=0.995,
+        gae=0.98,
+        epochs=2,
+        mini_batches=2,
+        learning_rate=4e-6,
+        max_learning_rate=2e-4,
+        target_kl=0.004,
+        symmetry=0.05,
+        smoothness=0.003,
+        symmetric_share=0.25,
+    )
+
+
+class CrlRun:
+    """Environment, policy, critic and learner."""
+
+    def __init__(self, config: CrlConfig, start: Recurrent | None = None) -> None:
+        self.config = c = config
+        torch.manual_seed(c.seed)
+        env_config = EnvConfig(
+            n=c.n, threads=c.threads, seed=c.seed, timestep=c.timestep, commands=c.commands, randomisation=c.randomisation
+        )
+        self.env = VelocityEnv(env_config)
+        self.rewards = Table2(self.env, c.rewards)
+        self.actor = Gaussian(start or student.new_actor(), 12, c.std)
+        self.actor.log_std.requires_grad_(False)
+        self.critic = Mlp(48 + PRIVILEGED, 1)
+        self.mirror_obs, self.mirror_action = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
+        self.ppo = Ppo(self.actor, self.critic, c.ppo, self.mirror_obs, self.mirror_action)
+        self.map = student.action_map(self.env)
+        self.samples = self.updates = 0
+        self._action = np.zeros((c.n, 12), np.float32)
+        self._noise = np.zeros((c.n, 12), np.float32)
+        network = self.actor.network
+        self._state = network.initial_state(c.n)  # type: ignore[operator]
+        self._mirrored = network.initial_state(self.ppo.mirrored(c.n))  # type: ignore[operator]
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "learner": self.ppo.state(),
+            "samples": self.samples,
+            "updates": self.updates,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint."""
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        self.ppo.restore(state["learner"])
+        self.samples, self.updates = state["samples"], state["updates"]
+
+    def step(self, done: float) -> dict[str, float]:
+        """One rollout, one update."""
+        rollout, seen = self.collect()
+        self.updates += 1
+        return seen | self.ppo.update(rollout, learn_actor=self.updates > self.config.critic_first)
+
+    def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
+        env = self.env
+        true = [env.plants.drawn, env.velocity, env.contact, env.height[:, None], 0.05 * env.torque]
+        return np.concatenate([obs, *true], axis=1).astype(np.float32)
+
+    def collect(self) -> tuple[Rollout, dict[str, float]]:
+        """One sequence of every environment."""
+        c, env = self.config, self.env
+        names = ("obs", "critic_obs", "action", "mean", "offset", "reward", "ended", "cut", "mask")
+        keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        std = self.actor.log_std.exp().numpy()
+        alive = np.ones(c.n, bool)
+        state, start, mirrored_start = self._state, self._state, self._mirrored
+        for _ in range(c.length):
+            obs = student.observe(env, self._action)
+            critic_obs = self._critic_obs(obs)
+            with torch.no_grad():
+                mean, state = self.actor(torch.from_numpy(obs[None]), state)
+            mean = mean[0].numpy()
+            # the draw is a normal step about the decayed noise: spread and offset as the learner sees them
+            offset = np.float32(c.correlation) * self._noise
+            drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
+            self._noise = offset + std * drawn
+            action = mean + self._noise
+            env.tick(self.map.targets(action))
+            reward = self.rewards(action)
+            self._action = action
+            fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
+            for name, value in zip(
+                names, (obs, critic_obs, action, mean, offset, reward, fell, late, alive.copy()), strict=True
+            ):
+                keep[name].append(value)
+            alive &= ~(fell | late)
+        self.samples += c.length * c.n
+        t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
+        last = torch.from_numpy(self._critic_obs(student.observe(env, self._action)))
+        rollout = Rollout(**t, last_critic_obs=last, state=start, mirrored_state=mirrored_start)
+        self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
+        error = env.command[:, :2] - env.velocity[:, :2]
+        seconds = c.length * c.n * 0.005
+        return rollout, {
+            "reward": float(t["reward"].mean()),
+            "error_xy": float(np.hypot(*error.T).mean()),
+            "falls_per_minute": float(60 * t["ended"].sum() / seconds),
+        }
+
+    def _advance_memories(self, state: Any, obs: torch.Tensor, over: np.ndarray) -> None:
+        """Carry the memory and, for the sequences that the symmetry term may see, the mirrored memory."""
+        seen = self._mirrored[0].shape[1]
+        with torch.no_grad():
+            _, mirrored = self.actor(self.mirror_obs(obs[:, :seen]), self._mirrored)
+        self._state, self._mirrored = state, mirrored
+        if len(over):
+            self.env.reset(over)
+            self.rewards.reset(over)
+            self._action[over] = self._noise[over] = 0.0
+            self._state, self._mirrored = (tuple(m.clone() for m in pair) for pair in (state, mirrored))
+            for memory in self._state:
+                memory[:, over] = 0.0
+            for memory in self._mirrored:
+                memory[:, over[over < seen]] = 0.0

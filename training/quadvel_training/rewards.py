@@ -1,0 +1,82 @@
+"""The rewards of Table 2, a tick. Where the printed formula cannot be meant, the reading is listed in docs/decisions/0004."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+
+from .env import TICK, VelocityEnv
+
+HEAT = 0.2  # k_r of the energy term, W/(N m)^2
+
+
+@attrs.frozen
+class RewardWeights:
+    """Coefficients of Table 2; `action_smoothness` is Section 4.4's, for the recipes without constraints."""
+
+    linear_tracking: float = 0.5
+    angular_tracking: float = 0.2
+    orientation: float = 0.1
+    torso_stability: float = 0.1
+    joint_velocity: float = 1.0e-4
+    joint_acceleration: float = 1.5e-8
+    slippage: float = 0.1
+    energy: float = 3e-4
+    velocity_compensation: float = 0.3
+    alive: float = 0.8
+    foot_lift_time: float = 1.0
+    foot_clearance: float = 3.0
+    action_smoothness: float = 0.0
+
+
+class Table2:
+    """The rewards of a batch of environments; remembers what needs a past."""
+
+    def __init__(self, env: VelocityEnv, weights: RewardWeights) -> None:
+        self.env, self.weights = env, weights
+        n = env.config.n
+        self._dq = np.zeros((n, 12))
+        self._air_time = np.zeros((n, 4))
+        self._actions = np.zeros((2, n, 12))
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the past of `ids`."""
+        self._dq[ids], self._air_time[ids], self._actions[:, ids] = self.env.dq[ids], 0.0, 0.0
+
+    def terms(self, action: np.ndarray) -> dict[str, np.ndarray]:
+        """Each term of the state after a tick with `action` (n, 12), unweighted, (n,)."""
+        env, c = self.env, self.env.command
+        v, w = env.velocity, env.angular_velocity
+        walking = c[:, 3] < 0.5
+        decay = np.maximum(1.0 - np.sum(c[:, :2] ** 2, axis=1), 0.0) * walking
+        landed = env.contact & (self._air_time > 0.0)
+        lift_time = np.minimum(self._air_time - 0.2, 0.5) * landed
+        clearance = np.clip(env.clearance, 0.0, 0.05) * ~env.contact
+        acceleration = (env.dq - self._dq) / TICK
+        along = np.clip(v[:, :2] * np.sign(c[:, :2]), 0.0, np.abs(c[:, :2]))
+        power = np.maximum(HEAT * env.torque**2 + env.torque * env.dq, 0.0)
+        bend = action - 2 * self._actions[0] + self._actions[1]
+        terms = {
+            "linear_tracking": np.exp(-np.sum((c[:, :2] - v[:, :2]) ** 2, axis=1)),
+            "angular_tracking": np.exp(-np.abs(c[:, 2] - w[:, 2]) ** 2),
+            "orientation": -np.abs(env.roll_pitch).sum(axis=1),
+            "torso_stability": -np.hypot(w[:, 0], w[:, 1]) - np.abs(v[:, 2]),
+            "joint_velocity": -np.sum(env.dq**2, axis=1),
+            "joint_acceleration": -np.sum(acceleration**2, axis=1),
+            "slippage": -np.sum(np.sum(env.foot_velocity[..., :2] ** 2, axis=-1) * env.contact, axis=1),
+            "energy": -power.sum(axis=1),
+            "velocity_compensation": np.hypot(along[:, 0], along[:, 1]),
+            "alive": np.ones(len(c)),
+            "foot_lift_time": lift_time.sum(axis=1) * decay,
+            "foot_clearance": clearance.sum(axis=1) * decay,
+            "action_smoothness": -np.abs(bend).sum(axis=1),
+        }
+        self._air_time = np.where(env.contact, 0.0, self._air_time + TICK)
+        self._dq = env.dq
+        self._actions = np.stack([action, self._actions[0]])
+        return terms
+
+    def __call__(self, action: np.ndarray) -> np.ndarray:
+        """The weighted sum, (n,)."""
+        terms = self.terms(action)
+        return np.sum([getattr(self.weights, name) * value for name, value in terms.items()], axis=0)
