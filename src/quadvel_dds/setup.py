@@ -11,5 +11,5 @@ setup(
         (f"share/{package}", ["package.xml"]),
     ],
     license="Apache-2.0",
-    description="The embedded default middleware: the part of rclpy that quadvel's nodes use, over Cyclone DDS.",
+    description="The part of rclpy that quadvel's nodes use, over Cyclone DDS: the default without ROS 2.",
 )

@@ -1,4 +1,4 @@
-"""What is offered has the names, parameters and defaults of rclpy 7.1.3 (Jazzy); the rest says that it is not offered."""
+"""What is offered has the names, parameters and defaults of rclpy 7.1.3 (Jazzy), or it says so."""
 
 import importlib
 import inspect
@@ -34,7 +34,9 @@ def parameters_of(function: object) -> str:
 
 
 def functions() -> list[tuple[str, str, str]]:
-    return [(module, name, s) for module, names in API.items() for name, s in names.items() if isinstance(s, str)]
+    return [
+        (module, name, s) for module, names in API.items() for name, s in names.items() if isinstance(s, str)
+    ]
 
 
 def members() -> list[tuple[str, str, str, str]]:
@@ -92,6 +94,6 @@ def test_what_is_not_offered_says_so() -> None:
     with pytest.raises(UnsupportedError, match=r"rclpy\.action is not offered"):
         importlib.import_module("rclpy.action")
     with pytest.raises(UnsupportedError, match=r"rclpy\.spin_some is not offered"):
-        rclpy.spin_some
+        _ = rclpy.spin_some
     with pytest.raises(UnsupportedError, match=r"rclpy\.qos\.qos_check_compatible"):
         from rclpy.qos import qos_check_compatible  # noqa: F401

@@ -57,7 +57,7 @@ class RosArguments:
 
 
 def parse(args: Sequence[str]) -> RosArguments:
-    """Read a command line. Raises InvalidROSArgsError with the argument at fault, or what was wrong in its file."""
+    """Read a command line. Raises InvalidROSArgsError that names what is at fault."""
     found = RosArguments()
     within = False
     arguments = iter(args)
@@ -145,13 +145,13 @@ def check_value(where: str, value: Any) -> Any:
     types = {type(item) for item in value} if isinstance(value, list) else {type(value)}
     if len(types) > 1 or not types <= {bool, int, float, str}:
         raise InvalidROSArgsError(
-            f"{where}: found {value!r}, expected a bool, an integer, a float, a string or a list of one of these"
+            f"{where}: found {value!r}, expected a bool, integer, float, string or a list of one of these"
         )
     return value
 
 
 def read_parameter_file(path: Path) -> list[ParameterOverride]:
-    """Overrides of a YAML parameter file. Raises InvalidROSArgsError that names the file and the key at fault."""
+    """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
     try:
         document = yaml.load(path.read_text(), _Loader)
     except OSError as error:
@@ -168,7 +168,7 @@ def _walk_nodes(path: Path, prefix: str, tree: Any) -> Iterable[ParameterOverrid
     if not isinstance(tree, dict):
         where = f" under '{prefix}'" if prefix else ""
         raise InvalidROSArgsError(
-            f"parameter file '{path}': found {tree!r}{where}, expected node names with '{SCOPE_KEY}' below them"
+            f"parameter file '{path}': found {tree!r}{where}, expected node names with '{SCOPE_KEY}' below"
         )
     for key, branch in tree.items():
         if key != SCOPE_KEY:

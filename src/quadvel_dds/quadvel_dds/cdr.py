@@ -1,8 +1,9 @@
 """Serialisers and deserialisers in XCDR1 (little endian), one pair of compiled functions per message type.
 
-The code is generated, because a message of the control loop is written and read up to a thousand times a second:
-runs of scalars, nested ones included, become one `struct` call, numeric arrays one copy. Field descriptions are those of
-`rosbags`. What a message class looks like is decided in `messages`; this module knows only its slots (`_name`).
+The code is generated, because a message of the control loop is written and read up to a thousand times a
+second: runs of scalars, nested ones included, become one `struct` call, numeric arrays one copy. Field
+descriptions are those of `rosbags`. What a message class looks like is decided in `messages`; this module
+knows only its slots (`_name`).
 """
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from rosbags.interfaces import Nodetype
 
 HEADER = b"\x00\x01\x00\x00"  # encapsulation: plain CDR, little endian, no options
 FORMATS = {
-    "bool": "?", "byte": "c", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i",
-    "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+    "bool": "?", "byte": "c", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
 NOT_NUMERIC = ("bool", "byte", "string")
 
@@ -35,7 +36,7 @@ def is_numeric(description: Any) -> bool:
 
 
 class _Generator:
-    """Walks the fields of a type in order, knows what is certain about the alignment, and collects scalar runs.
+    """Walks the fields of a type in order, knows what is sure about the alignment, and collects scalar runs.
 
     The position is known to be `remainder` modulo `modulus`; alignment is relative to the end of the header.
     """
@@ -145,7 +146,7 @@ class _Generator:
 
 
 class _Writer(_Generator):
-    """Generates `write(m, b)`, which appends message `m` to bytearray `b`; `o` is where the content starts."""
+    """Generates `write(m, b)`: append message `m` to bytearray `b`, whose content starts at `o`."""
 
     def pad(self, size: int) -> None:
         self.emit(f"b += bytes((o - len(b)) % {size})")
@@ -201,7 +202,7 @@ class _Writer(_Generator):
 
 
 class _Reader(_Generator):
-    """Generates `read(d, p)`, which returns the message that starts at `p` in bytes `d`, whose content starts at `o`."""
+    """Generates `read(d, p)`: the message at position `p` of bytes `d`, whose content starts at `o`."""
 
     def pad(self, size: int) -> None:
         self.emit(f"p += (o - p) % {size}")
@@ -276,7 +277,7 @@ def make_writer(typename: str, describe: Describe) -> Callable[..., None]:
 
 
 def make_reader(typename: str, describe: Describe) -> Callable[..., Any]:
-    """Function `read(d, p=4, o=4)` for a type, see `_Reader`. Raises struct.error or ValueError on malformed data."""
+    """Function `read(d, p=4, o=4)` for a type, see `_Reader`; struct.error or ValueError on bad data."""
     generator = _Reader(describe)
     variable = generator.local()
     generator.emit(f"{variable} = new({generator.constant('c', describe(typename)[0])})")

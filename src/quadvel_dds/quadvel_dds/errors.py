@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NoReturn
 
 
@@ -31,11 +32,12 @@ def refuse_options(where: str, **options: Any) -> None:
             raise UnsupportedError(f"{where}: option '{name}'")
 
 
-def module_getattr(module: str) -> Callable[[str], NoReturn]:
-    """`__getattr__` of a module: a public name that is not there is said to be unsupported."""
+def module_getattr(module: str, folder: Path | None = None) -> Callable[[str], NoReturn]:
+    """`__getattr__` of a module (of a package, with its `folder`): a public name not there is unsupported."""
 
     def getattr_(name: str) -> NoReturn:
-        if name.startswith("_"):
+        is_submodule = folder is not None and (folder / f"{name}.py").exists()
+        if name.startswith("_") or is_submodule:
             raise AttributeError(f"module '{module}' has no attribute '{name}'")
         raise UnsupportedError(f"{module}.{name}")
 

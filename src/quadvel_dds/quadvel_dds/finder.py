@@ -72,8 +72,8 @@ def is_installed() -> bool:
 def install() -> bool:
     """Make `rclpy` and the message packages resolve to the embedded middleware; returns whether they do.
 
-    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Raises RuntimeError if that
-    rclpy is imported already.
+    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Raises
+    RuntimeError if that rclpy is imported already.
     """
     if is_installed():
         return True

@@ -1,7 +1,7 @@
 """Descriptions of our messages for Cyclone DDS.
 
-Cyclone checks incoming samples against them, so that malformed data never arrives; the content itself is written and read in
-`cdr`.
+Cyclone checks incoming samples against them, so that malformed data never arrives; the content itself is
+written and read in `cdr`.
 """
 
 from __future__ import annotations
@@ -9,18 +9,20 @@ from __future__ import annotations
 from functools import cache
 from typing import Any
 
-from cyclonedds.idl import IdlStruct, make_idl_struct, types
+from cyclonedds.idl import IdlStruct, make_idl_struct
+from cyclonedds.idl import types as idl_types
 from rosbags.interfaces import Nodetype
 
 from quadvel_dds import messages
 
+types: Any = idl_types  # its subscripts are made at run time
 BASE = {"bool": bool, "char": types.uint8, "string": str}
 REQUEST_HEADER = {"client_guid_": types.uint64, "sequence_number_": types.int64}
 
 
 @cache
 def struct(typename: str) -> type[IdlStruct]:
-    """Structure of a message, or of a service's request or response with the header of rmw_cyclonedds in front."""
+    """Structure of a message; of a service's half, with the header of rmw_cyclonedds in front."""
     fields = {f"{name}_": _field(description) for name, description in messages.describe(typename)[1]}
     if "/srv/" in typename:
         fields = REQUEST_HEADER | fields

@@ -1,16 +1,16 @@
 """Message and service classes that look and behave like those which ROS 2 generates for Python.
 
-Definitions come from `rosbags` (Jazzy) and from the .msg and .srv files of `quadvel_msgs` and of `definitions/`. A class is
-made when it is first asked for. As in ROS 2, fields are not checked on assignment unless the environment variable
-ROS_PYTHON_CHECK_FIELDS is 1 (then a wrong type, range or length raises AssertionError); a value that cannot be sent raises
-ValueError when it is published, where the generated code of ROS 2 would cut it off or read past its end.
+Definitions come from `rosbags` (Jazzy), from `definitions` and from the files of `quadvel_msgs`; a class is
+made when it is first asked for. As in ROS 2, fields are not checked on assignment unless the environment
+variable ROS_PYTHON_CHECK_FIELDS is 1 (then a wrong type, range or length raises AssertionError). A value that
+cannot be sent raises ValueError when it is published, where ROS 2 would cut it off or read past its end.
 """
 
 from __future__ import annotations
 
 import array
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar
@@ -37,7 +37,7 @@ Describe = tuple[type, cdr.Fields]
 
 
 def _load_store() -> Any:
-    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it were a message."""
+    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for file in sorted(OWN_FILES.glob("msg/*.msg")):
         store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
@@ -60,14 +60,14 @@ def is_interface_package(package: str) -> bool:
 
 
 def names_in(package: str, kind: str) -> list[str]:
-    """Names of the messages ("msg") or of the services with their requests and responses ("srv") of a package."""
+    """Names of a package's messages ("msg"), or of its services with their requests and responses ("srv")."""
     prefix = f"{package}/{kind}/"
     names = {name.removeprefix(prefix) for name in STORE.fielddefs if name.startswith(prefix)}
     return sorted(names | {name.removesuffix("_Request") for name in names})
 
 
 class Message:
-    """Base of all message classes: comparison, text form and what the generated classes of ROS 2 tell about themselves."""
+    """Base of all message classes: comparison, text form, and what those of ROS 2 tell about themselves."""
 
     __slots__: ClassVar[tuple[str, ...]] = ()
     TYPENAME: ClassVar[str]
@@ -136,8 +136,10 @@ def reader(typename: str) -> Callable[..., Any]:
 
 
 def serialize(message: Message, prefix: bytes = b"") -> bytearray:
-    """CDR bytes of a message, encapsulation header included, padded to a multiple of four; `prefix` goes in front of the
-    content (the header of a service call). Raises ValueError that names the field which cannot be sent."""
+    """CDR bytes of a message, encapsulation header included, padded to a multiple of four.
+
+    `prefix` goes in front of the content: the header of a service call. Raises ValueError that says why.
+    """
     data = bytearray(cdr.HEADER + prefix)
     try:
         writer(message.TYPENAME)(message, data)
@@ -269,7 +271,7 @@ def _checked(field: str, description: Any) -> Callable[[Any], Any]:
 
 
 def check_message(message: Message) -> None:
-    """Raise AssertionError that names the first field, nested ones included, whose value does not fit its type."""
+    """Raise AssertionError that names the first field, nested ones included, whose value does not fit."""
     for field, description in STORE.fielddefs[message.TYPENAME][1]:
         value = getattr(message, f"_{field}")
         check_field(field, description, value)
@@ -279,7 +281,7 @@ def check_message(message: Message) -> None:
 
 
 def check_field(field: str, description: Any, value: Any) -> None:
-    """Raise AssertionError if a value does not fit the type of a field, as the generated code of ROS 2 does."""
+    """Raise AssertionError if a value does not fit the type of a field, as generated code of ROS 2 does."""
     kind, detail = description
     if kind == Nodetype.NAME:
         expected = f"a message of type {detail}"
@@ -289,19 +291,22 @@ def check_field(field: str, description: Any, value: Any) -> None:
         good = _fits(detail[0], value)
     else:
         item, count = detail
-        expected = f"{'' if not count else 'at most ' if kind == Nodetype.SEQUENCE else ''}{count or 'any number of'} values"
-        expected += f" of type {item[1] if item[0] == Nodetype.NAME else item[1][0]}"
+        limit = f"at most {count}" if kind == Nodetype.SEQUENCE else str(count)
+        type_ = item[1] if item[0] == Nodetype.NAME else item[1][0]
+        expected = f"{limit if count else 'any number of'} values of type {type_}"
         good = _items_fit(kind, item, count, value)
     assert good, f"field '{field}' must be {expected}, found {value!r}"
 
 
 def _items_fit(kind: int, item: Any, count: int, value: Any) -> bool:
-    if isinstance(value, str) or not hasattr(value, "__len__"):
+    """As ROS 2 has it, a NumPy array fits an array of its own type, but no sequence."""
+    is_block = isinstance(value, np.ndarray) and kind == Nodetype.ARRAY and item[0] == Nodetype.BASE
+    if isinstance(value, str) or not (is_block or isinstance(value, (Sequence, Set, array.array))):
         return False
     if count and (len(value) != count if kind == Nodetype.ARRAY else len(value) > count):
         return False
-    if isinstance(value, np.ndarray) and kind == Nodetype.ARRAY and item[0] == Nodetype.BASE:
-        return value.ndim == 1 and value.dtype == np.dtype(cdr.FORMATS[item[1][0]])
+    if is_block:
+        return bool(value.ndim == 1 and value.dtype == np.dtype(cdr.FORMATS[item[1][0]]))
     if item[0] == Nodetype.NAME:
         return all(isinstance(v, message_class(item[1])) for v in value)
     return all(_fits(item[1][0], v) for v in value)

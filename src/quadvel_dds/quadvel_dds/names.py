@@ -38,9 +38,9 @@ def expand(name: str, node: str, namespace: str) -> str:
 def remap(full_name: str, node: str, namespace: str, rules: Iterable[Rule]) -> str:
     """The name after the first rule that fits, both sides of which are expanded as names of this node."""
     for rule in rules:
-        if rule.node in (None, node) and not rule.name.startswith("__"):
-            if expand(rule.name, node, namespace) == full_name:
-                return expand(rule.value, node, namespace)
+        applies = rule.node in (None, node) and not rule.name.startswith("__")
+        if applies and expand(rule.name, node, namespace) == full_name:
+            return expand(rule.value, node, namespace)
     return full_name
 
 

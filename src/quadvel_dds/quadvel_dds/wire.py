@@ -1,8 +1,9 @@
 """DDS as ROS 2 uses it: names, types, QoS and user data on the wire, over Cyclone DDS.
 
-Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`; services are the pair `rq/NAMERequest`, `rr/NAMEReply`, each sample led
-by the request header of rmw_cyclonedds (a 64-bit client id and a 64-bit sequence number). rmw_fastrtps matches replies by the
-RTPS sample identity instead, so topics work with both, service calls with rmw_cyclonedds alone.
+Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`; services are the pair `rq/NAMERequest`,
+`rr/NAMEReply`, each sample led by the request header of rmw_cyclonedds (a 64-bit client id and a 64-bit
+sequence number). rmw_fastrtps matches replies by the RTPS sample identity instead, so topics work with both,
+service calls with rmw_cyclonedds alone.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _domains: dict[int, Domain] = {}
 
 
 def domain_configuration() -> str:
-    """Cyclone's configuration for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
+    """Cyclone's settings for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
     peers = [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     if reach not in ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF"):
@@ -68,7 +69,7 @@ def domain_configuration() -> str:
 
 
 def delete(entity: Entity) -> None:
-    """Delete a DDS entity now. Cyclone's Python layer offers this as the finaliser alone; a second call does nothing."""
+    """Delete a DDS entity now. Cyclone offers this in its finaliser alone; a second call is harmless."""
     entity.__del__()
 
 
@@ -218,7 +219,7 @@ class WaitSet:
 
 
 class CallEndpoint:
-    """A client's or a service's pair of writer and reader; every sample starts with (client id, sequence number)."""
+    """A client's or a service's writer and reader; every sample starts with (client id, sequence number)."""
 
     def __init__(
         self, participant: Participant, typename: str, name: str, profile: Any, serves: bool
@@ -237,7 +238,7 @@ class CallEndpoint:
         self.writer.write(messages.serialize(request, REQUEST_HEADER.pack(self.client_id, number)))
 
     def answer(self, response: Any, request_id: tuple[int, int], client: Any, timeout: float = 0.1) -> bool:
-        """Answer once the client's reader is matched (an answer sent earlier would be lost); False if it never is."""
+        """Answer once the client's reader is matched (before, it would be lost); False if it never is."""
         deadline = time.monotonic() + timeout
         while not self.writer.matches_participant(client.participant_key):
             if time.monotonic() > deadline:

@@ -1,10 +1,11 @@
-"""The part of rclpy that quadvel's nodes use, over Cyclone DDS; imported as `rclpy` after `quadvel_dds.install()`.
+"""The part of rclpy that our nodes use, over Cyclone DDS; imported as `rclpy` after `quadvel_dds.install()`.
 
-Names, parameters and defaults are those of rclpy 7.1 (Jazzy). What is not here raises `quadvel_dds.UnsupportedError`.
+Names, parameters and defaults are those of rclpy 7.1 (Jazzy). What is not here raises UnsupportedError.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 if __name__ != "rclpy":
@@ -12,36 +13,32 @@ if __name__ != "rclpy":
 
 from quadvel_dds.errors import module_getattr
 
-from . import (
-    callback_groups,
-    client,
-    clock,
-    context,
-    duration,
-    exceptions,
-    executors,
-    logging,
-    node,
-    parameter,
-    publisher,
-    qos,
-    service,
-    signals,
-    subscription,
-    task,
-    time,
-    timer,
-    utilities,
-)
+from . import signals, utilities
 from .context import Context
 from .executors import Executor, SingleThreadedExecutor
 from .node import Node
 from .parameter import Parameter
-from .signals import SignalHandlerOptions
 from .task import Future
 from .utilities import get_default_context, get_rmw_implementation_identifier, ok
 
-__getattr__ = module_getattr(__name__)
+__all__ = [
+    "Context",
+    "Future",
+    "Node",
+    "Parameter",
+    "create_node",
+    "get_default_context",
+    "get_global_executor",
+    "get_rmw_implementation_identifier",
+    "init",
+    "ok",
+    "shutdown",
+    "spin",
+    "spin_once",
+    "spin_until_future_complete",
+    "try_shutdown",
+]
+__getattr__ = module_getattr(__name__, Path(__file__).parent)
 _global_executor: Executor | None = None
 
 
@@ -50,13 +47,14 @@ def init(
     args: list[str] | None = None,
     context: Context | None = None,
     domain_id: int | None = None,
-    signal_handler_options: SignalHandlerOptions | None = None,
+    signal_handler_options: signals.SignalHandlerOptions | None = None,
 ) -> None:
-    """Start communication: read the arguments (sys.argv if None), join the domain, take over SIGINT and SIGTERM."""
+    """Start communication: read the arguments (sys.argv if None), take over SIGINT and SIGTERM."""
     default = get_default_context()
     context = context or default
     if signal_handler_options is None:
-        signal_handler_options = SignalHandlerOptions.ALL if context is default else SignalHandlerOptions.NO
+        options = signals.SignalHandlerOptions
+        signal_handler_options = options.ALL if context is default else options.NO
     context.init(args, domain_id=domain_id)
     signals.install_signal_handlers(signal_handler_options)
 

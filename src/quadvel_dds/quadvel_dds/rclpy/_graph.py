@@ -1,15 +1,17 @@
-"""What a process tells about its nodes on `ros_discovery_info`, so that `ros2 node list` and `ros2 node info` know them."""
+"""What a process tells about its nodes on `ros_discovery_info`, so that `ros2 node list` knows them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from typing import Any
 
-from rmw_dds_common.msg import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
-
 from quadvel_dds import messages, wire
 
 from .qos import DurabilityPolicy, QoSProfile
+
+Gid: Any = messages.message_class("rmw_dds_common/msg/Gid")
+NodeEntitiesInfo: Any = messages.message_class("rmw_dds_common/msg/NodeEntitiesInfo")
+ParticipantEntitiesInfo: Any = messages.message_class("rmw_dds_common/msg/ParticipantEntitiesInfo")
 
 
 class GraphAnnouncer:
@@ -27,7 +29,10 @@ class GraphAnnouncer:
 
 def _node_info(node: Any) -> Any:
     calls = [entity._endpoint for entity in (*node.clients, *node.services)]
-    readers = [*(subscription._reader for subscription in node.subscriptions), *(call.reader for call in calls)]
+    readers = [
+        *(subscription._reader for subscription in node.subscriptions),
+        *(call.reader for call in calls),
+    ]
     writers = [*(publisher._writer for publisher in node.publishers), *(call.writer for call in calls)]
     return NodeEntitiesInfo(
         node_namespace=node.get_namespace(),

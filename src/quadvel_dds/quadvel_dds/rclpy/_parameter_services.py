@@ -32,7 +32,9 @@ class ParameterServices:
             (SetParameters, "set_parameters"),
             (SetParametersAtomically, "set_parameters_atomically"),
         ):
-            node.create_service(type_, f"~/{name}", getattr(self, f"_{name}"), qos_profile=qos_profile_parameters)
+            node.create_service(
+                type_, f"~/{name}", getattr(self, f"_{name}"), qos_profile=qos_profile_parameters
+            )
 
     def _describe_parameters(self, request: Any, response: Any) -> Any:
         response.descriptors = self._of_each(self._node.describe_parameter, request.names)

@@ -27,8 +27,10 @@ PostSet = Callable[[list[Parameter]], None]
 
 
 class ParameterMixin:
-    """Keeps `_parameters` and `_descriptors` by name. `_parameter_overrides` holds what the command line and parameter
-    files give this node, whether or not it declares it."""
+    """Keeps `_parameters` and `_descriptors` by name.
+
+    `_parameter_overrides` holds what the command line and parameter files give this node, declared or not.
+    """
 
     PARAM_REL_TOL = 1e-6
 
@@ -44,10 +46,11 @@ class ParameterMixin:
     def declare_parameter(
         self, name: str, value: Any = None, descriptor: Any = None, ignore_override: bool = False
     ) -> Parameter:
-        """Declare a parameter with its default, or with its type alone (`Parameter.Type`), which must then be overridden.
+        """Declare a parameter with its default, or with its type alone if it must be overridden.
 
-        Raises ParameterAlreadyDeclaredException, InvalidParameterException on a bad name, InvalidParameterTypeException on an
-        override of another type, and InvalidParameterValueException if the value is out of range or refused by a callback.
+        Raises ParameterAlreadyDeclaredException, InvalidParameterException on a bad name,
+        InvalidParameterTypeException on an override of another type, and InvalidParameterValueException if
+        the value is out of range or refused by a callback.
         """
         if name in self._parameters:
             raise ParameterAlreadyDeclaredException(name)
@@ -82,9 +85,9 @@ class ParameterMixin:
     def _require_valid(self, parameter: Parameter) -> None:
         expected = Parameter.Type(self._descriptors[parameter.name].type)
         dynamic = self._descriptors[parameter.name].dynamic_typing
-        if not dynamic and parameter.type_ != expected and expected != Parameter.Type.NOT_SET:
-            if not _is_empty_list(parameter, expected):
-                raise InvalidParameterTypeException(parameter, expected)
+        fits = parameter.type_ == expected or _is_empty_list(parameter, expected)
+        if not dynamic and not fits and expected != Parameter.Type.NOT_SET:
+            raise InvalidParameterTypeException(parameter, expected)
         reason = range_fault(self._descriptors[parameter.name], parameter) or self._refusal([parameter])
         if reason is not None:
             raise InvalidParameterValueException(parameter.name, parameter.value, reason)
@@ -154,10 +157,17 @@ class ParameterMixin:
         return [self.describe_parameter(name) for name in names]
 
     def list_parameters(self, prefixes: list[str], depth: int) -> Any:
-        """Names below any of `prefixes` (all, if there are none), at most `depth` parts below (0: any), and their prefixes."""
+        """Names below `prefixes` (none: all), at most `depth` parts below (0: any), and their prefixes."""
         result = ListParametersResult()
         for name in self._parameters:
-            below = [name, *(name[len(p) + 1 :] for p in prefixes if name.startswith(f"{p}{PARAMETER_SEPARATOR_STRING}"))]
+            below = [
+                name,
+                *(
+                    name[len(p) + 1 :]
+                    for p in prefixes
+                    if name.startswith(f"{p}{PARAMETER_SEPARATOR_STRING}")
+                ),
+            ]
             candidates = below[1:] if prefixes else below
             is_near = any(not depth or n.count(PARAMETER_SEPARATOR_STRING) < depth for n in candidates)
             if is_near or name in prefixes:

@@ -39,7 +39,7 @@ class Client:
         self._lock = Lock()
 
     def call(self, request: Any, timeout_sec: float | None = None) -> Any:
-        """Call and wait for the answer, which another thread's executor must take; None after the time-out."""
+        """Call and wait for the answer, which another thread takes by spinning; None after the time-out."""
         answered = Event()
         future = self.call_async(request)
         future.add_done_callback(lambda _: answered.set())

@@ -1,7 +1,7 @@
 """Executors: they wait for data and deadlines, and run callbacks.
 
-The wait is one DDS wait set with the next timer deadline as its time-out: nothing is polled. Ready timers come before data,
-and each ready entity gets one callback before any gets a second, as in rclpy.
+The wait is one DDS wait set with the next timer deadline as its time-out: nothing is polled. Ready timers
+come before data, and each ready entity gets one callback before any gets a second, as in rclpy.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Executor:
         raise NotImplementedError
 
     def _next_work(self, deadline_ns: int, until: Callable[[], bool]) -> Work | None:
-        """The next callback, its callback group entered; None at the deadline, after shutdown, or once `until` holds.
+        """The next callback, its group entered; None at the deadline, after shutdown, or once `until` holds.
 
         Raises ExternalShutdownException if the context is shut down.
         """

@@ -32,7 +32,7 @@ def get_logger_effective_level(name: str) -> LoggingSeverity:
 
 
 def set_levels(texts: dict[str, str]) -> None:
-    """Levels from the command line, by logger name ("" is the default). Raises ValueError on an unknown one."""
+    """Set levels given by name, by logger name ("" is the default). Raises ValueError on an unknown one."""
     for name, text in texts.items():
         if text.upper() not in LoggingSeverity.__members__:
             expected = ", ".join(member.lower() for member in LoggingSeverity.__members__)

@@ -220,8 +220,8 @@ class Node(ParameterMixin):
         self._wake_executor()
 
     def _wake_executor(self) -> None:
-        if self.executor is not None:
-            self.executor.wake()
+        if (executor := self.executor) is not None:
+            executor.wake()
 
     def _removed(self, entity: Any, entities: list[Any]) -> bool:
         if entity not in entities:
@@ -380,8 +380,9 @@ class Node(ParameterMixin):
 
     def destroy_node(self) -> None:
         """Destroy the node and all that was created under it. A second call does nothing."""
-        if self.executor is not None:
-            self.executor.remove_node(self)
+        # Looked up once: the executor is held by a weak reference, and may go at any time.
+        if (executor := self.executor) is not None:
+            executor.remove_node(self)
         rcutils_logger.sinks.pop(self._logger.name, None)
         for entities in (self._timers, self._subscriptions, self._services, self._clients, self._publishers):
             for entity in entities:
@@ -413,12 +414,25 @@ class Node(ParameterMixin):
 
 
 for _name in (
-    "add_waitable, count_clients, count_services, create_guard_condition, destroy_guard_condition, "
-    "get_client_names_and_types_by_node, get_fully_qualified_node_names, get_node_names, get_node_names_and_namespaces, "
-    "get_node_names_and_namespaces_with_enclaves, get_publisher_names_and_types_by_node, get_publishers_info_by_topic, "
-    "get_service_names_and_types, get_service_names_and_types_by_node, get_subscriber_names_and_types_by_node, "
-    "get_subscriptions_info_by_topic, remove_waitable, wait_for_node"
-).split(", "):
+    "add_waitable",
+    "count_clients",
+    "count_services",
+    "create_guard_condition",
+    "destroy_guard_condition",
+    "get_client_names_and_types_by_node",
+    "get_fully_qualified_node_names",
+    "get_node_names",
+    "get_node_names_and_namespaces",
+    "get_node_names_and_namespaces_with_enclaves",
+    "get_publisher_names_and_types_by_node",
+    "get_publishers_info_by_topic",
+    "get_service_names_and_types",
+    "get_service_names_and_types_by_node",
+    "get_subscriber_names_and_types_by_node",
+    "get_subscriptions_info_by_topic",
+    "remove_waitable",
+    "wait_for_node",
+):
     setattr(Node, _name, unsupported(f"Node.{_name}"))
 for _name in ("guards", "handle", "waitables"):
     setattr(Node, _name, property(unsupported(f"Node.{_name}")))

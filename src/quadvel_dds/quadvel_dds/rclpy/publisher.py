@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 from quadvel_dds import messages, wire
@@ -9,6 +10,8 @@ from quadvel_dds.errors import unsupported
 
 from .duration import Duration
 from .exceptions import InvalidHandle
+
+FOREVER = Duration(nanoseconds=-(10**9))
 
 
 class Publisher:
@@ -25,13 +28,13 @@ class Publisher:
         self.msg_type = msg_type
         self.topic = topic
         self.qos_profile = qos_profile
-        self._is_valid = lambda: True  # the node tells whether its context still runs
+        self._is_valid: Callable[[], bool] = lambda: True  # the node tells whether its context still runs
 
     def publish(self, msg: Any) -> None:
         """Send a message, or its ready CDR bytes.
 
-        Raises TypeError on a message of another type, ValueError on one that cannot be sent, RuntimeError after shutdown,
-        InvalidHandle after `destroy`.
+        Raises TypeError on a message of another type, ValueError on one that cannot be sent, RuntimeError
+        after shutdown, InvalidHandle after `destroy`.
         """
         if self._writer is None:
             raise InvalidHandle(f"the publisher of '{self.topic}' was destroyed")
@@ -51,12 +54,11 @@ class Publisher:
     def topic_name(self) -> str:
         return self.topic
 
-    def wait_for_all_acked(self, timeout: Duration = Duration(nanoseconds=-(10**9))) -> bool:
+    def wait_for_all_acked(self, timeout: Duration = FOREVER) -> bool:
         """Wait until all matched reliable readers have all messages (for ever if the timeout is negative)."""
         if self._writer is None:
             raise InvalidHandle(f"the publisher of '{self.topic}' was destroyed")
-        forever = 2**63 - 1
-        return self._writer.wait_for_acks(timeout.nanoseconds if timeout.nanoseconds >= 0 else forever)
+        return self._writer.wait_for_acks(timeout.nanoseconds if timeout.nanoseconds >= 0 else 2**63 - 1)
 
     def destroy(self) -> None:
         if self._writer is not None:

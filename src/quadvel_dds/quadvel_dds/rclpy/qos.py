@@ -125,7 +125,7 @@ class QoSProfile:
 def _policy_property(name: str, type_: type) -> property:
     def assign(profile: QoSProfile, value: Any) -> None:
         value = type_(value) if issubclass(type_, IntEnum) else value
-        if not isinstance(value, type_) or (type_ is int and value < 0):
+        if not isinstance(value, type_) or (isinstance(value, int) and value < 0):
             raise ValueError(f"QoS policy '{name}' must be of type {type_.__name__}, found {value!r}")
         setattr(profile, f"_{name}", value)
 

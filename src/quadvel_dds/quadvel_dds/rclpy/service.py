@@ -36,8 +36,9 @@ class Service:
     def send_response(self, response: Any, header: Any) -> None:
         """Send the answer to the request that came with `header`."""
         if not isinstance(response, self.srv_type.Response):
+            expected = self.srv_type.Response.TYPENAME
             raise TypeError(
-                f"service {self.srv_name}: the callback returned {response!r}, expected a {self.srv_type.Response}"
+                f"service {self.srv_name}: the callback returned {response!r}, expected {expected}"
             )
         request_id, client = header
         if client is None:

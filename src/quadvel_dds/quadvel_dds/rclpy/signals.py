@@ -1,7 +1,8 @@
 """SIGINT and SIGTERM: they shut down the contexts of this process.
 
-SIGINT also raises KeyboardInterrupt in the main thread, as with rclpy. Ctrl-C reaches a node twice under a launcher; later
-SIGINTs are let pass, so that the first one's clean-up is not cut short (SIGTERM and SIGQUIT stay as a way out).
+The first SIGINT also raises KeyboardInterrupt in the main thread, as with rclpy. Under a launcher Ctrl-C
+reaches a node twice; later SIGINTs are ignored, so that neither clean-up nor the interpreter's end is cut
+short (SIGTERM and SIGQUIT stay as a way out).
 """
 
 from __future__ import annotations
@@ -24,16 +25,15 @@ class SignalHandlerOptions(IntFlag):
 
 
 _former: dict[int, Any] = {}
-_interrupted = False
 _waker: socket.socket | None = None
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    global _interrupted
+    if number == signal.SIGINT:
+        signal.signal(number, signal.SIG_IGN)
     for context in live_contexts():
         context.try_shutdown()
-    if number == signal.SIGINT and not _interrupted:
-        _interrupted = True
+    if number == signal.SIGINT:
         raise KeyboardInterrupt
 
 
@@ -46,21 +46,21 @@ def _wake_on_signals(receiver: socket.socket) -> None:
 
 def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
     """Take over the signals named; does nothing outside the main thread, where Python allows no handlers."""
-    global _waker, _interrupted
+    global _waker
     if threading.current_thread() is not threading.main_thread() or not options:
         return
-    _interrupted = False
-    for option, number in {
-        SignalHandlerOptions.SIGINT: signal.SIGINT,
-        SignalHandlerOptions.SIGTERM: signal.SIGTERM,
-    }.items():
-        if options & option and number not in _former:
-            _former[number] = signal.signal(number, _on_signal)
     if _waker is None:
         receiver, _waker = socket.socketpair()
         _waker.setblocking(False)
         threading.Thread(target=_wake_on_signals, args=(receiver,), daemon=True, name="signals").start()
         signal.set_wakeup_fd(_waker.fileno(), warn_on_full_buffer=False)
+    for option, number in (
+        (SignalHandlerOptions.SIGINT, signal.SIGINT),
+        (SignalHandlerOptions.SIGTERM, signal.SIGTERM),
+    ):
+        if options & option:
+            _former.setdefault(number, signal.getsignal(number))
+            signal.signal(number, _on_signal)
 
 
 def uninstall_signal_handlers() -> None:
@@ -68,5 +68,5 @@ def uninstall_signal_handlers() -> None:
     if threading.current_thread() is not threading.main_thread():
         return
     for number in list(_former):
-        if not (number == signal.SIGINT and _interrupted):
+        if signal.getsignal(number) is _on_signal:
             signal.signal(number, _former.pop(number))

@@ -59,7 +59,7 @@ class Subscription:
     handle = property(unsupported("Subscription.handle"))
 
     def _take(self) -> Callable[[], Any] | None:
-        """The oldest message that waits, as a call of the callback; a malformed one is dropped with an error."""
+        """The oldest message that waits, as a call of the callback; a malformed one is logged and dropped."""
         sample = self._reader.take()
         if sample is None:
             return None

@@ -15,8 +15,9 @@ from .clock import Clock
 class Timer:
     """Calls back every `timer_period_ns`.
 
-    Deadlines are multiples of the period from the start, on the monotonic clock (on simulated time where the clock is
-    driven by /clock), so that lateness does not add up; deadlines that passed while a callback ran are left out.
+    Deadlines are multiples of the period from the start, on the monotonic clock (on simulated time where the
+    clock is driven by /clock), so that lateness does not add up; deadlines missed while a callback ran are
+    left out.
     """
 
     def __init__(

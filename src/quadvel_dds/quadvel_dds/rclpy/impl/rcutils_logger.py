@@ -17,8 +17,8 @@ sinks: dict[
 class RcutilsLogger:
     """Logger with names in a hierarchy ("node.part").
 
-    Every method takes, as keyword options, `once`, `skip_first` and `throttle_duration_sec`; they count for each place in the
-    program that calls.
+    Every method takes, as keyword options, `once`, `skip_first` and `throttle_duration_sec`; they count for
+    each place in the program that calls.
     """
 
     def __init__(self, name: str = "") -> None:

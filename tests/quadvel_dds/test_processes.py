@@ -1,0 +1,147 @@
+"""Several processes: discovery, signals, and which middleware `install` chooses."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import rclpy
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+
+from quadvel_dds import wire
+from quadvel_msgs.msg import LowCmd, LowState
+
+Start = Callable[..., None]
+Program = Callable[..., "subprocess.Popen[str]"]
+
+ECHO = """
+import rclpy
+from rclpy.executors import ExternalShutdownException
+from rclpy.node import Node
+from quadvel_msgs.msg import LowCmd, LowState
+from std_srvs.srv import SetBool
+
+def main():
+    rclpy.init()
+    node = Node("echo")
+    publisher = node.create_publisher(LowCmd, "low_cmd", 1)
+    def answer(state):
+        publisher.publish(LowCmd(tick=state.tick, q=state.q))
+    node.create_subscription(LowState, "low_state", answer, 1)
+    def allow(request, response):
+        response.success = request.data
+        return response
+    node.create_service(SetBool, "allow", allow)
+    try:
+        print("ready", flush=True)
+        rclpy.spin(node)
+    except KeyboardInterrupt:
+        print("interrupted", flush=True)
+    except ExternalShutdownException:
+        print("shut down", flush=True)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+main()
+"""
+
+
+def wait_until(node: Node, condition: Callable[[], object], timeout: float = 40.0) -> None:
+    deadline = time.monotonic() + timeout
+    while not condition():
+        assert time.monotonic() < deadline, "time is up"
+        rclpy.spin_once(node, timeout_sec=0.1)
+
+
+def test_messages_and_calls_cross_processes(ros: Start, program: Program) -> None:
+    ros()
+    program(ECHO)
+    node, commands = Node("robot"), []
+    publisher = node.create_publisher(LowState, "low_state", 1)
+    node.create_subscription(LowCmd, "low_cmd", commands.append, 1)
+    wait_until(node, lambda: publisher.get_subscription_count() and node.count_publishers("low_cmd"))
+    wait_until(node, lambda: publisher.publish(LowState(tick=2**32 - 1, q=[0.5] * 12)) or commands)
+    assert commands[0].tick == 2**32 - 1
+    assert (commands[0].q == 0.5).all()
+
+    client = node.create_client(SetBool, "allow")
+    assert client.wait_for_service(timeout_sec=20.0)
+    future = client.call_async(SetBool.Request(data=True))
+    rclpy.spin_until_future_complete(node, future, timeout_sec=20.0)
+    assert future.result().success
+
+
+@pytest.mark.parametrize(
+    ("signals", "word"),
+    [
+        ([signal.SIGINT], "interrupted"),
+        ([signal.SIGINT, signal.SIGINT], "interrupted"),
+        ([signal.SIGTERM], "shut down"),
+    ],
+)
+def test_signals_end_a_node_cleanly(program: Program, signals: list[signal.Signals], word: str) -> None:
+    process = program(ECHO)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    for number in signals:
+        process.send_signal(number)
+    output, errors = process.communicate(timeout=40)
+    assert (process.returncode, output, errors) == (0, f"{word}\n", "")
+
+
+def test_second_interrupt_does_not_cut_the_clean_up_short(program: Program) -> None:
+    process = program(
+        ECHO.replace("node.destroy_node()", "import time; time.sleep(1.0); print('cleaned', flush=True)")
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "interrupted\n"
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=40)
+    assert (process.returncode, output, errors) == (0, "cleaned\n", "")
+
+
+def run(program: str, path: Path, **environment: str) -> str:
+    (path / "rclpy").mkdir()
+    (path / "rclpy/__init__.py").write_text("ORIGIN = 'ros'")
+    paths = os.pathsep.join([str(path), *sys.path])
+    env = {name: value for name, value in os.environ.items() if name != "QUADVEL_MIDDLEWARE"}
+    env.update(PYTHONPATH=paths, **environment)
+    result = subprocess.run(
+        [sys.executable, "-c", program], env=env, capture_output=True, text=True, check=True
+    )
+    return result.stdout.strip()
+
+
+INSTALL = "import quadvel_dds; print(quadvel_dds.install()); import rclpy; print(hasattr(rclpy, 'ORIGIN'))"
+
+
+def test_ros_is_preferred_where_it_is_importable(tmp_path: Path) -> None:
+    assert run(INSTALL, tmp_path).split() == ["False", "True"]
+
+
+def test_embedded_middleware_can_be_asked_for(tmp_path: Path) -> None:
+    program = INSTALL.replace("hasattr(rclpy, 'ORIGIN')", "'ORIGIN' in vars(rclpy)")
+    assert run(program, tmp_path, QUADVEL_MIDDLEWARE="embedded").split() == ["True", "False"]
+
+
+def test_discovery_stays_on_this_host_unless_asked_otherwise(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("CYCLONEDDS_URI", raising=False)
+    monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
+    assert "<AllowMulticast>false</AllowMulticast>" in wire.domain_configuration()
+    assert '<Peer address="localhost"/>' in wire.domain_configuration()
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
+    monkeypatch.setenv("ROS_STATIC_PEERS", "192.168.123.10")
+    assert "AllowMulticast" not in wire.domain_configuration()
+    assert "localhost" not in wire.domain_configuration()
+    assert '<Peer address="192.168.123.10"/>' in wire.domain_configuration()
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "PLANET")
+    with pytest.raises(ValueError, match="ROS_AUTOMATIC_DISCOVERY_RANGE is 'PLANET', expected LOCALHOST"):
+        wire.domain_configuration()
