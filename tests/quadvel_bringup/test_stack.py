@@ -29,6 +29,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     """The defaults of all parameters, by node, as the nodes' own classes have them."""
     quadvel_dds.install()
     from quadvel_estimator.estimator import EstimatorParameters
+    from quadvel_eval.scripted_planner import PlannerParameters
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
     from quadvel_sim.parameters import SimParameters
@@ -38,6 +39,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
         "estimator": EstimatorParameters,
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
+        "planner": PlannerParameters,
     }
     return {
         name: {
