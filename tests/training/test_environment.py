@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
 from quadvel_description import robot, symmetry  # noqa: E402
+from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_training import gait, loop  # noqa: E402
 from quadvel_training.distill import CommandMap  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
@@ -73,8 +74,6 @@ def test_velocity_is_the_derivative_of_position_in_the_body_frame():
     env.tick(np.tile(env.stand_q, (4, 1)))
     mean = 0.5 * (slow + env.velocity)
     moved = (env.batch.qpos[:, :3] - before) / TICK
-    from quadvel_description.kinematics import rotate
-
     assert np.abs(rotate(env.quaternion, mean) - moved).max() < 0.05
 
 
@@ -119,7 +118,7 @@ def test_lifting_feet_pays_only_while_walking():
 def test_the_command_map_finds_a_map_of_its_own_kind():
     rng = np.random.default_rng(0)
     wanted = rng.uniform(-1, 1, (2000, 3))
-    x, y, r = wanted.T
+    x, _, r = wanted.T
     given = wanted + np.stack([0.1 * x + 0.02, 0.2 * x * r, 0.3 * r], axis=1)
     command_map = CommandMap()
     assert command_map.fit(wanted, given) < 1e-4
@@ -166,5 +165,5 @@ def test_a_run_resumes_where_its_checkpoint_stands(tmp_path):
 
 
 def test_a_missing_checkpoint_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nowhere.pt: no such checkpoint"):
+    with pytest.raises(FileNotFoundError, match=r"nowhere[.]pt: no such checkpoint"):
         loop.load(tmp_path / "nowhere.pt")

@@ -44,6 +44,7 @@ def test_metadata_says_how_to_run_it(exported):
     metadata = PolicyFile(path).metadata
     assert metadata.command_limits == {"vx": (-1.0, 1.5), "vy": (-0.5, 0.5), "wz": (-1.2, 1.2)}
     assert np.allclose(metadata.action_offset, env.stand_q)
-    assert metadata.kp == (30.0,) * 12 and metadata.kd == (0.5,) * 12
+    assert metadata.kp == (30.0,) * 12
+    assert metadata.kd == (0.5,) * 12
     assert metadata.rate_hz == 200.0
     assert metadata.actuator["delta_kp"] == pytest.approx(-0.706)

@@ -70,7 +70,8 @@ def test_masked_samples_have_no_advantage():
     mask = torch.ones(6, 1)
     mask[3:] = 0.0
     advantage, _ = learner().advantages(rollout(1.0, mask=mask))
-    assert (advantage[3:] == 0).all() and (advantage[:3] != 0).all()
+    assert (advantage[3:] == 0).all()
+    assert (advantage[:3] != 0).all()
 
 
 def test_an_update_makes_the_better_action_likelier():

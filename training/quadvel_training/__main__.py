@@ -21,7 +21,9 @@ app = typer.Typer(
 )
 
 Out = Annotated[Path, typer.Option(help="Run directory: checkpoint, TensorBoard curves, ONNX.")]
-Recipe = Annotated[Path | None, typer.Option(help="YAML file whose fields replace the defaults; see training/recipes.")]
+Recipe = Annotated[
+    Path | None, typer.Option(help="YAML file whose fields replace the defaults; see training/recipes.")
+]
 Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
 
 
@@ -46,7 +48,9 @@ def _actor(path: Path) -> Any:
     if "student" in content:
         actor.load_state_dict(content["student"])
     else:
-        weights = {k.removeprefix("network."): v for k, v in content["actor"].items() if k.startswith("network.")}
+        weights = {
+            k.removeprefix("network."): v for k, v in content["actor"].items() if k.startswith("network.")
+        }
         actor.load_state_dict(weights)
     return actor
 
@@ -56,7 +60,9 @@ def _recipe(config: Any, run: Any, stage: str) -> dict[str, Any]:
 
 
 @app.command("teacher")
-def train_teacher(out: Out = Path("out/training/teacher"), recipe: Recipe = None, minutes: Minutes = None) -> None:
+def train_teacher(
+    out: Out = Path("out/training/teacher"), recipe: Recipe = None, minutes: Minutes = None
+) -> None:
     """Stage 1: the teacher with a clock and the true state."""
     config = _configured(teacher.TeacherConfig, recipe, minutes)
     loop.train(teacher.TeacherRun(config), config.budget, out / "teacher.pt")
@@ -78,7 +84,9 @@ def train_student(
 
 @app.command("crl")
 def train_crl(
-    start: Annotated[Path | None, typer.Option(help="Checkpoint of a student; without it, random weights.")] = None,
+    start: Annotated[
+        Path | None, typer.Option(help="Checkpoint of a student; without it, random weights.")
+    ] = None,
     out: Out = Path("out/training/crl"),
     recipe: Recipe = None,
     minutes: Minutes = None,
@@ -87,7 +95,7 @@ def train_crl(
     config = _configured(crl.CrlConfig, recipe, minutes)
     run = crl.CrlRun(config, _actor(start) if start else None)
     loop.train(run, config.budget, out / "crl.pt")
-    student.export_policy(run.actor.network, run.env, out / "policy.onnx", _recipe(config, run, "crl"))  # type: ignore[arg-type]
+    student.export_policy(run.actor.network, run.env, out / "policy.onnx", _recipe(config, run, "crl"))
 
 
 @app.command("estimator")

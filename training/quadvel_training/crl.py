@@ -63,22 +63,30 @@ class CrlRun:
         self.config = c = config
         torch.manual_seed(c.seed)
         env_config = EnvConfig(
-            n=c.n, threads=c.threads, seed=c.seed, timestep=c.timestep, commands=c.commands, randomisation=c.randomisation
+            n=c.n,
+            threads=c.threads,
+            seed=c.seed,
+            timestep=c.timestep,
+            commands=c.commands,
+            randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config)
         self.rewards = Table2(self.env, c.rewards)
         self.actor = Gaussian(start or student.new_actor(), 12, c.std)
         self.actor.log_std.requires_grad_(False)
         self.critic = Mlp(48 + PRIVILEGED, 1)
-        self.mirror_obs, self.mirror_action = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
+        self.mirror_obs, self.mirror_action = (
+            torch_mirror(symmetry.OBSERVATION),
+            torch_mirror(symmetry.JOINTS),
+        )
         self.ppo = Ppo(self.actor, self.critic, c.ppo, self.mirror_obs, self.mirror_action)
         self.map = student.action_map(self.env)
         self.samples = self.updates = 0
         self._action = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
         network = self.actor.network
-        self._state = network.initial_state(c.n)  # type: ignore[operator]
-        self._mirrored = network.initial_state(self.ppo.mirrored(c.n))  # type: ignore[operator]
+        self._state = network.initial_state(c.n)
+        self._mirrored = network.initial_state(self.ppo.mirrored(c.n))
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""

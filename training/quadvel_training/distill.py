@@ -2,8 +2,8 @@
 
 The teacher acts at every tick. Its own steady-state error is taken out first: a command map, found by integral action on
 held commands, says which command it has to be given to walk at the one wanted (docs/decisions/0003). The student sees the
-wanted command. Most environments are driven by the teacher under time-correlated noise, a growing share by the student
-itself, so that it learns to come back from its own states. Eq. 6 and 7 act on the student from the start.
+wanted command. The teacher drives under time-correlated noise: driven by the student, the labels of the teacher's clock
+would contradict the phase of the student's gait. Eq. 6 and 7 act on the student from the start.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from quadvel_description import robot, symmetry
 from . import gait, student, teacher
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
-from .networks import Gaussian, Mlp
-from .ppo import State, select
+from .networks import Gaussian, Mlp, State
+from .ppo import select
 from .teacher import GaitState, torch_mirror
 
 
@@ -36,7 +36,9 @@ class CommandMap:
     """Which command the teacher needs to walk at the wanted one: wanted + polynomial of it, odd under mirroring where due."""
 
     def __init__(self, weights: np.ndarray | None = None) -> None:
-        self.weights = np.zeros((self._features(np.zeros((1, 3))).shape[1], 3)) if weights is None else weights
+        self.weights = (
+            np.zeros((self._features(np.zeros((1, 3))).shape[1], 3)) if weights is None else weights
+        )
 
     @staticmethod
     def _features(c: np.ndarray) -> np.ndarray:
@@ -128,9 +130,11 @@ class DistillConfig:
     length: int = 32  # ticks a sequence
     learning_rate: float = 1e-3
     final_learning_rate: float = 1e-4
-    noise: float = 0.12  # rad, stationary std of the time-correlated noise on executed targets
+    noise: float = (
+        0.1  # rad, stationary std of the time-correlated noise on executed targets, up to, by environment
+    )
     noise_time: float = 0.05  # s
-    student_share: float = 0.5  # of the environments driven by the student at the end
+    mini_batches: int = 2
     symmetry: float = 0.5
     smoothness: float = 0.05
     correction_gain: float = 0.5  # 1/s, integral action of the teacher on top of the map
@@ -154,11 +158,15 @@ class DistillRun:
         self.map = student.action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
-        self._state: State = self.student.initial_state(config.n)
+        self._memory: State = self.student.initial_state(config.n)
         self._mirrored: State = self.student.initial_state(config.n)
         self._previous = np.zeros((config.n, 12), np.float32)
         self._noise = np.zeros((config.n, 12))
-        self._mirror_obs, self._mirror_action = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
+        self._noise_std = np.linspace(0.0, config.noise, config.n)[:, None]
+        self._mirror_obs, self._mirror_action = (
+            torch_mirror(symmetry.OBSERVATION),
+            torch_mirror(symmetry.JOINTS),
+        )
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -178,58 +186,72 @@ class DistillRun:
         """One sequence and one step of the optimiser."""
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
-        obs, label, mask, seen = self.collect(c.student_share * min(1.0, max(0.0, (done - 0.1) / 0.3)))
+        obs, label, mask, seen = self.collect()
         return seen | self.learn(obs, label, mask)
 
-    def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
+    def collect(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
         """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N)."""
         env, c = self.env, self.config
-        own = np.arange(c.n) >= round(c.n * (1 - share))  # driven by the student
         decay = np.exp(-TICK / c.noise_time)
         alive = np.ones(c.n, bool)
-        observations, labels, masks = [], [], []
-        state, falls = self._state, 0
+        observations, labels, masks, falls = [], [], [], 0
         for _ in range(c.length):
-            obs = student.observe(env, self._previous)
-            target = self.teacher.targets()
-            label = ((target - self.map.offset) / self.map.scale).astype(np.float32)
-            self._noise = decay * self._noise + np.sqrt(1 - decay**2) * c.noise * env.rng.standard_normal((c.n, 12))
-            executed = label + (self._noise / self.map.scale).astype(np.float32)
-            if own.any():
-                with torch.no_grad():
-                    action, state = self.student(torch.from_numpy(obs[None]), state)
-                executed[own] = action[0].numpy()[own]
-            observations.append(obs)
-            labels.append(label)
+            observations.append(student.observe(env, self._previous))
+            labels.append((self.teacher.targets() - self.map.offset) / self.map.scale)
             masks.append(alive.copy())
-            self._previous = executed
-            env.tick(self.map.targets(executed))
+            drawn = env.rng.standard_normal((c.n, 12))
+            self._noise = decay * self._noise + np.sqrt(1 - decay**2) * self._noise_std * drawn
+            self._previous = (labels[-1] + self._noise / self.map.scale).astype(np.float32)
+            env.tick(self.map.targets(self._previous))
             self.teacher.advance()
-            falls += int((env.fallen & alive & own).sum())
+            falls += int((env.fallen & alive).sum())
             alive &= ~(env.fallen | env.timed_out)
         self._over = np.flatnonzero(~alive)
         self.samples += c.length * c.n
-        lag = (self.teacher.gait.mean_command - self.teacher.gait.mean_velocity)[alive]
-        mine = lag[own[alive]] if own.any() else lag
-        seconds = max(own.sum(), 1) * c.length * TICK
-        seen = {
-            "error_xy": float(np.hypot(mine[:, 0], mine[:, 1]).mean()),
-            "error_wz": float(np.abs(mine[:, 2]).mean()),
-            "falls_per_minute": 60 * falls / seconds,
-        }
-        as_tensor = lambda x: torch.from_numpy(np.array(x, dtype=np.float32))  # noqa: E731
-        return as_tensor(observations), as_tensor(labels), as_tensor(masks), seen
+        lag = self.teacher.gait.mean_command - self.teacher.gait.mean_velocity
+        obs, label, mask = (
+            torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
+        )
+        return (
+            obs,
+            label,
+            mask,
+            {
+                "error_xy": float(np.hypot(lag[:, 0], lag[:, 1]).mean()),
+                "falls_per_minute": 60 * falls / (c.n * c.length * TICK),
+            },
+        )
 
     def learn(self, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor) -> dict[str, float]:
-        """One step on one sequence; carries the memories on and clears those of ended environments."""
+        """One step a mini-batch of environments; carries the memories on and clears those of ended environments."""
+        seen: dict[str, float] = {}
+        for ids in torch.randperm(self.config.n).chunk(self.config.mini_batches):
+            terms = self._learn(ids, obs[:, ids], label[:, ids], mask[:, ids])
+            seen = {
+                name: seen.get(name, 0.0) + value / self.config.mini_batches for name, value in terms.items()
+            }
+        over = self._over
+        if len(over):
+            self.env.reset(over)
+            self.teacher.reset(over)
+            self._noise[over] = self._previous[over] = 0.0
+            for memory in (*self._memory, *self._mirrored):
+                memory[:, over] = 0.0
+        return seen
+
+    def _learn(
+        self, ids: torch.Tensor, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor
+    ) -> dict[str, float]:
         c = self.config
-        half = torch.arange(0, c.n, 2)  # the symmetry term sees every other environment
-        action, state = self.student(obs, self._state)
-        mirrored, mirrored_state = self.student(self._mirror_obs(obs[:, half]), select(self._mirrored, half))
+        some = ids % 2 == 0  # the symmetry term sees every other environment
+        action, memory = self.student(obs, select(self._memory, ids))
+        mirrored, mirrored_memory = self.student(
+            self._mirror_obs(obs[:, some]), select(self._mirrored, ids[some])
+        )
         alive = mask.sum().clamp(min=1)
         clone = (((action - label) ** 2).sum(-1) * mask).sum() / alive
-        gap = ((action[:, half] - self._mirror_action(mirrored)) ** 2).sum(-1)
-        symmetric = (gap * mask[:, half]).sum() / mask[:, half].sum().clamp(min=1)
+        gap = ((action[:, some] - self._mirror_action(mirrored)) ** 2).sum(-1)
+        symmetric = (gap * mask[:, some]).sum() / mask[:, some].sum().clamp(min=1)
         bend = (action[2:] - 2 * action[1:-1] + action[:-2]).norm(dim=-1)
         smooth = (bend * mask[2:]).sum() / mask[2:].sum().clamp(min=1)
         loss = clone + c.symmetry * symmetric + c.smoothness * smooth
@@ -237,18 +259,12 @@ class DistillRun:
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
         self.optimiser.step()
-        self._carry(state, mirrored_state, half)
-        return {"clone": float(clone.detach()), "symmetry": float(symmetric.detach()), "smoothness": float(smooth.detach())}
-
-    def _carry(self, state: State, mirrored: State, half: torch.Tensor) -> None:
-        self._state = tuple(s.detach() for s in state)  # type: ignore[assignment]
-        for kept, new in zip(self._mirrored, mirrored, strict=True):
-            kept[:, half] = new.detach()
-        over = self._over
-        if len(over):
-            self.env.reset(over)
-            self.teacher.reset(over)
-            self._noise[over] = 0.0
-            self._previous[over] = 0.0
-            for memory in (*self._state, *self._mirrored):
-                memory[:, over] = 0.0
+        for kept, new in zip(self._memory, memory, strict=True):
+            kept[:, ids] = new.detach()
+        for kept, new in zip(self._mirrored, mirrored_memory, strict=True):
+            kept[:, ids[some]] = new.detach()
+        return {
+            "clone": float(clone.detach()),
+            "symmetry": float(symmetric.detach()),
+            "smoothness": float(smooth.detach()),
+        }

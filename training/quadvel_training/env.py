@@ -180,7 +180,9 @@ class VelocityEnv:
         self.clearance = self.feet[..., 2] - self._ground(self.feet) - robot.FOOT_RADIUS
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
-        self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9) | ~np.isfinite(self.height)
+        self.fallen = (
+            (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9) | ~np.isfinite(self.height)
+        )
         self.timed_out = self.time >= self.config.episode
 
     def sense(self) -> dict[str, np.ndarray]:

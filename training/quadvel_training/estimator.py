@@ -77,7 +77,9 @@ class Walk:
                 truths.append(env.velocity.copy())
                 masks.append(alive.copy())
                 sensed["linear_velocity"][self.on_estimate] = estimate[0, self.on_estimate, :3].numpy()
-                obs = build_observation(DEFAULT_OBSERVATION, command=env.command, previous_action=self.action, **sensed)
+                obs = build_observation(
+                    DEFAULT_OBSERVATION, command=env.command, previous_action=self.action, **sensed
+                )
                 action, self._policy_state = self.actor(torch.from_numpy(obs[None]), self._policy_state)
                 self.action = action[0].numpy()
                 self.target = self.map.targets(self.action)
@@ -85,7 +87,7 @@ class Walk:
                 alive &= ~(env.fallen | env.timed_out)
         self.over = np.flatnonzero(~alive)
         tensors = (torch.from_numpy(np.array(x, dtype=np.float32)) for x in (inputs, truths, masks))
-        return tuple(tensors)  # type: ignore[return-value]
+        return tuple(tensors)
 
     def _robot_state(self, sensed: dict[str, np.ndarray]) -> RobotState:
         """What the robot would report, with the sensors' biases."""

@@ -101,7 +101,9 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
     roll, pitch = body.roll_pitch.T
     up = np.stack([-np.sin(pitch), np.sin(roll) * np.cos(pitch), np.cos(roll) * np.cos(pitch)], axis=-1)
     error = command[:, :2] - body.velocity
-    force = robot.MASS * (robot.GRAVITY + 100 * (HEIGHT - body.height) - 14 * body.vertical_speed)[:, None] * up
+    force = (
+        robot.MASS * (robot.GRAVITY + 100 * (HEIGHT - body.height) - 14 * body.vertical_speed)[:, None] * up
+    )
     force[:, :2] += robot.MASS * 6.0 * error
     w = body.angular_velocity
     moment = np.stack(

@@ -65,7 +65,7 @@ def cosine(start: float, end: float, done: float) -> float:
 def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
     """Set the learning rate of every group."""
     for group in optimiser.param_groups:
-        group["lr"] = rate
+        group["lr"] = float(rate)
 
 
 def train(run: Run, budget: Budget, checkpoint: Path) -> None:
@@ -96,7 +96,9 @@ def train(run: Run, budget: Budget, checkpoint: Path) -> None:
                 if now - saved > SAVE_EVERY:
                     save(run.state(), checkpoint)
                     saved = now
-                    progress.console.print(f"{run.samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True)
+                    progress.console.print(
+                        f"{run.samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True
+                    )
         except KeyboardInterrupt:
             progress.console.print("stopped; the checkpoint holds everything so far")
     save(run.state(), checkpoint)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import torch
 from torch import Tensor, nn
 
@@ -11,7 +13,7 @@ State = tuple[Tensor, Tensor]
 def mlp(sizes: list[int]) -> nn.Sequential:
     """Linear layers with SiLU between them."""
     layers: list[nn.Module] = []
-    for a, b in zip(sizes[:-1], sizes[1:], strict=True):
+    for a, b in itertools.pairwise(sizes):
         layers += [nn.Linear(a, b), nn.SiLU()]
     return nn.Sequential(*layers[:-1])
 
@@ -36,7 +38,9 @@ class Mlp(nn.Module):
 class Recurrent(nn.Module):
     """LSTM, then linear layers with SiLU; one state (layers, N, hidden) pair is carried from sequence to sequence."""
 
-    def __init__(self, inputs: int, outputs: int, memory: int = 256, hidden: tuple[int, ...] = (192, 128)) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, memory: int = 256, hidden: tuple[int, ...] = (192, 128)
+    ) -> None:
         super().__init__()
         self.lstm = nn.LSTM(inputs, memory)
         self.body = mlp([memory, *hidden, outputs])

@@ -94,7 +94,7 @@ class Ppo:
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
         self.learning_rate = state["learning_rate"]
 
-    @torch.no_grad()
+    @torch.no_grad()  # type: ignore[untyped-decorator]
     def advantages(self, r: Rollout) -> tuple[Tensor, Tensor]:
         """Generalised advantage estimates and value targets, (T, N) each."""
         c = self.config
@@ -132,7 +132,9 @@ class Ppo:
         means = {name: value / batches for name, value in total.items()}
         if learn_actor:
             self._adapt_rate(means["kl"])
-        explained = 1 - (((advantage * spread + mean) ** 2) * r.mask).sum() / alive / target[r.mask > 0].var().clamp(min=1e-8)
+        explained = 1 - (((advantage * spread + mean) ** 2) * r.mask).sum() / alive / target[
+            r.mask > 0
+        ].var().clamp(min=1e-8)
         return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
 
     def _mini_batches(self, n: int) -> Iterator[Tensor]:

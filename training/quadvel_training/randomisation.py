@@ -35,22 +35,28 @@ class Randomisation:
     def none(cls) -> Randomisation:
         """The nominal plant without noise or pushes."""
         one, nil = (1.0, 1.0), (0.0, 0.0)
-        return cls(
-            (0.8, 0.8), nil, 0.0, one, one, one, one, nil, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0
-        )
+        return cls((0.8, 0.8), nil, 0.0, one, one, one, one, nil, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
 
 
 class PlantSampler:
     """Writes per-environment model fields into a batch; keeps what was drawn for the critic to see."""
 
-    FIELDS = ("body_mass", "body_inertia", "body_ipos", "geom_friction", "dof_frictionloss", "dof_damping", "dof_armature")
+    FIELDS = (
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "geom_friction",
+        "dof_frictionloss",
+        "dof_damping",
+        "dof_armature",
+    )
 
     def __init__(self, batch: Batch, ranges: Randomisation, rng: np.random.Generator) -> None:
         self._batch, self._ranges, self._rng = batch, ranges, rng
         model = batch.model
         self._nominal = {name: getattr(model, name).copy() for name in self.FIELDS}
         self._fields = {name: batch.expand(name) for name in self.FIELDS}
-        self._feet = [i for i in range(model.ngeom) if model.geom(i).name.endswith("_foot")]
+        self._feet = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith("_foot")])
         self._trunk = model.body("trunk").id
         self.drawn = np.zeros((batch.nsim, 8))  # 4 frictions, payload, com shift (3)
 
@@ -59,7 +65,7 @@ class PlantSampler:
         r, rng, n, f = self._ranges, self._rng, len(ids), self._fields
         uniform = rng.uniform
         friction = uniform(*r.foot_friction, (n, len(self._feet)))
-        f["geom_friction"][np.ix_(ids, self._feet, [0])] = friction[..., None]
+        f["geom_friction"][ids[:, None], self._feet, 0] = friction
 
         scale = uniform(*r.mass_scale, (n, self._batch.model.nbody))
         scale[:, : self._trunk + 1] = 1.0
@@ -81,7 +87,9 @@ class PlantSampler:
         self.drawn[ids] = np.concatenate([friction, payload[:, None], shift / max(r.com_shift, 1e-3)], axis=1)
 
 
-def sample_actuators(actuators: ActuatorModel, ids: np.ndarray, ranges: Randomisation, rng: np.random.Generator) -> None:
+def sample_actuators(
+    actuators: ActuatorModel, ids: np.ndarray, ranges: Randomisation, rng: np.random.Generator
+) -> None:
     """Draw delays and gains as Section 3.1 says, add the transmission delay, and forget the past of `ids`."""
     actuators.sample(ids, rng)
     delay = actuators.input_delay

@@ -58,7 +58,7 @@ class Table2:
         bend = action - 2 * self._actions[0] + self._actions[1]
         terms = {
             "linear_tracking": np.exp(-np.sum((c[:, :2] - v[:, :2]) ** 2, axis=1)),
-            "angular_tracking": np.exp(-np.abs(c[:, 2] - w[:, 2]) ** 2),
+            "angular_tracking": np.exp(-(np.abs(c[:, 2] - w[:, 2]) ** 2)),
             "orientation": -np.abs(env.roll_pitch).sum(axis=1),
             "torso_stability": -np.hypot(w[:, 0], w[:, 1]) - np.abs(v[:, 2]),
             "joint_velocity": -np.sum(env.dq**2, axis=1),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -36,9 +35,13 @@ def action_map(env: VelocityEnv) -> ActionMap:
     return ActionMap(env.stand_q, ACTION_SCALE)
 
 
-def observe(env: VelocityEnv, previous_action: np.ndarray, ids: Sequence[int] | slice = slice(None)) -> np.ndarray:
+def observe(
+    env: VelocityEnv, previous_action: np.ndarray, ids: Sequence[int] | slice = slice(None)
+) -> np.ndarray:
     """The student's noisy observation (n, 48)."""
-    return build_observation(DEFAULT_OBSERVATION, command=env.command, previous_action=previous_action, **env.sense())[ids]
+    return build_observation(
+        DEFAULT_OBSERVATION, command=env.command, previous_action=previous_action, **env.sense()
+    )[ids]
 
 
 class _Step(nn.Module):
@@ -76,7 +79,9 @@ def export(network: Recurrent, path: Path, outputs: Sequence[str], metadata: str
 
 def commit() -> str:
     """The commit that a file was made at, or "unknown" outside a checkout."""
-    result = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
+    result = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
     return result.stdout.strip() or "unknown"
 
 
@@ -84,16 +89,15 @@ def export_policy(actor: Recurrent, env: VelocityEnv, path: Path, recipe: dict[s
     """Write the policy file of `actor` as it was trained in `env`."""
     c = env.config.commands
     metadata = PolicyMetadata(
-        action_offset=env.stand_q,
-        action_scale=ACTION_SCALE,
-        kp=env.config.kp,
-        kd=env.config.kd,
-        nominal_q=robot.NOMINAL_Q,
-        command_limits={"vx": c.vx, "vy": c.vy, "wz": c.wz},
+        action_offset=tuple(env.stand_q),
+        action_scale=(ACTION_SCALE,) * 12,
+        kp=(env.config.kp,) * 12,
+        kd=(env.config.kd,) * 12,
+        nominal_q=tuple(robot.NOMINAL_Q),
+        command_limits={"vx": c.vx, "vy": (-c.vy, c.vy), "wz": (-c.wz, c.wz)},
         state_shape=(1, 1, MEMORY),
         actuator=attrs.asdict(env.config.actuator),
         recipe=recipe,
         commit=commit(),
     )
     export(actor, path, ["actions"], metadata.to_json())
-    json.loads(metadata.to_json())

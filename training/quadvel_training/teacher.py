@@ -73,7 +73,9 @@ def body_of(env: VelocityEnv) -> gait.Body:
     )
 
 
-def observe(env: VelocityEnv, g: GaitState, command: np.ndarray, previous: np.ndarray, base: np.ndarray) -> np.ndarray:
+def observe(
+    env: VelocityEnv, g: GaitState, command: np.ndarray, previous: np.ndarray, base: np.ndarray
+) -> np.ndarray:
     """The teacher's input (n, 67): the paper's 48 numbers from the true state, the clock, the gait's targets, contacts."""
     angle = 2 * np.pi * g.phase[:, None]
     moving = command[:, 3:] < 0.5
@@ -108,7 +110,12 @@ def reward(env: VelocityEnv, g: GaitState) -> np.ndarray:
     ev = np.sum((c[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
     ew = (c[:, 2] - env.angular_velocity[:, 2]) ** 2
     lag = g.mean_command - g.mean_velocity
-    tracking = 1.0 * np.exp(-ev / 0.25) + 0.5 * np.exp(-ev / 0.02) + 0.5 * np.exp(-ew / 0.25) + 0.25 * np.exp(-ew / 0.05)
+    tracking = (
+        1.0 * np.exp(-ev / 0.25)
+        + 0.5 * np.exp(-ev / 0.02)
+        + 0.5 * np.exp(-ew / 0.25)
+        + 0.25 * np.exp(-ew / 0.05)
+    )
     tracking -= 1.5 * np.hypot(lag[:, 0], lag[:, 1]) + 0.5 * np.abs(lag[:, 2])
     body = (
         -0.5 * np.abs(env.roll_pitch).sum(1)
@@ -157,7 +164,11 @@ class TeacherRun:
         self.actor = Gaussian(Mlp(size, 12), 12, config.std)
         self.critic = Mlp(size + CRITIC_MIRROR_FREE, 1)
         self.ppo = Ppo(
-            self.actor, self.critic, config.ppo, torch_mirror(OBSERVATION_MIRROR), torch_mirror(symmetry.JOINTS)
+            self.actor,
+            self.critic,
+            config.ppo,
+            torch_mirror(OBSERVATION_MIRROR),
+            torch_mirror(symmetry.JOINTS),
         )
         self.samples = 0
 
@@ -188,7 +199,9 @@ class TeacherRun:
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One rollout of `length` samples with exploration noise."""
         env, g, c = self.env, self.gait, self.config
-        keep: dict[str, list[np.ndarray]] = {name: [] for name in ("obs", "extra", "action", "mean", "reward", "ended", "cut")}
+        keep: dict[str, list[np.ndarray]] = {
+            name: [] for name in ("obs", "extra", "action", "mean", "reward", "ended", "cut")
+        }
         std = self.actor.log_std.exp().detach().numpy()
         errors, falls = [], 0
         base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
@@ -209,7 +222,9 @@ class TeacherRun:
             lag = g.mean_command - g.mean_velocity
             errors.append([np.hypot(lag[:, 0], lag[:, 1]).mean(), np.abs(lag[:, 2]).mean()])
             falls += int(fell.sum())
-            for name, value in zip(keep, (obs, extra, action, mean, total / HOLD - 4.0 * fell, fell, late), strict=True):
+            for name, value in zip(
+                keep, (obs, extra, action, mean, total / HOLD - 4.0 * fell, fell, late), strict=True
+            ):
                 keep[name].append(value)
             over = np.flatnonzero(fell | late)
             if len(over):
@@ -233,4 +248,9 @@ class TeacherRun:
         )
         xy, wz = np.mean(errors, axis=0)
         seconds = c.length * c.n * HOLD * TICK
-        return rollout, {"error_xy": xy, "error_wz": wz, "falls_per_minute": 60 * falls / seconds, "reward": float(t["reward"].mean())}
+        return rollout, {
+            "error_xy": xy,
+            "error_wz": wz,
+            "falls_per_minute": 60 * falls / seconds,
+            "reward": float(t["reward"].mean()),
+        }

@@ -46,7 +46,9 @@ def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
     p = np.asarray(feet, float) - HIPS
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
     offset = THIGH_OFFSET * _SIDE
-    depth = np.sqrt(np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8))  # leg plane: foot at depth below the thigh joint
+    depth = np.sqrt(
+        np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8)
+    )  # leg plane: foot at depth below the thigh joint
     hip = np.arctan2(z, y) - np.arctan2(-depth, offset)
     hip = np.arctan2(np.sin(hip), np.cos(hip))
     reach = np.clip(np.hypot(x, depth), abs(THIGH_LENGTH - CALF_LENGTH) + 1e-6, THIGH_LENGTH + CALF_LENGTH)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import attrs
 import mujoco
 import numpy as np
+from numpy.typing import ArrayLike
 
 from . import robot
-from .robot import FOOT_RADIUS, FRONT, KINDS, LEFT, LEGS
+from .robot import FOOT_RADIUS, KINDS, LEFT, LEGS
 
 
-def _text(values: object) -> str:
-    return " ".join(repr(float(v)) for v in np.ravel(values))  # type: ignore[arg-type]
+def _text(values: ArrayLike) -> str:
+    return " ".join(repr(float(v)) for v in np.ravel(np.asarray(values, float)))
 
 
 @attrs.frozen(eq=False)
@@ -31,7 +32,7 @@ class Plant:
 
 
 def _leg(leg: str, plant: Plant) -> str:
-    sx, sy = FRONT[leg], LEFT[leg]
+    sy = LEFT[leg]
     first = 3 * LEGS.index(leg)
     shells = {
         "hip": f'<geom class="shell" type="cylinder" size="0.046 0.0209" pos="0 {0.083 * sy!r} 0" euler="{np.pi / 2!r} 0 0"/>',
@@ -49,7 +50,11 @@ def _leg(leg: str, plant: Plant) -> str:
         inertial = robot.lumped(link.name)
         i = first + k
         axis = "1 0 0" if link.axis == "x" else "0 1 0"
-        shell = shells[kind].replace('class="shell"', 'class="visual"') if plant.only_feet_and_trunk else shells[kind]
+        shell = (
+            shells[kind].replace('class="shell"', 'class="visual"')
+            if plant.only_feet_and_trunk
+            else shells[kind]
+        )
         inner = (
             f'<body name="{link.name}" pos="{_text(link.origin)}">'
             f'<inertial mass="{_text(inertial.mass)}" pos="{_text(inertial.com)}" fullinertia="{_text(inertial.full())}"/>'
@@ -74,11 +79,15 @@ def mjcf(plant: Plant | None = None) -> str:
         if plant.plane
         else ""
     )
-    sensors = """<sensor>
+    sensors = (
+        """<sensor>
     <accelerometer name="accelerometer" site="imu"/>
     <gyro name="gyro" site="imu"/>
     <framequat name="orientation" objtype="site" objname="imu"/>
-  </sensor>""" if plant.sensors else ""
+  </sensor>"""
+        if plant.sensors
+        else ""
+    )
     motors = "\n    ".join(
         f'<motor name="{name}" joint="{name}" ctrlrange="{-limit!r} {limit!r}"/>'
         for name, limit in zip(robot.JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)

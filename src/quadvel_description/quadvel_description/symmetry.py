@@ -30,9 +30,7 @@ def _signs(*signs: float) -> Mirror:
     return Mirror(np.arange(len(signs)), np.array(signs, float))
 
 
-JOINTS = Mirror(
-    np.array([3 * leg + k for leg in _LEG_SWAP for k in range(3)]), np.tile([-1.0, 1.0, 1.0], 4)
-)
+JOINTS = Mirror(np.array([3 * leg + k for leg in _LEG_SWAP for k in range(3)]), np.tile([-1.0, 1.0, 1.0], 4))
 FEET = Mirror(np.array(_LEG_SWAP), np.ones(4))
 PARTS = {
     "command": _signs(1, -1, -1, 1),
