@@ -92,6 +92,12 @@ def test_in_simulated_time_the_simulator_waits_and_the_others_follow_its_clock()
     assert all(values["use_sim_time"] is True for values in overrides.values())
 
 
+def test_beside_a_robot_that_others_serve_nothing_moves_without_an_operator() -> None:
+    overrides = Stack(low_level="external").overrides()
+    assert "sim_node" not in overrides
+    assert overrides["controller"] == {"require_operator": True}
+
+
 def test_another_robot_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="low_level"):
         Stack(low_level="spot")

@@ -72,7 +72,10 @@ def run(context: typer.Context, node: Annotated[str, typer.Argument(metavar="NOD
 
 @app.command()
 def up(
-    low_level: Annotated[Literal["sim"], typer.Option(help="What serves low_state and low_cmd.")] = "sim",
+    low_level: Annotated[
+        Literal["sim", "external"],
+        typer.Option(help="What serves low_state and low_cmd; external: others do."),
+    ] = "sim",
     policy: Annotated[
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
     ] = None,

@@ -31,7 +31,9 @@ NODES = {
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
     "planner": NodeEntry("quadvel_eval.scripted_planner", "walks the robot through a script of velocities"),
-    "planner": NodeEntry("quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"),
+    "planner": NodeEntry(
+        "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
+    ),
 }
 
 

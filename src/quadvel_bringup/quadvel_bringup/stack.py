@@ -15,13 +15,17 @@ Parameters = dict[str, bool | str]
 
 @attrs.frozen
 class LowLevel:
-    """What serves low_state and low_cmd: its node, and what it wants of the controller."""
+    """What serves low_state and low_cmd: its nodes, and what it wants of the controller."""
 
-    node: str
+    nodes: tuple[str, ...]
     controller: Parameters
 
 
-LOW_LEVELS = {"sim": LowLevel("sim_node", {"auto_stand": True})}
+LOW_LEVELS = {
+    "sim": LowLevel(("sim_node",), {"auto_stand": True}),
+    # Started by somebody else, and perhaps a real robot: it stands up and walks only on an operator's call.
+    "external": LowLevel((), {"require_operator": True}),
+}
 
 
 @attrs.frozen(kw_only=True)
@@ -48,11 +52,11 @@ class Stack:
             "controller": low_level.controller | _given(policy=policy),
             "command_mux": _given(),
         }
-        served = _given(terrain=self.terrain)
+        serving = {name: _given(terrain=self.terrain) for name in low_level.nodes}
         if self.use_sim_time:
-            served |= {"mode": "lockstep"}
+            serving = {name: values | {"mode": "lockstep"} for name, values in serving.items()}
             followers = {name: values | {"use_sim_time": True} for name, values in followers.items()}
-        return {low_level.node: served, **followers}
+        return serving | followers
 
     def arguments(self) -> dict[str, list[str]]:
         """The same as arguments of ROS 2."""
