@@ -30,7 +30,6 @@ NODES = {
     "estimator": NodeEntry("quadvel_estimator.estimator", "linear velocity from IMU and encoders"),
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
-    "planner": NodeEntry("quadvel_eval.scripted_planner", "walks the robot through a script of velocities"),
     "planner": NodeEntry(
         "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
     ),
