@@ -12,8 +12,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
+from . import bench
 from .grid import evaluate
-from .report import evaluation_table, output_folder, write_evaluation
+from .report import evaluation_table, output_folder, write_evaluation, write_json
 from .walk import Setup
 
 
@@ -51,3 +52,20 @@ def eval_command(
     console = Console()
     console.print(evaluation_table(result))
     console.print(f"written: {folder}/eval.json, eval.csv, eval.png")
+
+
+def bench_command(
+    out: Annotated[Path, typer.Option(help="JSON file for the figures.")] = Path("out/bench.json"),
+) -> None:
+    """Measure how fast this machine simulates, infers, talks and trains; on an idle machine, some minutes."""
+    output_folder(out.parent)
+    results = {}
+    messages = Console(stderr=True)
+    with messages.status("") as status:
+        for name in bench.PARTS:
+            status.update(f"measuring: {name}")
+            results[name] = bench.PARTS[name]()
+    write_json(out, {"schema": bench.SCHEMA, "machine": bench.machine(), **results})
+    console = Console()
+    console.print(bench.table(results))
+    console.print(f"written: {out}")

@@ -31,7 +31,7 @@ Array = NDArray[np.float64]
 
 PERIOD = 1.0 / RATE_HZ  # s
 ESTIMATORS = ("learned", "kalman", "truth")
-_STEPS = round(PERIOD / DT)  # of the simulator, a tick
+STEPS = round(PERIOD / DT)  # of the simulator, a tick
 _PLANNER = MuxInput("planner", priority=0, timeout=1.0)
 
 
@@ -109,7 +109,7 @@ class RobotLoop:
         self._velocity, _ = self._estimator.update(state, self._previous_action)
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)
-        simulator.step(_STEPS)
+        simulator.step(STEPS)
         return Sample(state, truth, estimates, command, self.supervisor.mode, fallen)
 
     def start_walking(self) -> None:

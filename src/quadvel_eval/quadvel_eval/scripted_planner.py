@@ -32,7 +32,7 @@ class PlannerParameters:
             raise ValueError(f"script is {self.script!r}, expected {' or '.join(SCRIPTS)}")
 
 
-class ScriptedPlanner(Node):  # type: ignore[misc]
+class ScriptedPlanner(Node):
     """Orders modes from the controller and publishes velocities; ends with 0 when the script is through."""
 
     def __init__(self) -> None:

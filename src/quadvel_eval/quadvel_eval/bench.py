@@ -1,0 +1,168 @@
+"""How fast this machine runs the parts: what `quadvel bench` measures. Figures for people, no test of anything.
+
+Everything is measured in one run, so that ratios hold where absolute figures vary between machines.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import time
+from collections.abc import Callable
+from importlib import metadata, util
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.table import Table
+
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import JointCommand, RobotState
+from quadvel_estimator.learned import LearnedEstimator
+from quadvel_policy.policy_file import PolicyFile
+
+from . import round_trip
+from .robot_loop import PERIOD, STEPS, RobotLoop, TrueVelocity
+from .walk import Setup, make_loop, make_simulator
+
+WALK = (0.5, 0.0, 0.0)
+SCHEMA = 1
+
+
+def machine() -> dict[str, Any]:
+    """What the figures belong to."""
+    packages = {name: metadata.version(name) for name in ("mujoco", "numpy", "onnxruntime")}
+    return {"cores": len(os.sched_getaffinity(0)), "python": platform.python_version(), **packages}
+
+
+def _percentiles(seconds: list[float]) -> dict[str, float]:
+    p50, p99 = 1e6 * np.quantile(seconds, (0.5, 0.99))
+    return {"p50_us": float(p50), "p99_us": float(p99)}
+
+
+def _time(job: Callable[[], object], count: int) -> list[float]:
+    """Seconds of each of `count` calls, after some to warm up."""
+    times = []
+    for _ in range(count + count // 10):
+        start = time.perf_counter()
+        job()
+        times.append(time.perf_counter() - start)
+    return times[-count:]
+
+
+def simulator() -> dict[str, Any]:
+    """One robot that stands, a command every 5 ms; alone, and with its sensors read at 200 Hz."""
+    robot = make_simulator(Setup(), seed=0)
+    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+
+    def step() -> None:
+        robot.command(command)
+        robot.step(STEPS)
+
+    def step_and_read() -> None:
+        step()
+        robot.state()
+
+    alone, read = _time(step, 1000), _time(step_and_read, 1000)
+    return {
+        "realtime_factor": PERIOD / float(np.mean(alone)),
+        "with_sensors_realtime_factor": PERIOD / float(np.mean(read)),
+    }
+
+
+def loop() -> dict[str, Any]:
+    """The evaluation's whole loop, both estimators included, while walking."""
+    walking = make_loop(Setup(), seed=0)
+    times = _time(lambda: walking.tick(WALK), 600)
+    return {"realtime_factor": PERIOD / float(np.mean(times))}
+
+
+def policy() -> dict[str, Any]:
+    """Inference alone."""
+    network = PolicyFile()
+    observation = np.zeros(network.metadata.observation.size, np.float32)
+    return _percentiles(_time(lambda: network.step(observation), 5000))
+
+
+def estimator() -> dict[str, Any]:
+    """The learned estimator from state to velocity."""
+    network, state = LearnedEstimator(), make_simulator(Setup(), seed=0).state()
+    previous_action = np.zeros(12)
+    return _percentiles(_time(lambda: network.update(state, previous_action), 5000))
+
+
+class _TimedSupervisor(Supervisor):
+    """Notes what each of its ticks takes."""
+
+    def __init__(self, policy: PolicyFile) -> None:
+        super().__init__(policy)
+        self.seconds: list[float] = []
+
+    def tick(
+        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike
+    ) -> JointCommand:
+        """As the supervisor's."""
+        start = time.perf_counter()
+        answer = super().tick(now, state, velocity, command)
+        self.seconds.append(time.perf_counter() - start)
+        return answer
+
+
+def supervisor() -> dict[str, Any]:
+    """A tick from state to command: all checks, observation and inference, while walking."""
+    robot, timed = make_simulator(Setup(), seed=0), _TimedSupervisor(PolicyFile())
+    walking = RobotLoop(robot, timed, TrueVelocity(robot))
+    walking.start_walking()
+    timed.seconds.clear()
+    for _ in range(600):
+        walking.tick(WALK)
+    return _percentiles(timed.seconds)
+
+
+def _training(part: str) -> Callable[[], dict[str, Any]]:
+    def measure() -> dict[str, Any]:
+        if util.find_spec("torch") is None:
+            return {"skipped": "torch is not installed; pip install -e '.[train]'"}
+        from quadvel_training import bench
+
+        figures: dict[str, Any] = getattr(bench, part)()
+        return figures
+
+    return measure
+
+
+PARTS: dict[str, Callable[[], dict[str, Any]]] = {
+    "simulator": simulator,
+    "loop": loop,
+    "policy": policy,
+    "estimator": estimator,
+    "supervisor": supervisor,
+    "round_trip": round_trip.measure,
+    "environment": _training("environment"),
+    "training": _training("training"),
+}
+ROWS = (  # part, figure, what it is, what is wanted
+    ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
+    ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
+    ("loop", "realtime_factor", "evaluation loop, times real time", ""),
+    ("policy", "p50_us", "inference, median, us", "50 or less"),
+    ("policy", "p99_us", "inference, 99 %, us", ""),
+    ("supervisor", "p50_us", "supervisor tick, median, us", ""),
+    ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
+    ("estimator", "p50_us", "learned estimator, median, us", ""),
+    ("round_trip", "p50_us", "message there and back, median, us", ""),
+    ("round_trip", "p99_us", "message there and back, 99 %, us", ""),
+    ("environment", "steps_per_s", "training environment, steps/s", ""),
+    ("environment", "ratio", "of the bare batch's", "0.7 or more"),
+    ("training", "samples_per_s", "training, policy samples/s", ""),
+    ("training", "ratio", "of what bare steps and passes allow", "0.6 or more"),
+)
+
+
+def table(results: dict[str, dict[str, Any]]) -> Table:
+    """The figures and what is wanted of them."""
+    found = Table("figure", "measured", "wanted", title="Benchmark")
+    for part, figure, about, wanted in ROWS:
+        result = results[part]
+        found.add_row(about, result.get("skipped") or f"{result[figure]:,.4g}", wanted)
+    return found
