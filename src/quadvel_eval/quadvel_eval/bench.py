@@ -20,6 +20,7 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
+from quadvel_policy.supervisor import Supervisor
 
 from . import round_trip
 from .robot_loop import PERIOD, STEPS, RobotLoop, TrueVelocity

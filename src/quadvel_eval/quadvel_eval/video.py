@@ -69,7 +69,7 @@ def strip_times(recording: Recording) -> NDArray[np.float64]:
 
 def write_video(path: Path, recording: Recording) -> None:
     """The whole recording as an MP4 in real time."""
-    from imageio_ffmpeg import write_frames  # type: ignore[import-untyped]
+    from imageio_ffmpeg import write_frames
 
     start, end = recording.position.time[[0, -1]]
     with replacing(path) as draft, Film(recording, *SIZE) as film:
