@@ -11,6 +11,7 @@ import attrs
 import numpy as np
 import onnx
 import pytest
+from numpy.typing import NDArray
 from onnx import TensorProto, helper, numpy_helper
 
 import quadvel_dds
@@ -25,20 +26,37 @@ WEIGHTS = np.random.default_rng(0).normal(size=(45, 3)).astype(np.float32)
 VARIANCE = np.array([0.04, 0.01, 0.09])
 
 
-def sample(time: float, **changes: Any) -> RobotState:
-    """A robot that stands still, changed by `changes`."""
-    standing = RobotState(
-        time=time,
-        tick=round(1e3 * time),
-        q=NOMINAL_Q,
-        dq=np.zeros(12),
-        tau=np.zeros(12),
-        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
-        angular_velocity=np.zeros(3),
-        linear_acceleration=np.array([0.0, 0.0, GRAVITY]),
-        foot_force=np.full(4, 80.0),
-    )
-    return attrs.evolve(standing, **changes)
+@pytest.fixture
+def standing() -> Callable[..., RobotState]:
+    """standing(time, **changes): the state of a robot that stands still, changed by `changes`."""
+
+    def state(time: float, **changes: Any) -> RobotState:
+        still = RobotState(
+            time=time,
+            tick=round(1e3 * time),
+            q=NOMINAL_Q,
+            dq=np.zeros(12),
+            tau=np.zeros(12),
+            quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+            angular_velocity=np.zeros(3),
+            linear_acceleration=np.array([0.0, 0.0, GRAVITY]),
+            foot_force=np.full(4, 80.0),
+        )
+        return attrs.evolve(still, **changes)
+
+    return state
+
+
+@pytest.fixture
+def weights() -> NDArray[np.float32]:
+    """(45, 3), of the network that `write_estimator` writes."""
+    return WEIGHTS
+
+
+@pytest.fixture
+def variance() -> NDArray[np.float64]:
+    """(3,), before scaling, of the network that `write_estimator` writes."""
+    return VARIANCE
 
 
 def write_estimator_file(

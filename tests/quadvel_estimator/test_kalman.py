@@ -1,5 +1,7 @@
 """The Kalman filter on motions known in closed form, and its parts against independent computations."""
 
+from collections.abc import Callable
+
 import attrs
 import numpy as np
 import pytest
@@ -10,11 +12,11 @@ from quadvel_description.robot import FOOT_RADIUS, GRAVITY, MASS, NOMINAL_HEIGHT
 from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_trunk, _ground_force, _rolling
 
-from .conftest import sample
-
 DT = 0.005
 NOMINAL_FEET = foot_positions(NOMINAL_Q)
 CONFIG = KalmanConfig()
+State = Callable[..., RobotState]
+Trot = Callable[[float, int], list[RobotState]]
 
 
 def rolling_stance(speed: float, time: np.ndarray) -> np.ndarray:
@@ -31,19 +33,26 @@ def rolling_stance(speed: float, time: np.ndarray) -> np.ndarray:
     return q
 
 
-def trot(speed: float, samples: int) -> list[RobotState]:
-    """Diagonal pairs take turns of 0.2 s; the pair in the air swings forward as the other goes back."""
-    times = DT * np.arange(1, samples + 1)
-    phase = times % 0.4
-    stance = np.where(phase[:, None] < 0.2, [True, False, False, True], [False, True, True, False])
+@pytest.fixture
+def trot(standing: State) -> Trot:
+    """trot(speed, samples): diagonal pairs take turns of 0.2 s; the pair in the air swings as the other's mirror."""
 
-    def joints(ahead: float) -> np.ndarray:
-        step = phase % 0.2 - 0.1 + ahead
-        return np.where(np.repeat(stance, 3, 1), rolling_stance(speed, step), rolling_stance(speed, -step))
+    def states(speed: float, samples: int) -> list[RobotState]:
+        times = DT * np.arange(1, samples + 1)
+        phase = times % 0.4
+        stance = np.where(phase[:, None] < 0.2, [True, False, False, True], [False, True, True, False])
 
-    q, dq = joints(0.0), (joints(1e-6) - joints(-1e-6)) / 2e-6
-    force = np.where(stance, 150.0, 0.0)
-    return [sample(t, q=q[i], dq=dq[i], foot_force=force[i]) for i, t in enumerate(times)]
+        def joints(ahead: float) -> np.ndarray:
+            step = phase % 0.2 - 0.1 + ahead
+            return np.where(
+                np.repeat(stance, 3, 1), rolling_stance(speed, step), rolling_stance(speed, -step)
+            )
+
+        q, dq = joints(0.0), (joints(1e-6) - joints(-1e-6)) / 2e-6
+        force = np.where(stance, 150.0, 0.0)
+        return [standing(t, q=q[i], dq=dq[i], foot_force=force[i]) for i, t in enumerate(times)]
+
+    return states
 
 
 def stack(states: list[RobotState]) -> RobotState:
@@ -58,21 +67,21 @@ def run(estimator: KalmanEstimator, states: list[RobotState]) -> np.ndarray:
 
 
 @pytest.mark.parametrize("speed", [0.8, -0.5])
-def test_a_trot_at_constant_velocity_is_recovered_exactly(speed: float) -> None:
+def test_a_trot_at_constant_velocity_is_recovered_exactly(trot: Trot, speed: float) -> None:
     velocity = run(KalmanEstimator(CONFIG), trot(speed, 300))[200:]
     np.testing.assert_allclose(velocity, np.broadcast_to([speed, 0.0, 0.0], (100, 3)), atol=2e-3)
 
 
-def test_the_velocity_is_told_in_the_body_frame() -> None:
+def test_the_velocity_is_told_in_the_body_frame(trot: Trot) -> None:
     heading = Rotation.from_euler("z", 2.0).as_quat(scalar_first=True)
     states = [attrs.evolve(state, quaternion=heading) for state in trot(0.8, 300)]
     np.testing.assert_allclose(run(KalmanEstimator(CONFIG), states)[-1], [0.8, 0.0, 0.0], atol=2e-3)
 
 
-def test_at_rest_noise_leaves_no_bias() -> None:
+def test_at_rest_noise_leaves_no_bias(standing: State) -> None:
     rng = np.random.default_rng(1)
     states = [
-        sample(
+        standing(
             DT * i,
             q=NOMINAL_Q + rng.normal(0.0, 0.002, 12),
             dq=rng.normal(0.0, 0.1, 12),
@@ -85,19 +94,21 @@ def test_at_rest_noise_leaves_no_bias() -> None:
     assert velocity.std() < 0.02
 
 
-def test_the_accelerometer_carries_it_through_a_flight() -> None:
+def test_the_accelerometer_carries_it_through_a_flight(standing: State) -> None:
     airborne = np.zeros(4)
     estimator = KalmanEstimator(CONFIG)
-    run(estimator, [sample(DT * i) for i in range(100)])
+    run(estimator, [standing(DT * i) for i in range(100)])
     ballistic = [
-        sample(0.5 + DT * i, foot_force=airborne, linear_acceleration=np.array([1.0, 0.0, 0.0]), q=NOMINAL_Q)
+        standing(
+            0.5 + DT * i, foot_force=airborne, linear_acceleration=np.array([1.0, 0.0, 0.0]), q=NOMINAL_Q
+        )
         for i in range(20)
     ]
     # the robot's free fall: the accelerometer reads 1 m/s^2 forward and no gravity
     np.testing.assert_allclose(run(estimator, ballistic)[-1], [0.1, 0.0, -0.1 * GRAVITY], atol=0.01)
 
 
-def test_one_foot_that_slips_is_not_believed() -> None:
+def test_one_foot_that_slips_is_not_believed(standing: State) -> None:
     slide = 0.6  # m/s, the front right foot goes forward on the ground, the others stand
 
     def state(time: float) -> RobotState:
@@ -107,21 +118,21 @@ def test_one_foot_that_slips_is_not_believed() -> None:
         foot_rate = np.zeros((4, 3, 1))
         foot_rate[0, 0] = slide
         dq = np.linalg.solve(foot_jacobians(q), foot_rate).reshape(12)
-        return sample(time, q=q, dq=dq)
+        return standing(time, q=q, dq=dq)
 
     estimator = KalmanEstimator(CONFIG)
-    run(estimator, [sample(DT * i) for i in range(-100, 0)])
+    run(estimator, [standing(DT * i) for i in range(-100, 0)])
     velocity = run(estimator, [state(DT * i) for i in range(40)])
     assert np.abs(velocity).max() < 0.03
 
 
-def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest() -> None:
+def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: State) -> None:
     """Against finite differences of the material point of the foot that touches the ground."""
     rng = np.random.default_rng(2)
     q = NOMINAL_Q + rng.uniform(-0.3, 0.3, 12)
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
-    state = sample(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
+    state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
     told = _rolling(state, attitude.as_matrix()) - _against_trunk(state, foot_positions(q), foot_jacobians(q))
 
     def calf(q: np.ndarray, leg: int) -> Rotation:
@@ -153,17 +164,17 @@ def test_joint_torques_tell_the_weight_on_each_foot() -> None:
     np.testing.assert_allclose(_ground_force(tau, rotation, foot_jacobians(q)), share, rtol=0.02)
 
 
-def test_standing_on_torques_alone_works_without_foot_sensors() -> None:
+def test_standing_on_torques_alone_works_without_foot_sensors(standing: State) -> None:
     load = np.array([0.0, 0.0, MASS * GRAVITY / 4])
     tau = -np.einsum("fij,i->fj", foot_jacobians(NOMINAL_Q), load).reshape(12)
     config = attrs.evolve(CONFIG, contact_source="torque")
     estimator = KalmanEstimator(config)
-    states = [sample(DT * i, tau=tau, foot_force=np.zeros(4)) for i in range(100)]
+    states = [standing(DT * i, tau=tau, foot_force=np.zeros(4)) for i in range(100)]
     biased = [attrs.evolve(s, linear_acceleration=np.array([0.2, 0.0, GRAVITY])) for s in states]
     assert abs(run(estimator, biased)[-1, 0]) < 0.02
 
 
-def test_a_batch_gives_the_same_as_one_by_one() -> None:
+def test_a_batch_gives_the_same_as_one_by_one(trot: Trot) -> None:
     walks = [trot(speed, 60) for speed in (0.3, -0.6, 0.9)]
     alone = [run(KalmanEstimator(CONFIG), walk) for walk in walks]
     estimator = KalmanEstimator(CONFIG, shape=(3,))
@@ -171,7 +182,7 @@ def test_a_batch_gives_the_same_as_one_by_one() -> None:
     np.testing.assert_allclose(together.swapaxes(0, 1), alone, atol=1e-10)
 
 
-def test_reset_forgets_one_robot_of_a_batch_and_keeps_the_others() -> None:
+def test_reset_forgets_one_robot_of_a_batch_and_keeps_the_others(trot: Trot) -> None:
     estimator = KalmanEstimator(CONFIG, shape=(2,))
     twice = [stack([state, state]) for state in trot(0.8, 101)]
     run(estimator, twice[:-2])
@@ -183,28 +194,28 @@ def test_reset_forgets_one_robot_of_a_batch_and_keeps_the_others() -> None:
     np.testing.assert_allclose(velocity[:, 0], 0.8, atol=0.02)
 
 
-def test_the_covariance_is_symmetric_and_grows_without_contact() -> None:
+def test_the_covariance_is_symmetric_and_grows_without_contact(standing: State) -> None:
     estimator = KalmanEstimator(CONFIG)
-    run(estimator, [sample(DT * i) for i in range(100)])
-    _, planted = estimator.update(sample(0.5))
-    run(estimator, [sample(0.5 + DT * i, foot_force=np.zeros(4)) for i in range(1, 40)])
-    _, flying = estimator.update(sample(0.7, foot_force=np.zeros(4)))
+    run(estimator, [standing(DT * i) for i in range(100)])
+    _, planted = estimator.update(standing(0.5))
+    run(estimator, [standing(0.5 + DT * i, foot_force=np.zeros(4)) for i in range(1, 40)])
+    _, flying = estimator.update(standing(0.7, foot_force=np.zeros(4)))
     np.testing.assert_array_equal(planted, planted.T)
     assert 0.0 < planted[0, 0] < 0.3 * flying[0, 0]
 
 
-def test_time_that_runs_backwards_is_an_error() -> None:
+def test_time_that_runs_backwards_is_an_error(standing: State) -> None:
     estimator = KalmanEstimator(CONFIG)
-    estimator.update(sample(1.0))
+    estimator.update(standing(1.0))
     with pytest.raises(ValueError, match=r"state.time is 0.5, expected 1.0 or later"):
-        estimator.update(sample(0.5))
+        estimator.update(standing(0.5))
     estimator.reset()
-    estimator.update(sample(0.5))
+    estimator.update(standing(0.5))
 
 
-def test_a_result_that_is_not_finite_is_an_error() -> None:
+def test_a_result_that_is_not_finite_is_an_error(standing: State) -> None:
     with pytest.raises(FloatingPointError):
-        KalmanEstimator(CONFIG).update(sample(0.0, dq=np.full(12, np.nan)))
+        KalmanEstimator(CONFIG).update(standing(0.0, dq=np.full(12, np.nan)))
 
 
 def test_a_vector_within_the_bounds_makes_a_configuration_and_back() -> None:

@@ -8,51 +8,59 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from quadvel_description.network_input import InputLayout
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.state import RobotState
 from quadvel_estimator import features
 from quadvel_estimator.learned import LearnedEstimator
 
-from .conftest import VARIANCE, WEIGHTS, sample
-
 WriteEstimator = Callable[..., Path]
+State = Callable[..., RobotState]
+Array = NDArray[np.floating]
 ACTION = np.linspace(-0.3, 0.3, 12)
 
 
-def test_velocity_and_covariance_are_the_scaled_outputs(write_estimator: WriteEstimator) -> None:
+def test_velocity_and_covariance_are_the_scaled_outputs(
+    write_estimator: WriteEstimator, standing: State, weights: Array, variance: Array
+) -> None:
     estimator = LearnedEstimator(write_estimator(output_scale=0.5))
-    state = sample(0.0, dq=np.linspace(-1.0, 1.0, 12))
-    product = features.build(state, ACTION) @ WEIGHTS
+    state = standing(0.0, dq=np.linspace(-1.0, 1.0, 12))
+    product = features.build(state, ACTION) @ weights
     for step in range(3):
         velocity, covariance = estimator.update(state, ACTION)
         np.testing.assert_allclose(velocity, 0.5 * (product + step), atol=1e-5)
-        np.testing.assert_allclose(covariance, 0.25 * np.diag(VARIANCE), rtol=1e-6)
+        np.testing.assert_allclose(covariance, 0.25 * np.diag(variance), rtol=1e-6)
 
 
-def test_a_reset_forgets_everything(write_estimator: WriteEstimator) -> None:
+def test_a_reset_forgets_everything(write_estimator: WriteEstimator, standing: State) -> None:
     estimator = LearnedEstimator(write_estimator())
-    first, _ = estimator.update(sample(0.0), ACTION)
-    second, _ = estimator.update(sample(0.005), ACTION)
+    first, _ = estimator.update(standing(0.0), ACTION)
+    second, _ = estimator.update(standing(0.005), ACTION)
     estimator.reset()
-    again, _ = estimator.update(sample(1.0), ACTION)
+    again, _ = estimator.update(standing(1.0), ACTION)
     assert not np.array_equal(first, second)
     np.testing.assert_array_equal(first, again)
 
 
-def test_the_layout_in_the_file_decides_over_the_default(write_estimator: WriteEstimator) -> None:
+def test_the_layout_in_the_file_decides_over_the_default(
+    write_estimator: WriteEstimator, standing: State, weights: Array
+) -> None:
     backwards = InputLayout(features.DEFAULT_LAYOUT.terms[::-1])
-    state = sample(0.0, dq=np.linspace(-1.0, 1.0, 12))
+    state = standing(0.0, dq=np.linspace(-1.0, 1.0, 12))
     estimator = LearnedEstimator(write_estimator(inputs=backwards.to_metadata(), output_scale=1.0))
-    expected = features.build(state, ACTION, backwards) @ WEIGHTS
+    expected = features.build(state, ACTION, backwards) @ weights
     np.testing.assert_allclose(estimator.update(state, ACTION)[0], expected, atol=1e-5)
 
 
-def test_an_input_that_is_not_finite_shows_as_an_error(write_estimator: WriteEstimator) -> None:
+def test_an_input_that_is_not_finite_shows_as_an_error(
+    write_estimator: WriteEstimator, standing: State
+) -> None:
     estimator = LearnedEstimator(write_estimator())
     with pytest.raises(FloatingPointError, match=r"estimator\.onnx.* velocity is not finite"):
-        estimator.update(sample(0.0, q=np.full(12, np.nan)), ACTION)
+        estimator.update(standing(0.0, q=np.full(12, np.nan)), ACTION)
 
 
 def test_a_missing_file_is_refused_by_name(tmp_path: Path) -> None:

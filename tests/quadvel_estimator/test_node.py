@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -22,13 +21,10 @@ from tf2_msgs.msg import TFMessage
 
 from quadvel_description.messages import write_low_cmd, write_low_state
 from quadvel_description.robot import NOMINAL_Q
-from quadvel_description.state import JointCommand
+from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
 
-from .conftest import WEIGHTS, sample
-
-DOMAIN = 81
 RECEIVED = {
     "velocity_estimate": TwistWithCovarianceStamped,
     "odom": Odometry,
@@ -37,11 +33,15 @@ RECEIVED = {
 }
 
 
+State = Callable[..., RobotState]
+
+
 class Bench:
     """The node under test and a peer that feeds it, served by one executor."""
 
-    def __init__(self, arguments: list[str]) -> None:
-        rclpy.init(args=["--ros-args", *arguments], domain_id=DOMAIN)
+    def __init__(self, arguments: list[str], standing: State) -> None:
+        rclpy.init(args=["--ros-args", *arguments])
+        self._standing = standing
         self._executor = SingleThreadedExecutor()
         peer = rclpy.create_node("peer", use_global_arguments=False)
         for node in (estimator.EstimatorNode(), peer):
@@ -54,7 +54,7 @@ class Bench:
         self.wait(lambda: self.states.get_subscription_count() and self.commands.get_subscription_count())
         self.wait(lambda: all(peer.count_publishers(topic) for topic in RECEIVED))
 
-    def wait(self, is_so: Callable[[], Any], seconds: float = 10.0) -> None:
+    def wait(self, is_so: Callable[[], Any], seconds: float = 30.0) -> None:
         """Serve until the predicate holds; fail with what was heard when the time is up."""
         end = time.monotonic() + seconds
         while not is_so():
@@ -64,7 +64,7 @@ class Bench:
     def send(self, at: float, **changes: Any) -> Any:
         """Publish a state with its stamp at `at` s; returns the message."""
         message = LowState()
-        write_low_state(sample(at, **changes), message)
+        write_low_state(self._standing(at, **changes), message)
         message.stamp.sec, message.stamp.nanosec = int(at), round(1e9 * (at % 1.0))
         self.states.publish(message)
         return message
@@ -80,14 +80,18 @@ class Bench:
 
 
 @pytest.fixture
-def bench(request: pytest.FixtureRequest, write_estimator: Callable[..., Path]) -> Iterator[Bench]:
+def bench(
+    request: pytest.FixtureRequest, write_estimator: Callable[..., Path], standing: State, domain_id: int
+) -> Iterator[Bench]:
     arguments = getattr(request, "param", ["-p", f"model:={write_estimator()}"])
-    bench = Bench(arguments)
+    bench = Bench(arguments, standing)
     yield bench
     bench.close()
 
 
-def test_each_state_is_answered_with_the_network_s_velocity(bench: Bench) -> None:
+def test_each_state_is_answered_with_the_network_s_velocity(
+    bench: Bench, standing: State, weights: np.ndarray
+) -> None:
     command = LowCmd()
     write_low_cmd(JointCommand(q=NOMINAL_Q + 0.2), command)
     bench.commands.publish(command)
@@ -98,7 +102,7 @@ def test_each_state_is_answered_with_the_network_s_velocity(bench: Bench) -> Non
     assert answer.header.stamp == state.stamp
     assert answer.header.frame_id == "trunk"
     velocity = answer.twist.twist.linear
-    expected = 0.5 * (features.build(sample(0.0), np.full(12, 0.2)) @ WEIGHTS + 4)
+    expected = 0.5 * (features.build(standing(0.0), np.full(12, 0.2)) @ weights + 4)
     np.testing.assert_allclose([velocity.x, velocity.y, velocity.z], expected, atol=1e-4)
     np.testing.assert_allclose(
         np.reshape(answer.twist.covariance, (6, 6)).diagonal()[:3], [0.01, 0.0025, 0.0225], rtol=1e-5
@@ -149,7 +153,9 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
         ("speed:=3", "unknown parameter speed, expected one of kind, model, reset_gap"),
     ],
 )
-def test_a_wrong_parameter_ends_the_start_with_one_sentence(argument: str, sentence: str) -> None:
+def test_a_wrong_parameter_ends_the_start_with_one_sentence(
+    argument: str, sentence: str, domain_id: int
+) -> None:
     with pytest.raises(SystemExit) as ended:
         estimator.main(["--ros-args", "-p", argument])
     assert str(ended.value.code).startswith(sentence)
@@ -161,27 +167,29 @@ def launch(*arguments: str) -> subprocess.Popen[str]:
     program = "import quadvel_dds; quadvel_dds.install(); from quadvel_estimator import estimator"
     return subprocess.Popen(
         [sys.executable, "-c", f"{program}; estimator.main()", "--ros-args", *arguments],
-        env=os.environ | {"ROS_DOMAIN_ID": str(DOMAIN + 1)},
         stderr=subprocess.PIPE,
         text=True,
     )
 
 
-def test_a_missing_network_ends_the_process_with_one_sentence() -> None:
+def test_a_missing_network_ends_the_process_with_one_sentence(domain_id: int) -> None:
     process = launch("-p", "model:=/nowhere.onnx")
     _, error = process.communicate(timeout=60)
     expected = "/nowhere.onnx: no such file, expected an ONNX network\n"
     assert (process.returncode, error) == (1, expected)
 
 
-def test_ctrl_c_that_arrives_twice_ends_it_with_exit_code_0() -> None:
+def test_ctrl_c_that_arrives_twice_ends_it_with_exit_code_0(domain_id: int) -> None:
     process = launch("-p", "kind:=kalman")
-    rclpy.init(domain_id=DOMAIN + 1)
+    rclpy.init(args=[])
     watcher = rclpy.create_node("watcher")
-    end = time.monotonic() + 30.0
-    while not watcher.count_publishers("velocity_estimate") and time.monotonic() < end:
-        time.sleep(0.05)
+    reports: list[Any] = []
+    watcher.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 10)
+    end = time.monotonic() + 60.0
+    while not reports and time.monotonic() < end:
+        rclpy.spin_once(watcher, timeout_sec=0.1)
     rclpy.shutdown()
+    assert reports, "the node did not report within a minute"
     process.send_signal(signal.SIGINT)
     process.send_signal(signal.SIGINT)
     _, error = process.communicate(timeout=60)

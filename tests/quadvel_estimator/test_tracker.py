@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import ArrayLike, NDArray
@@ -12,7 +14,7 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_estimator import features
 from quadvel_estimator.tracker import PATIENCE, VelocityTracker
 
-from .conftest import sample
+State = Callable[..., RobotState]
 
 
 class Scripted:
@@ -47,80 +49,86 @@ def tracker(estimator: Scripted) -> VelocityTracker:
     return VelocityTracker(estimator, reset_gap=0.1)
 
 
-def test_states_at_200_hz_are_all_taken(tracker: VelocityTracker, estimator: Scripted) -> None:
+def test_states_at_200_hz_are_all_taken(
+    tracker: VelocityTracker, estimator: Scripted, standing: State
+) -> None:
     times = [5.0 + 0.005 * i for i in range(40)]
-    assert all(tracker.take(sample(t)) is not None for t in times)
+    assert all(tracker.take(standing(t)) is not None for t in times)
     assert estimator.times == times
 
 
 def test_states_at_1_khz_are_taken_at_the_estimator_s_rate(
-    tracker: VelocityTracker, estimator: Scripted
+    tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     for i in range(1000):
-        tracker.take(sample(0.001 * i))
+        tracker.take(standing(0.001 * i))
     assert len(estimator.times) == pytest.approx(200, abs=1)
     np.testing.assert_allclose(np.diff(estimator.times[1:]), 0.005)
 
 
-def test_an_old_state_is_refused_and_changes_nothing(tracker: VelocityTracker, estimator: Scripted) -> None:
-    tracker.take(sample(1.0))
-    tracker.take(sample(1.005))
+def test_an_old_state_is_refused_and_changes_nothing(
+    tracker: VelocityTracker, estimator: Scripted, standing: State
+) -> None:
+    tracker.take(standing(1.0))
+    tracker.take(standing(1.005))
     with pytest.raises(MessageError, match="stamp is 505 ms older than the newest, expected a later one"):
-        tracker.take(sample(0.5))
-    assert tracker.take(sample(1.010)) is not None
+        tracker.take(standing(0.5))
+    assert tracker.take(standing(1.010)) is not None
     assert estimator.times == [1.0, 1.005, 1.010]
     assert estimator.resets == 0
 
 
 def test_a_stamp_that_never_changes_is_refused_for_ever(
-    tracker: VelocityTracker, estimator: Scripted
+    tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(sample(1.0))
+    tracker.take(standing(1.0))
     for _ in range(5 * PATIENCE):
         with pytest.raises(MessageError):
-            tracker.take(sample(1.0))
+            tracker.take(standing(1.0))
     assert estimator.resets == 0
 
 
 def test_time_that_was_set_back_starts_the_estimator_anew(
-    tracker: VelocityTracker, estimator: Scripted
+    tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(sample(100.0))
+    tracker.take(standing(100.0))
     for i in range(PATIENCE - 1):
         with pytest.raises(MessageError):
-            tracker.take(sample(0.005 * i))
-    assert tracker.take(sample(0.005 * PATIENCE)) is not None
+            tracker.take(standing(0.005 * i))
+    assert tracker.take(standing(0.005 * PATIENCE)) is not None
     assert estimator.resets == tracker.restarts == 1
-    assert tracker.take(sample(0.005 * (PATIENCE + 1))) is not None
+    assert tracker.take(standing(0.005 * (PATIENCE + 1))) is not None
 
 
 def test_a_gap_starts_the_estimator_anew_and_a_short_one_does_not(
-    tracker: VelocityTracker, estimator: Scripted
+    tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     for time in (0.0, 0.005, 0.045):
-        tracker.take(sample(time))
+        tracker.take(standing(time))
     assert estimator.resets == 0
-    tracker.take(sample(0.2))
+    tracker.take(standing(0.2))
     assert estimator.resets == tracker.restarts == 1
 
 
 def test_an_estimate_that_is_not_finite_resets_the_estimator(
-    tracker: VelocityTracker, estimator: Scripted
+    tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     estimator.velocity = np.full(3, np.nan)
     with pytest.raises(FloatingPointError):
-        tracker.take(sample(0.0))
+        tracker.take(standing(0.0))
     assert estimator.resets == 1
 
 
-def test_the_position_is_what_the_velocity_adds_up_to(tracker: VelocityTracker, estimator: Scripted) -> None:
+def test_the_position_is_what_the_velocity_adds_up_to(
+    tracker: VelocityTracker, estimator: Scripted, standing: State
+) -> None:
     """A quarter circle: at heading psi the velocity (1, 0, 0) of the body points to (cos psi, sin psi, 0)."""
     estimator.velocity = np.array([1.0, 0.0, 0.0])
     steps = 400
     for i in range(steps + 1):
         half = 0.5 * (np.pi / 2) * i / steps
         estimate = tracker.take(
-            sample(0.005 * i, quaternion=np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
+            standing(0.005 * i, quaternion=np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
         )
     assert estimate is not None
     radius = 0.005 * steps / (np.pi / 2)
@@ -128,20 +136,22 @@ def test_the_position_is_what_the_velocity_adds_up_to(tracker: VelocityTracker, 
     np.testing.assert_allclose(estimate.position_deviation, 0.1 * 0.005 * steps)
 
 
-def test_a_restart_leaves_the_position_where_it_was(tracker: VelocityTracker) -> None:
+def test_a_restart_leaves_the_position_where_it_was(tracker: VelocityTracker, standing: State) -> None:
     for i in range(201):
-        before = tracker.take(sample(0.005 * i))
-    after = tracker.take(sample(10.0))
+        before = tracker.take(standing(0.005 * i))
+    after = tracker.take(standing(10.0))
     assert before is not None
     assert after is not None
     np.testing.assert_allclose(before.position, [1.0, 0.0, 0.0])
     np.testing.assert_array_equal(after.position, before.position)
 
 
-def test_the_estimator_sees_the_targets_in_force(tracker: VelocityTracker, estimator: Scripted) -> None:
-    tracker.take(sample(0.0))
+def test_the_estimator_sees_the_targets_in_force(
+    tracker: VelocityTracker, estimator: Scripted, standing: State
+) -> None:
+    tracker.take(standing(0.0))
     tracker.command(features.previous_action(NOMINAL_Q + 0.1, MODE_SERVO))
-    tracker.take(sample(0.005))
+    tracker.take(standing(0.005))
     tracker.command(features.previous_action(NOMINAL_Q + 0.1, MODE_DAMPING))
-    tracker.take(sample(0.010))
+    tracker.take(standing(0.010))
     np.testing.assert_allclose(estimator.actions, np.array([np.zeros(12), np.full(12, 0.1), np.zeros(12)]))
