@@ -23,7 +23,7 @@ from rclpy.exceptions import (
     ParameterNotDeclaredException,
     ParameterUninitializedException,
 )
-from rclpy.executors import MultiThreadedExecutor
+from rclpy.executors import Executor, MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
@@ -433,6 +433,41 @@ def test_blocking_call_with_a_spinning_thread(ros: Start) -> None:
     thread.join()
     executor.shutdown()
     assert answer == SetBool.Response()
+
+
+@pytest.mark.parametrize("executor_class", [SingleThreadedExecutor, MultiThreadedExecutor])
+def test_executor_is_shut_down_by_another_thread(ros: Start, executor_class: type[Executor]) -> None:
+    ros()
+    node, failures = Node("idle"), []
+
+    def spin() -> None:
+        try:
+            executor.spin()
+        except BaseException as error:
+            failures.append(error)
+
+    for _ in range(5):
+        executor = executor_class()
+        executor.add_node(node)
+        thread = threading.Thread(target=spin)
+        thread.start()
+        executor.shutdown()
+        thread.join(timeout=20.0)
+        assert not thread.is_alive()
+    assert not failures
+
+
+def test_order_of_the_end_does_not_matter(ros: Start) -> None:
+    ros()
+    node, executor = Node("idle"), SingleThreadedExecutor()
+    executor.add_node(node)
+    executor.spin_once(timeout_sec=0.0)
+    rclpy.shutdown()
+    node.destroy_node()
+    node.destroy_node()
+    executor.remove_node(node)
+    executor.shutdown()
+    rclpy.try_shutdown()
 
 
 def test_publishing_after_shutdown_is_refused(ros: Start) -> None:

@@ -142,7 +142,7 @@ class _Generator:
         self.flush()
         self.emit(result)
         exec("\n".join([f"def {signature}:", *self.lines]), self.names)
-        return self.names[signature.split("(")[0]]  # type: ignore[no-any-return]
+        return self.names[signature.split("(")[0]]
 
 
 class _Writer(_Generator):

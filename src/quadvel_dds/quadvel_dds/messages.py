@@ -259,7 +259,7 @@ def _make_init(cls: type, typename: str, fields: cdr.Fields) -> Callable[..., No
             f"    else: self.{field} = {field}",
         ]
     exec("\n".join(lines), names)
-    return names["__init__"]  # type: ignore[no-any-return]
+    return names["__init__"]
 
 
 def _checked(field: str, description: Any) -> Callable[[Any], Any]:

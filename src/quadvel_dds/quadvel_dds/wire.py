@@ -165,7 +165,7 @@ class Reader:
             if not samples:
                 return None
             if samples[0][1].valid_data:  # else: news of a writer that left, which ROS 2 does not tell
-                return samples[0]  # type: ignore[no-any-return]
+                return samples[0]
         return None
 
     def matched(self) -> int:
@@ -201,17 +201,16 @@ class WaitSet:
         self.readers = readers
 
     def wait(self, timeout_ns: int) -> set[int]:
-        """Keys of the readers that have data; empty after the time-out or a wake-up."""
+        """Keys of the readers that have data; empty after the time-out, a wake-up, or the participant's leave."""
         size = len(self.readers) + 1
         triggered = (ctypes.c_void_p * size)()
         count = self.dds._waitset_wait(self.dds._ref, triggered, size, timeout_ns)
-        if count < 0:
-            raise DDSException(count, "while waiting for data")
-        self.guard.take()
-        return {key for key in triggered[:count] if key}
+        self.guard._take_guardcondition(self.guard._ref, ctypes.byref(ctypes.c_bool()))
+        return {key for key in triggered[: max(count, 0)] if key}
 
     def wake(self) -> None:
-        self.guard.set(True)
+        # Not `guard.set`, which complains if the participant has left.
+        self.guard._set_guardcondition(self.guard._ref, True)
 
     def close(self) -> None:
         delete(self.guard)
