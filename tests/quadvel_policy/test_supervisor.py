@@ -123,6 +123,14 @@ def test_it_stands_up_by_itself_once_if_told_so(policy: Any) -> None:
     assert rig.mode == "passive"
 
 
+def test_an_order_ends_standing_up_by_itself(policy: Any) -> None:
+    rig = Rig(policy, auto_stand=True)
+    rig.tick(quaternion=np.array([0.0, 1.0, 0.0, 0.0]))
+    rig.supervisor.request("passive")
+    rig.run(0.1)
+    assert rig.mode == "passive"
+
+
 def test_a_leg_that_does_not_follow_ends_standing_up(rig: Rig) -> None:
     rig.tick()
     rig.supervisor.request("stand_up")
@@ -141,6 +149,16 @@ def test_a_velocity_starts_walking_from_stance_at_once(rig: Rig) -> None:
     rig.tick(FORWARD)
     assert rig.mode == "walk"
     assert not math.isnan(rig.supervisor.inference_seconds)
+
+
+def test_walking_waits_until_the_posture_is_reached(rig: Rig) -> None:
+    rig.state.q = NOMINAL_Q + 0.2
+    rig.tick()
+    assert rig.supervisor.request("stance")[0]
+    rig.run(0.29, FORWARD)
+    assert rig.mode == "stance"
+    rig.run(0.05, FORWARD)
+    assert rig.mode == "walk"
 
 
 def test_walking_feeds_the_policy_and_uses_its_gains_and_targets(rig: Rig) -> None:

@@ -5,6 +5,7 @@ Plain arrays and times in, joint commands out; it knows no ROS. `modes` holds wh
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -217,10 +218,11 @@ class Supervisor:
             yield "the velocity estimate is not finite"
 
     def _attitude_problems(self, quaternion: Array) -> Iterator[str]:
-        length = float(np.linalg.norm(quaternion))
+        w, x, y, z = quaternion.tolist()
+        length = math.hypot(w, x, y, z)
         if abs(length - 1.0) > 0.05:
             yield f"the state's quaternion has length {length:.2f}, expected 1"
-        tilt = float(np.arccos(np.clip(1.0 - 2.0 * (quaternion[1] ** 2 + quaternion[2] ** 2), -1.0, 1.0)))
+        tilt = math.acos(max(-1.0, min(1.0 - 2.0 * (x * x + y * y), 1.0)))
         if tilt > self.config.max_tilt:
             yield f"the trunk is tilted by {tilt:.2f} rad, limit {self.config.max_tilt:.2f}"
 
