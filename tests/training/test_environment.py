@@ -11,7 +11,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_training import gait, loop  # noqa: E402
-from quadvel_training.distill import CommandMap  # noqa: E402
+from quadvel_training.command_map import CommandMap  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402

@@ -71,13 +71,14 @@ def train_teacher(
 @app.command("distill")
 def train_student(
     teacher_file: Annotated[Path, typer.Option("--teacher")] = Path("out/training/teacher/teacher.pt"),
+    start: Annotated[Path | None, typer.Option(help="Checkpoint of a student to refine.")] = None,
     out: Out = Path("out/training/student"),
     recipe: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
     """Stage 2: the recurrent student learns from the teacher."""
     config = _configured(distill.DistillConfig, recipe, minutes)
-    run = distill.DistillRun(config, teacher_file)
+    run = distill.DistillRun(config, teacher_file, _actor(start) if start else None)
     loop.train(run, config.budget, out / "student.pt")
     student.export_policy(run.student, run.env, out / "policy.onnx", _recipe(config, run, "distill"))
 

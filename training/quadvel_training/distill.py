@@ -18,9 +18,10 @@ import torch
 from quadvel_description import robot, symmetry
 
 from . import gait, student, teacher
+from .command_map import CommandMap, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
-from .networks import Gaussian, Mlp, State
+from .networks import Gaussian, Mlp, Recurrent, State
 from .ppo import select
 from .teacher import GaitState, torch_mirror
 
@@ -32,64 +33,31 @@ def load_teacher(path: Path) -> Gaussian:
     return actor.eval()
 
 
-class CommandMap:
-    """Which command the teacher needs to walk at the wanted one: wanted + polynomial of it, odd under mirroring where due."""
-
-    def __init__(self, weights: np.ndarray | None = None) -> None:
-        self.weights = (
-            np.zeros((self._features(np.zeros((1, 3))).shape[1], 3)) if weights is None else weights
-        )
-
-    @staticmethod
-    def _features(c: np.ndarray) -> np.ndarray:
-        x, y, r = np.moveaxis(c[..., :3], -1, 0)
-        one = np.ones_like(x)
-        even = [one, x, x * x, y * y, r * r, y * r, x**3, x * y * y, x * r * r, x * y * r]
-        odd = [y, r, x * y, x * r, y**3, r**3, y * r * r, y * y * r, x * x * y, x * x * r]
-        return np.stack(even + odd, axis=-1)
-
-    def fit(self, wanted: np.ndarray, given: np.ndarray) -> float:
-        """Ridge regression of given - wanted, (n, 3) each; returns the residual's RMS."""
-        a = self._features(wanted)
-        b = given - wanted
-        half = a.shape[1] // 2
-        self.weights = np.zeros((a.shape[1], 3))
-        for axis, columns in ((0, slice(0, half)), (1, slice(half, None)), (2, slice(half, None))):
-            part = a[:, columns]
-            gram = part.T @ part + 1e-2 * np.eye(part.shape[1])
-            self.weights[columns, axis] = np.linalg.solve(gram, part.T @ b[:, axis])
-        return float(np.sqrt(np.mean((a @ self.weights - b) ** 2)))
-
-    def __call__(self, command: np.ndarray) -> np.ndarray:
-        """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
-        given = command.copy()
-        moving = command[:, 3] < 0.5
-        given[:, :3] += (self._features(command) @ self.weights).clip(-0.6, 0.6) * moving[:, None]
-        return given
-
-
 class Teacher:
-    """The teacher in a batch of environments, evaluated at every tick."""
+    """The teacher in a batch of environments, evaluated at every tick.
 
-    def __init__(self, actor: Gaussian, env: VelocityEnv, command_map: CommandMap, gain: float) -> None:
-        self.actor, self.env, self.map, self.gain = actor, env, command_map, gain
+    `own` is its command map; `goal` says at which velocity it is to walk for a command: the student's map, once there is one.
+    """
+
+    def __init__(
+        self, actor: Gaussian, env: VelocityEnv, own: CommandMap, gain: float, goal: CommandMap | None = None
+    ) -> None:
+        self.actor, self.env, self.own, self.goal = actor, env, own, goal or CommandMap()
         self.gait = GaitState(env.config.n)
-        self.correction = np.zeros((env.config.n, 3))
+        self.tracking = Tracking(env.config.n, gain)
         self._past = [np.zeros((env.config.n, 12)) for _ in range(teacher.HOLD)]
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
         self.gait.reset(ids)
-        self.correction[ids] = 0.0
+        self.tracking.reset(ids)
         for past in self._past:
             past[ids] = 0.0
 
     def targets(self) -> np.ndarray:
         """Joint targets (n, 12) for the present state."""
         env = self.env
-        self.correction[env.changed] = 0.0
-        command = self.map(env.command)
-        command[:, :3] += self.correction * (command[:, 3:] < 0.5)
+        command = self.tracking.corrected(self.own(self.goal(env.command)))
         base = gait.targets(self.gait.phase, command, teacher.body_of(env), robot.KP)
         obs = teacher.observe(env, self.gait, command, self._past[0], base)
         with torch.no_grad():
@@ -98,27 +66,33 @@ class Teacher:
         return base + teacher.RESIDUAL * residual
 
     def advance(self) -> None:
-        """After the environment's tick: the clock, and integral action on what is left of the velocity error."""
+        """After the environment's tick."""
         self.gait.advance(self.env)
-        error = self.gait.mean_command - self.gait.mean_velocity
-        self.correction = (self.correction + self.gain * TICK * error).clip(-0.5, 0.5)
+        self.tracking.advance(self.env, self.goal(self.env.command)[:, :3])
 
 
-def fit_command_map(actor: Gaussian, config: EnvConfig, seconds: float = 10.0) -> tuple[CommandMap, float]:
-    """Hold commands, let integral action settle, and fit the map on the environments that still walk."""
-    hold = attrs.evolve(config.commands, hold=(1e3, 1e3), stance=0.0)
-    env = VelocityEnv(attrs.evolve(config, commands=hold, episode=1e4))
-    walker = Teacher(actor, env, CommandMap(), gain=0.6)
-    total, ticks, fell = np.zeros((config.n, 3)), round(seconds / TICK), np.zeros(config.n, bool)
-    for tick in range(ticks):
-        env.tick(walker.targets())
-        walker.advance()
-        fell |= env.fallen
-        if tick >= ticks // 2:
-            total += walker.correction / (ticks - ticks // 2)
-    kept = ~fell & (np.abs(total) < 0.45).all(axis=1)
-    command_map = CommandMap()
-    return command_map, command_map.fit(env.command[kept, :3], env.command[kept, :3] + total[kept])
+class Student:
+    """The student at the wheel, with integral action on its command."""
+
+    def __init__(self, actor: Recurrent, env: VelocityEnv, gain: float) -> None:
+        self.actor, self.env = actor, env
+        self.tracking = Tracking(env.config.n, gain)
+        self._map = student.action_map(env)
+        self._memory = actor.initial_state(env.config.n)
+        self._action = np.zeros((env.config.n, 12), np.float32)
+
+    def targets(self) -> np.ndarray:
+        """Joint targets (n, 12) for the present state."""
+        command = self.tracking.corrected(self.env.command)
+        obs = torch.from_numpy(student.observe(self.env, self._action, command)[None])
+        with torch.no_grad():
+            action, self._memory = self.actor(obs, self._memory)
+        self._action = action[0].numpy()
+        return self._map.targets(self._action)
+
+    def advance(self) -> None:
+        """After the environment's tick."""
+        self.tracking.advance(self.env, self.env.command[:, :3])
 
 
 @attrs.frozen
@@ -145,16 +119,18 @@ class DistillConfig:
 class DistillRun:
     """Teacher, student and environment of stage 2."""
 
-    def __init__(self, config: DistillConfig, teacher_file: Path) -> None:
+    def __init__(self, config: DistillConfig, teacher_file: Path, start: Recurrent | None = None) -> None:
+        """`start`: a student to go on from; its steady-state error is measured and put into the teacher's goal."""
         self.config = config
         torch.manual_seed(config.seed)
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
-        command_map, left = fit_command_map(actor, env_config)
-        print(f"command map fitted, residual {left:.3f} (m/s, rad/s)")
+        trial = held_commands(env_config)
+        own = fit_command_map(Teacher(actor, VelocityEnv(trial), CommandMap(), gain=0.6))
+        goal = fit_command_map(Student(start, VelocityEnv(trial), gain=0.6)) if start else CommandMap()
         self.env = VelocityEnv(env_config)
-        self.teacher = Teacher(actor, self.env, command_map, config.correction_gain)
-        self.student = student.new_actor()
+        self.teacher = Teacher(actor, self.env, own, config.correction_gain, goal)
+        self.student = start or student.new_actor()
         self.map = student.action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
@@ -208,7 +184,7 @@ class DistillRun:
             alive &= ~(env.fallen | env.timed_out)
         self._over = np.flatnonzero(~alive)
         self.samples += c.length * c.n
-        lag = self.teacher.gait.mean_command - self.teacher.gait.mean_velocity
+        lag = self.teacher.tracking.error
         obs, label, mask = (
             torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
         )

@@ -35,13 +35,14 @@ def action_map(env: VelocityEnv) -> ActionMap:
     return ActionMap(env.stand_q, ACTION_SCALE)
 
 
-def observe(
-    env: VelocityEnv, previous_action: np.ndarray, ids: Sequence[int] | slice = slice(None)
-) -> np.ndarray:
-    """The student's noisy observation (n, 48)."""
+def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray | None = None) -> np.ndarray:
+    """The student's noisy observation (n, 48), with another command (n, 4) than the environment's if given."""
     return build_observation(
-        DEFAULT_OBSERVATION, command=env.command, previous_action=previous_action, **env.sense()
-    )[ids]
+        DEFAULT_OBSERVATION,
+        command=env.command if command is None else command,
+        previous_action=previous_action,
+        **env.sense(),
+    )
 
 
 class _Step(nn.Module):

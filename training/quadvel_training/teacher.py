@@ -16,6 +16,7 @@ from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 
 from . import gait
+from .command_map import Tracking
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget
 from .networks import Gaussian, Mlp
@@ -23,7 +24,6 @@ from .ppo import Ppo, PpoConfig, Rollout
 
 HOLD = 4  # ticks a residual is held
 RESIDUAL = 0.2  # rad a unit of the network's output
-STRIDE = 0.35  # s, time constant of the low-passed velocity
 
 
 def _signs(*signs: float) -> Mirror:
@@ -43,27 +43,22 @@ def torch_mirror(mirror: Mirror) -> Callable[[torch.Tensor], torch.Tensor]:
 
 
 class GaitState:
-    """The clock, the residual and the low-passed velocity of `n` environments."""
+    """The clock and the residual of `n` environments."""
 
     def __init__(self, n: int) -> None:
         self.phase = np.zeros(n)
         self.residual = np.zeros((n, 12))
         self.residual_before = np.zeros((n, 12))
-        self.mean_velocity = np.zeros((n, 3))  # vx, vy, wz over a stride
-        self.mean_command = np.zeros((n, 3))
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
-        for array in (self.phase, self.residual, self.residual_before, self.mean_velocity, self.mean_command):
+        for array in (self.phase, self.residual, self.residual_before):
             array[ids] = 0.0
 
     def advance(self, env: VelocityEnv) -> None:
         """One tick further; the clock rests at its start while the command is to stand."""
         moving = env.command[:, 3] < 0.5
         self.phase = np.where(moving, (self.phase + gait.frequency(env.command) * TICK) % 1.0, 0.0)
-        now = np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1)
-        self.mean_velocity += (now - self.mean_velocity) * TICK / STRIDE
-        self.mean_command += (env.command[:, :3] - self.mean_command) * TICK / STRIDE
 
 
 def body_of(env: VelocityEnv) -> gait.Body:
@@ -98,18 +93,16 @@ def observe(
     ).astype(np.float32)
 
 
-def critic_extra(env: VelocityEnv, g: GaitState) -> np.ndarray:
+def critic_extra(env: VelocityEnv, tracking: Tracking) -> np.ndarray:
     """What only the critic sees: the drawn plant and the low-passed errors, (n, 14)."""
-    error = g.mean_command - g.mean_velocity
-    return np.concatenate([env.plants.drawn, error, g.mean_velocity], axis=1).astype(np.float32)
+    return np.concatenate([env.plants.drawn, tracking.error, tracking.velocity], axis=1).astype(np.float32)
 
 
-def reward(env: VelocityEnv, g: GaitState) -> np.ndarray:
-    """Reward of one tick, (n,): tracking at every distance, attitude, effort, smooth residuals, feet on the clock."""
+def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
+    """Reward of one tick, (n,): tracking (`lag`: its error over a stride), attitude, effort, smooth residuals, feet on the clock."""
     c = env.command
     ev = np.sum((c[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
     ew = (c[:, 2] - env.angular_velocity[:, 2]) ** 2
-    lag = g.mean_command - g.mean_velocity
     tracking = (
         1.0 * np.exp(-ev / 0.25)
         + 0.5 * np.exp(-ev / 0.02)
@@ -160,6 +153,7 @@ class TeacherRun:
         torch.manual_seed(config.seed)
         self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands))
         self.gait = GaitState(config.n)
+        self.tracking = Tracking(config.n, gain=0.0)
         size = len(OBSERVATION_MIRROR.index)
         self.actor = Gaussian(Mlp(size, 12), 12, config.std)
         self.critic = Mlp(size + CRITIC_MIRROR_FREE, 1)
@@ -210,16 +204,17 @@ class TeacherRun:
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
             action = (mean + std * env.rng.standard_normal(mean.shape)).astype(np.float32)
-            extra = critic_extra(env, g)
+            extra = critic_extra(env, self.tracking)
             g.residual_before, g.residual = g.residual, np.clip(action, -5, 5).astype(float)
             total = np.zeros(c.n)
             for _ in range(HOLD):
                 env.tick(base + RESIDUAL * g.residual)
                 g.advance(env)
                 base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
-                total += reward(env, g)
+                self.tracking.advance(env, env.command[:, :3])
+                total += reward(env, g, self.tracking.error)
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
-            lag = g.mean_command - g.mean_velocity
+            lag = self.tracking.error
             errors.append([np.hypot(lag[:, 0], lag[:, 1]).mean(), np.abs(lag[:, 2]).mean()])
             falls += int(fell.sum())
             for name, value in zip(
@@ -230,9 +225,12 @@ class TeacherRun:
             if len(over):
                 env.reset(over)
                 g.reset(over)
+                self.tracking.reset(over)
                 base[over] = gait.targets(g.phase, env.command, body_of(env), robot.KP)[over]
         self.samples += c.length * c.n
-        last = np.concatenate([observe(env, g, env.command, g.residual, base), critic_extra(env, g)], axis=1)
+        last = np.concatenate(
+            [observe(env, g, env.command, g.residual, base), critic_extra(env, self.tracking)], axis=1
+        )
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         rollout = Rollout(
             obs=t["obs"],
