@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import sys
 import time
 from threading import Thread
@@ -60,6 +61,7 @@ class SimNode(Node):  # type: ignore[misc]
         self.create_service(StepSim, "~/step", self._on_step)
         self.create_service(Push, "~/push", self._on_push)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
         self._thread = Thread(target=self._simulate, name="simulation")
         self._thread.start()
 

@@ -1,0 +1,163 @@
+"""The node over DDS: topics, lockstep, services, refusals, the end."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from geometry_msgs.msg import Vector3, Wrench
+
+from quadvel_description import robot
+from quadvel_description.messages import seconds
+from quadvel_description.state import JointCommand
+
+Start = Callable[..., Any]
+
+
+def hold(tick: int) -> JointCommand:
+    return JointCommand(q=robot.NOMINAL_Q, kp=np.full(12, 150.0), kd=np.full(12, 4.0), tick=tick)
+
+
+def answer(state: Any) -> JointCommand:
+    return hold(state.tick)
+
+
+def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) -> None:
+    start(mode="lockstep", keyframe="stand", answer_timeout=0.2)
+    states = peer.heard["low_state"]
+    peer.spin_until(lambda: len(states) >= 3)
+    assert {state.tick for state in states} == {
+        0
+    }  # nobody answers: time stands still, the state is sent again
+    peer.spin_until(lambda: "waiting for the LowCmd that answers the last state" in peer.diagnosed()[0])
+    states.clear()
+    peer.answer = answer
+    peer.spin_until(lambda: len(states) >= 101)
+    ticks = [state.tick for state in states[:101]]
+    np.testing.assert_array_equal(np.diff(ticks[1:]), 5)
+    for state in states:
+        assert seconds(state.stamp) == pytest.approx(1e-3 * state.tick)
+    stamps = {(s.stamp.sec, s.stamp.nanosec) for s in states[:101]}
+    peer.spin_until(lambda: stamps <= {(m.clock.sec, m.clock.nanosec) for m in peer.heard["/clock"]})
+    np.testing.assert_allclose(states[100].q, robot.NOMINAL_Q, atol=0.1)
+    odom = peer.heard["ground_truth/odom"][-1]
+    assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "trunk")
+    assert odom.pose.pose.position.z == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.03)
+    joints = peer.heard["joint_states"][-1]
+    assert list(joints.name) == list(robot.JOINT_NAMES)
+    assert len(joints.position) == len(joints.velocity) == len(joints.effort) == 12
+    assert peer.heard["imu"][-1].linear_acceleration.z == pytest.approx(robot.GRAVITY, abs=2.0)
+    assert not peer.heard["/tf"]
+
+
+def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None:
+    start(mode="lockstep", publish_tf=True)
+    states = peer.heard["low_state"]
+    peer.answer = answer
+    peer.spin_until(lambda: len(states) > 5)
+
+    response = peer.call("step", steps=10)
+    assert (response.success, response.message) == (False, "the simulation runs; pause it first")
+    assert peer.call("reset", keyframe="stand").success
+    response = peer.call("reset", keyframe="sit")
+    assert (response.success, response.message) == (
+        False,
+        "keyframe: found 'sit', expected one of stand, lie",
+    )
+    response = peer.call("push", body="tail", duration=0.1)
+    assert not response.success
+    assert response.message.startswith("push: body: found 'tail', expected one of trunk, FR_hip")
+
+    assert peer.call("pause", data=True).success
+    peer.answer = lambda state: None
+    peer.spin(0.2)
+    count, tick = len(states), states[-1].tick
+    force = Wrench(force=Vector3(x=0.0, y=0.0, z=40.0 * robot.MASS * robot.GRAVITY))
+    assert peer.call("push", wrench=force, duration=0.01).success
+    assert peer.call("step", steps=12).success
+    peer.spin_until(
+        lambda: len(states) > count and peer.heard["ground_truth/odom"][-1].twist.twist.linear.z > 2.0
+    )
+    assert (len(states), states[-1].tick) == (count + 1, tick + 12)
+    assert peer.heard["/tf"][-1].transforms[0].child_frame_id == "trunk"
+
+    peer.answer = answer
+    assert peer.call("pause", data=False).success
+    peer.send(hold(states[-1].tick))
+    peer.spin_until(lambda: states[-1].tick > tick + 30)
+
+
+def test_bad_commands_are_refused_counted_and_named(start: Start, peer: Any) -> None:
+    start(mode="realtime")
+    states = peer.heard["low_state"]
+    peer.spin_until(lambda: len(states) > 60)
+    bad = (
+        ({"q": np.full(12, np.nan, np.float32)}, "q holds nan, expected finite numbers"),
+        ({"tick": states[0].tick}, "expected at most 100 ms"),
+        ({"mode": 3}, "mode is 3, expected 0 or 10"),
+    )
+    for count, (changes, reason) in enumerate(bad, start=1):
+        peer.send(hold(states[-1].tick), **changes)
+        text = f"{count}, last: "
+        peer.spin_until(lambda: peer.diagnosed()[1].get("refused low_cmd", "").startswith(text))  # noqa: B023
+        assert reason in peer.diagnosed()[1]["refused low_cmd"]
+        assert peer.diagnosed()[0] == "1 messages refused in the last second"
+        assert peer.diagnosed()[1]["braking"] == "True"
+    peer.answer = answer
+    peer.spin_until(lambda: peer.diagnosed()[1]["braking"] == "False")
+
+
+def test_in_realtime_stamps_are_system_time(start: Start, peer: Any) -> None:
+    before = time.time()
+    start(mode="realtime", state_rate=500)
+    states = peer.heard["low_state"]
+    peer.spin_until(lambda: len(states) > 100)
+    stamps = np.array([seconds(state.stamp) for state in states])
+    assert before < stamps[0]
+    assert stamps[-1] < time.time()
+    assert np.median(np.diff(stamps)) == pytest.approx(0.002, abs=1e-5)
+    assert not peer.heard["/clock"]
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep"])
+def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, peer: Any, mode: str) -> None:
+    simulation = start(mode=mode)
+    peer.spin_until(lambda: peer.heard["low_state"])
+    if mode == "realtime":
+        assert peer.call("pause", data=True).success
+    simulation.interrupt()
+    time.sleep(0.05)
+    simulation.interrupt()
+    assert simulation.end() == (0, "")
+
+
+def test_a_diverged_simulation_ends_the_node_with_one_sentence(
+    start: Start, peer: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its log where it stands
+    simulation = start(mode="fast")
+    peer.spin_until(lambda: peer.heard["low_state"])
+    assert peer.call("push", wrench=Wrench(force=Vector3(x=1e300, y=0.0, z=0.0)), duration=1.0).success
+    status, text = simulation.end()
+    assert status == 1
+    assert "the robot's state is not finite" in text
+    assert "Traceback" not in text
+
+
+@pytest.mark.parametrize(
+    ("parameters", "sentence"),
+    [
+        ({"mode": "slow"}, "mode is 'slow', expected one of realtime, lockstep, fast"),
+        ({"friktion": 0.5}, "unknown parameter friktion, expected one of mode,"),
+        ({"keyframe": "sit"}, "keyframe: found 'sit', expected one of stand, lie"),
+    ],
+)
+def test_a_bad_parameter_ends_the_start_with_one_sentence(
+    start: Start, parameters: dict, sentence: str
+) -> None:
+    status, text = start(**parameters).end()
+    assert status == 1
+    assert sentence in text
+    assert len(text.strip().splitlines()) == 1
