@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from quadvel_dds import messages
 
@@ -76,10 +76,38 @@ def reference(message: Any) -> Any:
 NAMES = sorted(name for name in messages.STORE.fielddefs if not name.startswith("rosbag2_interfaces"))
 
 
-@pytest.mark.parametrize("typename", NAMES)
+# Every kind of field after one that leaves the position unaligned.
+AWKWARD = "test_msgs/msg/Awkward"
+FIELDS = """
+uint8[3] a
+float64 b
+string c
+float64[] d
+uint16[5] e
+int64 f
+float32[3] g
+geometry_msgs/Vector3[2] h
+bool i
+geometry_msgs/Vector3[] j
+byte[3] k
+string[2] l
+bool[] m
+uint8[] n
+geometry_msgs/Quaternion o
+string[] p
+uint16 q
+uint64[<=3] r
+int8 s
+std_msgs/Header[] t
+float32 u
+"""
+messages.STORE.register(get_types_from_msg(FIELDS, AWKWARD))
+
+
+@pytest.mark.parametrize("typename", [*NAMES, AWKWARD])
 def test_bytes_equal_the_reference_and_read_back(typename: str) -> None:
     random = np.random.default_rng(5)
-    for _ in range(4):
+    for _ in range(40 if typename == AWKWARD else 4):
         message = filled(typename, random)
         data = bytes(messages.serialize(message))
         expected = bytes(reference(message))

@@ -201,7 +201,7 @@ class WaitSet:
         self.readers = readers
 
     def wait(self, timeout_ns: int) -> set[int]:
-        """Keys of the readers that have data; empty after the time-out, a wake-up, or the participant's leave."""
+        """Keys of the readers that have data; empty after the time-out, a wake-up, or once this is closed."""
         size = len(self.readers) + 1
         triggered = (ctypes.c_void_p * size)()
         count = self.dds._waitset_wait(self.dds._ref, triggered, size, timeout_ns)

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
 from concurrent.futures import ThreadPoolExecutor
-from threading import Lock, RLock
+from threading import RLock
 from typing import Any
 
 from quadvel_dds import wire
@@ -37,7 +37,6 @@ class Executor:
         self._tasks: deque[Task] = deque()
         self._ready: deque[Any] = deque()  # entities that had data or were due after the last wait
         self._lock = RLock()
-        self._wait_lock = Lock()  # held while waiting, so that nobody takes the wait set away
         self._waitset: wire.WaitSet | None = None
         self._is_shutdown = False
         self._context._wakers.add(self)
@@ -79,9 +78,9 @@ class Executor:
 
     def shutdown(self, timeout_sec: float | None = None) -> bool:
         """Stop; True once no callback runs any more."""
-        self._is_shutdown = True
         self.wake()
-        with self._wait_lock, self._lock:
+        with self._lock:
+            self._is_shutdown = True
             self._nodes = []
             waitset, self._waitset = self._waitset, None
         if waitset is not None:
@@ -137,12 +136,9 @@ class Executor:
 
     def _wait(self, deadline_ns: int) -> None:
         """Wait until something is ready, the deadline, or a wake-up; what is ready goes into `_ready`."""
-        with self._wait_lock:
-            if not self._is_shutdown:
-                self._wait_for_entities(deadline_ns)
-
-    def _wait_for_entities(self, deadline_ns: int) -> None:
         with self._lock:
+            if self._is_shutdown:
+                return
             if self._waitset is None:
                 self._waitset = wire.WaitSet(self._context.participant)
             waitset = self._waitset
