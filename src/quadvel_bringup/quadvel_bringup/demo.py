@@ -49,6 +49,9 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for every node.")
+    ] = False,
 ) -> None:
     """Walk a simulated robot through all directions, in real time, through the nodes.
 
@@ -57,7 +60,7 @@ def demo_command(
     """
     folder, console = output_folder(out), Console(soft_wrap=True)
     with replacing(folder / "demo.mcap") as draft:
-        problem = _Run(draft, "quick" if quick else "full", console).walk()
+        problem = _Run(draft, "quick" if quick else "full", lockstep, console).walk()
     recording = read_recording(folder / "demo.mcap")
     summary = demo_summary.summarise(recording)
     write_json(folder / "summary.json", summary)
@@ -74,9 +77,10 @@ def demo_command(
 class _Run:
     """The nodes, the recorder in this process, and a bar that shows how far the script is."""
 
-    def __init__(self, recording: Path, script: str, console: Console) -> None:
+    def __init__(self, recording: Path, script: str, lockstep: bool, console: Console) -> None:
         self._recording = recording
         self._script = script
+        self._stack = Stack(use_sim_time=lockstep)
         self._steps = [step.name for step in SCRIPTS[script]]
         columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=console)
@@ -86,13 +90,15 @@ class _Run:
         """Run the script to its end; what went wrong, or "". Ctrl-C ends it with a typer.Exit."""
         quadvel_dds.install()
         import rclpy
+        from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
         from std_msgs.msg import String
 
         from .recorder import Recorder
 
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("demo")
+        use_sim_time = Parameter("use_sim_time", value=self._stack.use_sim_time)
+        node = rclpy.create_node("demo", parameter_overrides=[use_sim_time])
         try:
             node.create_subscription(String, "planner/step", self._on_step, 10)
             with StopSignals() as signals, Recorder(node, self._recording) as recorder, self._bar:
@@ -109,9 +115,11 @@ class _Run:
 
     def _spin(self, rclpy: Any, node: Any, group: ProcessGroup, signals: StopSignals) -> str:
         """Start the nodes and record until one of them ends: the planner, if all goes well."""
-        for name, arguments in Stack().arguments().items():
+        for name, arguments in self._stack.arguments().items():
             group.start(name, command(name, arguments))
-        group.start("planner", command("planner", ["--ros-args", "-p", f"script:={self._script}"]))
+        planner = {"script": self._script, "use_sim_time": str(self._stack.use_sim_time).lower()}
+        arguments = [word for name, value in planner.items() for word in ("-p", f"{name}:={value}")]
+        group.start("planner", command("planner", ["--ros-args", *arguments]))
         ended: dict[str, int] = {}
         while not ended and not signals.received:
             until = time.monotonic() + LOOK
