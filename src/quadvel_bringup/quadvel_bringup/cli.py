@@ -60,7 +60,7 @@ def doctor() -> None:
         findings.append(finding)
         print(f"{'ok  ' if finding.good else 'note'} {finding.subject:12} {finding.text}", flush=True)
     for ability, possible in abilities(findings):
-        print(f"{'can run' if possible else 'cannot '} {ability}")
+        print(f"{'can' if possible else 'cannot'} run {ability}")
 
 
 @app.command(help=RUN_HELP, context_settings=HANDED_ON)

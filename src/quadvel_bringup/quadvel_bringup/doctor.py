@@ -15,7 +15,7 @@ import numpy as np
 
 NEEDED = ("mujoco", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
 GL_BACKENDS = ("egl", "osmesa")
-GL_PACKAGES = "libegl1 (or libosmesa6)"
+GL_PACKAGES = "libegl1 libopengl0"
 
 
 @attrs.frozen
@@ -115,5 +115,5 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
     yield "quadvel demo, up, run, record", runs
     yield "quadvel eval, bench", runs
-    yield "video of the demo", runs and good["GL"]
+    yield "the video of the demo", runs and good["GL"]
     yield "training", runs and torch
