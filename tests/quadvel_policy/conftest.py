@@ -161,9 +161,10 @@ class Graph:
         for node in (self.node, self.peer):
             self._executor.add_node(node)
         self.now = 1000.0  # s
+        self.diagnostics: list[Any] = []
         self._clock = self.peer.create_publisher(Clock, "/clock", 10)
         self.diagnostics = self.listen(DiagnosticArray, "/diagnostics")
-        self.wait(lambda: self._clock.get_subscription_count())
+        self.wait(self._clock.get_subscription_count)
 
     def listen(self, kind: Any, topic: str) -> list[Any]:
         """The list of what arrives on a topic from now on."""
@@ -186,14 +187,18 @@ class Graph:
         self.wait(future.done)
         return future.result()
 
-    def wait(self, is_so: Callable[[], Any], seconds: float = 30.0) -> None:
-        """Serve until the predicate holds; fail when the time is up."""
+    def holds(self, is_so: Callable[[], Any], seconds: float) -> bool:
+        """Serve until the predicate holds; whether it does before the time is up."""
         end = time.monotonic() + seconds
         while not is_so():
-            assert time.monotonic() < end, (
-                f"waited {seconds} s in vain; /diagnostics: {self.diagnostics[-1:]}"
-            )
+            if time.monotonic() > end:
+                return False
             self._executor.spin_once(timeout_sec=0.02)
+        return True
+
+    def wait(self, is_so: Callable[[], Any]) -> None:
+        """Serve until the predicate holds; fail where that takes too long."""
+        assert self.holds(is_so, 30.0), f"waited in vain; /diagnostics: {self.diagnostics[-1:]}"
 
     def pass_time(self, seconds: float) -> None:
         """Move the clock on; returns once the node has it."""
@@ -212,13 +217,10 @@ class Graph:
         """Wait until the node's /diagnostics says `text` in its message or a value; returns that status."""
 
         def said() -> Any:
-            for array in self.diagnostics:
-                for status in array.status:
-                    if any(
-                        text in said
-                        for said in (status.message, *(f"{p.key}: {p.value}" for p in status.values))
-                    ):
-                        return status
+            for status in (status for array in self.diagnostics for status in array.status):
+                texts = [status.message, *(f"{pair.key}: {pair.value}" for pair in status.values)]
+                if any(text in line for line in texts):
+                    return status
             return None
 
         self.wait(said)

@@ -65,6 +65,7 @@ class Controller(Node):
         self._refused_before = self._overruns_before = 0
         self._grid = TickGrid(PERIOD)
         self._state: RobotState | None = None
+        self._waiting: RobotState | None = None  # for the velocity estimate, on simulated time
         self._answer = JointCommand.damping()
         self._velocity: tuple[float, Array] | None = None  # stamp and value
         self._command: tuple[float, Array] | None = None
@@ -107,6 +108,21 @@ class Controller(Node):
         except MessageError as error:
             self._refusals.add("low_state", error)
             return
+        sent_again = self._waiting is not None and self._waiting.time == state.time
+        if self._awaits_velocity(state) and not sent_again:
+            self._waiting = state
+        else:
+            self._take(state, start)
+
+    def _awaits_velocity(self, state: RobotState) -> bool:
+        """Whether a simulator shall wait until the estimator has kept up, as it does by itself in real time."""
+        if not self._sim_time or self._velocity is None:
+            return False
+        return 1.5 * PERIOD < state.time - self._velocity[0] <= self._settings.max_velocity_age
+
+    def _take(self, state: RobotState, start: float) -> None:
+        """Answer the state if it is due. start: when that began, s on the steady clock."""
+        self._waiting = None
         periods = self._grid.periods(state.time)
         if periods:
             self._tick(state)
@@ -138,6 +154,9 @@ class Controller(Node):
             self._velocity = stamp, linear_velocity(message.twist.twist)
         except MessageError as error:
             self._refusals.add("velocity_estimate", error)
+            return
+        if self._waiting is not None and not self._awaits_velocity(self._waiting):
+            self._take(self._waiting, time.perf_counter())
 
     def _on_command(self, message: Any) -> None:
         try:
