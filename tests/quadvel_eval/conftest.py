@@ -1,0 +1,55 @@
+"""A robot loop that needs no trained network: its policy holds a posture."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from quadvel_description import mjcf, robot
+from quadvel_estimator.kalman import KalmanEstimator
+from quadvel_eval.robot_loop import RobotLoop, TrueVelocity
+from quadvel_policy.observation import PolicyMetadata
+from quadvel_policy.supervisor import Supervisor
+from quadvel_sim.simulator import Simulator, SimulatorConfig
+
+
+class StandingPolicy:
+    """Always asks for the standing posture."""
+
+    def __init__(self) -> None:
+        self.metadata = PolicyMetadata(
+            action_offset=tuple(robot.NOMINAL_Q + mjcf.gravity_torque(mjcf.load_model()) / robot.KP),
+            action_scale=1.0,
+            kp=robot.KP,
+            kd=robot.KD,
+            command_limits={"vx": (-2.0, 2.0), "vy": (-1.0, 1.0), "wz": (-2.0, 2.0)},
+            state_shape=(1, 1, 1),
+        )
+
+    def reset(self) -> None:
+        """Nothing to forget."""
+
+    def step(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros(12, np.float32)
+
+
+@pytest.fixture
+def standing_policy() -> StandingPolicy:
+    return StandingPolicy()
+
+
+@pytest.fixture(scope="session")
+def make_loop() -> Callable[..., RobotLoop]:
+    """make_loop(seed) -> a robot in walk mode under a policy that stands."""
+
+    def make(seed: int = 0) -> RobotLoop:
+        simulator = Simulator(SimulatorConfig(seed=seed))
+        simulator.reset("stand")
+        beside = {"kalman": KalmanEstimator()}
+        loop = RobotLoop(simulator, Supervisor(StandingPolicy()), TrueVelocity(simulator), beside)
+        loop.start_walking()
+        return loop
+
+    return make

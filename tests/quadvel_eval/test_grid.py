@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from quadvel_eval.grid import GRIDS, Cell, CellResult, cells, drift, evaluate, judge, summarise
+from quadvel_eval.segments import Segment
+from quadvel_eval.walk import Setup, Walk
+
+
+def walk(velocity: tuple[float, float, float], seconds: float = 6.0) -> Walk:
+    n = round(seconds / 0.005)
+    time = np.arange(n) * 0.005
+    return Walk(
+        time=time,
+        position=np.outer(time, [*velocity[:2], 0.0]),
+        velocity=np.where(time[:, None] < 2.0, 0.0, velocity),
+        targets=np.tile((0.5 * 0.002 * np.arange(n) ** 2)[:, None], (1, 12)),
+        power=np.where(time < 2.0, 9e9, 250.0),
+        estimate_errors={"learned": np.full((n, 3), [0.03, -0.04, 0.0])},
+    )
+
+
+def result(command: tuple[float, float, float], mean: tuple[float, float, float]) -> CellResult:
+    return CellResult(
+        Cell(command, 0), Segment(np.array(command), np.array(mean)), 0.01, 0.5, {"learned": np.full(3, 0.04)}
+    )
+
+
+FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
+
+
+def test_quick_grid_is_every_combination_with_every_seed() -> None:
+    found = cells("quick", seeds=2)
+    assert len(found) == 2 * 6 * 3 * 3
+    assert len({(cell.command, cell.seed) for cell in found}) == len(found)
+    assert {cell.command[0] for cell in found} == {-1.0, -0.5, 0.0, 0.5, 1.0, 1.5}
+    assert {cell.command[1] for cell in found} == {-0.4, 0.0, 0.4}
+    assert {cell.command[2] for cell in found} == {-1.0, 0.0, 1.0}
+
+
+def test_paper_grid_is_that_of_section_4() -> None:
+    commands = np.array([cell.command for cell in cells("paper", seeds=1)])
+    assert commands.shape == (11 * 11, 3)
+    np.testing.assert_allclose(np.unique(commands[:, 0]), np.linspace(-2.5, 2.5, 11))
+    np.testing.assert_allclose(np.unique(commands[:, 1]), np.linspace(-1.0, 1.0, 11))
+    assert not commands[:, 2].any()
+
+
+def test_a_cell_is_judged_over_its_last_four_seconds() -> None:
+    judged = judge(walk((0.9, 0.1, 0.0)), Cell((1.0, 0.0, 0.0), 0), mass=25.0)
+    assert judged.segment is not None
+    assert judged.segment.error_xy == pytest.approx(np.hypot(0.1, 0.1))
+    assert judged.jitter == pytest.approx(0.002)
+    assert judged.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
+    np.testing.assert_allclose(judged.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
+
+
+def test_evaluation_has_the_fields_of_schema_1() -> None:
+    evaluation = summarise([result((0.5, 0.0, 0.0), (0.4, 0.0, 0.1)), FALLEN], [0.012, 0.003])
+    assert evaluation["schema"] == 1
+    assert evaluation["cells"][0] == {
+        "command": [0.5, 0.0, 0.0],
+        "seed": 0,
+        "mean": [0.4, 0.0, 0.1],
+        "error_xy": 0.1,
+        "error_wz": 0.1,
+        "fell": False,
+    }
+    assert evaluation["stance"] == {"drift_10s_m": 0.012}
+    assert evaluation["estimator"] == {"learned": {"rmse": [0.2, 0.2, 0.2]}}
+    json.dumps(evaluation, allow_nan=False)
+
+
+def test_a_fallen_cell_is_null_and_out_of_the_aggregates() -> None:
+    evaluation = summarise(
+        [result((0.5, 0.0, 0.0), (0.4, 0.0, 0.0)), FALLEN, result((0.5, 0.0, 0.0), (0.2, 0.0, 0.0))], [0.01]
+    )
+    fallen = evaluation["cells"][1]
+    assert (fallen["mean"], fallen["error_xy"], fallen["error_wz"], fallen["fell"]) == (
+        None,
+        None,
+        None,
+        True,
+    )
+    assert evaluation["falls"] == 1
+    assert evaluation["max_error_xy"] == pytest.approx(0.3)
+    assert evaluation["mean_error_xy"] == pytest.approx(0.2)
+    assert evaluation["jitter"] == pytest.approx(0.01)
+    assert evaluation["cot"] == [0.5, None, 0.5]
+
+
+def test_aggregates_are_numbers_even_if_every_robot_fell() -> None:
+    evaluation = summarise([FALLEN, CellResult(Cell((0.0, 0.5, 0.0), 0))], [None])
+    assert evaluation["falls"] == 2
+    assert evaluation["max_error_xy"] == pytest.approx(1.0)  # as a robot that does not move
+    assert evaluation["mean_error_xy"] == pytest.approx(0.75)
+    assert evaluation["jitter"] == 0.0
+    assert evaluation["stance"] == {"drift_10s_m": None}
+
+
+def test_drift_is_the_largest_distance_and_horizontal() -> None:
+    assert drift(np.array([[1.0, 1.0, 0.4], [1.3, 1.4, 0.4], [1.0, 1.0, 9.0]])) == pytest.approx(0.5)
+
+
+def test_a_grid_over_processes_equals_itself_in_the_order_of_its_cells(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    few = np.array([0.0, 0.3]), np.array([0.0]), np.array([0.0])
+    monkeypatch.setitem(GRIDS, "quick", few)
+    heard: list[tuple[int, int]] = []
+    evaluation = evaluate(Setup(estimator="truth"), "quick", 1, lambda done, of: heard.append((done, of)))
+    assert [cell["command"][0] for cell in evaluation["cells"]] == [0.0, 0.3]
+    assert heard == [(1, 3), (2, 3), (3, 3)]
+    assert set(evaluation["estimator"]) == {"learned", "kalman"}

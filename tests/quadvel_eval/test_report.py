@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+from rich.console import Console
+
+from quadvel_eval.grid import Cell, CellResult, summarise
+from quadvel_eval.report import evaluation_table, output_folder, replacing, write_evaluation, write_json
+from quadvel_eval.segments import Segment
+
+WALKED = CellResult(
+    Cell((0.5, 0.0, 0.0), 0),
+    Segment(np.array([0.5, 0.0, 0.0]), np.array([0.4, 0.0, 0.0])),
+    jitter=0.01,
+    cot=0.5,
+    estimator_mse={"learned": np.full(3, 0.04)},
+)
+FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
+EVALUATION = summarise([WALKED, FALLEN], [0.01])
+
+
+def test_only_own_outputs_of_a_folder_are_replaced(tmp_path: Path) -> None:
+    for name in ("eval.json", "eval.csv", "notes.txt"):
+        (tmp_path / name).write_text("old")
+    write_evaluation(tmp_path, EVALUATION)
+    assert (tmp_path / "notes.txt").read_text() == "old"
+    assert json.loads((tmp_path / "eval.json").read_text()) == EVALUATION
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "eval.csv",
+        "eval.json",
+        "eval.png",
+        "notes.txt",
+    ]
+
+
+def test_csv_has_a_row_a_cell_and_nothing_where_a_robot_fell(tmp_path: Path) -> None:
+    write_evaluation(tmp_path, EVALUATION)
+    with (tmp_path / "eval.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [(row["vx"], row["error_xy"], row["fell"]) for row in rows] == [
+        ("0.5", "0.1", "0"),
+        ("1.0", "", "1"),
+    ]
+
+
+def test_heatmap_is_drawn_even_if_every_robot_fell(tmp_path: Path) -> None:
+    write_evaluation(tmp_path, summarise([FALLEN, CellResult(Cell((0.5, 0.2, 1.0), 0))], [None]))
+    assert matplotlib.image.imread(tmp_path / "eval.png").size > 0
+
+
+def test_a_file_that_is_not_finished_leaves_the_old_one_and_no_draft(tmp_path: Path) -> None:
+    (tmp_path / "eval.json").write_text("old")
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(tmp_path / "eval.json", {"mean_error_xy": float("nan")})
+    with pytest.raises(KeyboardInterrupt), replacing(tmp_path / "eval.json") as draft:  # noqa: PT012
+        draft.write_text("half")
+        raise KeyboardInterrupt
+    assert [path.name for path in tmp_path.iterdir()] == ["eval.json"]
+    assert (tmp_path / "eval.json").read_text() == "old"
+
+
+def test_a_folder_that_is_a_file_is_refused_with_its_name(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("")
+    for path in (tmp_path / "out", tmp_path / "out" / "eval"):
+        with pytest.raises(NotADirectoryError, match=rf"{path}: is a file or lies below one"):
+            output_folder(path)
+
+
+def test_a_missing_folder_is_made_with_its_parents(tmp_path: Path) -> None:
+    assert output_folder(tmp_path / "a" / "b").is_dir()
+
+
+def test_table_tells_falls_and_the_worst_cell() -> None:
+    console = Console(record=True, width=100)
+    console.print(evaluation_table(EVALUATION))
+    text = console.export_text()
+    assert "2, 1" in text
+    assert "0.5, 0, 0" in text

@@ -1,0 +1,83 @@
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from quadvel_eval.robot_loop import RobotLoop
+from quadvel_eval.walk import Setup, cost_of_transport, drive_power, jitter, make_simulator, record
+
+G = 9.81
+
+
+def test_power_counts_heat_and_work_and_gives_nothing_back() -> None:
+    torque, speed = np.zeros(12), np.zeros(12)
+    torque[:3], speed[:3] = [10.0, -5.0, 2.0], [1.0, -2.0, -9.0]
+    # 0.2 * 100 + 10; 0.2 * 25 + 10; 0.2 * 4 - 18 < 0
+    assert drive_power(torque, speed) == pytest.approx(30.0 + 15.0)
+    assert drive_power(np.tile(torque, (7, 1)), speed).shape == (7,)
+
+
+@pytest.mark.parametrize(
+    ("command", "mean", "pace"),
+    [
+        ((1.0, 0.0, 0.0), (0.5, 0.3, 0.2), 0.5),
+        ((0.0, -1.0, 0.0), (0.5, -0.3, 0.0), 0.3),
+        ((3.0, 4.0, 1.0), (1.0, 1.0, 0.0), 1.4),
+        ((0.0, 0.0, -1.0), (0.1, 0.0, -0.5), 0.555 * 0.5),
+    ],
+)
+def test_cost_of_transport_follows_the_commanded_direction(
+    command: tuple[float, ...], mean: tuple[float, ...], pace: float
+) -> None:
+    cost = cost_of_transport(200.0, 25.0, np.array(command), np.array(mean))
+    assert cost == pytest.approx(200.0 / (25.0 * G * pace))
+
+
+@pytest.mark.parametrize("command", [(0.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0)])
+def test_no_cost_of_transport_where_the_robot_does_not_go_where_it_should(command: tuple[float, ...]) -> None:
+    assert cost_of_transport(200.0, 25.0, np.array(command), np.array([0.2, 0.0, -0.1])) is None
+
+
+def test_jitter_of_a_parabola_is_its_second_difference_and_of_a_line_zero() -> None:
+    k = np.arange(50.0)
+    assert jitter(np.tile((0.5 * 0.01 * k**2)[:, None], (1, 12))) == pytest.approx(0.01)
+    assert jitter(np.tile(3.0 * k[:, None], (1, 12))) == pytest.approx(0.0)
+
+
+def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Callable[..., RobotLoop]) -> None:
+    walk = record(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
+    assert walk is not None
+    np.testing.assert_allclose(walk.time, np.arange(100) * 0.005, atol=1e-9)
+    assert walk.targets.shape == (100, 12)
+    assert np.abs(walk.velocity).max() < 0.2
+    assert np.abs(walk.estimate_errors["kalman"]).max() < 0.2
+    assert walk.power.min() > 0.0
+
+
+def test_a_robot_that_falls_leaves_no_walk(make_loop: Callable[..., RobotLoop]) -> None:
+    loop = make_loop()
+    loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
+    assert record(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
+
+
+def test_seeds_draw_the_plant_only_where_randomised_is_asked_for() -> None:
+    def friction(randomised: bool, seed: int) -> list[float]:
+        return make_simulator(Setup(randomised=randomised), seed).config.friction.tolist()
+
+    assert friction(False, 1) == friction(False, 2) == [0.8] * 4
+    assert len({*friction(True, 1), *friction(True, 2)}) == 8
+    assert friction(True, 1) == friction(True, 1)
+
+
+@pytest.mark.parametrize("terrain", ["flat", "rough", "slope"])
+def test_the_robot_starts_on_its_feet_on_every_terrain(terrain: str) -> None:
+    simulator = make_simulator(Setup(terrain=terrain), seed=1)
+    assert simulator.config.terrain.kind == terrain
+    assert not simulator.fallen
+
+
+def test_an_unknown_terrain_is_refused() -> None:
+    with pytest.raises(ValueError, match="sand"):
+        Setup(terrain="sand")
