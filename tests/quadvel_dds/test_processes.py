@@ -44,6 +44,8 @@ def main():
         print("interrupted", flush=True)
     except ExternalShutdownException:
         print("shut down", flush=True)
+    else:
+        print("shut down", flush=True)  # between two callbacks the spin just ends
     finally:
         node.destroy_node()
         rclpy.try_shutdown()

@@ -104,10 +104,12 @@ def create_node(
 def get_global_executor() -> Executor:
     """The executor of the spin functions where none is given; it ends with the default context."""
     global _global_executor
-    if _global_executor is None:
-        _global_executor = SingleThreadedExecutor()
+    executor = _global_executor
+    if executor is None:
+        executor = _global_executor = SingleThreadedExecutor()
+        # Called at once if a signal has shut the context down already: the executor then ends at its first step.
         get_default_context().on_shutdown(_forget_global_executor)
-    return _global_executor
+    return executor
 
 
 def _forget_global_executor() -> None:
