@@ -14,7 +14,7 @@ from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_tru
 
 DT = 0.005
 NOMINAL_FEET = foot_positions(NOMINAL_Q)
-CONFIG = KalmanConfig()
+CONFIG = KalmanConfig(contact_source="foot_force")
 State = Callable[..., RobotState]
 Trot = Callable[[float, int], list[RobotState]]
 

@@ -50,7 +50,7 @@ class KalmanConfig:
     slip_gate: the foot speed, in standard deviations, beyond which a foot is taken to slip
     contact_force: N, below it a foot is in the air
     contact_ramp: N, so much above `contact_force` a foot is trusted fully
-    contact_source: what tells the force on a foot, its own sensor or the joint torques
+    contact_source: what tells the force on a foot, its own sensor or the joint torques, which every robot has
     """
 
     accelerometer: float = _positive(0.05, 1.0, 20.0)
@@ -61,7 +61,7 @@ class KalmanConfig:
     contact_force: float = _positive(1.0, 15.0, 60.0)
     contact_ramp: float = _positive(1.0, 40.0, 150.0)
     contact_source: Literal["foot_force", "torque"] = attrs.field(
-        default="foot_force", validator=attrs.validators.in_(("foot_force", "torque"))
+        default="torque", validator=attrs.validators.in_(("foot_force", "torque"))
     )
 
     @classmethod
