@@ -1,4 +1,4 @@
-"""Our learner against cusrl's recurrent PPO: the measurement behind docs/decisions/0005-own-learner.md.
+"""Our learner against cusrl's recurrent PPO: the measurement behind docs/decisions/0007-own-learner.md.
 
 Same networks, environments, sequence length, epochs and mini-batches, one thread, taken in turns. What counts is
 processor time, so that the ratios hold on a busy machine. It measures speed only, not how well either learns.

@@ -99,7 +99,7 @@ def critic_extra(env: VelocityEnv, tracking: Tracking) -> np.ndarray:
 
 
 def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
-    """Reward of one tick, (n,): tracking (`lag`: its error over a stride), attitude, effort, smooth residuals, feet on the clock."""
+    """Reward of one tick, (n,): tracking (`lag`: its error over a stride), attitude, effort, smooth residuals, feet on time."""
     c = env.command
     ev = np.sum((c[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
     ew = (c[:, 2] - env.angular_velocity[:, 2]) ** 2
