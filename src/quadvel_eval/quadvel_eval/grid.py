@@ -149,7 +149,7 @@ def evaluate(
 ) -> dict[str, Any]:
     """Run the whole grid over all cores; `progress` hears how many runs of how many are done.
 
-    A KeyboardInterrupt ends it once the runs under way are through.
+    A KeyboardInterrupt ends it; where only this process heard of it, once the runs under way are through.
     """
     todo = cells(grid, seeds)
     jobs: list[tuple[Callable[..., Any], Setup, Any]] = [(run_cell, setup, cell) for cell in todo]
@@ -167,7 +167,7 @@ def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterato
         len(os.sched_getaffinity(0)),
         multiprocessing.get_context("spawn"),  # forking a process with threads is not safe
         initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_IGN),  # Ctrl-C reaches the whole group: only the parent answers
+        initargs=(signal.SIGINT, signal.SIG_DFL),  # Ctrl-C reaches the whole group: they end without a word
     ) as pool:
         futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
         try:
