@@ -23,7 +23,8 @@ from quadvel_sim.terrain import Terrain
 from . import student
 from .env import CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, set_rate
-from .networks import Recurrent
+from .networks import Recurrent, State
+from .ppo import select
 
 MEMORY = 128
 HIDDEN = (64,)
@@ -36,6 +37,9 @@ BIAS_TILT = 0.01  # rad
 def new_network() -> Recurrent:
     """45 numbers in; velocity (3) and log variance (3) out."""
     return Recurrent(features.DEFAULT_LAYOUT.size, 6, MEMORY, HIDDEN)
+
+
+Sequence = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class Walk:
@@ -62,7 +66,7 @@ class Walk:
         for memory in (*self._policy_state, *self.state):
             memory[:, ids] = 0.0
 
-    def sequence(self, length: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    def sequence(self, length: int) -> Sequence:
         """`length` ticks: features (T, N, 45), true velocity (T, N, 3), mask (T, N)."""
         env, n = self.env, self.env.config.n
         alive = np.ones(n, bool)
@@ -85,7 +89,7 @@ class Walk:
                 self.target = self.map.targets(self.action)
                 env.tick(self.target)
                 alive &= ~(env.fallen | env.timed_out)
-        self.over = np.flatnonzero(~alive)
+        self._over = np.flatnonzero(~alive)
         tensors = (torch.from_numpy(np.array(x, dtype=np.float32)) for x in (inputs, truths, masks))
         return tuple(tensors)
 
@@ -107,12 +111,16 @@ class Walk:
             foot_force=np.zeros((n, 4)),
         )
 
-    def carry(self, state: tuple[torch.Tensor, torch.Tensor]) -> None:
-        """Go on from the memory after the learner's pass; ended walks start over."""
-        self.state = (state[0].detach(), state[1].detach())
-        if len(self.over):
-            self.env.reset(self.over)
-            self._start(self.over)
+    def remember(self, ids: torch.Tensor, state: State) -> None:
+        """Take over the memory (of `ids`) from the learner's pass."""
+        for kept, new in zip(self.state, state, strict=True):
+            kept[:, ids] = new.detach()
+
+    def start_over(self) -> None:
+        """Put the environments that ended in the last sequence back to a start."""
+        if len(self._over):
+            self.env.reset(self._over)
+            self._start(self._over)
 
 
 def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -131,16 +139,25 @@ class EstimatorConfig:
     length: int = 32
     learning_rate: float = 2e-3
     final_learning_rate: float = 1e-4
+    mini_batches: int = 4
+    truth_first: float = 0.4  # share of the budget before the policy walks on the estimate anywhere
     seed: int = 2
     commands: CommandRange = CommandRange()
     rough: Terrain = Terrain(kind="rough", roughness=0.04, size=30.0)
 
 
-def nll(output: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
-    """Gaussian negative log likelihood a sample, variances bounded below 1 mm/s."""
-    error, log_variance = truth - output[..., :3], output[..., 3:].clamp(-10.0, 4.0)
-    loss = 0.5 * (error**2 * (-log_variance).exp() + log_variance).sum(-1)
-    return (loss * mask).sum() / mask.sum().clamp(min=1)
+def loss_terms(
+    output: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Squared error for the velocity, Gaussian likelihood for the variance alone; a sample each.
+
+    Trained on the likelihood together, a velocity that is hard to see is given up for a large variance.
+    """
+    alive = mask.sum().clamp(min=1)
+    square = (truth - output[..., :3]) ** 2
+    log_variance = output[..., 3:].clamp(-10.0, 4.0)
+    likelihood = 0.5 * (square.detach() * (-log_variance).exp() + log_variance)
+    return (square.sum(-1) * mask).sum() / alive, (likelihood.sum(-1) * mask).sum() / alive
 
 
 class EstimatorRun:
@@ -178,22 +195,34 @@ class EstimatorRun:
         student.export(self.network, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:
-        """One sequence on each ground and one step of the optimiser."""
-        set_rate(self.optimiser, cosine(self.config.learning_rate, self.config.final_learning_rate, done))
-        losses, seen, states = [], {}, []
-        for name, walk in zip(("flat", "rough"), self.walks, strict=True):
-            inputs, truth, mask = walk.sequence(self.config.length)
-            output, state = self.network(inputs, walk.state)
-            losses.append(nll(output, truth, mask))
-            states.append(state)
-            square = ((output[..., :3] - truth) ** 2 * mask[..., None]).detach().sum((0, 1)) / mask.sum()
-            seen[name] = float(square.mean().sqrt())
+        """One sequence on each ground, and a step of the optimiser for each mini-batch of both."""
+        c = self.config
+        set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
+        for walk in self.walks:
+            walk.on_estimate[:] = done > c.truth_first
+            walk.on_estimate[1::2] = False
+        data = [walk.sequence(c.length) for walk in self.walks]
+        seen = {"flat": 0.0, "rough": 0.0, "nll": 0.0}
+        for ids in torch.randperm(c.n // 2).chunk(c.mini_batches):
+            for name, value in self._learn(ids, data).items():
+                seen[name] += value / c.mini_batches
+        for walk in self.walks:
+            walk.start_over()
+        self.samples += c.length * c.n
+        return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
+
+    def _learn(self, ids: torch.Tensor, data: list[Sequence]) -> dict[str, float]:
+        """One step; returns the mean squared error an axis on each ground, and the likelihood."""
+        losses, squares = [], []
+        for walk, (inputs, truth, mask) in zip(self.walks, data, strict=True):
+            output, state = self.network(inputs[:, ids], select(walk.state, ids))
+            square, likelihood = loss_terms(output, truth[:, ids], mask[:, ids])
+            losses.append(10.0 * square + 0.1 * likelihood)
+            squares.append(float(square.detach()) / 3)
+            walk.remember(ids, state)
         loss = torch.stack(losses).mean()
         self.optimiser.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
-        for walk, state in zip(self.walks, states, strict=True):
-            walk.carry(state)
-        self.samples += self.config.length * self.config.n
-        return seen | {"nll": float(loss.detach())}
+        return {"flat": squares[0], "rough": squares[1], "nll": float(likelihood.detach())}
