@@ -61,7 +61,7 @@ def variance() -> NDArray[np.float64]:
 
 def write_estimator_file(
     path: Path,
-    outputs: tuple[str, str] = features.OUTPUTS,
+    outputs: tuple[str, str] = tuple(features.OUTPUTS),
     size: int = 45,
     width: int = 3,
     metadata: str | None = None,

@@ -7,7 +7,7 @@ thread. What the inputs and outputs mean is the caller's matter.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,22 +28,24 @@ class NetworkFileError(ValueError):
 
 
 class RecurrentNetwork:
-    """Inputs `obs` (1, n), `h_in`, `c_in`; outputs `outputs` (1, m each), `h_out`, `c_out`; all float32.
+    """Inputs `obs` (1, n), `h_in`, `c_in`; outputs `outputs`, `h_out`, `c_out`; all float32.
 
-    `fields` are the metadata fields that the caller needs besides `schema`, `joint_names` and `state_shape`,
-    the shape of both memories. Raises NetworkFileError.
+    `outputs` gives the length m of each output (1, m) by its name, in order. `fields` are the metadata fields
+    that the caller needs besides `schema`, `joint_names` and `state_shape`, the shape of both memories. Raises
+    NetworkFileError.
     """
 
-    def __init__(self, path: str | Path, outputs: Sequence[str], fields: Sequence[str] = ()) -> None:
+    def __init__(self, path: str | Path, outputs: Mapping[str, int], fields: Sequence[str] = ()) -> None:
         self.path = Path(path)
         self._session = self._open()
         self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
         self._require("metadata field schema", self.metadata["schema"], SCHEMA)
         self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
-        self._outputs = tuple(outputs)
+        self._outputs = dict(outputs)
         self._check_signature()
         self._zero = np.zeros(self.metadata["state_shape"], np.float32)
         self.reset()
+        self._try_out()
 
     @property
     def input_size(self) -> int:
@@ -69,6 +71,16 @@ class RecurrentNetwork:
     def refuse(self, what: str, found: object, expected: object) -> NetworkFileError:
         """The error for a file of which `what` is `found`, for the caller to raise."""
         return NetworkFileError(f"{self.path}: {what} is {found!r}, expected {expected!r}")
+
+    def _try_out(self) -> None:
+        """One step on zeros: shows the true shapes of the outputs, and is the slow first run of the session."""
+        try:
+            results = self.step(np.zeros(self.input_size, np.float32))
+        except FloatingPointError as error:
+            raise NetworkFileError(f"{error} for an input of zeros") from None
+        for (name, size), result in zip(self._outputs.items(), results, strict=True):
+            self._require(f"shape of output {name}", (1, *result.shape), (1, size))
+        self.reset()
 
     def _require(self, what: str, found: object, expected: object) -> None:
         if found != expected:
@@ -111,6 +123,7 @@ class RecurrentNetwork:
         inputs, outputs = self._session.get_inputs(), self._session.get_outputs()
         self._require("list of inputs", [i.name for i in inputs], ["obs", *MEMORY_INPUTS])
         self._require("list of outputs", [o.name for o in outputs], [*self._outputs, *MEMORY_OUTPUTS])
+        self._require("types of the inputs", {i.type for i in inputs}, {"tensor(float)"})
         for memory in inputs[1:]:
             self._require(f"shape of input {memory.name}", memory.shape, self.metadata["state_shape"])
         shape = inputs[0].shape

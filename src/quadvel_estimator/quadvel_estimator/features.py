@@ -18,7 +18,7 @@ from quadvel_description.state import MODE_SERVO, RobotState
 RATE_HZ = 200
 KIND = "velocity_estimator"
 METADATA_FIELDS = ("kind", "nominal_q", "rate_hz", "inputs", "output_scale")
-OUTPUTS = ("velocity", "log_variance")  # and the memory that `recurrent_network` names
+OUTPUTS = {"velocity": 3, "log_variance": 3}  # and the memory that `recurrent_network` names
 
 # Clips lie beyond anything that walking shows; they only keep a shock from throwing the memory far off.
 DEFAULT_LAYOUT = InputLayout(

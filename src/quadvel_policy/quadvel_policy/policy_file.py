@@ -25,7 +25,7 @@ class PolicyFile:
     """
 
     def __init__(self, path: str | Path = SHIPPED_POLICY) -> None:
-        network = RecurrentNetwork(path, ["actions"], METADATA_FIELDS)
+        network = RecurrentNetwork(path, {"actions": JOINTS}, METADATA_FIELDS)
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:
@@ -35,13 +35,6 @@ class PolicyFile:
         if network.input_size != self.metadata.observation.size:
             raise network.refuse("length of input obs", network.input_size, self.metadata.observation.size)
         self._network = network
-        try:
-            trial = self.step(np.zeros(network.input_size, np.float32))  # also warms the session up
-        except FloatingPointError as error:
-            raise NetworkFileError(f"{error} for an input of zeros") from None
-        if trial.shape != (JOINTS,):
-            raise network.refuse("shape of output actions", (1, *trial.shape), (1, JOINTS))
-        self.reset()
 
     def reset(self) -> None:
         """Forget everything seen so far."""
