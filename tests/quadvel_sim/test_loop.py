@@ -223,12 +223,13 @@ def test_a_reset_puts_the_robot_back_while_its_clock_goes_on() -> None:
     for _ in range(3):
         bench.loop.advance()
     bench.clock.now = 100.016
+    bench.loop.submit(command(9.0, 15))
     bench.loop.reset("stand")
     state, instant = bench.samples[-1]
     assert (state.tick, state.time, instant) == (20, 0.02, 100.016)  # later than the sample before
     np.testing.assert_array_equal(state.q, robot.NOMINAL_Q)
-    assert bench.loop.simulator.braking
     bench.loop.advance()
+    assert bench.loop.simulator.braking  # what came before the reset is forgotten
     assert bench.samples[-1][0].tick == 25
     assert bench.samples[-1][1] == pytest.approx(100.021)
     with pytest.raises(ValueError, match="it answers tick 15, 10 ms ago: expected at most 100 ms, and none"):

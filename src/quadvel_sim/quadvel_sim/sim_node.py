@@ -37,7 +37,7 @@ VIEW_PERIOD = 20  # ms, of what is there for people's tools: imu, joint_states, 
 STAMP_TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart before the stamps follow
 
 
-class SimNode(Node):  # type: ignore[misc]
+class SimNode(Node):
     """Topics and services around a SimulationLoop, which runs in a thread of its own."""
 
     def __init__(self) -> None:

@@ -162,15 +162,15 @@ class Simulator:
         model, data, q, dq = self.model, self.data, self._q, self._dq
         torque, answer = data.ctrl, self.actuator.step
         for _ in range(n):
-            if self._command_left == 0:
-                self._law = self._brake
-            self._command_left -= 1
             torque[:] = answer(q, dq, *self._law)
             if self._sampled:  # all that depends on positions and velocities alone is there
                 mujoco.mj_step2(model, data)
                 self._sampled = False
             else:
                 mujoco.mj_step(model, data)
+            self._command_left -= 1
+            if self._command_left == 0:
+                self._law = self._brake
             if self._pushes:
                 self._end_pushes()
         self.steps += n
@@ -270,8 +270,7 @@ class Simulator:
         """
         if self._sampled:
             return
-        law = self._brake if self._command_left == 0 else self._law
-        self.data.ctrl[:] = self.actuator.peek(self._q, self._dq, *law)
+        self.data.ctrl[:] = self.actuator.peek(self._q, self._dq, *self._law)
         mujoco.mj_forward(self.model, self.data)
         self._sampled = True
 
