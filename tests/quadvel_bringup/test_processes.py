@@ -103,11 +103,16 @@ def test_a_name_is_given_once() -> None:
 
 
 def test_processes_end_when_the_one_that_started_them_is_killed(tmp_path: Path) -> None:
+    silent = [
+        sys.executable,
+        "-c",
+        "import time; time.sleep(60)",
+    ]  # the closed pipe would end one that writes
     program = f"""
 import os
 from quadvel_bringup.processes import ProcessGroup
 with ProcessGroup(lambda name, line: None) as group:
-    group.start("sleeper", {SLEEPER!r})
+    group.start("sleeper", {silent!r})
     print(group._processes["sleeper"].pid, flush=True)
     os.kill(os.getpid(), 9)
 """
