@@ -59,7 +59,7 @@ def start(context: LaunchContext) -> list[Action]:
             executable=name,
             name=name,
             output="screen",
-            parameters=[str(stack.parameters), overrides],
+            parameters=[str(stack.parameters), *([overrides] if overrides else [])],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )
         for name, overrides in stack.overrides().items()
