@@ -61,17 +61,20 @@ def demo_command(
     folder, console = output_folder(out), Console(soft_wrap=True)
     with replacing(folder / "demo.mcap") as draft:
         problem = _Run(draft, "quick" if quick else "full", lockstep, console).walk()
-    recording = read_recording(folder / "demo.mcap")
-    summary = demo_summary.summarise(recording)
+    if problem:
+        console.print(f"[bold red]{problem}")
+    try:
+        recording = read_recording(folder / "demo.mcap")
+        summary = demo_summary.summarise(recording)
+    except ValueError as error:
+        raise ValueError(f"the walk can't be judged: {error}") from None
     write_json(folder / "summary.json", summary)
     _report(summary, console)
     _draw(recording, folder, video, console)
     console.print(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
-    if summary["falls"] and not problem:
-        problem = f"the robot fell {summary['falls']} times"
-    if problem:
-        console.print(f"[bold red]{problem}")
-    raise typer.Exit(1 if problem else 0)
+    if summary["falls"]:
+        console.print(f"[bold red]falls: {summary['falls']}")
+    raise typer.Exit(1 if problem or summary["falls"] else 0)
 
 
 class _Run:

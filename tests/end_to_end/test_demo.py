@@ -1,0 +1,63 @@
+"""The whole stack over DDS, each node a process: `quadvel demo`, in lockstep so that a busy machine does not matter."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.cli import main; main()")
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("demo")
+
+
+def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path, domain_id: int) -> None:
+    (out / "notes.txt").write_text("mine")
+    command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(out)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    assert sorted(summary) == [
+        *("estimator", "falls", "loop", "max_error_xy", "mean_error_xy", "realtime_factor", "segments"),
+    ]
+    assert [segment["command"] for segment in summary["segments"]] == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
+    assert summary["falls"] == 0
+    assert summary["max_error_xy"] < 0.15
+    assert max(summary["estimator"]["rmse"]) < 0.08
+    assert sorted(summary["loop"]) == [
+        *("compute_p50_us", "compute_p99_us", "inference_p50_us", "overruns", "period_p99_ms", "rate_hz"),
+    ]
+    assert (out / "notes.txt").read_text() == "mine"
+    assert {"demo.mcap", "summary.json", "tracking.png", "loop.png"} <= {path.name for path in out.iterdir()}
+
+
+def test_its_recording_holds_every_state_and_the_answer_to_it(out: Path) -> None:
+    if not (out / "demo.mcap").exists():
+        pytest.skip("the demo made no recording")
+    with (out / "demo.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    counts = {
+        channel.topic: summary.statistics.channel_message_counts[number]
+        for number, channel in summary.channels.items()
+    }
+    assert counts["/low_cmd"] == pytest.approx(counts["/low_state"], rel=0.02)
+    assert counts["/ground_truth/odom"] == pytest.approx(counts["/low_state"], rel=0.02)
+    assert {schema.name for schema in summary.schemas.values()} >= {"quadvel_msgs/msg/LowState"}
+
+
+def test_a_demo_whose_folder_is_a_file_starts_nothing(tmp_path: Path, domain_id: int) -> None:
+    (tmp_path / "out").write_text("mine")
+    command = [*QUADVEL, "demo", "--out", str(tmp_path / "out")]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert "is a file or lies below one" in ended.stderr
+    assert "Traceback" not in ended.stderr

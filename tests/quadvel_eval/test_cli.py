@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from quadvel_description.recurrent_network import NetworkFileError
+from quadvel_eval import bench
+from quadvel_eval.cli import bench_command, eval_command
+
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.cli import main; main()")
+
+
+def test_a_missing_policy_is_refused_by_its_name_before_anything_is_made(tmp_path: Path) -> None:
+    with pytest.raises(NetworkFileError, match=r"nowhere\.onnx: no such file"):
+        eval_command(tmp_path / "out", "quick", policy=tmp_path / "nowhere.onnx")
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "out").write_text("mine")
+    with pytest.raises(NotADirectoryError, match="is a file"):
+        eval_command(tmp_path / "out", "quick")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_an_unknown_grid_ends_in_a_sentence_and_no_traceback(tmp_path: Path) -> None:
+    command = [*QUADVEL, "eval", "--grid", "huge", "--out", str(tmp_path)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 2
+    assert "'huge'" in ended.stderr
+    assert "Traceback" not in ended.stderr
+
+
+def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Path) -> None:
+    (tmp_path / "eval.json").write_text("old")
+    command = [*QUADVEL, "eval", "--grid", "paper", "--out", str(tmp_path)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True, text=True)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+    until = time.monotonic() + 60.0
+    while len(children.read_text().split()) < 2 and time.monotonic() < until:  # workers, and their tracker
+        time.sleep(0.1)
+    time.sleep(0.5)
+    assert process.poll() is None, "it ended before it was asked to"
+    for _ in range(2):
+        os.killpg(process.pid, signal.SIGINT)
+        time.sleep(0.1)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode != 0
+    assert "Traceback" not in said
+    assert [path.name for path in tmp_path.iterdir()] == ["eval.json"]
+    assert (tmp_path / "eval.json").read_text() == "old"
+
+
+def test_bench_writes_figures_and_says_what_it_skipped(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    parts = dict.fromkeys(bench.PARTS, lambda: {"skipped": "not now"})
+    parts["simulator"] = lambda: {"realtime_factor": 17.25, "with_sensors_realtime_factor": 9.0}
+    monkeypatch.setattr(bench, "PARTS", parts)
+    bench_command(tmp_path / "out" / "bench.json")
+    written = json.loads((tmp_path / "out" / "bench.json").read_text())
+    assert written["simulator"]["realtime_factor"] == 17.25
+    assert written["policy"] == {"skipped": "not now"}
+    assert written["machine"]["cores"] >= 1
+    said = capsys.readouterr().out
+    assert "17.25" in said
+    assert "not now" in said
