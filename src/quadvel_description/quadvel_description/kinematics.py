@@ -31,11 +31,12 @@ def foot_jacobians(q: np.ndarray) -> np.ndarray:
     """d foot / d (hip, thigh, calf) in the trunk frame, (..., 12) -> (..., 4, 3, 3), m/rad; columns are joints."""
     x, z, calf_x, calf_z, s, c = _leg_plane(q)
     y = THIGH_OFFSET * _SIDE
-    zero = np.zeros_like(x)
-    hip = np.stack([zero, -y * s - z * c, y * c - z * s], axis=-1)
-    thigh = np.stack([z, x * s, -x * c], axis=-1)
-    calf = np.stack([calf_z, calf_x * s, -calf_x * c], axis=-1)
-    return np.stack([hip, thigh, calf], axis=-1)
+    jacobians = np.zeros((*x.shape, 3, 3))
+    jacobians[..., 1, 0], jacobians[..., 2, 0] = -y * s - z * c, y * c - z * s
+    for joint, forward, down in ((1, z, x), (2, calf_z, calf_x)):
+        jacobians[..., 0, joint] = forward
+        jacobians[..., 1, joint], jacobians[..., 2, joint] = down * s, -down * c
+    return jacobians
 
 
 def inverse_kinematics(feet: np.ndarray) -> np.ndarray:

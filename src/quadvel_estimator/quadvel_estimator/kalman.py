@@ -144,7 +144,7 @@ class KalmanEstimator:
         acceleration = rotation @ np.asarray(state.linear_acceleration)[..., None]
         acceleration[..., 2, 0] -= GRAVITY
         self._state = transition @ self._state + gain[:, None] * acceleration.swapaxes(-1, -2)
-        noise = np.outer(gain, gain) * self.config.accelerometer**2
+        noise = gain[:, None] * gain * self.config.accelerometer**2
         self._covariance = transition @ self._covariance @ transition.T + noise
 
     def _unknown_speed(self, leg_velocity: Array, trust: Array) -> Array:
@@ -168,10 +168,12 @@ class KalmanEstimator:
         weight = 1.0 / (self.config.foot_velocity**2 + speed_variance)
         total = weight.sum(-1, keepdims=True)
         mean = (weight[..., None, :] @ leg_velocity) / total[..., None]
-        noise = np.concatenate([np.full_like(weight, self.config.foot_position**2), 1.0 / total], axis=-1)
 
         measured = MEASURED @ self._covariance  # (..., 5, 6)
-        innovation_covariance = measured @ MEASURED.T + noise[..., None] * np.eye(5)
+        innovation_covariance = measured @ MEASURED.T
+        diagonal = np.einsum("...ii->...i", innovation_covariance)  # a view
+        diagonal[..., :4] += self.config.foot_position**2
+        diagonal[..., 4:] += 1.0 / total
         gain = np.linalg.solve(innovation_covariance, measured).swapaxes(-1, -2)
         innovation = np.concatenate([feet, mean], axis=-2) - MEASURED @ self._state
         self._state = self._state + gain @ innovation
