@@ -20,14 +20,17 @@ STRIDE = 0.4  # s, over which a velocity is averaged to be seen without the sway
 AXES = ("vx, m/s", "vy, m/s", "wz, rad/s")
 
 
-def tracking_figure(recording: Recording, frames: Sequence[NDArray[np.uint8]] = ()) -> Figure:
-    """Commanded, true and estimated velocity over time; above them the `frames` (h, w, 3) as a strip."""
-    strip = 1.4 if frames else 0.0
+def tracking_figure(recording: Recording, frames: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> Figure:
+    """Commanded, true and estimated velocity over time; above them `frames`, captions and (h, w, 3) images."""
+    strip = 1.7 if frames else 0.0
     figure = Figure(figsize=(11, 6 + strip), layout="constrained")
     if frames:
         top, below = figure.subfigures(2, 1, squeeze=False, height_ratios=(strip, 6))[:, 0]
-        for panel, frame in zip(top.subplots(1, len(frames), squeeze=False)[0], frames, strict=True):
-            panel.imshow(frame)
+        for panel, (caption, image) in zip(
+            top.subplots(1, len(frames), squeeze=False)[0], frames, strict=True
+        ):
+            panel.imshow(image)
+            panel.set_title(caption, fontsize="medium")
             panel.set_axis_off()
         _tracking_panels(below.subplots(3, 1, sharex=True), recording)
     else:
@@ -47,7 +50,7 @@ def _tracking_panels(panels: Any, recording: Recording) -> None:
             panel.plot(series.time[within] - start, series.value[within, axis], colour, label=label, lw=1.2)
         panel.set_ylabel(name)
         panel.grid(alpha=0.3)
-    panels[0].legend(loc="upper right", fontsize="small", ncols=3)
+    panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
     panels[-1].set_xlabel(f"time, s (true and estimated: means over {STRIDE} s)")
 
 

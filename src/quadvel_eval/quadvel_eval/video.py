@@ -25,8 +25,8 @@ Image = NDArray[np.uint8]
 
 RATE = 20  # frames a second
 SIZE = (640, 360)
-STRIP = 6  # frames
-STRIP_SIZE = (360, 270)
+STRIP = 5  # frames
+STRIP_SIZE = (400, 300)
 
 
 class Film:
@@ -60,11 +60,17 @@ class Film:
             yield self._renderer.render().copy()
 
 
-def strip_times(recording: Recording) -> NDArray[np.float64]:
-    """Some times (n,) in the middle of segments in which the robot moves."""
+def strip(recording: Recording) -> list[tuple[str, Image]]:
+    """Frames from the middle of some segments in which the robot moves, with the command as caption."""
     moving = [c for c in commands(recording.planned.time, recording.planned.value) if c[2].any()]
-    picked = np.unique(np.linspace(0, len(moving) - 1, STRIP).round().astype(int))
-    return np.array([0.5 * (moving[i][0] + moving[i][1]) for i in picked])
+    picked = [moving[i] for i in np.unique(np.linspace(0, len(moving) - 1, STRIP).round().astype(int))]
+    with Film(recording, *STRIP_SIZE) as film:
+        images = list(film.frames([0.5 * (start + end) for start, end, _ in picked]))
+    return [(_caption(velocity), image) for (_, _, velocity), image in zip(picked, images, strict=True)]
+
+
+def _caption(velocity: NDArray[np.float64]) -> str:
+    return ", ".join(f"{axis} {x:g}" for axis, x in zip(("vx", "vy", "wz"), velocity, strict=True) if x)
 
 
 def write_video(path: Path, recording: Recording) -> None:
@@ -83,9 +89,7 @@ def write_video(path: Path, recording: Recording) -> None:
 def main(arguments: Sequence[str]) -> None:
     """`demo.png` with a strip of frames, then `demo.mp4`."""
     recording, folder = read_recording(Path(arguments[0])), Path(arguments[1])
-    with Film(recording, *STRIP_SIZE) as film:
-        frames = list(film.frames(strip_times(recording)))
-    write_figure(folder / "demo.png", tracking_figure(recording, frames))
+    write_figure(folder / "demo.png", tracking_figure(recording, strip(recording)))
     write_video(folder / "demo.mp4", recording)
 
 
