@@ -20,6 +20,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path, domain_id: int) -> None:
     (out / "notes.txt").write_text("mine")
+    (out / "demo.mp4").write_text("of another walk")
     command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(out)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 0, ended.stdout + ended.stderr
@@ -35,7 +36,8 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path, domain_i
         *("compute_p50_us", "compute_p99_us", "inference_p50_us", "overruns", "period_p99_ms", "rate_hz"),
     ]
     assert (out / "notes.txt").read_text() == "mine"
-    assert {"demo.mcap", "summary.json", "tracking.png", "loop.png"} <= {path.name for path in out.iterdir()}
+    assert not (out / "demo.mp4").exists()
+    assert {"demo.mcap", "summary.json", "demo.png", "loop.png"} <= {path.name for path in out.iterdir()}
 
 
 def test_its_recording_holds_every_state_and_the_answer_to_it(out: Path) -> None:

@@ -42,6 +42,8 @@ RECORDED = {
     "/tf": "tf2_msgs/msg/TFMessage",
     "/velocity_estimate": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
+MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
+"""What is made of the recording; what is left of an earlier one goes."""
 LOOK = 0.2  # s, between two looks whether all nodes still run
 
 
@@ -59,19 +61,23 @@ def demo_command(
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
     folder, console = output_folder(out), Console(soft_wrap=True)
-    with replacing(folder / "demo.mcap") as draft:
+    recorded = folder / "demo.mcap"
+    with replacing(recorded) as draft:
         problem = _Run(draft, "quick" if quick else "full", lockstep, console).walk()
+    for name in MADE_OF_IT:
+        (folder / name).unlink(missing_ok=True)
     if problem:
         console.print(f"[bold red]{problem}")
     try:
-        recording = read_recording(folder / "demo.mcap")
+        recording = read_recording(recorded)
         summary = demo_summary.summarise(recording)
     except ValueError as error:
         raise ValueError(f"the walk can't be judged: {error}") from None
     write_json(folder / "summary.json", summary)
     _report(summary, console)
     _draw(recording, folder, video, console)
-    console.print(f"written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}")
+    written = [name for name in ("demo.mcap", *MADE_OF_IT) if (folder / name).exists()]
+    console.print(f"written to {folder}: {', '.join(written)}")
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
@@ -156,9 +162,9 @@ def _report(summary: dict[str, Any], console: Console) -> None:
 
 
 def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> None:
-    """Plots always; a strip of frames and a video where GL is there."""
+    """Plots always; a strip of frames above them and a video where GL is there."""
     write_figure(folder / "loop.png", demo_figures.loop_figure(recording))
-    write_figure(folder / "tracking.png", demo_figures.tracking_figure(recording))
+    write_figure(folder / "demo.png", demo_figures.tracking_figure(recording))
     if not video:
         return
     backend = gl_backend()
