@@ -52,7 +52,7 @@ def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Pa
         os.killpg(process.pid, signal.SIGINT)
         time.sleep(0.1)
     _, said = process.communicate(timeout=30)
-    assert process.returncode != 0
+    assert process.returncode == 128 + signal.SIGINT
     assert "Traceback" not in said
     assert [path.name for path in tmp_path.iterdir()] == ["eval.json"]
     assert (tmp_path / "eval.json").read_text() == "old"

@@ -10,6 +10,8 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 from typing import Any
 
 import attrs
@@ -163,15 +165,35 @@ def evaluate(
 
 def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterator[tuple[int, Any]]:
     """Number and result of each job as they are done."""
-    with ProcessPoolExecutor(
-        len(os.sched_getaffinity(0)),
-        multiprocessing.get_context("spawn"),  # forking a process with threads is not safe
-        initializer=signal.signal,
-        initargs=(signal.SIGINT, signal.SIG_DFL),  # Ctrl-C reaches the whole group: they end without a word
-    ) as pool:
-        futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
+    context = multiprocessing.get_context("spawn")  # forking a process with threads is not safe
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_end_on_interrupt) as pool:
+        with _interrupts_held_back():
+            futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
         try:
             for future in as_completed(futures):
                 yield futures[future], future.result()
+        except KeyboardInterrupt:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
+            raise
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _interrupts_held_back() -> Iterator[None]:
+    """SIGINT waits until the end of the block, and in processes that are started in it until they allow it.
+
+    Ctrl-C reaches the whole group, and a worker that is hit while it still imports would write a traceback.
+    """
+    resource_tracker.ensure_running()  # it is started with the workers otherwise, and then lets signals through
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+
+
+def _end_on_interrupt() -> None:
+    """In a worker: SIGINT ends it at once and without a word."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
