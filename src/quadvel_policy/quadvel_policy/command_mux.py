@@ -40,7 +40,7 @@ class MuxConfig:
         metadata={"description": "largest vx, vy, wz passed on, m/s, rad/s"},
     )
     acceleration: Axes = attrs.field(
-        default=(5.0, 5.0, 10.0),
+        default=(1.2, 0.8, 1.5),
         validator=_axes,
         metadata={"description": "largest change of a followed command, m/s^2, rad/s^2"},
     )
