@@ -180,7 +180,11 @@ def test_pictures_are_drawn(recorded: Callable[..., Path], tmp_path: Path) -> No
     recording = read_recording(recorded())
     frame = np.zeros((27, 36, 3), np.uint8)
     for number, figure in enumerate(
-        (tracking_figure(recording), tracking_figure(recording, [("vx 0.5", frame)] * 3), loop_figure(recording))
+        (
+            tracking_figure(recording),
+            tracking_figure(recording, [("vx 0.5", frame)] * 3),
+            loop_figure(recording),
+        )
     ):
         figure.savefig(tmp_path / f"{number}.png")
     assert len(list(tmp_path.iterdir())) == 3

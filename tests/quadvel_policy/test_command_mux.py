@@ -14,11 +14,12 @@ from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput, MuxOutpu
 TELEOP, PLANNER = MuxInput("teleop", 100, 0.5), MuxInput("planner", 10, 0.3)
 FORWARD, BACK = (1.0, 0.0, 0.0), (-0.5, 0.0, 0.0)
 PERIOD = 0.02
+BRISK = MuxConfig(acceleration=(5.0, 5.0, 10.0))
 
 
 @pytest.fixture
 def mux() -> CommandMux:
-    return CommandMux([PLANNER, TELEOP])
+    return CommandMux([PLANNER, TELEOP], BRISK)
 
 
 def run(mux: CommandMux, start: float, seconds: float, **heard: Any) -> MuxOutput:
@@ -149,8 +150,7 @@ EVENT = st.tuples(st.floats(0.0, 0.4), st.sampled_from(["teleop", "planner", "lo
 @given(st.lists(EVENT, max_size=40))
 @settings(max_examples=60, deadline=None)
 def test_whatever_happens_the_command_is_bounded_and_stance_means_zero(events: list[Any]) -> None:
-    mux, now, last = CommandMux([TELEOP, PLANNER]), 0.0, np.zeros(3)
-    config = MuxConfig()
+    mux, now, last = CommandMux([TELEOP, PLANNER], BRISK), 0.0, np.zeros(3)
     for wait, kind, velocity in events:
         now += wait
         if kind in ("teleop", "planner"):
@@ -158,8 +158,8 @@ def test_whatever_happens_the_command_is_bounded_and_stance_means_zero(events: l
         else:
             mux.locks = {"lock"} if kind == "lock" else set()
         output = mux.update(now)
-        assert (np.abs(output.velocity) <= config.max_velocity).all()
-        assert (np.abs(output.velocity - last) <= np.multiply(config.acceleration, wait) + 1e-9).all()
+        assert (np.abs(output.velocity) <= BRISK.max_velocity).all()
+        assert (np.abs(output.velocity - last) <= np.multiply(BRISK.acceleration, wait) + 1e-9).all()
         assert not (output.stance and output.velocity.any())
         assert not (mux.locks and output.source != "none")
         last = output.velocity
