@@ -14,6 +14,7 @@ import torch
 
 from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
+from quadvel_sim.terrain import Terrain
 
 from . import gait
 from .command_map import Tracking
@@ -142,6 +143,7 @@ class TeacherConfig:
     final_std: float = 0.15
     seed: int = 0
     commands: CommandRange = CommandRange()
+    terrain: Terrain = Terrain()
     ppo: PpoConfig = PpoConfig()
 
 
@@ -151,7 +153,7 @@ class TeacherRun:
     def __init__(self, config: TeacherConfig) -> None:
         self.config = config
         torch.manual_seed(config.seed)
-        self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands))
+        self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands, terrain=config.terrain))
         self.gait = GaitState(config.n)
         self.tracking = Tracking(config.n, gain=0.0)
         size = len(OBSERVATION_MIRROR.index)

@@ -18,7 +18,6 @@ KINDS = ("flat", "slope", "rough")
 GEOM_NAME = "ground"
 _RESOLUTION = 0.05  # m between the points of the height grid
 _LEVEL_RADIUS = 0.5  # m around the origin where rough ground stays level, so that a robot can be put down
-_BLEND = 0.5  # m from level to fully rough
 _BASE = 0.5  # m of solid ground below the lowest point
 
 
@@ -57,6 +56,8 @@ class Terrain:
     """Bound of the noise of rough ground above and below the slope, m."""
     wavelength: float = attrs.field(default=0.6, **number(0.1, 10.0))
     """Spacing of the noise's lattice, m: about the distance from a hump to the next hollow."""
+    blend: float = attrs.field(default=0.5, **number(0.1, 100.0))
+    """Distance over which rough ground grows from level to fully rough, m. Long: a field from easy to hard."""
     size: float = attrs.field(default=40.0, **number(4.0, 200.0))
     """Edge of the square of rough ground, m. Flat ground and slopes have no edge."""
     seed: int = attrs.field(default=0, **whole_number())
@@ -76,7 +77,7 @@ class Terrain:
         x, y = np.meshgrid(axis, axis)
         noise = perlin(x, y, self.wavelength, self.seed)
         x, y = x - 0.5 * self.size, y - 0.5 * self.size
-        grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS) / _BLEND, 0.0, 1.0)
+        grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS) / self.blend, 0.0, 1.0)
         return np.asarray(x * np.tan(self.slope) + self.roughness * grown * noise)
 
     @property
