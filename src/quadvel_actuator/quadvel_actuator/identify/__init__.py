@@ -1,0 +1,1 @@
+"""What measured logs say about the joints: residual, diagnosis, correction, before and after."""

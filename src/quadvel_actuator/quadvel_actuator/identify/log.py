@@ -1,0 +1,160 @@
+"""A measured log of joints, whatever file it came from: `Log`, and `read_log`, which makes one of a path.
+
+Here stands what a log has to be before anything can be computed from it: shapes that fit, finite numbers, times
+that rise. What a well-formed log says about the robot is for `inspect.py`; the formats are in `recordings.py`
+(MCAP, rosbag2) and `tables.py` (NPZ, CSV).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating[Any]]
+Bools = NDArray[np.bool_]
+
+LEAST_ROWS = 10
+"""Fewer samples say nothing about a joint."""
+
+
+class LogError(ValueError):
+    """What is wrong with a log: one sentence that names the file and the field."""
+
+
+def joint_name(name: str) -> str:
+    """The name with `_joint` at its end."""
+    return name if name.endswith("_joint") else f"{name}_joint"
+
+
+@attrs.frozen(eq=False)
+class Log:
+    """J joints, state rows (N,) and command rows (M,) on time bases of their own; SI units.
+
+    A row holds what was at its time; a command counts from its time until the next. Times rise strictly and all
+    numbers are finite: building a Log that breaks this raises LogError. Floats are double precision, single in
+    a log of more than `tables.LONG` values: cast before solving with them.
+    """
+
+    name: str  # the file
+    joints: tuple[str, ...]  # (J,), each ends in _joint
+    t: Array  # (N,) s
+    q: Array  # (N, J) rad
+    dq: Array  # (N, J) rad/s
+    t_cmd: Array  # (M,) s
+    q_des: Array  # (M, J) rad
+    valid: Bools  # (N, J), false: not to be explained
+    tau: Array | None = None  # (N, J) N m
+    temperature: Array | None = None  # (N, J) degrees Celsius
+    voltage: Array | None = None  # (N,) V
+    dq_des: Array | None = None  # (M, J) rad/s
+    tau_ff: Array | None = None  # (M, J) N m
+    kp: Array | None = None  # (M, J) N m/rad
+    kd: Array | None = None  # (M, J) N m s/rad
+    remarks: tuple[str, ...] = ()  # what the reader had to assume
+
+    def __attrs_post_init__(self) -> None:
+        for name in self.joints:
+            if self.joints.count(name) > 1:
+                raise LogError(f"{self.name}: joint_names: '{name}' stands there twice")
+        self._check_time("t", self.t)
+        self._check_time("t_cmd", self.t_cmd)
+        joints = len(self.joints)
+        states, commands = (len(self.t), joints), (len(self.t_cmd), joints)
+        for field in ("q", "dq", "tau", "temperature", "valid"):
+            self._check_values(field, getattr(self, field), states)
+        self._check_values("voltage", self.voltage, states[:1])
+        for field in ("q_des", "dq_des", "tau_ff", "kp", "kd"):
+            self._check_values(field, getattr(self, field), commands)
+
+    @property
+    def duration(self) -> float:
+        """From the first state to the last, s."""
+        return float(self.t[-1] - self.t[0])
+
+    @property
+    def period(self) -> float:
+        """The median spacing of the states, s."""
+        return float(np.median(np.diff(self.t)))
+
+    def command_rows(self, at: Array) -> NDArray[np.intp]:
+        """The command row that counts at the times `at`, s, the first one before there is any; shape of `at`."""
+        return np.maximum(np.searchsorted(self.t_cmd, at, side="right") - 1, 0)
+
+    def select(self, joints: Sequence[str]) -> Log:
+        """The log with these joints only, in this order. Raises LogError for one that it does not hold."""
+        names = tuple(joint_name(name) for name in joints)
+        for name in names:
+            if name not in self.joints:
+                raise LogError(f"{self.name}: joint_names: no '{name}', found {', '.join(self.joints)}")
+        if names == self.joints:
+            return self
+        columns = [self.joints.index(name) for name in names]
+        taken = {
+            field.name: getattr(self, field.name)[:, columns]
+            for field in attrs.fields(Log)
+            if np.ndim(getattr(self, field.name)) == 2
+        }
+        return attrs.evolve(self, joints=names, **taken)
+
+    def _check_time(self, field: str, time: Array) -> None:
+        if time.ndim != 1 or len(time) < LEAST_ROWS:
+            raise LogError(
+                f"{self.name}: {field}: found shape {time.shape}, expected ({LEAST_ROWS} or more,)"
+            )
+        self._check_finite(field, time)
+        steps = np.diff(time)
+        backward = np.flatnonzero(steps <= 0.0)
+        if backward.size:
+            row = int(backward[0]) + 1
+            raise LogError(
+                f"{self.name}: {field}: the time does not rise from row {row - 1} to row {row} "
+                f"({time[row - 1]:.6f} to {time[row]:.6f} s; {backward.size} of {steps.size} steps), "
+                "expected rows in the order of time"
+            )
+
+    def _check_values(self, field: str, values: Array | Bools | None, shape: tuple[int, ...]) -> None:
+        if values is None:
+            return
+        if values.shape != shape:
+            raise LogError(f"{self.name}: {field}: found shape {values.shape}, expected {shape}")
+        self._check_finite(field, values)
+
+    def _check_finite(self, field: str, values: Array | Bools) -> None:
+        finite = np.isfinite(values)
+        if finite.all():
+            return
+        missing = np.argwhere(~finite)
+        row = int(missing[0][0])
+        joint = f"/{self.joints[missing[0][1]]}" if missing.shape[1] == 2 else ""
+        raise LogError(
+            f"{self.name}: {field}{joint}: {len(missing)} of {finite.size} values are not finite, "
+            f"the first in row {row}, expected numbers (leave out rows without a measurement)"
+        )
+
+
+def read_log(path: str | Path, joints: Sequence[str] | None = None) -> Log:
+    """The log at `path`: an .mcap file, a rosbag2 folder, an .npz or a .csv; only `joints` where they are given.
+
+    Raises LogError, one sentence that names the file and the field, and OSError where there is no such file.
+    """
+    from . import recordings, tables  # both build a Log
+
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
+    if path.is_dir() or path.suffix in (".mcap", ".db3"):
+        log = recordings.read(path)
+    elif path.suffix == ".npz":
+        log = tables.read_npz(path)
+    elif path.suffix == ".csv":
+        log = tables.read_csv(path)
+    else:
+        raise LogError(
+            f"{path}: the suffix is '{path.suffix}', expected .mcap, .npz, .csv or a rosbag2 folder"
+        )
+    return log if joints is None else log.select(joints)
