@@ -19,11 +19,11 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description.messages import write_low_cmd, write_low_state
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_nodes.messages import write_low_cmd, write_low_state
 
 RECEIVED = {
     "velocity_estimate": TwistWithCovarianceStamped,

@@ -13,8 +13,8 @@ from geometry_msgs.msg import Twist, TwistStamped
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
-from quadvel_description.node import StartError
 from quadvel_msgs.msg import VelocityCommand
+from quadvel_nodes.node import StartError
 from quadvel_policy.command_mux_node import CommandMuxNode
 
 PERIOD = 0.02

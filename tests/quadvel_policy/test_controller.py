@@ -18,13 +18,13 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
 from std_srvs.srv import SetBool
 
-from quadvel_description.messages import write_low_state
-from quadvel_description.node import StartError
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
 from quadvel_msgs.srv import SetMode
+from quadvel_nodes.messages import write_low_state
+from quadvel_nodes.node import StartError
 from quadvel_policy.controller import Controller
 
 PERIOD = 0.005

@@ -23,10 +23,10 @@ from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-from quadvel_description.messages import write_low_cmd  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import Push, ResetSim, StepSim  # noqa: E402
+from quadvel_nodes.messages import write_low_cmd  # noqa: E402
 
 PROGRAM = "import quadvel_dds; quadvel_dds.install(); from quadvel_sim.sim_node import main; main()"
 TOPICS = {

@@ -10,8 +10,8 @@ import pytest
 from geometry_msgs.msg import Vector3, Wrench
 
 from quadvel_description import robot
-from quadvel_description.messages import seconds
 from quadvel_description.state import JointCommand
+from quadvel_nodes.messages import seconds
 
 Start = Callable[..., Any]
 

@@ -19,11 +19,11 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description.diagnostics import diagnostics
-from quadvel_description.messages import MessageError, Refusals, numbers, read_low_state
-from quadvel_description.node import read_parameters, run
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
+from quadvel_nodes.node import read_parameters, run
 
 from . import features
 from .kalman import KalmanEstimator

@@ -5,6 +5,7 @@ Nothing here needs torch, onnxruntime or ROS. Body frame x forward, y left, z up
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from quadvel_description.kinematics import rotate_inverse
 from quadvel_description.network_input import InputLayout, InputTerm
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
 from quadvel_description.state import MODE_SERVO, RobotState
+
+from .odometry import leg_velocity
 
 RATE_HZ = 200
 KIND = "velocity_estimator"
@@ -29,31 +32,43 @@ DEFAULT_LAYOUT = InputLayout(
         InputTerm("linear_acceleration", 3, scale=1.0 / GRAVITY, clip=5.0),  # m/s^2, body, with gravity
         InputTerm("gravity", 3),  # unit vector pointing down, body frame
         InputTerm("previous_action", 12, clip=4.0),  # rad, joint targets minus NOMINAL_Q
+        InputTerm("torque", 12, scale=0.05, clip=4.0),  # N m
+        InputTerm("leg_velocity", 12, scale=0.5, clip=4.0),  # m/s, the trunk's by each leg if it is planted
     ]
 )
 KNOWN_INPUTS = {term.name: term.size for term in DEFAULT_LAYOUT.terms}
 
 
+def _gravity(state: RobotState, action: ArrayLike) -> ArrayLike:
+    quaternion = np.asarray(state.quaternion)
+    return rotate_inverse(quaternion, np.broadcast_to((0.0, 0.0, -1.0), (*quaternion.shape[:-1], 3)))
+
+
+def _leg_velocity(state: RobotState, action: ArrayLike) -> ArrayLike:
+    return leg_velocity(state).reshape(*np.shape(state.q)[:-1], 12)
+
+
+_QUANTITIES: dict[str, Callable[[RobotState, ArrayLike], ArrayLike]] = {
+    "q": lambda state, action: state.q,
+    "dq": lambda state, action: state.dq,
+    "angular_velocity": lambda state, action: state.angular_velocity,
+    "linear_acceleration": lambda state, action: state.linear_acceleration,
+    "gravity": _gravity,
+    "previous_action": lambda state, action: action,
+    "torque": lambda state, action: state.tau,
+    "leg_velocity": _leg_velocity,
+}
+
+
 def build(
     state: RobotState, previous_action: ArrayLike, layout: InputLayout = DEFAULT_LAYOUT
 ) -> NDArray[np.float32]:
-    """The network input (..., 45) of a state whose arrays carry leading axes (...).
+    """The network input (..., 69) of a state whose arrays carry leading axes (...); other layouts, other sizes.
 
     `previous_action` (..., 12) is the joint targets in force when the state was taken, minus `NOMINAL_Q`, in
     rad: the answer to the state before this one.
     """
-    quaternion = np.asarray(state.quaternion)
-    down = np.broadcast_to((0.0, 0.0, -1.0), (*quaternion.shape[:-1], 3))
-    return layout.build(
-        {
-            "q": state.q,
-            "dq": state.dq,
-            "angular_velocity": state.angular_velocity,
-            "linear_acceleration": state.linear_acceleration,
-            "gravity": rotate_inverse(quaternion, down),
-            "previous_action": previous_action,
-        }
-    )
+    return layout.build({name: _QUANTITIES[name](state, previous_action) for name in layout.names})
 
 
 def previous_action(q_target: ArrayLike, mode: int) -> NDArray[np.float64]:

@@ -17,8 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.kinematics import foot_jacobians, foot_positions, rotation_matrix
-from quadvel_description.robot import FOOT_RADIUS, GRAVITY
+from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
+
+from .odometry import against_trunk, rolling
 
 Array = NDArray[np.float64]
 
@@ -30,8 +32,6 @@ FIRST_VARIANCE = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # m^2, (m/s)^2, m^2: t
 # What is measured: the four feet against the trunk, and the velocity of the trunk.
 MEASURED = np.zeros((5, 6))
 MEASURED[:4, 0], MEASURED[:4, FEET], MEASURED[4, V] = -1.0, np.eye(4), 1.0
-# (a @ CROSS).reshape(3, 3) is the matrix by which a row vector b becomes a x b.
-CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
 
 
 def _positive(low: float, default: float, high: float) -> Any:
@@ -114,13 +114,13 @@ class KalmanEstimator:
         jacobians = foot_jacobians(state.q)
         feet = foot_positions(state.q)
         to_world = rotation.swapaxes(-1, -2)  # for rows of vectors
-        rolling = _rolling(state, rotation) @ to_world
-        leg_velocity = rolling - _against_trunk(state, feet, jacobians) @ to_world
+        foot_rolling = rolling(state, rotation) @ to_world
+        leg_velocity = foot_rolling - against_trunk(state, feet, jacobians) @ to_world
         trust = self._contact_trust(state, rotation, jacobians)
 
         self._predict(state, rotation, dt)
         speed_variance = self._unknown_speed(leg_velocity, trust)
-        self._move_feet(rolling, speed_variance, dt)
+        self._move_feet(foot_rolling, speed_variance, dt)
         self._correct(feet @ to_world, leg_velocity, speed_variance)
 
         velocity = (self._state[..., V : V + 1, :] @ rotation)[..., 0, :]
@@ -179,31 +179,6 @@ class KalmanEstimator:
         self._state = self._state + gain @ innovation
         covariance = self._covariance - gain @ measured
         self._covariance = 0.5 * (covariance + covariance.swapaxes(-1, -2))
-
-
-def _rolling(state: RobotState, rotation: Array) -> Array:
-    """Velocity (..., 4, 3), body frame, of each foot's centre that rolls on level ground: w_calf x (r up).
-
-    At a brisk walk this makes some six per cent of the trunk's velocity.
-    """
-    dq = np.reshape(state.dq, (*np.shape(state.dq)[:-1], 4, 3))
-    hip = np.asarray(state.q)[..., ::3]
-    knee = dq[..., 1] + dq[..., 2]
-    bending = np.stack([dq[..., 0], knee * np.cos(hip), knee * np.sin(hip)], axis=-1)
-    calf = np.asarray(state.angular_velocity)[..., None, :] + bending
-    velocity: Array = -calf @ _cross(FOOT_RADIUS * rotation[..., 2, :])
-    return velocity
-
-
-def _against_trunk(state: RobotState, feet: Array, jacobians: Array) -> Array:
-    """Velocity (..., 4, 3), body frame, of each foot's centre against the trunk's origin: w x s + J dq."""
-    dq = np.reshape(state.dq, (*feet.shape, 1))
-    return feet @ _cross(np.asarray(state.angular_velocity)) + (jacobians @ dq)[..., 0]
-
-
-def _cross(a: Array) -> Array:
-    """The matrix (..., 3, 3) by which a row vector b becomes a x b."""
-    return (a @ CROSS).reshape(*a.shape[:-1], 3, 3)
 
 
 def _ground_force(tau: ArrayLike, rotation: Array, jacobians: Array) -> Array:

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.kinematics import rotate
-from quadvel_description.messages import MessageError
 from quadvel_description.state import RobotState
-from quadvel_description.tick_grid import TickGrid
+from quadvel_nodes.messages import MessageError
+from quadvel_nodes.tick_grid import TickGrid
 
 from .features import RATE_HZ
 

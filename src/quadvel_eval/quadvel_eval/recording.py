@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from quadvel_dds.messages import STORE
-from quadvel_description.messages import seconds
+from quadvel_nodes.messages import seconds
 
 Array = NDArray[np.float64]
 

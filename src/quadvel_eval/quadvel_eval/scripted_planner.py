@@ -10,9 +10,9 @@ from geometry_msgs.msg import Twist
 from rclpy.node import Node
 from std_msgs.msg import String
 
-from quadvel_description.node import read_parameters, run
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
+from quadvel_nodes.node import read_parameters, run
 
 from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 

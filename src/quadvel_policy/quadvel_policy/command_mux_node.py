@@ -13,10 +13,10 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
-from quadvel_description.diagnostics import diagnostics
-from quadvel_description.messages import MessageError, Refusals, seconds
-from quadvel_description.node import read_parameters, run
 from quadvel_msgs.msg import VelocityCommand
+from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.messages import MessageError, Refusals, seconds
+from quadvel_nodes.node import read_parameters, run
 
 from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 from .received import StampCheck, planar_velocity

@@ -22,13 +22,13 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_srvs.srv import SetBool
 
-from quadvel_description.diagnostics import diagnostics
-from quadvel_description.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
-from quadvel_description.node import read_parameters, run
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_description.tick_grid import TickGrid
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
 from quadvel_msgs.srv import SetMode
+from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
+from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.tick_grid import TickGrid
 
 from .loop_stats import LoopStats
 from .observation import RATE_HZ

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.messages import MessageError
+from quadvel_nodes.messages import MessageError
 
 Array = NDArray[np.float64]
 

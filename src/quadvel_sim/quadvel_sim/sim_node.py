@@ -22,12 +22,12 @@ from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description import robot
-from quadvel_description.diagnostics import diagnostics
-from quadvel_description.messages import Refusals, read_low_cmd, write_low_state
-from quadvel_description.node import read_parameters, run
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
+from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
+from quadvel_nodes.node import read_parameters, run
 from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
 from quadvel_sim.parameters import SimParameters
 from quadvel_sim.simulator import Simulator, Truth

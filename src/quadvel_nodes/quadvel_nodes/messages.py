@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .state import JointCommand, RobotState
+from quadvel_description.state import JointCommand, RobotState
 
 QUATERNION_TOLERANCE = 0.05
 

@@ -8,7 +8,9 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_description.messages import (
+from quadvel_description.state import JointCommand, RobotState
+from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_nodes.messages import (
     MessageError,
     Refusals,
     read_low_cmd,
@@ -16,8 +18,6 @@ from quadvel_description.messages import (
     write_low_cmd,
     write_low_state,
 )
-from quadvel_description.state import JointCommand, RobotState
-from quadvel_msgs.msg import LowCmd, LowState
 
 
 def some_state() -> RobotState:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_description.tick_grid import TickGrid
+from quadvel_nodes.tick_grid import TickGrid
 
 PERIOD = 0.005
 
