@@ -142,17 +142,18 @@ def read_log(path: str | Path, joints: Sequence[str] | None = None) -> Log:
 
     Raises LogError, one sentence that names the file and the field, and OSError where there is no such file.
     """
-    from . import recordings, tables  # both build a Log
+    from .recordings import read as read_recording  # these build a Log
+    from .tables import read_csv, read_npz
 
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.is_dir() or path.suffix in (".mcap", ".db3"):
-        log = recordings.read(path)
+        log = read_recording(path)
     elif path.suffix == ".npz":
-        log = tables.read_npz(path)
+        log = read_npz(path)
     elif path.suffix == ".csv":
-        log = tables.read_csv(path)
+        log = read_csv(path)
     else:
         raise LogError(
             f"{path}: the suffix is '{path.suffix}', expected .mcap, .npz, .csv or a rosbag2 folder"
