@@ -1,0 +1,206 @@
+"""Logs as one set of rows, and their signals at the instant at which the drive asked for the torque of each row.
+
+A torque that is measured at `t` was asked for at `u = t - output delay`, on the joint state of that instant and the
+command that was sent an input delay earlier. The state is interpolated between its rows; the command, which is held
+until the next one, is shifted exactly. A drive that computes in steps gives the mean over a step: `window` (s) is
+that step, 0 for the instant itself. Rows are never resampled, so errors are those of the measured samples.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from .log import Log
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+GAP = 3.5
+"""A spacing above this many times the usual one begins a new stretch: memories start anew there."""
+
+SETTLING = 0.03
+"""Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
+
+_CACHED = 64
+
+
+@attrs.frozen(eq=False)
+class Signals:
+    """What the drive saw at the instants `u`, (N, J) or (N, 1); the units of the log."""
+
+    t: Array  # (N, 1) s since the log began
+    dt: Array  # (N, 1) s since the row before
+    q: Array
+    dq: Array
+    ddq: Array
+    q_des: Array
+    dq_des: Array
+    tau_ff: Array
+    kp: Array
+    kd: Array
+    measured: Array  # N m, torque as logged at `u`
+    temperature: Array | None
+    voltage: Array | None  # (N, 1)
+    packet: NDArray[np.intp]  # (N, J), the command row in force, counted over all logs
+
+    @property
+    def power(self) -> Array:
+        """Mechanical power that the joints draw together, (N, 1), W."""
+        power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)
+        return power
+
+
+def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
+    """Slope of `values` (N, J) over `half_width` s to either side, by rows."""
+    n = len(log.t)
+    reach = max(1, round(half_width / log.period))
+    rows = np.arange(n)
+    first, last = np.maximum(rows - reach, 0), np.minimum(rows + reach, n - 1)
+    slope: Array = (values[last] - values[first]) / (log.t[last] - log.t[first])[:, None]
+    return slope
+
+
+class _LogSignals:
+    """One log, ready to be read at any time."""
+
+    def __init__(self, log: Log, kp: Array | None, kd: Array | None) -> None:
+        self.log = log
+        self.states = {"q": _double(log.q), "dq": _double(log.dq)}
+        self.states["ddq"] = derivative(log, self.states["dq"])
+        self.states["measured"] = _double(log.tau) if log.tau is not None else np.zeros_like(self.states["q"])
+        if log.temperature is not None:
+            self.states["temperature"] = _double(log.temperature)
+        if log.voltage is not None:
+            self.states["voltage"] = _double(log.voltage)[:, None]
+        shape = log.q_des.shape
+        zero = np.zeros(shape)
+        self.commands = {
+            "q_des": _double(log.q_des),
+            "dq_des": zero if log.dq_des is None else _double(log.dq_des),
+            "tau_ff": zero if log.tau_ff is None else _double(log.tau_ff),
+        }
+        self.gains = {
+            "kp": np.broadcast_to(
+                _double(log.kp) if kp is None and log.kp is not None else _or_one(kp), shape
+            ),
+            "kd": np.broadcast_to(
+                _double(log.kd) if kd is None and log.kd is not None else _or_one(kd), shape
+            ),
+        }
+        spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
+        self.sums = {
+            name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
+            for name, values in self.commands.items()
+            if values.any()
+        }
+
+    def state(self, name: str, at: Array) -> Array:
+        """A state signal, linear between rows."""
+        t = self.log.t
+        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        share = np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)[:, None]
+        values = self.states[name]
+        return values[row] + share * (values[row + 1] - values[row])
+
+    def command(self, name: str, at: Array, window: float) -> Array:
+        """A command signal: the mean over `at` to `at + window`."""
+        if name not in self.sums:
+            return np.zeros((len(at), self.log.q_des.shape[1]))
+        if window == 0.0:
+            return self.commands[name][self.log.command_rows(at + 1e-9)]
+        return (self._integral(name, at + window) - self._integral(name, at)) / window
+
+    def _integral(self, name: str, at: Array) -> Array:
+        row = self.log.command_rows(at)
+        return self.sums[name][row] + self.commands[name][row] * (at - self.log.t_cmd[row])[:, None]
+
+
+def _double(values: NDArray[np.floating]) -> Array:
+    return np.asarray(values, dtype=np.float64)
+
+
+def _or_one(values: Array | None) -> Array:
+    return np.ones(1) if values is None else values
+
+
+class Samples:
+    """The rows of all `logs`, one after the other: measured torque, who judges what, and the signals behind it.
+
+    `kp`, `kd` (J,) stand for logs that hold no gains; without either the gains count as 1, so that what is fitted
+    is the gain itself. `judged` (N, J) are the rows that a model has to explain.
+    """
+
+    def __init__(self, logs: Sequence[Log], kp: Array | None = None, kd: Array | None = None) -> None:
+        self.logs = [_LogSignals(log, kp, kd) for log in logs]
+        self.joints = logs[0].joints
+        lengths = [len(log.t) for log in logs]
+        self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
+        self.t = np.concatenate([_double(log.t) for log in logs])
+        self.period = float(np.median(np.concatenate([np.diff(log.t) for log in logs])))
+        self.tau = np.concatenate([one.states["measured"] for one in self.logs])
+        starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
+        self.start: Bools = np.concatenate(starts)
+        self.dt = np.concatenate(steps)
+        self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
+        self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
+        self._cache: dict[tuple[float, float, float], Signals] = {}
+
+    def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
+        """Of each row: does a stretch begin there, the spacing to the row before, is the past known."""
+        steps = np.diff(log.t, prepend=log.t[0] - self.period)
+        start = steps > GAP * self.period
+        start[0] = True
+        steps = np.where(start, self.period, steps)
+        began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
+        known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
+        return start, steps, known
+
+    @property
+    def knows_gains(self) -> bool:
+        """Were all gains logged or given?"""
+        return all(one.gains["kp"].any() and not (one.gains["kp"] == 1.0).all() for one in self.logs)
+
+    def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
+        """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
+        delays = np.broadcast_arrays(np.atleast_1d(input_delay), np.atleast_1d(output_delay))
+        keys = [(round(float(a), 7), round(float(b), 7), window) for a, b in zip(*delays, strict=True)]
+        if len(set(keys)) == 1:
+            return self._at(keys[0])
+        every = [self._at(key) for key in keys]
+        columns = {
+            field.name: np.column_stack([getattr(one, field.name)[:, j] for j, one in enumerate(every)])
+            for field in attrs.fields(Signals)
+            if np.ndim(getattr(every[0], field.name)) == 2 and getattr(every[0], field.name).shape[1] > 1
+        }
+        return attrs.evolve(every[0], **columns)
+
+    def _at(self, key: tuple[float, float, float]) -> Signals:
+        if key not in self._cache:
+            if len(self._cache) >= _CACHED:
+                self._cache.pop(next(iter(self._cache)))
+            self._cache[key] = self._make(*key)
+        return self._cache[key]
+
+    def _make(self, input_delay: float, output_delay: float, window: float) -> Signals:
+        parts: dict[str, list[Array]] = {}
+        packets = []
+        for one, first in zip(self.logs, self._first_packet, strict=False):
+            at = _double(one.log.t) - output_delay
+            for name in one.states:
+                parts.setdefault(name, []).append(one.state(name, at))
+            for name in one.commands:
+                parts.setdefault(name, []).append(one.command(name, at - input_delay, window))
+            row = one.log.command_rows(at - input_delay + 1e-9)
+            for name, values in one.gains.items():
+                parts.setdefault(name, []).append(values[row])
+            packets.append(np.broadcast_to((row + first)[:, None], one.log.q.shape))
+            parts.setdefault("t", []).append((at - one.log.t[0])[:, None])
+        signals = {name: np.concatenate(part) for name, part in parts.items()}
+        for name in ("temperature", "voltage"):
+            if name not in signals or len(signals[name]) < len(self.t):
+                signals[name] = None  # type: ignore[assignment]  # not in every log
+        return Signals(dt=self.dt[:, None], packet=np.concatenate(packets), **signals)
