@@ -45,6 +45,15 @@ def nothing_left_running() -> Iterator[None]:
     assert not left, f"left running: {', '.join(sorted(text for _, text in left))}"
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_as_before() -> Iterator[None]:
+    """The main of a node takes SIGINT over for the rest of its process; here other tests follow."""
+    handler, mask = signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    yield
+    signal.signal(signal.SIGINT, handler)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
 def _marked() -> dict[int, str]:
     """Command lines, by process id, of the processes that this one started, their children included."""
     found = {}

@@ -13,7 +13,7 @@ setup(
         (f"share/{package}/launch", ["launch/sim.launch.py"]),
         (f"share/{package}/config", [f"{package}/config/params.yaml", f"{package}/config/robot.rviz"]),
     ],
-    entry_points={"console_scripts": ["quadvel = quadvel_bringup.cli:main"]},
+    entry_points={"console_scripts": ["quadvel = quadvel_bringup.__main__:main"]},
     license="Apache-2.0",
     description="Starts the nodes together: launch files, parameters and the `quadvel` command line.",
 )

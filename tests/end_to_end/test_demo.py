@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from mcap.reader import make_reader
 
-QUADVEL = (sys.executable, "-c", "from quadvel_bringup.cli import main; main()")
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 
 
 @pytest.fixture(scope="module")

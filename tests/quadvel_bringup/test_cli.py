@@ -15,7 +15,7 @@ COMMANDS = ("doctor", "run", "up", "drive", "record", "demo", "eval", "bench")
 
 
 def quadvel(*arguments: str) -> subprocess.CompletedProcess[str]:
-    program = "from quadvel_bringup.cli import main; main()"
+    program = "from quadvel_bringup.__main__ import main; main()"
     return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True)
 
 

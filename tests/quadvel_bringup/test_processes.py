@@ -14,7 +14,11 @@ import pytest
 
 from quadvel_bringup.processes import ProcessGroup, StopSignals
 
-SLEEPER = [sys.executable, "-c", "import time; print('up'); time.sleep(60)"]
+SLEEPER = [
+    sys.executable,
+    "-c",
+    "import signal, time; signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT}); time.sleep(60)",
+]
 # Deaf to the gentle ways, as a node that hangs.
 STUBBORN = """
 import signal, time
@@ -31,6 +35,7 @@ def stop(number, frame):
     time.sleep(0.3)
     sys.exit(7)
 signal.signal(signal.SIGINT, stop)
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 print("up")
 time.sleep(60)
 """
@@ -77,6 +82,13 @@ def test_stop_sends_one_interrupt() -> None:
         group.start("counting", [sys.executable, "-c", COUNTING])
         wait_until(lambda: ("counting", "up") in lines.seen)
         assert group.stop() == {"counting": 7}
+
+
+def test_an_interrupt_waits_until_the_process_allows_it() -> None:
+    late = COUNTING.replace("signal.pthread", "time.sleep(0.5)\nsignal.pthread")
+    with ProcessGroup(Lines()) as group:
+        group.start("late", [sys.executable, "-c", late])
+        assert group.stop() == {"late": 7}
 
 
 def test_stop_kills_what_does_not_listen() -> None:
@@ -131,3 +143,12 @@ def test_stop_signals_are_noted_and_not_raised_however_often_they_come() -> None
         assert signals.wait(1.0)
         assert signals.received == signal.SIGTERM
     assert signal.getsignal(signal.SIGINT) is former
+
+
+def test_stop_signals_hear_what_was_held_back_and_hold_back_again() -> None:
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.kill(os.getpid(), signal.SIGINT)
+    with StopSignals() as signals:
+        assert signals.received == signal.SIGINT
+    os.kill(os.getpid(), signal.SIGINT)
+    assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None

@@ -108,7 +108,7 @@ def test_recording_all_takes_topics_as_they_come(node: Node, tmp_path: Path) -> 
 
 def test_ctrl_c_leaves_a_whole_file(node: Node, tmp_path: Path) -> None:
     path = tmp_path / "walk.mcap"
-    program = "from quadvel_bringup.cli import main; main()"
+    program = "from quadvel_bringup.__main__ import main; main()"
     recording = subprocess.Popen([sys.executable, "-c", program, "record", "low_state", "--out", str(path)])
     publisher = node.create_publisher(LowState, "low_state", 10)
     spin_until(node, lambda: publisher.get_subscription_count() > 0, "recorder", 60.0)
@@ -131,7 +131,7 @@ def test_drive_repeats_one_velocity_and_ends_with_zero(node: Node) -> None:
     node.create_subscription(
         Twist, "cmd_vel_teleop", lambda m: heard.append((m.linear.x, m.linear.y, m.angular.z)), 50
     )
-    program = "import sys; from quadvel_bringup.cli import main; main()"
+    program = "import sys; from quadvel_bringup.__main__ import main; main()"
     arguments = ["drive", "--vx", "0.5", "--vy", "-0.25", "--wz", "1", "--seconds", "2"]
     driving = subprocess.Popen([sys.executable, "-c", program, *arguments])
     spin_until(node, lambda: (0.0, 0.0, 0.0) in heard, "the stop", 60.0)

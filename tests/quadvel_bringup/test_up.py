@@ -15,7 +15,8 @@ from quadvel_bringup import up
 from quadvel_bringup.stack import Stack
 
 NODE = """
-import sys, time
+import signal, time
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 try:
     print("ready", flush=True)
     time.sleep(60)

@@ -14,7 +14,7 @@ from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_eval import bench
 from quadvel_eval.cli import bench_command, eval_command
 
-QUADVEL = (sys.executable, "-c", "from quadvel_bringup.cli import main; main()")
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 
 
 def test_a_missing_policy_is_refused_by_its_name_before_anything_is_made(tmp_path: Path) -> None:

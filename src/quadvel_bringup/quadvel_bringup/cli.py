@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import os
-import sys
+import signal
 from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -45,9 +44,17 @@ What follows the name are arguments of ROS 2:
 """
 
 PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
-app = typer.Typer(help=EXAMPLES, no_args_is_help=True, **PLAIN)
+app = typer.Typer(no_args_is_help=True, **PLAIN)
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+# Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
+ENDED_BY_CTRL_C = ("run", "up", "drive", "record")
+
+
+@app.callback(help=EXAMPLES)
+def begin(context: typer.Context) -> None:
+    if context.invoked_subcommand not in ENDED_BY_CTRL_C:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
 @app.command()
@@ -159,14 +166,3 @@ def _hand_on(context: typer.Context, where: str) -> None:
     command = typer.Typer(**PLAIN)
     command.command()(getattr(import_module(module), name))
     command(context.args, prog_name=context.command_path)
-
-
-def main() -> None:
-    """A wrong argument or file ends in one sentence and exit code 2, without a traceback."""
-    try:
-        app()
-    except (OSError, ValueError) as error:
-        if os.environ.get("QUADVEL_TRACEBACK"):
-            raise
-        print(f"quadvel: {error}", file=sys.stderr)
-        sys.exit(2)

@@ -17,13 +17,15 @@ Output = Callable[[str, str], None]
 
 LIBC = ctypes.CDLL(None)
 PR_SET_PDEATHSIG = 1
+INTERRUPT = {signal.SIGINT}
 
 
 class ProcessGroup:
     """Starts processes, hands on what they write, and leaves none behind.
 
-    Each runs in a session of its own, so that Ctrl-C reaches it through `stop` alone and once. If this
-    process is killed, the kernel tells them to end.
+    Each runs in a session of its own, so that Ctrl-C reaches it through `stop` alone and once. SIGINT is blocked
+    where it starts: it waits until the process allows it, as a node does once it is ready to end cleanly. If
+    this process is killed, the kernel tells them to end.
     """
 
     def __init__(self, output: Output) -> None:
@@ -42,7 +44,7 @@ class ProcessGroup:
             stderr=subprocess.STDOUT,
             env={**os.environ, "PYTHONUNBUFFERED": "1", **(environment or {})},
             start_new_session=True,
-            preexec_fn=_end_with_parent,
+            preexec_fn=_before_exec,
         )
         self._processes[name] = process
         reader = threading.Thread(target=self._read, args=(name, process), daemon=True)
@@ -54,7 +56,7 @@ class ProcessGroup:
         codes = {name: process.poll() for name, process in self._processes.items()}
         return {name: code for name, code in codes.items() if code is not None}
 
-    def stop(self, patience: float = 4.0) -> dict[str, int]:
+    def stop(self, patience: float = 10.0) -> dict[str, int]:
         """End all: SIGINT, after `patience` s SIGTERM, then SIGKILL. Returns the exit codes."""
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             for process in self._processes.values():
@@ -84,7 +86,7 @@ class StopSignals:
     """While entered, SIGINT, SIGTERM and SIGHUP are noted instead of raised, however often they come.
 
     To be entered in the main thread, outside of a `ProcessGroup`, so that a second Ctrl-C does not cut its
-    clean-up short.
+    clean-up short. A SIGINT that was held back before comes now; after the block it is held back again.
     """
 
     NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -92,6 +94,7 @@ class StopSignals:
     def __init__(self) -> None:
         self.received: int | None = None
         self._former: dict[int, Any] = {}
+        self._mask: set[int] = set()
 
     def wait(self, seconds: float) -> bool:
         """Whether one came; returns early if it comes now."""
@@ -105,17 +108,20 @@ class StopSignals:
 
     def __enter__(self) -> StopSignals:
         self._former = {number: signal.signal(number, self._note) for number in self.NUMBERS}
+        self._mask = signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
         for number, handler in self._former.items():
             signal.signal(number, handler)
 
 
-def _end_with_parent() -> None:
-    """Runs in the child between fork and exec: have the kernel send SIGTERM when the parent is gone."""
+def _before_exec() -> None:
+    """Runs in the child: hold SIGINT back, and have the kernel send SIGTERM when the parent is gone."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
     LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 

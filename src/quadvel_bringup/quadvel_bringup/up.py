@@ -38,9 +38,10 @@ def up(stack: Stack) -> int:
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])
     with StopSignals() as signals, ProcessGroup(say) as group:
+        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them")
         for name, arguments in nodes.items():
-            group.start(name, command(name, arguments))
-        say("quadvel", f"started {', '.join(nodes)}; Ctrl-C stops them")
+            if not signals.received:
+                group.start(name, command(name, arguments))
         ended: dict[str, int] = {}
         while not ended and not signals.wait(0.1):
             ended = group.ended()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable
+from types import FrameType
 from typing import Any, TypeVar
 
 import attrs
@@ -15,6 +16,7 @@ from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 
 Config = TypeVar("Config")
+INTERRUPT = {signal.SIGINT}
 
 
 class StartError(ValueError):
@@ -49,14 +51,22 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1."""
+    """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1.
+
+    For the main of a process, which ends with it. Ctrl-C may come at any moment and, where a launcher forwards
+    it, again: while the node starts SIGINT waits, then it shuts rclpy down, and while the node ends it is blocked.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
+    signal.signal(signal.SIGINT, _leave_it_to_rclpy)
     node = None
     try:
         node = _start(make_node, args)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
         rclpy.spin(node)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C comes twice where a launcher forwards it
+    except ExternalShutdownException:
+        pass
     finally:
+        signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
@@ -68,3 +78,7 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
         return make_node()
     except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
         sys.exit(" ".join(str(error).split()))
+
+
+def _leave_it_to_rclpy(number: int, frame: FrameType | None) -> None:
+    """In the place of Python's own handler, whose KeyboardInterrupt would come on top, anywhere, and each time."""

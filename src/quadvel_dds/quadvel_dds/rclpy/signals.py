@@ -1,8 +1,8 @@
 """SIGINT and SIGTERM: they shut down the contexts of this process.
 
-The first SIGINT also raises KeyboardInterrupt in the main thread, as with rclpy. Under a launcher Ctrl-C
-reaches a node twice; later SIGINTs are ignored, so that neither clean-up nor the interpreter's end is cut
-short (SIGTERM and SIGQUIT stay as a way out).
+Then the handler that was there before is called, as with rclpy: Python's own raises KeyboardInterrupt in the
+main thread. Under a launcher Ctrl-C reaches a node twice; later SIGINTs are ignored, so that neither clean-up
+nor the interpreter's end is cut short (SIGTERM and SIGQUIT stay as a way out).
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
         signal.signal(number, signal.SIG_IGN)
     for context in live_contexts():
         context.try_shutdown()
-    if number == signal.SIGINT:
-        raise KeyboardInterrupt
+    former = _former.get(number)
+    if callable(former):
+        former(number, frame)
 
 
 def _wake_on_signals(receiver: socket.socket) -> None:

@@ -1,0 +1,63 @@
+"""Ctrl-C at the worst moments: before the first line of the program, and while the interpreter ends."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+
+from quadvel_bringup.nodes import NODES
+
+RUN = "from quadvel_bringup.__main__ import main; main()"
+INTERRUPTED_AT_THE_END = (
+    f"import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT); {RUN}"
+)
+
+
+def interrupt_first() -> None:
+    """In the child before exec: a SIGINT that waits until the program allows it, as while it starts."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("up",), ("drive", "--vx", "0.5"), ("record", "--out", "walk.mcap"), *(("run", name) for name in NODES)],
+    ids=" ".join,
+)
+def test_ctrl_c_during_start_up_ends_a_command_cleanly(
+    arguments: tuple[str, ...], tmp_path: Path, domain_id: int
+) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", RUN, *arguments],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60,
+        preexec_fn=interrupt_first,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr
+    for file in tmp_path.iterdir():
+        with file.open("rb") as stream:
+            assert make_reader(stream).get_summary() is not None
+
+
+@pytest.mark.parametrize("arguments", [("drive",), ("record", "--out", "walk.mcap")], ids=" ".join)
+def test_ctrl_c_while_the_interpreter_ends_changes_nothing(
+    arguments: tuple[str, ...], tmp_path: Path, domain_id: int
+) -> None:
+    ended = subprocess.run(
+        [sys.executable, "-c", INTERRUPTED_AT_THE_END, *arguments, "--seconds", "0.2"],
+        cwd=tmp_path,
+        stderr=subprocess.PIPE,
+        text=True,
+        timeout=60,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "Traceback" not in ended.stderr
