@@ -22,7 +22,7 @@ from quadvel_estimator import features
 quadvel_dds.install()  # before a test module imports rclpy
 
 MEMORY = (1, 1, 3)
-WEIGHTS = np.random.default_rng(0).normal(size=(45, 3)).astype(np.float32)
+WEIGHTS = np.random.default_rng(0).normal(size=(features.DEFAULT_LAYOUT.size, 3)).astype(np.float32)
 VARIANCE = np.array([0.04, 0.01, 0.09])
 
 
@@ -49,7 +49,7 @@ def standing() -> Callable[..., RobotState]:
 
 @pytest.fixture
 def weights() -> NDArray[np.float32]:
-    """(45, 3), of the network that `write_estimator` writes."""
+    """(69, 3), of the network that `write_estimator` writes."""
     return WEIGHTS
 
 
@@ -62,7 +62,7 @@ def variance() -> NDArray[np.float64]:
 def write_estimator_file(
     path: Path,
     outputs: tuple[str, str] = tuple(features.OUTPUTS),
-    size: int = 45,
+    size: int = len(WEIGHTS),
     width: int = 3,
     metadata: str | None = None,
     **changes: Any,

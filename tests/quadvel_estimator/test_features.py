@@ -18,7 +18,7 @@ def some_state() -> RobotState:
         tick=5,
         q=NOMINAL_Q + 0.01 * np.arange(1, 13),
         dq=np.arange(1.0, 13.0),
-        tau=np.full(12, 99.0),
+        tau=np.arange(-6.0, 6.0),
         quaternion=np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0]),
         angular_velocity=np.array([0.2, -0.4, 0.6]),
         linear_acceleration=np.array([0.981, 9.81, -1.962]),
@@ -34,26 +34,32 @@ GOLDEN = np.array(
         *[0.1, 1.0, -0.2],  # acceleration in units of gravity
         *[0.0, -1.0, 0.0],  # gravity
         *[-0.6, -0.5, -0.4, -0.3, -0.2, -0.1, 0.0, 0.1, 0.2, 0.3, 0.4, 0.5],  # previous action
+        *[-0.3, -0.25, -0.2, -0.15, -0.1, -0.05, 0.0, 0.05, 0.1, 0.15, 0.2, 0.25],  # torque
+        # half of what each leg says, from finite differences of its contact point
+        *[0.58533, -0.31295, 0.22090],
+        *[1.61624, -0.92220, 0.09208],
+        *[2.50133, -1.42758, 0.67370],
+        *[3.57053, -1.97075, -0.24417],
     ]
 )
 
 
-def test_the_input_is_these_45_numbers() -> None:
+def test_the_input_is_these_69_numbers() -> None:
     vector = features.build(some_state(), np.arange(-6, 6) / 10)
     assert vector.dtype == np.float32
-    np.testing.assert_allclose(vector, GOLDEN, atol=1e-6)
+    np.testing.assert_allclose(vector, GOLDEN, atol=1e-5)
 
 
 def test_a_batch_gives_the_same_as_one_by_one() -> None:
     rng = np.random.default_rng(0)
     batch = some_state()
-    sizes = {"q": 12, "dq": 12, "quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3}
+    sizes = {"q": 12, "dq": 12, "tau": 12, "quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3}
     for name, size in sizes.items():
         setattr(batch, name, rng.normal(size=(2, 5, size)))
     batch.quaternion /= np.linalg.norm(batch.quaternion, axis=-1, keepdims=True)
     action = rng.normal(size=(2, 5, 12))
     whole = features.build(batch, action)
-    assert whole.shape == (2, 5, 45)
+    assert whole.shape == (2, 5, 69)
     one = some_state()
     for name in sizes:
         setattr(one, name, getattr(batch, name)[1, 3])

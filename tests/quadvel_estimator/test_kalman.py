@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from quadvel_description.kinematics import foot_jacobians, foot_positions, inverse_kinematics, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS, GRAVITY, MASS, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_description.state import RobotState
-from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _against_trunk, _ground_force, _rolling
+from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator, _ground_force
+from quadvel_estimator.odometry import leg_velocity
 
 DT = 0.005
 NOMINAL_FEET = foot_positions(NOMINAL_Q)
@@ -133,7 +134,7 @@ def test_each_leg_tells_the_velocity_that_lets_its_contact_point_rest(standing: 
     dq, omega = rng.normal(size=12), rng.normal(size=3)
     attitude = Rotation.from_euler("ZYX", [1.0, 0.3, -0.2])
     state = standing(0.0, q=q, dq=dq, angular_velocity=omega, quaternion=attitude.as_quat(scalar_first=True))
-    told = _rolling(state, attitude.as_matrix()) - _against_trunk(state, foot_positions(q), foot_jacobians(q))
+    told = leg_velocity(state)
 
     def calf(q: np.ndarray, leg: int) -> Rotation:
         hip, thigh, knee = q[3 * leg : 3 * leg + 3]

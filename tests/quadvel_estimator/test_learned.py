@@ -85,7 +85,7 @@ def test_a_file_that_is_no_network_is_refused_by_name(tmp_path: Path) -> None:
         ({"state_shape": [1, 1, 8]}, "shape of input h_in is [1, 1, 3], expected [1, 1, 8]"),
         ({"output_scale": "1"}, "metadata field output_scale is '1', expected 'a positive number'"),
         ({"inputs": []}, "metadata field inputs is [], expected a list of inputs"),
-        ({"size": 42}, "length of input obs is 42, expected 45"),
+        ({"size": 42}, "length of input obs is 42, expected 69"),
         ({"metadata": "[]"}, "metadata 'quadvel' is '[]', expected a JSON object"),
         ({"metadata": "{}"}, "metadata 'quadvel' lacks schema, joint_names, state_shape, kind, nominal_q"),
         (

@@ -107,8 +107,8 @@ class VelocityEnv:
         self._spawn_radius = 0.4 * c.terrain.size if rough else 0.0  # m
         self.reset(np.arange(n))
 
-    def reset(self, ids: np.ndarray) -> None:
-        """Start the environments `ids` over: new plant, new actuators, near the standing posture, a new command."""
+    def reset(self, ids: np.ndarray, posture: np.ndarray = robot.NOMINAL_Q) -> None:
+        """Start the environments `ids` over: new plant, new actuators, near `posture` (12,) or (n, 12), a new command."""
         if not len(ids):
             return
         n, rng = len(ids), self.rng
@@ -119,7 +119,7 @@ class VelocityEnv:
         heading = rng.uniform(-np.pi, np.pi, n)
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
         qpos[:, 3], qpos[:, 6] = np.cos(heading / 2), np.sin(heading / 2)
-        qpos[:, 7:] = robot.NOMINAL_Q + rng.normal(0, 0.08, (n, 12))
+        qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
         feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
         self._qpos[ids], self._qvel[ids] = qpos, qvel
@@ -135,15 +135,22 @@ class VelocityEnv:
         self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.config.commands.hold, len(ids))
         self.changed[ids] = True
 
-    def tick(self, target: np.ndarray) -> None:
-        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start."""
+    def tick(
+        self,
+        target: np.ndarray,
+        target_speed: np.ndarray | float = 0.0,
+        kp: np.ndarray | None = None,
+        kd: np.ndarray | None = None,
+    ) -> None:
+        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start; other gains (n, 12) if given."""
+        gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
         self.changed[:] = False
         self._push()
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
         for step in range(self.substeps):
             if step == self.substeps - 1:
                 before = self._qvel[:, :3].copy()
-            self.torque = self.actuators.step(q, dq, target, self.config.kp, self.config.kd)
+            self.torque = self.actuators.step(q, dq, target, *gains, target_speed)
             self._ctrl[:] = self.torque
             self.batch.step()
         self.time += TICK

@@ -1,7 +1,7 @@
 """Training of the linear-velocity estimator: on walks of the policy, on flat and rough ground, with every randomisation.
 
-The estimator reads what the robot has (IMU, encoders, the targets in force). In half of the environments the policy walks
-on the estimate instead of the truth, so that the estimator is trained on the walks that it causes itself.
+The estimator reads what the robot has (IMU, encoders, torques, the targets in force). In half of the environments the policy
+walks on the estimate instead of the truth, so that the estimator is trained on the walks that it causes itself.
 """
 
 from __future__ import annotations
@@ -14,10 +14,7 @@ import attrs
 import numpy as np
 import torch
 
-from quadvel_description.robot import NOMINAL_Q
-from quadvel_description.state import RobotState
 from quadvel_estimator import features
-from quadvel_policy.observation import DEFAULT_OBSERVATION, build_observation
 from quadvel_sim.terrain import Terrain
 
 from . import student
@@ -25,116 +22,80 @@ from .env import CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State
 from .ppo import select
+from .walks import Walks
 
 MEMORY = 128
 HIDDEN = (64,)
-NOISE_ACCELERATION = 0.3  # m/s^2
-BIAS_ACCELERATION = 0.15  # m/s^2, constant a walk
-BIAS_ANGULAR_VELOCITY = 0.01  # rad/s
-BIAS_TILT = 0.01  # rad
+LEGS = features.DEFAULT_LAYOUT.terms[-1]  # "leg_velocity", the last numbers of the input
 
 
-def new_network() -> Recurrent:
-    """45 numbers in; velocity (3) and log variance (3) out."""
-    return Recurrent(features.DEFAULT_LAYOUT.size, 6, MEMORY, HIDDEN)
+class VelocityNetwork(Recurrent):
+    """Network input to velocity (3) and log variance (3): a weighted mean of what the legs say, and a correction.
+
+    Both the weights, of the four legs and of none, and the correction come from the LSTM.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(features.DEFAULT_LAYOUT.size, 6 + 5, MEMORY, HIDDEN)
+
+    def head(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
+        """Output (..., 6) from the input (..., 69) and what the LSTM makes of it."""
+        correction, log_variance, weights = super().head(x, y).split([3, 3, 5], dim=-1)
+        legs = x[..., -LEGS.size :].unflatten(-1, (4, 3)) / LEGS.scale
+        share = weights.softmax(-1)[..., :4, None]
+        return torch.cat([correction + (share * legs).sum(-2), log_variance], dim=-1)
 
 
 Sequence = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 class Walk:
-    """A batch of environments that a frozen policy drives; yields features and true velocities."""
+    """Walks, and what the network makes of them; yields features and true velocities."""
 
-    def __init__(self, env: VelocityEnv, actor: Recurrent, estimator: Recurrent) -> None:
-        self.env, self.actor, self.estimator = env, actor, estimator
-        n = env.config.n
-        self.map = student.action_map(env)
-        self.action = np.zeros((n, 12), np.float32)
-        self.target = np.tile(env.stand_q, (n, 1))
-        self.on_estimate = np.arange(n) % 2 == 0
-        self._policy_state = actor.initial_state(n)
-        self.state = estimator.initial_state(n)
-        self._biases = np.zeros((n, 8))
-        self._start(np.arange(n))
-
-    def _start(self, ids: np.ndarray) -> None:
-        self._biases[ids] = self.env.rng.normal(size=(len(ids), 8)) * (
-            [BIAS_ACCELERATION] * 3 + [BIAS_ANGULAR_VELOCITY] * 3 + [BIAS_TILT] * 2
-        )
-        self.action[ids] = 0.0
-        self.target[ids] = self.env.stand_q
-        for memory in (*self._policy_state, *self.state):
-            memory[:, ids] = 0.0
+    def __init__(self, walks: Walks, network: VelocityNetwork) -> None:
+        self.walks, self.network = walks, network
+        n = walks.env.config.n
+        self.on_estimate = np.zeros(n, bool)
+        self.state = network.initial_state(n)
+        self._estimate = np.zeros((n, 3))
 
     def sequence(self, length: int) -> Sequence:
-        """`length` ticks: features (T, N, 45), true velocity (T, N, 3), mask (T, N)."""
-        env, n = self.env, self.env.config.n
-        alive = np.ones(n, bool)
-        inputs, truths, masks = [], [], []
-        state = self.state
+        """`length` ticks: features (T, N, 69), true velocity (T, N, 3), mask (T, N)."""
+        walks, state = self.walks, self.state
+        rows = []
         with torch.no_grad():
             for _ in range(length):
-                sensed = env.sense()
-                x = features.build(self._robot_state(sensed), self.target - NOMINAL_Q)
-                estimate, state = self.estimator(torch.from_numpy(x[None]), state)
-                inputs.append(x)
-                truths.append(env.velocity.copy())
-                masks.append(alive.copy())
-                sensed["linear_velocity"][self.on_estimate] = estimate[0, self.on_estimate, :3].numpy()
-                obs = build_observation(
-                    DEFAULT_OBSERVATION, command=env.command, previous_action=self.action, **sensed
-                )
-                action, self._policy_state = self.actor(torch.from_numpy(obs[None]), self._policy_state)
-                self.action = action[0].numpy()
-                self.target = self.map.targets(self.action)
-                env.tick(self.target)
-                alive &= ~(env.fallen | env.timed_out)
-        self._over = np.flatnonzero(~alive)
-        tensors = (torch.from_numpy(np.array(x, dtype=np.float32)) for x in (inputs, truths, masks))
-        return tuple(tensors)
-
-    def _robot_state(self, sensed: dict[str, np.ndarray]) -> RobotState:
-        """What the robot would report, with the sensors' biases."""
-        env, b = self.env, self._biases
-        n = len(b)
-        tilt = np.concatenate([np.ones((n, 1)), b[:, 6:] / 2, np.zeros((n, 1))], axis=1)
-        noise = NOISE_ACCELERATION * env.rng.standard_normal((n, 3))
-        return RobotState(
-            time=0.0,
-            tick=0,
-            q=sensed["q"],
-            dq=sensed["dq"],
-            tau=env.torque,
-            quaternion=_multiply(env.quaternion, tilt / np.linalg.norm(tilt, axis=1, keepdims=True)),
-            angular_velocity=sensed["angular_velocity"] + b[:, 3:6],
-            linear_acceleration=env.acceleration + noise + b[:, :3],
-            foot_force=np.zeros((n, 4)),
-        )
+                sensed = walks.sense()
+                x = features.build(sensed, walks.previous_action)
+                rows.append((x, walks.truth.copy(), ~walks.over))
+                # the controller works with the estimate of the state before
+                believed = np.where(self.on_estimate[:, None], self._estimate, walks.noisy_truth())
+                output, state = self.network(torch.from_numpy(x[None]), state)
+                self._estimate = output[0, :, :3].numpy()
+                walks.advance(sensed, believed)
+        inputs, truth, mask = (torch.from_numpy(np.array(r, np.float32)) for r in zip(*rows, strict=True))
+        return inputs, truth, mask
 
     def remember(self, ids: torch.Tensor, state: State) -> None:
         """Take over the memory (of `ids`) from the learner's pass."""
         for kept, new in zip(self.state, state, strict=True):
             kept[:, ids] = new.detach()
 
-    def start_over(self) -> None:
-        """Put the environments that ended in the last sequence back to a start."""
-        if len(self._over):
-            self.env.reset(self._over)
-            self._start(self._over)
-
-
-def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Quaternion product, wxyz, (n, 4)."""
-    scalar = a[:, :1] * b[:, :1] - np.sum(a[:, 1:] * b[:, 1:], axis=1, keepdims=True)
-    vector = a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + np.cross(a[:, 1:], b[:, 1:])
-    return np.concatenate([scalar, vector], axis=1)
+    def start_over(self, forget: float) -> None:
+        """Start anew where a walk ended; a share `forget` of the others loses its memory, as after a gap in the stream."""
+        ended = self.walks.over.copy()
+        self.walks.start_over(np.flatnonzero(ended))
+        lost = ended | (self.walks.env.rng.random(len(ended)) < forget)
+        self._estimate[lost] = 0.0
+        for memory in self.state:
+            memory[:, lost] = 0.0
 
 
 @attrs.frozen
 class EstimatorConfig:
     """One run; half of the `n` environments walk on flat ground, half on rough."""
 
-    budget: Budget = Budget(samples=6e6, minutes=15.0)
+    budget: Budget = Budget(samples=8e6, minutes=15.0)
     n: int = 512
     length: int = 32
     learning_rate: float = 2e-3
@@ -142,8 +103,10 @@ class EstimatorConfig:
     mini_batches: int = 4
     truth_first: float = 0.4  # share of the budget before the policy walks on the estimate anywhere
     seed: int = 2
-    commands: CommandRange = CommandRange()
-    rough: Terrain = Terrain(kind="rough", roughness=0.04, size=30.0)
+    episode: float = 30.0  # s
+    forget: float = 0.005  # share of the memories lost a sequence, as after a gap in the stream
+    commands: CommandRange = CommandRange(vx=(-1.8, 2.6), vy=0.8, wz=1.6)
+    rough: Terrain = Terrain(kind="rough", roughness=0.06, blend=10.0)
 
 
 def loss_terms(
@@ -160,20 +123,24 @@ def loss_terms(
     return (square.sum(-1) * mask).sum() / alive, (likelihood.sum(-1) * mask).sum() / alive
 
 
+def both_grounds(config: EstimatorConfig, actor: Recurrent) -> list[Walks]:
+    """Walks on flat and on rough ground, half of the environments each."""
+    env = EnvConfig(n=config.n // 2, seed=config.seed, commands=config.commands, episode=config.episode)
+    return [
+        Walks(VelocityEnv(attrs.evolve(env, terrain=terrain)), actor) for terrain in (Terrain(), config.rough)
+    ]
+
+
 class EstimatorRun:
     """Walks on both grounds, one network, one optimiser."""
 
     def __init__(self, config: EstimatorConfig, actor: Recurrent) -> None:
         self.config = config
         torch.manual_seed(config.seed)
-        self.network = new_network()
+        self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.samples = 0
-        env = EnvConfig(n=config.n // 2, seed=config.seed, commands=config.commands)
-        self.walks = [
-            Walk(VelocityEnv(attrs.evolve(env, terrain=terrain)), actor, self.network)
-            for terrain in (Terrain(), config.rough)
-        ]
+        self.walks = [Walk(walks, self.network) for walks in both_grounds(config, actor)]
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -207,7 +174,7 @@ class EstimatorRun:
             for name, value in self._learn(ids, data).items():
                 seen[name] += value / c.mini_batches
         for walk in self.walks:
-            walk.start_over()
+            walk.start_over(c.forget)
         self.samples += c.length * c.n
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 

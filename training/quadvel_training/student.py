@@ -57,14 +57,14 @@ class _Step(nn.Module):
         weight = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
         self.weight = nn.Parameter(weight.detach().T.contiguous())
         self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
-        self.body, self.outputs = network.body, outputs
+        self.network, self.outputs = network, outputs
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
         gates = torch.addmm(self.bias, torch.cat([obs, h.flatten(0, 1)], dim=1), self.weight)
         admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
         memory = forget.sigmoid() * c.flatten(0, 1) + admit.sigmoid() * candidate.tanh()
         hidden = release.sigmoid() * memory.tanh()
-        y = self.body(nn.functional.silu(hidden))
+        y = self.network.head(obs, hidden)
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
 
