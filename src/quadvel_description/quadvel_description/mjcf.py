@@ -27,6 +27,7 @@ class Plant:
     plane: bool = True  # add a flat ground; False where the caller brings a terrain
     only_feet_and_trunk: bool = False  # leave the legs' own collision shapes out (training: faster)
     sensors: bool = True  # IMU sensors at the IMU site
+    hung: bool = False  # the trunk held at HUNG_HEIGHT, as on a stand: the feet are in the air
     iterations: int = 20  # of the Newton solver
     ls_iterations: int = 20
 
@@ -93,6 +94,15 @@ def mjcf(plant: Plant | None = None) -> str:
         for name, limit in zip(robot.JOINT_NAMES, robot.TORQUE_LIMIT.tolist(), strict=True)
     )
     legs = "\n      ".join(_leg(leg, plant) for leg in LEGS)
+    # relpose: where the world is, seen from the trunk
+    stand = (
+        f"""<equality>
+    <weld name="hung" body1="trunk" relpose="0 0 {-robot.HUNG_HEIGHT!r} 1 0 0 0" solref="0.004 1"/>
+  </equality>"""
+        if plant.hung
+        else ""
+    )
+    heights = [robot.HUNG_HEIGHT] * 2 if plant.hung else [robot.NOMINAL_HEIGHT, robot.LIE_HEIGHT]
     return f"""<mujoco model="aliengo">
   <compiler angle="radian" autolimits="true"/>
   <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="pyramidal"
@@ -129,9 +139,10 @@ def mjcf(plant: Plant | None = None) -> str:
     {motors}
   </actuator>
   {sensors}
+  {stand}
   <keyframe>
-    {_keyframe("stand", robot.NOMINAL_HEIGHT, robot.NOMINAL_Q)}
-    {_keyframe("lie", robot.LIE_HEIGHT, robot.LIE_Q)}
+    {_keyframe("stand", heights[0], robot.NOMINAL_Q)}
+    {_keyframe("lie", heights[1], robot.LIE_Q)}
   </keyframe>
 </mujoco>
 """

@@ -54,6 +54,7 @@ NOMINAL_Q = _per_leg(0.0, 0.6435, -1.287)  # rad, stance: feet 0.4 m below the h
 LIE_Q = _per_leg(0.0, 1.343, -2.696)  # rad
 NOMINAL_HEIGHT = 0.4265  # m, trunk above ground in NOMINAL_Q
 LIE_HEIGHT = 0.137  # m
+HUNG_HEIGHT = 1.0  # m, trunk of a robot that is held in the air
 
 # mechanical range
 LOWER = _per_leg(-1.2217305, -2.0943951, -2.7750735)

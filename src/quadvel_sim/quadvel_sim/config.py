@@ -49,6 +49,8 @@ class SimulatorConfig:
     """Coulomb friction, (12,), N m."""
     joint_damping: NDArray[np.float64] = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
     """Viscous friction, (12,), N m s/rad."""
+    hung: bool = False
+    """Whether the trunk is held in the air, as on a stand."""
     watchdog: float = attrs.field(default=0.02, **number(0.001))
     """Without a command for this long (s) the drives brake, as the robot's board has them do."""
     watchdog_kd: float = attrs.field(default=5.0, **number(0.0, 50.0))

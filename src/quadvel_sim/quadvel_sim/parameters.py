@@ -42,6 +42,7 @@ class SimParameters:
     payload_position: tuple[float, ...] = _parameter(
         tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
     )
+    hung: bool = _parameter(_CONFIG.hung, "whether the trunk is held in the air, as on a stand")
     watchdog: float = _parameter(_CONFIG.watchdog, "s without a command after which the drives brake")
     watchdog_kd: float = _parameter(_CONFIG.watchdog_kd, "gain of that brake, N m s/rad")
     noise_q: float = _parameter(_NOISE.q, "standard deviation of q, rad")
@@ -79,6 +80,7 @@ class SimParameters:
             friction=np.array(self.friction),
             payload=self.payload,
             payload_position=np.array(self.payload_position),
+            hung=self.hung,
             watchdog=self.watchdog,
             watchdog_kd=self.watchdog_kd,
         )

@@ -63,6 +63,7 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         joint_friction=config.joint_friction,
         joint_damping=config.joint_damping,
         plane=False,
+        hung=config.hung,
     )
     spec = build_spec(plant)
     config.terrain.add_to(spec)
@@ -122,9 +123,10 @@ class Simulator:
         self.actuator = ActuatorModel(self.config.actuator, dt=DT, seed=int(seeds[0]))
         self._rng = np.random.default_rng(seeds[1])
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key(keyframe).id)
-        tilt = self.config.terrain.tilt
-        self.data.qpos[:3] = rotate(tilt, self.data.qpos[:3])
-        self.data.qpos[3:7] = tilt
+        if not self.config.hung:
+            tilt = self.config.terrain.tilt
+            self.data.qpos[:3] = rotate(tilt, self.data.qpos[:3])
+            self.data.qpos[3:7] = tilt
         self._pushes: list[_Push] = []
         self.steps = 0
         self._sampled = False
