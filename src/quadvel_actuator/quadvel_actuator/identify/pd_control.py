@@ -1,0 +1,121 @@
+"""When were the drives under PD control? Outside of these stretches no PD model applies, whatever its parameters.
+
+A drive that was switched off, or put into damping, while the log goes on with the last command shows it: the torque no
+longer answers the position error. Found from the data, so logged gains are not needed; where they are logged, a
+kp of 0 says it too. What the drive does under PD control is for the identification, not for here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .log import Array, Bools, Log
+
+BIN = 0.02  # s
+WINDOW = 5  # bins
+LOST = 0.2
+"""Share of the usual position gain below which the position error is no longer answered."""
+SHORTEST = 0.15  # s, of a stretch out of PD control
+MARGIN = 0.1  # s, on both sides of it
+LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
+
+
+def without_position_gain(log: Log) -> Bools:
+    """Rows and joints (N, J) whose logged kp was 0."""
+    if log.kp is None:
+        return np.zeros(log.q.shape, bool)
+    return np.asarray(log.kp == 0.0)[log.command_rows(log.t)]
+
+
+def out_of_control(log: Log) -> Bools:
+    """Rows (N,) in which no drive answered the position error; none where the data cannot tell."""
+    return _error_at_rest(log) if log.tau is None else _unanswered(log)
+
+
+def stretches(rows: NDArray[Any], t: Array, least: float = 0.0) -> list[tuple[float, float]]:
+    """First and last time (s) of each run of true rows that lasts `least` s or longer."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], rows, [False]]).astype(np.int8)))
+    pairs = [(float(t[a]), float(t[b - 1])) for a, b in edges.reshape(-1, 2)]
+    return [(first, last) for first, last in pairs if last - first >= least]
+
+
+def _unanswered(log: Log) -> Bools:
+    """Torque against position error, in short windows over all joints: where is the gain far below its usual size?"""
+    bins = ((log.t - log.t[0]) / BIN).astype(np.intp)
+    sums = max((_sums(log, bins, lag) for lag in LAGS), key=_explained)
+    count, ee, ed, dd, et, dt, _ = (np.convolve(row, np.ones(WINDOW), "same") for row in sums)
+    determinant = ee * dd - ed**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        alone, joint = et / ee, (et * dd - dt * ed) / determinant
+        gain = np.where(determinant > 1e-3 * ee * dd, joint, alone)
+        size = ee / count
+    there = np.isfinite(gain) & np.isfinite(size) & (count > 0)
+    if not there.any():
+        return np.zeros(len(log.t), bool)
+    tells = there & (size > 0.1 * np.median(size[there]))
+    usual = float(np.percentile(gain[tells], 75))
+    if usual <= 0.0:
+        return np.zeros(len(log.t), bool)
+    # A window that tells nothing, as the error is small there, is taken to be like the one before.
+    last = np.maximum.accumulate(np.where(tells, np.arange(len(gain)), -1))
+    lost = (last >= 0) & (gain[last] < LOST * usual)
+    return _widened(lost[bins], log.t)
+
+
+def _sums(log: Log, bins: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+    """Sums in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
+    row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
+    command = log.command_rows(log.t[row])
+    total = np.zeros((7, bins[-1] + 1))
+    assert log.tau is not None
+    for j in range(len(log.joints)):
+        use = log.valid[:, j].astype(float)
+        stiffness = 1.0 if log.kp is None else np.asarray(log.kp)[command, j]
+        e = use * stiffness * (log.q_des[command, j] - log.q[row, j])
+        d, tau = -use * log.dq[row, j], use * log.tau[:, j]
+        for k, product in enumerate((use, e * e, e * d, d * d, e * tau, d * tau, tau * tau)):
+            total[k] += np.bincount(bins, product, len(total[k]))
+    return total
+
+
+def _explained(sums: NDArray[np.float64]) -> float:
+    """Share of the torque that the position error explains, where it does: the median over the bins."""
+    _, ee, _, _, et, _, tt = sums
+    there = (ee > 0.0) & (tt > 0.0)
+    return float(np.median(et[there] ** 2 / (ee * tt)[there])) if there.any() else 0.0
+
+
+def _error_at_rest(log: Log) -> Bools:
+    """Without torque: stretches in which the command rests and the joints drift further off than they ever do else."""
+    row = log.command_rows(log.t)
+    changed = np.concatenate([[True], (np.diff(log.q_des, axis=0) != 0.0).any(axis=1)])
+    changes = np.maximum.accumulate(np.where(changed, np.arange(len(changed)), 0))
+    since = log.t - log.t_cmd[changes[row]]
+    error = np.sqrt(np.mean((log.q_des[row] - log.q) ** 2, axis=1))
+    resting = since > 0.5
+    if resting.all() or not resting.any():
+        return np.zeros(len(log.t), bool)
+    off = resting & (error > 2.0 * np.percentile(error[~resting], 95))
+    held = np.unique(changes[row][off])
+    return _widened(np.isin(changes[row], held) & (since > 2.0 * MARGIN), log.t)
+
+
+def _widened(rows: Bools, t: Array) -> Bools:
+    """Runs of at least SHORTEST, with MARGIN on both sides."""
+    wide = np.zeros(len(t), bool)
+    for first, last in stretches(rows, t, SHORTEST):
+        wide |= (t >= first - MARGIN) & (t <= last + MARGIN)
+    return wide
+
+
+def in_words(spans: list[tuple[float, float]], t: Array, most: int = 4) -> str:
+    """`1.20 to 3.45 s, 9.70 s to the end`."""
+    texts = [
+        f"{first:.2f} s to the end" if last >= t[-1] else f"{first:.2f} to {last:.2f} s"
+        for first, last in spans
+    ]
+    rest = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + rest
