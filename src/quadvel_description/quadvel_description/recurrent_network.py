@@ -43,9 +43,15 @@ class RecurrentNetwork:
         self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
         self._outputs = dict(outputs)
         self._check_signature()
-        self._zero = np.zeros(self.metadata["state_shape"], np.float32)
-        self.reset()
         self._try_out()
+        self._input = np.zeros((1, self.input_size), np.float32)
+        self._results = [np.zeros((1, size), np.float32) for size in self._outputs.values()]
+        # Two memories that take turns: what one step writes, the next one reads, and nothing is copied.
+        self._memories = [
+            [np.zeros(self.metadata["state_shape"], np.float32) for _ in "hc"] for _ in range(2)
+        ]
+        self._bindings = [self._bind(*self._memories), self._bind(*self._memories[::-1])]
+        self.reset()
 
     @property
     def input_size(self) -> int:
@@ -54,33 +60,47 @@ class RecurrentNetwork:
 
     def reset(self) -> None:
         """Forget everything seen so far."""
-        self._h = self._c = self._zero
+        self._turn = 0
+        for memory in self._memories[0]:
+            memory[:] = 0.0
 
     def step(self, observation: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         """One time step: `obs` (n,) to the outputs, each (m,).
 
         Raises FloatingPointError where an output is not finite; the memory then is of no use until `reset`.
         """
-        feed = {"obs": observation[None], "h_in": self._h, "c_in": self._c}
-        *results, self._h, self._c = self._session.run(None, feed)
-        for name, result in zip(self._outputs, results, strict=True):
+        self._input[0] = observation
+        self._session.run_with_iobinding(self._bindings[self._turn])
+        self._turn = 1 - self._turn
+        for name, result in zip(self._outputs, self._results, strict=True):
             if not np.isfinite(result).all():
                 raise FloatingPointError(f"{self.path}: the network's output {name} is not finite")
-        return [result[0] for result in results]
+        return [result[0].copy() for result in self._results]
+
+    def _bind(self, read: list[NDArray[np.float32]], write: list[NDArray[np.float32]]) -> Any:
+        """Tie the network to our arrays, so that a run looks up, converts and allocates nothing."""
+        binding = self._session.io_binding()
+        for name, array in zip(("obs", *MEMORY_INPUTS), (self._input, *read), strict=True):
+            binding.bind_input(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
+        for name, array in zip((*self._outputs, *MEMORY_OUTPUTS), (*self._results, *write), strict=True):
+            binding.bind_output(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
+        return binding
 
     def refuse(self, what: str, found: object, expected: object) -> NetworkFileError:
         """The error for a file of which `what` is `found`, for the caller to raise."""
         return NetworkFileError(f"{self.path}: {what} is {found!r}, expected {expected!r}")
 
     def _try_out(self) -> None:
-        """One step on zeros: shows the true shapes of the outputs, and is the slow first run of the session."""
-        try:
-            results = self.step(np.zeros(self.input_size, np.float32))
-        except FloatingPointError as error:
-            raise NetworkFileError(f"{error} for an input of zeros") from None
-        for (name, size), result in zip(self._outputs.items(), results, strict=True):
-            self._require(f"shape of output {name}", (1, *result.shape), (1, size))
-        self.reset()
+        """One run on zeros: shows the true shapes of the outputs, and is the slow first run of the session."""
+        memory = self.metadata["state_shape"]
+        zeros = {name: np.zeros(memory, np.float32) for name in MEMORY_INPUTS}
+        results = self._session.run(None, {"obs": np.zeros((1, self.input_size), np.float32), **zeros})
+        expected = {name: (1, size) for name, size in self._outputs.items()}
+        expected |= dict.fromkeys(MEMORY_OUTPUTS, tuple(memory))
+        for (name, shape), result in zip(expected.items(), results, strict=True):
+            self._require(f"shape of output {name}", result.shape, shape)
+            if not np.isfinite(result).all():
+                raise NetworkFileError(f"{self.path}: output {name} is not finite for an input of zeros")
 
     def _require(self, what: str, found: object, expected: object) -> None:
         if found != expected:
