@@ -34,6 +34,7 @@ class Signals:
 
     t: Array  # (N, 1) s since the log began
     dt: Array  # (N, 1) s since the row before
+    start: Bools  # (N, 1), does a stretch begin here
     q: Array
     dq: Array
     ddq: Array
@@ -45,13 +46,25 @@ class Signals:
     measured: Array  # N m, torque as logged at `u`
     temperature: Array | None
     voltage: Array | None  # (N, 1)
-    packet: NDArray[np.intp]  # (N, J), the command row in force, counted over all logs
+    packet: NDArray[np.intp]  # (N, 1), the command row in force, counted over all logs
+    sent: Array  # (M, J), q_des of every command row of all logs
 
     @property
     def power(self) -> Array:
         """Mechanical power that the joints draw together, (N, 1), W."""
         power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)
         return power
+
+    def shifted(self, name: str, late: Array) -> Array:
+        """The signal `late` s earlier (negative: later), linear between rows; `late` (J,) or (B, 1, J)."""
+        values = getattr(self, name)
+        rows = np.arange(len(values))[:, None] - late / float(np.median(self.dt))
+        first = np.clip(np.floor(rows), 0, len(values) - 2)
+        share = np.clip(rows - first, 0.0, 1.0)
+        index = first.astype(np.intp)
+        joint = np.arange(values.shape[1])
+        early: Array = values[index, joint]
+        return early + share * (values[index + 1, joint] - early)
 
 
 def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
@@ -146,6 +159,7 @@ class Samples:
         self.start: Bools = np.concatenate(starts)
         self.dt = np.concatenate(steps)
         self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
+        self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._cache: dict[tuple[float, float, float], Signals] = {}
 
@@ -197,10 +211,10 @@ class Samples:
             row = one.log.command_rows(at - input_delay + 1e-9)
             for name, values in one.gains.items():
                 parts.setdefault(name, []).append(values[row])
-            packets.append(np.broadcast_to((row + first)[:, None], one.log.q.shape))
+            packets.append((row + first)[:, None])
             parts.setdefault("t", []).append((at - one.log.t[0])[:, None])
         signals = {name: np.concatenate(part) for name, part in parts.items()}
         for name in ("temperature", "voltage"):
             if name not in signals or len(signals[name]) < len(self.t):
                 signals[name] = None  # type: ignore[assignment]  # not in every log
-        return Signals(dt=self.dt[:, None], packet=np.concatenate(packets), **signals)
+        return Signals(dt=self.dt[:, None], start=self.start[:, None], packet=np.concatenate(packets), sent=self.sent, **signals)

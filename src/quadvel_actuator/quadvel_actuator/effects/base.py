@@ -1,0 +1,207 @@
+"""What an effect is: a law that turns what the EAM asks for into what the joint gives.
+
+A law is written once and runs in two ways: over whole series (identification) and step by step (`ActuatorModel`). Its
+values broadcast, so that the same lines serve (N, J) rows, a batch (B, N, J) of parameter guesses, and one step of
+(J,) or (environments, J). The order in which laws act is that of the drive: `Stage`.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar, Protocol
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Params = Mapping[str, Array]
+Errors = tuple[Array, Array]
+"""q_des - q (rad) and dq_des - dq (rad/s), as the drive sees them"""
+
+
+class Stage(enum.IntEnum):
+    """Where in the drive a law acts; laws of a lower stage act first."""
+
+    ERRORS = 0
+    """on the errors of position and velocity that the PD law is given"""
+    GAIN = 1
+    """on the asked torque, as a gain"""
+    LIMIT = 2
+    """on the asked torque, as a bound"""
+    FLOW = 3
+    """on how fast the torque follows"""
+    ADDED = 4
+    """a torque beside it: friction, springs, coupling"""
+
+
+class View(Protocol):
+    """What a law may look at: `quadvel_actuator.identify.signals.Signals`, or one step of a running model."""
+
+    t: Any
+    dt: Any
+    q: Array
+    dq: Array
+    ddq: Array
+    q_des: Array
+    measured: Array
+    temperature: Any
+    voltage: Any
+
+    sent: Any
+    packet: Any
+
+    @property
+    def power(self) -> Array: ...
+
+    def shifted(self, name: str, late: Array) -> Array: ...
+
+
+@attrs.frozen
+class Parameter:
+    """One number of a law. `low` and `high` bound it; `scale` is its usual size, which numerical slopes need."""
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    scale: float
+
+
+Start = Mapping[str, Any]
+"""a guess of every parameter but the `linear` ones: a number, or one for each joint (J,)"""
+
+
+@attrs.frozen(eq=False)
+class EffectLaw:
+    """An entry of the registry. Subclass `ErrorLaw`, `TorqueLaw`, `AddedLaw` or one with memory, not this one."""
+
+    name: ClassVar[str]
+    stage: ClassVar[Stage]
+    parameters: ClassVar[tuple[Parameter, ...]]
+    signal: ClassVar[str] = "tau"
+    """the signal over which its residual shows its shape"""
+    shifts: ClassVar[bool] = False
+    """looks like a delay, so that the delays have to be fitted anew with it"""
+    motion: ClassVar[str] = "richer motion"
+    """what to record so that it can be told from others"""
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[EffectLaw]:
+        """The forms of the law to try on the data `about` (`identify.model.Model`); none where they cannot act."""
+        return (cls(),)
+
+    @classmethod
+    def configured(cls, settings: Mapping[str, Any]) -> EffectLaw:
+        """The form that a parameter file names: of its parameters those that are no numbers."""
+        return cls(**settings)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What `configured` needs to make this form again."""
+        return attrs.asdict(self)
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        """Guesses to search from.
+
+        `torque` (N, J) is what the model without the effect gives, `residual` what is left of the measured torque,
+        0 where it is not to be explained.
+        """
+        raise NotImplementedError
+
+    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+        """Parameters (J,) brought into the order that makes them unique, within the bounds."""
+        return p
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the parameters, in order."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+
+class ErrorLaw(EffectLaw):
+    """Changes the errors that the PD law is given."""
+
+    stage = Stage.ERRORS
+
+    def errors(self, e: Errors, s: View, p: Params) -> Errors:
+        """The errors that the drive sees instead of `e`."""
+        raise NotImplementedError
+
+
+class TorqueLaw(EffectLaw):
+    """Changes the asked torque."""
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        """The torque instead of `x`."""
+        raise NotImplementedError
+
+
+class AddedLaw(EffectLaw):
+    """Adds a torque; it is the sum of terms in proportion to each of the parameters `linear`."""
+
+    stage = Stage.ADDED
+    linear: ClassVar[tuple[str, ...]]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        """The torque to add, `x` being what the drive gives without it."""
+        raise NotImplementedError
+
+
+Memory = tuple[Array, ...]
+
+
+class MemoryLaw(EffectLaw):
+    """A law with a memory: `advance` is one step of it, and a series is one step after the other.
+
+    At stage ERRORS `x` is the pair of errors, and so is what comes back; at ADDED it is the torque to add.
+    """
+
+    inputs: ClassVar[tuple[str, ...]] = ()
+    """the signals that `advance` is given, by name"""
+
+    def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
+        """The memory of a joint that has rested at `x`, `u` since ever."""
+        raise NotImplementedError
+
+    def advance(
+        self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory
+    ) -> tuple[Any, Memory]:
+        """The value instead of `x` after `dt` (s), and the new memory."""
+        raise NotImplementedError
+
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        """All rows of a series, memory starting anew with every stretch."""
+        pair = isinstance(x, tuple)
+        given = x if pair else (x,)
+        lead = np.broadcast_shapes(*(np.shape(one)[:-2] for one in (*given, *p.values())))
+        rows, joints = given[0].shape[-2:]
+        xs = [np.ascontiguousarray(np.moveaxis(np.broadcast_to(one, (*lead, rows, joints)), -2, 0)) for one in given]
+        us = [np.broadcast_to(getattr(s, name), (rows, joints)) for name in self.inputs]
+        p = {name: np.squeeze(value, -2) if np.ndim(value) > 1 else value for name, value in p.items()}
+        out = [np.empty_like(one) for one in xs]
+        dts, starts = s.dt[:, 0].tolist(), s.start[:, 0].tolist()
+        memory: Memory = ()
+        for k in range(rows):
+            here = tuple(one[k] for one in xs) if pair else xs[0][k]
+            u = [one[k] for one in us]
+            if starts[k]:
+                memory = self.rest(here, u, p)
+            now, memory = self.advance(here, u, dts[k], p, memory)
+            for one, value in zip(out, now if pair else (now,), strict=True):
+                one[k] = value
+        back = tuple(np.moveaxis(one, 0, -2) for one in out)
+        return back if pair else back[0]
+
+
+def smooth_sign(v: Array, width: Array) -> Array:
+    """-1 to 1, through zero at rest; `width` (rad/s) is where it has come to 0.76."""
+    sign: Array = np.tanh(v / width)
+    return sign
+
+
+def rms(x: Array) -> Array:
+    """Root mean square over the rows, (J,)."""
+    value: Array = np.sqrt(np.mean(x * x, axis=-2)) + 1e-9
+    return value

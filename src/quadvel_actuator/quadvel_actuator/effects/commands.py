@@ -1,0 +1,56 @@
+"""Commands that are lost or late: the drive goes on with the old one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import Array, Errors, ErrorLaw, Parameter, Params, Start, View
+
+MOST = 6
+"""commands lost in a row that are looked for"""
+
+
+@attrs.frozen(eq=False)
+class CommandHold(ErrorLaw):
+    """A `share` of the commands never acts, or late; which ones is read off the residual, `behind` (N, 1) or (N, J).
+
+    `behind` counts by how many commands the drive lags at each row. It is an inference about this record: a model that
+    runs draws its losses at random.
+    """
+
+    name = "command_hold"
+    parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
+    signal = "q_des@history"
+    motion = "commands that change at every sending, with the sender's sequence number logged"
+    behind: NDArray[np.intp] | None = attrs.field(default=None, repr=False)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {}
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[CommandHold]:
+        return tuple(cls(behind) for behind in about.lost_commands(MOST))
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        if self.behind is None:
+            return [{"share": 0.05}]
+        fresh = np.diff(s.packet[:, 0], prepend=s.packet[0, 0] - 1) > 0
+        lost = (self.behind > 0) & fresh[:, None]
+        share = lost.sum(axis=0) / max(int(fresh.sum()), 1)
+        return [{"share": np.broadcast_to(share, s.q.shape[-1:]).copy()}]
+
+    def errors(self, e: Errors, s: View, p: Params) -> Errors:
+        if self.behind is None:
+            return e
+        row = np.maximum(s.packet - self.behind, 0)
+        old: Array = s.sent[row, np.arange(s.q.shape[-1])]
+        return np.where(self.behind > 0, e[0] + old - s.q_des, e[0]), e[1]
+
+
+LAWS = (CommandHold,)

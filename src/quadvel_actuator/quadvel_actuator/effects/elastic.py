@@ -1,0 +1,196 @@
+"""Laws of position: offsets, springs, cogging, deadband, and play and hysteresis with their memory."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from .base import AddedLaw, Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View, rms
+
+_STILL = "small slow reversals about many postures, each held for a second"
+
+
+class TorqueOffset(AddedLaw):
+    """A constant; an encoder bias looks the same"""
+
+    name = "torque_offset"
+    parameters = (Parameter("offset", "N m", -20.0, 20.0, 0.3),)
+    linear = ("offset",)
+    signal = "q"
+    motion = "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return p["offset"] + 0.0 * s.q
+
+
+class ParallelSpring(AddedLaw):
+    """-k (q - q0)"""
+
+    name = "parallel_spring"
+    parameters = (Parameter("k", "N m/rad", -200.0, 200.0, 1.0), Parameter("q0", "rad", -30.0, 30.0, 0.3))
+    linear = ("k",)
+    signal = "q"
+    motion = "slow sweeps over the whole range of every joint"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        """The straight line through the residual over the position."""
+        weight = (residual != 0.0).astype(float)
+        n = weight.sum(axis=0) + 1e-9
+        q, r = (s.q * weight).sum(axis=0) / n, residual.sum(axis=0) / n
+        slope = ((s.q - q) * residual).sum(axis=0) / (((s.q - q) ** 2 * weight).sum(axis=0) + 1e-9)
+        slope = np.where(np.abs(slope) < 1e-3, 1e-3, slope)
+        return [{"q0": np.clip(q - r / slope, -25.0, 25.0)}, {"q0": q}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return -p["k"] * (s.q - p["q0"])
+
+
+class Cogging(AddedLaw):
+    """a sin(n q + phi)"""
+
+    name = "cogging"
+    parameters = (
+        Parameter("a", "N m", -20.0, 20.0, 0.3),
+        Parameter("n", "1/rad", 3.0, 400.0, 0.2),
+        Parameter("phi", "rad", -20.0, 20.0, 0.3),
+    )
+    linear = ("a",)
+    signal = "q"
+    motion = "slow sweeps over the whole range of every joint"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        """The highest lines of the residual's spectrum over the position."""
+        spread = np.maximum(np.ptp(s.q, axis=0), 1e-3)
+        steps = np.arange(1.0, 60.0, 0.5)
+        centre = s.q.mean(axis=0)
+        wave = np.exp(1j * 2.0 * np.pi * 0.5 * (s.q - centre) / spread)  # half a turn over the range
+        lines = np.empty((len(steps), s.q.shape[1]), dtype=complex)
+        power = wave * residual
+        for i in range(len(steps)):
+            power = power * wave
+            lines[i] = np.conj(power.sum(axis=0))
+        n = 2.0 * np.pi * 0.5 * np.arange(2, len(steps) + 2)[:, None] / spread
+        size = np.where((n > 3.0) & (n < 400.0), np.abs(lines), 0.0)
+        peak = (size >= np.roll(size, 1, axis=0)) & (size >= np.roll(size, -1, axis=0))
+        order = np.argsort(-np.where(peak, size, 0.0), axis=0)
+        found = []
+        for rank in range(4):
+            best = order[rank][None]
+            line = np.take_along_axis(lines, best, axis=0)[0]
+            turns = np.take_along_axis(np.broadcast_to(n, lines.shape), best, axis=0)[0]
+            # residual ~ Re(conj(line) exp(-i n (q - centre))), which is a sine a quarter turn on
+            phase = np.angle(line) + np.pi / 2 - turns * centre
+            found.append({"n": turns, "phi": np.remainder(phase + np.pi, 2.0 * np.pi) - np.pi})
+        return found
+
+    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+        phi = p["phi"] + np.where(p["a"] < 0.0, np.pi, 0.0)
+        return p | {"a": np.abs(p["a"]), "phi": np.remainder(phi + np.pi, 2.0 * np.pi) - np.pi}
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return p["a"] * np.sin(p["n"] * s.q + p["phi"])
+
+
+class Deadband(ErrorLaw):
+    """No answer to position errors below `width`; beyond it the error less `share` of the width"""
+
+    name = "deadband"
+    parameters = (Parameter("width", "rad", 0.0005, 0.5, 0.01), Parameter("share", "1", 0.0, 1.0, 0.5))
+    signal = "q_des"
+    motion = _STILL
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        error = np.abs(s.q_des - s.q)
+        return [
+            {"width": np.quantile(error, at, axis=0) + 5e-4, "share": share}
+            for at in (0.05, 0.15, 0.3, 0.5)
+            for share in (0.0, 1.0)
+        ]
+
+    def errors(self, e: Errors, s: View, p: Params) -> Errors:
+        beyond = np.abs(e[0]) > p["width"]
+        return np.where(beyond, e[0] - p["share"] * p["width"] * np.sign(e[0]), 0.0), e[1]
+
+
+@attrs.frozen(eq=False)
+class Backlash(MemoryLaw):
+    """Play: the drive sees `on` (the position q, the error q_des - q, or the torque) through a gap of +-`gap`"""
+
+    name = "backlash"
+    on: str = "error"
+
+    @property
+    def stage(self) -> Stage:  # type: ignore[override]
+        return Stage.FLOW if self.on == "torque" else Stage.ERRORS
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+        if self.on == "torque":
+            return (Parameter("gap", "N m", 0.01, 50.0, 0.3),)
+        return (Parameter("gap", "rad", 0.0002, 0.5, 0.01),)
+
+    inputs = ("q",)
+    signal = "q@history"
+    motion = _STILL
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[Backlash]:
+        return tuple(cls(on) for on in ("error", "q", "torque"))
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        of = {"error": rms(s.q_des - s.q), "q": rms(s.q_des - s.q), "torque": rms(torque)}[self.on]
+        return [{"gap": share * of + 2e-4} for share in (0.05, 0.1, 0.2, 0.4, 0.8)]
+
+    def _seen(self, x: Any, u: Sequence[Array]) -> Array:
+        seen: Array = {"error": lambda: x[0], "q": lambda: u[0], "torque": lambda: x}[self.on]()
+        return seen
+
+    def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
+        return (self._seen(x, u) + 0.0 * p["gap"],)
+
+    def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
+        seen = self._seen(x, u)
+        follows = np.minimum(np.maximum(memory[0], seen - p["gap"]), seen + p["gap"])
+        if self.on == "torque":
+            return follows, (follows,)
+        error = follows if self.on == "error" else x[0] + seen - follows
+        return (error, x[1]), (follows,)
+
+
+class Hysteresis(MemoryLaw):
+    """-F z with Bouc-Wen's dz/dq = (1 - (beta + (1 - beta) sign(z dq)) |z|) / reach, -1 <= z <= 1"""
+
+    name = "hysteresis"
+    stage = Stage.ADDED
+    linear = ("F",)
+    parameters = (
+        Parameter("F", "N m", 0.0, 30.0, 0.3),
+        Parameter("reach", "rad", 0.001, 1.0, 0.03),
+        Parameter("beta", "1", 0.0, 1.0, 0.3),
+    )
+    inputs = ("q", "dq")
+    signal = "q@history"
+    motion = _STILL
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)]
+
+    def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
+        return 0.0 * (u[0] + p["reach"]), u[0]
+
+    def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
+        z, before = memory
+        way = (u[0] - before) / p["reach"]
+        bend = p["beta"] + (1.0 - p["beta"]) * np.sign(z * way)
+        z = z + way * (1.0 - bend * np.abs(z))
+        z = np.minimum(np.maximum(z, -1.0), 1.0)
+        return -p["F"] * z, (z, u[0])
+
+
+LAWS = (TorqueOffset, ParallelSpring, Cogging, Deadband, Backlash, Hysteresis)

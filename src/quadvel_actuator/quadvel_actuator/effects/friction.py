@@ -1,0 +1,104 @@
+"""Friction: torques against the velocity. s is a smooth sign, v_0 the velocity at which it turns."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+import numpy as np
+
+from .base import AddedLaw, Array, Parameter, Params, Start, View, smooth_sign
+
+_WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
+_WIDTHS = (0.02, 0.06, 0.2)
+_SLOW = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/s"
+
+
+class CoulombFriction(AddedLaw):
+    """-c s(dq)"""
+
+    name = "coulomb_friction"
+    parameters = (Parameter("c", "N m", 0.0, 20.0, 0.3), _WIDTH)
+    linear = ("c",)
+    signal = "dq"
+    motion = _SLOW
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{"v_0": width} for width in _WIDTHS]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return -p["c"] * smooth_sign(s.dq, p["v_0"])
+
+
+class ViscousFriction(AddedLaw):
+    """-b dq, on some joints only: shared by all it is a deviation of the gain kd"""
+
+    name = "viscous_friction"
+    parameters = (Parameter("b", "N m s/rad", 0.0, 10.0, 0.05),)
+    linear = ("b",)
+    signal = "dq"
+    motion = _SLOW
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return -p["b"] * s.dq
+
+
+class StribeckFriction(AddedLaw):
+    """-(c + (c_s - c) exp(-(dq / v_s)^2)) s(dq), where c_s > c"""
+
+    name = "stribeck_friction"
+    parameters = (
+        Parameter("c", "N m", 0.0, 20.0, 0.3),
+        Parameter("c_s", "N m", 0.0, 30.0, 0.5),
+        Parameter("v_s", "rad/s", 0.02, 5.0, 0.3),
+        _WIDTH,
+    )
+    linear = ("c", "c_s")
+    signal = "dq"
+    motion = _SLOW
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08)]
+
+    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+        return p | {"c_s": np.maximum(p["c_s"], p["c"])}
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        sticking = np.exp(-np.square(s.dq / p["v_s"]))
+        return -(p["c"] + (p["c_s"] - p["c"]) * sticking) * smooth_sign(s.dq, p["v_0"])
+
+
+class QuadraticDrag(AddedLaw):
+    """-c dq |dq|"""
+
+    name = "quadratic_drag"
+    parameters = (Parameter("c", "N m s^2/rad^2", 0.0, 2.0, 0.02),)
+    linear = ("c",)
+    signal = "dq"
+    motion = "fast sweeps, up to the joint's top speed"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return -p["c"] * s.dq * np.abs(s.dq)
+
+
+class LoadDependentFriction(AddedLaw):
+    """-mu |tau*| s(dq)"""
+
+    name = "load_dependent_friction"
+    parameters = (Parameter("mu", "1", 0.0, 0.9, 0.05), _WIDTH)
+    linear = ("mu",)
+    signal = "dq"
+    motion = "slow reversals under different loads: hung in the air, standing, with a payload"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{"v_0": width} for width in _WIDTHS]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return -p["mu"] * np.abs(x) * smooth_sign(s.dq, p["v_0"])
+
+
+LAWS = (CoulombFriction, ViscousFriction, StribeckFriction, QuadraticDrag, LoadDependentFriction)

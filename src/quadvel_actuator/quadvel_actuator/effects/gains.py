@@ -1,0 +1,165 @@
+"""Gains that change: with the torque's sign, with time or temperature, with the supply; and coupling."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Stage, Start, TorqueLaw, View
+
+
+class GainAsymmetry(TorqueLaw):
+    """tau* (1 + a sign(tau*))"""
+
+    name = "gain_asymmetry"
+    stage = Stage.GAIN
+    parameters = (Parameter("a", "1", -0.9, 0.9, 0.05),)
+    signal = "tau"
+    motion = "loads of both signs on every joint"
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{"a": a} for a in (-0.2, -0.05, 0.05, 0.2)]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return x + p["a"] * np.abs(x)
+
+
+@attrs.frozen(eq=False)
+class ThermalDrift(TorqueLaw):
+    """tau* (1 + drift): with temperature, drift = rate (temperature - 25), else rate tau_t (1 - exp(-t / tau_t))"""
+
+    name = "thermal_drift"
+    stage = Stage.GAIN
+    signal = "t"
+    motion = "one motion repeated from cold until the drives are warm, with their temperature logged"
+    of: str = "time"
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+        if self.of == "temperature":
+            return (Parameter("rate", "1/K", -0.2, 0.2, 0.005),)
+        return (Parameter("rate", "1/s", -2.0, 2.0, 0.02), Parameter("tau_t", "s", 0.2, 3000.0, 5.0))
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[ThermalDrift]:
+        warm = about.signals.temperature is not None and float(np.ptp(about.signals.temperature)) > 0.5
+        return (cls("time"), cls("temperature")) if warm else (cls("time"),)
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        if self.of == "temperature":
+            return [{"rate": rate} for rate in (-0.01, 0.01)]
+        span = float(np.max(s.t))
+        return [
+            {"rate": sign * 0.15 / min(share, 1.0) / span, "tau_t": share * span}
+            for sign in (-1, 1)
+            for share in (0.15, 0.5, 3.0)
+        ]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        if self.of == "temperature":
+            return x * (1.0 + p["rate"] * (s.temperature - 25.0))
+        return x * (1.0 - p["rate"] * p["tau_t"] * np.expm1(-np.maximum(s.t, 0.0) / p["tau_t"]))
+
+
+@attrs.frozen(eq=False)
+class SupplySag(TorqueLaw):
+    """Gain or bound falls as the voltage, or as the joints' total power rises: by 1 - sag x, x = 1 - V / `full`, or W"""
+
+    name = "supply_sag"
+    signal = "power"
+    motion = "hard accelerations of all joints together, with the supply voltage logged"
+    of: str = "power"
+    what: str = "gain"
+    full: float = 1.0
+
+    @property
+    def stage(self) -> Stage:  # type: ignore[override]
+        return Stage.GAIN if self.what == "gain" else Stage.LIMIT
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+        sag = (
+            Parameter("sag", "1/W", 0.0, 0.5, 0.0005)
+            if self.of == "power"
+            else Parameter("sag", "1", 0.0, 20.0, 0.3)
+        )
+        return (sag,) if self.what == "gain" else (sag, Parameter("limit", "N m", 0.1, 500.0, 10.0))
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[SupplySag]:
+        voltage = about.signals.voltage
+        if voltage is not None and float(np.ptp(voltage)) > 0.01 * float(np.max(voltage)):
+            full = float(np.quantile(voltage, 0.99))
+            return tuple(cls("voltage", what, full) for what in ("gain", "bound"))
+        return tuple(cls("power", what) for what in ("gain", "bound"))
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        top = float(np.quantile(self._strain(s), 0.95)) + 1e-6
+        sags = [{"sag": share / top} for share in (0.05, 0.2, 0.5)]
+        if self.what == "gain":
+            return sags
+        return [
+            sag | {"limit": np.quantile(np.abs(torque), at, axis=0)} for sag in sags for at in (0.9, 0.97, 1.0)
+        ]
+
+    def _strain(self, s: View) -> Array:
+        strain: Array = s.power if self.of == "power" else 1.0 - s.voltage / self.full
+        return strain
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        left = np.maximum(1.0 - p["sag"] * self._strain(s), 0.0)
+        if self.what == "gain":
+            return x * left
+        return np.clip(x, -p["limit"] * left, p["limit"] * left)
+
+
+@attrs.frozen(eq=False)
+class CrossCoupling(AddedLaw):
+    """a times q, dq or tau of another joint: `source` names one for each joint, as in FR_thigh_joint/dq"""
+
+    name = "cross_coupling"
+    parameters = (Parameter("a", "N m per unit of the source", -100.0, 100.0, 0.05),)
+    linear = ("a",)
+    motion = "each joint moved alone while the others hold still"
+    source: tuple[str, ...] = ()
+    columns: tuple[tuple[str, int], ...] = ()
+
+    @property
+    def signal(self) -> str:  # type: ignore[override]
+        return self.source[0] if self.source else "dq"
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"source": list(self.source)}
+
+    @classmethod
+    def configured(cls, settings: Mapping[str, Any]) -> EffectLaw:
+        source = tuple(settings["source"])
+        return cls(source, tuple(cls._column(one, settings["all_joints"]) for one in source))
+
+    @staticmethod
+    def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:
+        joint, signal = source.split("/")
+        return ("measured" if signal == "tau" else signal), list(joints).index(joint)
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[CrossCoupling]:
+        """For each joint the other's signal that the residual goes with most, beside what the joint's own explain."""
+        joints = about.samples.joints
+        if len(joints) < 2:
+            return ()
+        names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
+        found = [names[k] for k in about.strongest_neighbour(("q", "dq", "measured"))]
+        return (cls(tuple(found), tuple(cls._column(one, joints) for one in found)),)
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return p["a"] * np.stack([getattr(s, name)[..., k] for name, k in self.columns], axis=-1)
+
+
+LAWS = (GainAsymmetry, ThermalDrift, SupplySag, CrossCoupling)

@@ -1,0 +1,268 @@
+"""The EAM with effects on it, over whole logs: what it predicts, and how it is fitted.
+
+All parameters are fitted together by damped least squares. A parameter is shared by the joints of a group; every joint
+keeps its own small Jacobian, and sharing is an index into the common unknowns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from ..effects import EffectLaw, MemoryLaw, Stage
+from .signals import Array, Bools, Samples, Signals
+
+Groups = NDArray[np.intp]
+
+_DAMPING = (1e-7, 1e-2, 1.0)
+_SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
+_GAIN_SLOPE = 0.01
+_SETTLED = 1e-5  # relative fall of the error below which a fit has converged
+
+
+@attrs.frozen(eq=False)
+class Applied:
+    """A law at work on some joints."""
+
+    law: EffectLaw
+    active: Bools  # (J,)
+    values: Array  # (P, J)
+    groups: Groups  # (J,), joints with the same number share the values
+
+    def part(self, values: Array) -> dict[str, Array]:
+        """Parameters by name; `values` (B, P, J) becomes (B, 1, J) each, or (J,) where the batch has one value."""
+        found = {}
+        for k, name in enumerate(self.law.names):
+            one = values[:, k]
+            found[name] = one[0] if len(one) == 1 or (one == one[0]).all() else one[:, None]
+        return found
+
+    def tidied(self) -> Applied:
+        """With parameters in their unique order."""
+        p = self.law.tidy(dict(zip(self.law.names, self.values, strict=True)))
+        return attrs.evolve(self, values=np.array([p[name] for name in self.law.names]))
+
+
+@attrs.frozen(eq=False)
+class Model:
+    """EAM parameters of each joint, (J,) or (2, J), and the effects on it."""
+
+    samples: Samples
+    window: float
+    gains: Array
+    gain_groups: Groups  # (2, J)
+    input_delay: Array
+    output_delay: Array
+    delay_groups: Groups  # (J,)
+    applied: tuple[Applied, ...] = ()
+
+    @property
+    def signals(self) -> Signals:
+        """The signals at this model's delays."""
+        return self.samples.at(self.input_delay, self.output_delay, self.window)
+
+    def predict(self) -> Array:
+        """Torque of every row, (N, J), N m."""
+        torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.applied])[0]
+        return torque
+
+    def residual(self, rows: Bools) -> Array:
+        """Measured minus predicted torque, (N, J), 0 outside `rows`."""
+        left: Array = np.where(rows, self.samples.tau - self.predict(), 0.0)
+        return left
+
+    def mse(self, rows: Bools) -> float:
+        """Mean squared error over `rows` (N, J)."""
+        left = self.residual(rows)
+        return float(np.sum(left * left) / max(int(rows.sum()), 1))
+
+    def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
+        """Torque (B, N, J) for a batch of gains (B, 2, J) and of each effect's values (B, P, J)."""
+        s = self.signals
+        todo = sorted(zip(self.applied, values, strict=True), key=lambda pair: pair[0].law.stage)
+        error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
+        for one, value in todo:
+            if one.law.stage == Stage.ERRORS:
+                error = _pair(one, error, s, one.part(value))
+        g = _lean(gains)
+        x = g[..., 0, :][..., None, :] * (s.kp * error[0]) + g[..., 1, :][..., None, :] * (s.kd * error[1]) + s.tau_ff
+        for one, value in todo:
+            if Stage.ERRORS < one.law.stage < Stage.ADDED:
+                law, p = one.law, one.part(value)
+                after = law.series(x, s, p) if isinstance(law, MemoryLaw) else law.torque(x, s, p)  # type: ignore[attr-defined]
+                x = _where(one.active, after, x)
+        total = x
+        for one, value in todo:
+            if one.law.stage == Stage.ADDED:
+                law, p = one.law, one.part(value)
+                extra = law.series(x, s, p) if isinstance(law, MemoryLaw) else law.torque(x, s, p)  # type: ignore[attr-defined]
+                total = total + (extra if one.active.all() else extra * one.active)
+        batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
+        return np.broadcast_to(total, (batch, *s.q.shape))
+
+    def with_delays(self, input_delay: Array, output_delay: Array) -> Model:
+        """The same model with other delays (J,)."""
+        return attrs.evolve(self, input_delay=input_delay, output_delay=output_delay)
+
+    def plus(self, applied: Applied) -> Model:
+        """With one more effect."""
+        return attrs.evolve(self, applied=(*self.applied, applied))
+
+    def without(self, index: int) -> Model:
+        """Without the effect of this index."""
+        return attrs.evolve(self, applied=tuple(one for k, one in enumerate(self.applied) if k != index))
+
+
+def _lean(batch: Array) -> Array:
+    """A batch of equal values as one."""
+    return batch[:1] if len(batch) > 1 and (batch == batch[0]).all() else batch
+
+
+def _where(active: Bools, new: Array, old: Array) -> Array:
+    return new if active.all() else np.where(active, new, old)
+
+
+def _pair(one: Applied, error: Any, s: Signals, p: dict[str, Array]) -> Any:
+    law = one.law
+    after = law.series(error, s, p) if isinstance(law, MemoryLaw) else law.errors(error, s, p)  # type: ignore[attr-defined]
+    return tuple(_where(one.active, new, old) for new, old in zip(after, error, strict=True))
+
+
+@attrs.frozen(eq=False)
+class Slots:
+    """The unknowns of a fit: slot a of joint j (gains first, then each effect's parameters) is unknown index[a, j]."""
+
+    index: Groups  # (A, J), -1: not fitted
+    low: Array  # (A, J)
+    high: Array
+    step: Array  # (A,)
+    count: int
+
+    @classmethod
+    def of(cls, model: Model) -> Slots:
+        """All parameters of the model."""
+        joints = model.gains.shape[1]
+        rows, low, high, step = [], [], [], []
+        count = 0
+
+        def add(groups: Groups, active: Bools, bounds: tuple[float, float], size: float) -> None:
+            nonlocal count
+            names = np.unique(groups[active])
+            found = np.where(active, count + np.searchsorted(names, groups), -1)
+            rows.append(found)
+            low.append(np.full(joints, bounds[0]))
+            high.append(np.full(joints, bounds[1]))
+            step.append(size)
+            count += len(names)
+
+        everywhere = np.ones(joints, dtype=bool)
+        for groups in model.gain_groups:
+            add(groups, everywhere, (-1e6, 1e6), _GAIN_SLOPE)
+        for one in model.applied:
+            for parameter in one.law.parameters:
+                add(one.groups, one.active, (parameter.low, parameter.high), _SLOPE * parameter.scale)
+        return cls(np.array(rows), np.array(low), np.array(high), np.array(step), count)
+
+
+def unpack(model: Model, theta: Array) -> tuple[Array, list[Array]]:
+    """Slots (B, A, J) as gains (B, 2, J) and values (B, P, J) of each effect."""
+    values, first = [], 2
+    for one in model.applied:
+        last = first + len(one.law.parameters)
+        values.append(theta[:, first:last])
+        first = last
+    return theta[:, :2], values
+
+
+def pack(model: Model) -> Array:
+    """All slots (A, J) of a model."""
+    return np.concatenate([model.gains, *(one.values for one in model.applied)])
+
+
+def with_slots(model: Model, theta: Array) -> Model:
+    """The model with the slots (A, J)."""
+    gains, values = unpack(model, theta[None])
+    applied = tuple(
+        attrs.evolve(one, values=value[0]) for one, value in zip(model.applied, values, strict=True)
+    )
+    return attrs.evolve(model, gains=gains[0], applied=applied)
+
+
+def jacobian(model: Model, slots: Slots) -> tuple[Array, Array]:
+    """Prediction (N, J) and its slopes (J, A, N) along every slot."""
+    theta = pack(model)
+    steps = np.where(theta + slots.step[:, None] > slots.high, -slots.step[:, None], slots.step[:, None])
+    batch = np.repeat(theta[None], len(theta) + 1, axis=0)
+    for a in range(len(theta)):
+        batch[a + 1, a] += steps[a]
+    torque = model.evaluate(*unpack(model, batch))
+    slopes = (torque[1:] - torque[0]) / steps[:, None, :]
+    return torque[0], np.ascontiguousarray(slopes.transpose(2, 0, 1))
+
+
+def gather(slots: Slots, local: Array) -> Array:
+    """Per-joint matrices (J, A, A) or vectors (J, A) summed into the common unknowns."""
+    fitted = slots.index.T >= 0
+    at = np.where(fitted, slots.index.T, 0)
+    if local.ndim == 2:
+        total = np.zeros(slots.count)
+        np.add.at(total, at, np.where(fitted, local, 0.0))
+        return total
+    square = np.zeros((slots.count, slots.count))
+    both = fitted[:, :, None] & fitted[:, None, :]
+    np.add.at(square, (at[:, :, None], at[:, None, :]), np.where(both, local, 0.0))
+    return square
+
+
+def fit(model: Model, rows: Bools, iterations: int = 5) -> Model:
+    """The model with gains and effects fitted to `rows` (N, J); the delays stay."""
+    slots = Slots.of(model)
+    error = np.inf
+    for _ in range(iterations):
+        predicted, slopes = jacobian(model, slots)
+        left = np.where(rows, model.samples.tau - predicted, 0.0)
+        error = float(np.sum(left * left))
+        slopes *= rows.T[:, None]
+        hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
+        gradient = gather(slots, np.einsum("jan,nj->ja", slopes, left))
+        theta = pack(model)
+        trials = np.stack([_step(slots, theta, hessian, gradient, damping) for damping in _DAMPING])
+        errors = _errors(model, trials, rows)
+        best = int(np.argmin(errors))
+        if not errors[best] < error:
+            break
+        model = with_slots(model, trials[best])
+        if errors[best] > error * (1.0 - _SETTLED):
+            break
+    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+
+
+def _errors(model: Model, theta: Array, rows: Bools) -> Array:
+    """Sum of squares of each of a batch of slots (B, A, J)."""
+    left = (model.evaluate(*unpack(model, theta)) - model.samples.tau) * rows
+    return np.einsum("bnj,bnj->b", left, left)
+
+
+def _step(slots: Slots, theta: Array, hessian: Array, gradient: Array, damping: float) -> Array:
+    """Slots (A, J) after one damped step; what would leave its bounds stays on them."""
+    held = np.zeros(slots.count, dtype=bool)
+    after = theta
+    for _ in range(2):
+        free = ~held
+        size = np.diagonal(hessian)[free]
+        matrix = hessian[np.ix_(free, free)] + np.diag(damping * size + 1e-12 * (1.0 + size.max(initial=0.0)))
+        change = np.zeros(slots.count)
+        change[free] = np.linalg.solve(matrix, gradient[free])
+        move = np.where(slots.index >= 0, change[slots.index], 0.0)
+        after = np.clip(theta + move, slots.low, slots.high)
+        stuck = (slots.index >= 0) & (after == theta) & (move != 0.0)
+        if not stuck.any():
+            break
+        held[slots.index[stuck]] = True
+    return after
+
+
