@@ -189,24 +189,25 @@ class WaitSet:
         self.guard = GuardCondition(participant.dds)
         self.dds._waitset_attach(self.dds._ref, self.guard._ref, 0)
         self.readers: dict[int, Reader] = {}
+        self.update({})
 
     def update(self, readers: dict[int, Reader]) -> None:
         """Wait for these readers from now on; the keys, all above 0, tell which have data."""
-        if readers.keys() == self.readers.keys():
-            return
         for key in self.readers.keys() - readers.keys():
             self.dds._waitset_detach(self.dds._ref, self.readers[key].condition._ref)
         for key in readers.keys() - self.readers.keys():
             self.dds._waitset_attach(self.dds._ref, readers[key].condition._ref, key)
         self.readers = readers
+        self._triggered = (ctypes.c_void_p * (len(readers) + 1))()
 
     def wait(self, timeout_ns: int) -> set[int]:
         """Keys of the readers that have data; empty after the time-out, a wake-up, or once this is closed."""
-        size = len(self.readers) + 1
-        triggered = (ctypes.c_void_p * size)()
-        count = self.dds._waitset_wait(self.dds._ref, triggered, size, timeout_ns)
-        self.guard._take_guardcondition(self.guard._ref, ctypes.byref(ctypes.c_bool()))
-        return {key for key in triggered[: max(count, 0)] if key}
+        triggered = self._triggered
+        count = self.dds._waitset_wait(self.dds._ref, triggered, len(triggered), timeout_ns)
+        keys = {key for key in triggered[: max(count, 0)] if key}
+        if len(keys) < count:
+            self.guard._take_guardcondition(self.guard._ref, ctypes.byref(ctypes.c_bool()))
+        return keys
 
     def wake(self) -> None:
         # Not `guard.set`, which complains if the participant has left.

@@ -92,10 +92,12 @@ def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def roll_pitch(quaternion: np.ndarray) -> np.ndarray:
     """Roll and pitch (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), (..., 4) -> (..., 2)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
-    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
-    return np.stack([roll, pitch], axis=-1)
+    q = np.asarray(quaternion)
+    w, x, y, z = (q[..., i] for i in range(4))
+    angles = np.empty((*q.shape[:-1], 2), np.result_type(q, np.float32))
+    angles[..., 0] = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    angles[..., 1] = np.arcsin(np.minimum(np.maximum(2 * (w * y - z * x), -1.0), 1.0))
+    return angles
 
 
 def yaw(quaternion: np.ndarray) -> np.ndarray:

@@ -53,6 +53,8 @@ class InputLayout:
     def __init__(self, terms: Sequence[InputTerm]) -> None:
         self.terms = tuple(terms)
         self.size = sum(term.size for term in self.terms)
+        self.names = tuple(term.name for term in self.terms)
+        """The names of the terms in their order."""
 
         def spread(values: Iterable[Any]) -> NDArray[np.float64]:
             return np.concatenate(
@@ -63,15 +65,13 @@ class InputLayout:
         self._scale = spread(t.scale for t in self.terms)
         self._clip = spread(np.inf if t.clip is None else t.clip for t in self.terms)
 
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The names of the terms in their order."""
-        return tuple(term.name for term in self.terms)
-
     def build(self, values: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
         """The input (..., size) from each term's value (..., term.size); all leading axes are the same."""
-        raw = np.concatenate([values[term.name] for term in self.terms], axis=-1)
-        return np.clip((raw - self._offset) * self._scale, -self._clip, self._clip).astype(np.float32)
+        built = np.concatenate([values[name] for name in self.names], axis=-1, dtype=np.float64)
+        built -= self._offset
+        built *= self._scale
+        np.maximum(built, -self._clip, out=built)
+        return np.minimum(built, self._clip, out=built).astype(np.float32)
 
     def to_metadata(self) -> list[dict[str, Any]]:
         """The list that a network file's metadata carries."""

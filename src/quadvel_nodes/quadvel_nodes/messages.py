@@ -6,7 +6,10 @@ every node reads what it receives through here.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Iterator, Mapping
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,17 @@ from numpy.typing import NDArray
 from quadvel_description.state import JointCommand, RobotState
 
 QUATERNION_TOLERANCE = 0.05
+LOW_STATE = {
+    "q": 12,
+    "dq": 12,
+    "tau": 12,
+    "orientation_wxyz": 4,
+    "angular_velocity": 3,
+    "linear_acceleration": 3,
+    "foot_force": 4,
+}
+LOW_CMD = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), 12)
+"""The fields of these messages that hold numbers, and how many."""
 
 
 class MessageError(ValueError):
@@ -36,22 +50,35 @@ def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
     return value
 
 
+def _all_numbers(message: Any, sizes: Mapping[str, int]) -> Iterator[NDArray[np.float64]]:
+    """`numbers` of several fields, which are checked in one piece: the control loop does this every tick."""
+    values = [getattr(message, field) for field in sizes]
+    block = np.concatenate(values, dtype=np.float64)
+    if list(map(len, values)) != list(sizes.values()) or not np.isfinite(block).all():
+        for field, size in sizes.items():
+            numbers(message, field, size)
+    ends = accumulate(sizes.values())
+    return (block[end - size : end] for size, end in zip(sizes.values(), ends, strict=True))
+
+
 def read_low_state(message: Any) -> RobotState:
     """LowState to RobotState, the quaternion normalised. Raises MessageError."""
-    quaternion = numbers(message, "orientation_wxyz", 4)
-    norm = float(np.sqrt(quaternion @ quaternion))
+    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _all_numbers(
+        message, LOW_STATE
+    )
+    norm = math.hypot(*quaternion.tolist())
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise MessageError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
     return RobotState(
         time=seconds(message.stamp),
         tick=message.tick,
-        q=numbers(message, "q", 12),
-        dq=numbers(message, "dq", 12),
-        tau=numbers(message, "tau", 12),
+        q=q,
+        dq=dq,
+        tau=tau,
         quaternion=quaternion / norm,
-        angular_velocity=numbers(message, "angular_velocity", 3),
-        linear_acceleration=numbers(message, "linear_acceleration", 3),
-        foot_force=numbers(message, "foot_force", 4),
+        angular_velocity=angular_velocity,
+        linear_acceleration=linear_acceleration,
+        foot_force=foot_force,
     )
 
 
@@ -65,15 +92,15 @@ def write_low_state(state: RobotState, message: Any) -> None:
 
 def read_low_cmd(message: Any) -> JointCommand:
     """LowCmd to JointCommand. Raises MessageError."""
-    fields = {field: numbers(message, field, 12) for field in ("q", "dq", "tau", "kp", "kd")}
-    return JointCommand(**fields, mode=message.mode, tick=message.tick)
+    fields = zip(LOW_CMD, _all_numbers(message, LOW_CMD), strict=True)
+    return JointCommand(**dict(fields), mode=message.mode, tick=message.tick)
 
 
 def write_low_cmd(command: JointCommand, message: Any) -> None:
     """Fill a LowCmd; its stamp is the caller's matter."""
     message.mode = command.mode
     message.tick = command.tick
-    for field in ("q", "dq", "tau", "kp", "kd"):
+    for field in LOW_CMD:
         setattr(message, field, np.asarray(getattr(command, field), np.float32))
 
 

@@ -28,10 +28,11 @@ class Histogram:
 
     def percentile(self, percent: float) -> float:
         """In s, within 1 %; nan before the first `add`."""
-        cumulated = np.cumsum(self._counts)
-        if not cumulated[-1]:
+        cumulated = self._counts.cumsum()
+        total = int(cumulated[-1])
+        if not total:
             return math.nan
-        bin = int(np.searchsorted(cumulated, math.ceil(percent / 100.0 * cumulated[-1])))
+        bin = int(cumulated.searchsorted(math.ceil(percent / 100.0 * total)))
         return self._SHORTEST * math.exp((bin + 0.5) * self._WIDTH)
 
 
@@ -52,17 +53,18 @@ class LoopStats:
 
     def __init__(self) -> None:
         self._period, self._inference, self._compute = Histogram(), Histogram(), Histogram()
-        self._starts: deque[float] = deque()
+        self._starts: deque[float] = deque()  # of the last second
+        self._last = math.nan
         self.overruns = 0
         self.in_a_row = 0
 
     def add(self, start: float, compute: float, inference: float, missed: int) -> None:
         """One tick: start on a steady clock, what it and the network alone took (s), deadlines missed."""
-        if self._starts:
-            self._period.add(start - self._starts[-1])
+        if not math.isnan(self._last):
+            self._period.add(start - self._last)
+        self._last = start
         self._starts.append(start)
-        while self._starts[0] <= start - 1.0:
-            self._starts.popleft()
+        self._forget_until(start - 1.0)
         self._compute.add(compute)
         if not math.isnan(inference):
             self._inference.add(inference)
@@ -71,11 +73,16 @@ class LoopStats:
 
     def summary(self, now: float) -> LoopSummary:
         """Rate over the second before `now` (the clock of `add`); the rest since the start."""
+        self._forget_until(now - 1.0)
         return LoopSummary(
-            rate_hz=float(sum(start > now - 1.0 for start in self._starts)),
+            rate_hz=float(len(self._starts)),
             period_p99_ms=1e3 * self._period.percentile(99),
             inference_p50_us=1e6 * self._inference.percentile(50),
             compute_p50_us=1e6 * self._compute.percentile(50),
             compute_p99_us=1e6 * self._compute.percentile(99),
             overruns=self.overruns,
         )
+
+    def _forget_until(self, start: float) -> None:
+        while self._starts and self._starts[0] <= start:
+            self._starts.popleft()

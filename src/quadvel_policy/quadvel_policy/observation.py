@@ -308,4 +308,5 @@ class ActionMap:
         if self.clip is not None:
             action = np.clip(action, *self.clip)
         targets: NDArray[np.float64] = self.offset + self.scale * np.asarray(action)
-        return np.clip(targets, COMMAND_LOWER, COMMAND_UPPER, out=targets)
+        np.maximum(targets, COMMAND_LOWER, out=targets)
+        return np.minimum(targets, COMMAND_UPPER, out=targets)

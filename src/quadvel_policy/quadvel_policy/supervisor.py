@@ -77,7 +77,12 @@ class Supervisor:
     def __init__(self, policy: Policy, config: SupervisorConfig = SupervisorConfig()) -> None:
         self.config = c = config
         nominal = np.array(policy.metadata.nominal_q)
-        self._low, self._high = policy.metadata.command_bounds
+        # The last number is stance, which is 0 wherever a velocity counts.
+        self._low, self._high = np.pad(policy.metadata.command_bounds, ((0, 0), (0, 1)))
+        low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
+        speed, any_number = np.full(12, c.max_joint_speed), np.full(7, np.finfo(float).max)
+        self._middle = np.concatenate((0.5 * (low + high), np.zeros(19)))
+        self._reach = np.concatenate((0.5 * (high - low), speed, any_number))
         self._walk = Walk(policy, c.blend_time)
         self._stance = Posture([(c.settle_time, nominal)], c.stand_kp, c.stand_kd)
         self._stand_up = Posture([(c.fold_time, LIE_Q), (c.rise_time, nominal)], c.stand_kp, c.stand_kd)
@@ -169,7 +174,8 @@ class Supervisor:
             return JointCommand.damping(self.config.damping_kd)
         if self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
-        np.clip(answer.q, COMMAND_LOWER, COMMAND_UPPER, out=answer.q)
+        np.maximum(answer.q, COMMAND_LOWER, out=answer.q)
+        np.minimum(answer.q, COMMAND_UPPER, out=answer.q)
         return answer
 
     def _seen(self, state: RobotState, velocity: Array | None) -> Tick:
@@ -181,7 +187,8 @@ class Supervisor:
         asked = np.asarray(command, float)
         if not self.walk_allowed or not np.isfinite(asked).all() or asked[3] >= 0.5:
             return STILL.copy()
-        return np.append(np.clip(asked[:3], self._low, self._high), 0.0)
+        limited: Array = np.minimum(np.maximum(asked, self._low), self._high)
+        return limited
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
@@ -201,9 +208,9 @@ class Supervisor:
     def _problems(self, seen: Tick, gap: float = 0.0) -> Iterator[str]:
         """Every reason to go to damping, as sentences. gap: s since the state before."""
         c, state = self.config, seen.state
-        for name in ("q", "dq", "quaternion", "angular_velocity"):
-            if not np.isfinite(getattr(state, name)).all():
-                yield f"the state's {name} is not finite"
+        sound = self._is_sound(state)
+        if not sound:
+            yield from self._not_finite(state)
         if self._age > c.max_state_age:
             yield f"the state is {1e3 * self._age:.0f} ms old, limit {1e3 * c.max_state_age:.0f} ms"
         if gap < 0.0:
@@ -211,11 +218,22 @@ class Supervisor:
         if gap > c.max_state_age:
             yield f"no state came for {1e3 * gap:.0f} ms, limit {1e3 * c.max_state_age:.0f} ms"
         yield from self._attitude_problems(state.quaternion)
-        yield from self._joint_problems(state)
+        if not sound:
+            yield from self._joint_problems(state)
         if self.mode == "walk" and seen.velocity is None:
             yield "there is no fresh velocity estimate"
         if seen.velocity is not None and not np.isfinite(seen.velocity).all():
             yield "the velocity estimate is not finite"
+
+    def _is_sound(self, state: RobotState) -> bool:
+        """Whether every number is finite and every joint within its limits: all in one look, as it mostly is."""
+        numbers = np.concatenate((state.q, state.dq, state.quaternion, state.angular_velocity))
+        return bool((np.abs(numbers - self._middle) <= self._reach).all())
+
+    def _not_finite(self, state: RobotState) -> Iterator[str]:
+        for name in ("q", "dq", "quaternion", "angular_velocity"):
+            if not np.isfinite(getattr(state, name)).all():
+                yield f"the state's {name} is not finite"
 
     def _attitude_problems(self, quaternion: Array) -> Iterator[str]:
         w, x, y, z = quaternion.tolist()

@@ -38,6 +38,10 @@ class Executor:
         self._ready: deque[Any] = deque()  # entities that had data or were due after the last wait
         self._lock = RLock()
         self._waitset: wire.WaitSet | None = None
+        # What the wait set waits for, looked up again once something changed.
+        self._timers: list[Timer] = []
+        self._waiting: dict[int, Any] = {}
+        self._has_changed = True
         self._is_shutdown = False
         self._context._wakers.add(self)
 
@@ -73,6 +77,7 @@ class Executor:
     def wake(self) -> None:
         """End the current wait, because something changed."""
         with self._lock:
+            self._has_changed = True
             if self._waitset is not None:
                 self._waitset.wake()
 
@@ -142,20 +147,30 @@ class Executor:
             if self._waitset is None:
                 self._waitset = wire.WaitSet(self._context.participant)
             waitset = self._waitset
-            entities = [e for node in self._nodes for e in node._entities() if self.can_execute(e)]
-        timers = [entity for entity in entities if isinstance(entity, Timer)]
-        waiting = {id(entity._reader): entity for entity in entities if not isinstance(entity, Timer)}
-        waitset.update({key: entity._reader for key, entity in waiting.items()})
+            if self._has_changed:
+                self._look_up(waitset)
+            timers, waiting = self._timers, self._waiting
         wakes = [timer._wake_ns() for timer in timers if not timer.is_canceled()]
         wake_ns = min([deadline_ns, *(wake for wake in wakes if wake is not None)])
         keys = waitset.wait(max(0, wake_ns - time.monotonic_ns()) if wake_ns < FOREVER else FOREVER)
         self._ready.extend(timer for timer in timers if timer.is_ready())
-        self._ready.extend(entity for key, entity in waiting.items() if key in keys)
+        if keys:
+            self._ready.extend(entity for key, entity in waiting.items() if key in keys)
+
+    def _look_up(self, waitset: wire.WaitSet) -> None:
+        """What may be executed now; where a group is busy, this is to be asked again."""
+        entities = [entity for node in self._nodes for entity in node._entities()]
+        free = [entity for entity in entities if self.can_execute(entity)]
+        self._has_changed = len(free) < len(entities)
+        self._timers = [entity for entity in free if isinstance(entity, Timer)]
+        self._waiting = {id(entity._reader): entity for entity in free if not isinstance(entity, Timer)}
+        waitset.update({key: entity._reader for key, entity in self._waiting.items()})
 
     def _claim(self, entity: Any) -> Work | None:
         """Take what is ready of an entity, if its callback group is free."""
         group = entity.callback_group
         if not group.beginning_execution(entity):
+            self._has_changed = True
             return None
         callback = entity._take()
         if callback is None:
