@@ -148,6 +148,12 @@ def demo(context: typer.Context) -> None:
     _hand_on(context, "quadvel_bringup.demo:demo_command")
 
 
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def excite(context: typer.Context) -> None:
+    """Move the joints so that they show what they are, and record it for `quadvel identify`."""
+    _hand_on(context, "quadvel_bringup.excite:excite_command")
+
+
 @app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)
 def evaluate(context: typer.Context) -> None:
     """Measure how well a policy tracks a grid of commands, faster than real time."""

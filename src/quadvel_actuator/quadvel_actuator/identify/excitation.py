@@ -95,22 +95,21 @@ class Sweep(Excitation):
 
 @attrs.frozen
 class Chirp(Excitation):
-    """All joints swing at once, each with a phase of its own, from slow to fast: lags, delays and inertias differ."""
+    """All joints swing at once, each at its own pace, from slow to fast: lags, delays and inertias differ."""
 
     hung: ClassVar[bool] = True
     seconds: float = _seconds(20.0)
     frequencies: tuple[float, float] = (0.3, 20.0)  # Hz
     amplitude: float = 0.35  # rad, less where the speed limit asks for it
-    seed: int = 0
 
     def _motion(self, t: Array) -> Array:
         low, high = self.frequencies
         growth = np.log(high / low) / self.seconds
-        frequency = low * np.exp(growth * t)
-        angle = 2 * np.pi * np.cumsum(frequency) * PERIOD
-        phase = np.random.default_rng(self.seed).uniform(0.0, 2 * np.pi, 12)
-        fastest = 0.5 * robot.VELOCITY_LIMIT / (2 * np.pi * frequency[:, None])
-        swing = np.minimum(self.amplitude, fastest) * np.sin(angle[:, None] + phase)
+        frequency = low * np.exp(growth * t)[:, None] * np.linspace(0.75, 1.25, 12)
+        fastest = 0.5 * robot.VELOCITY_LIMIT / (2 * np.pi * frequency)
+        swing = np.minimum(self.amplitude, fastest) * np.sin(
+            2 * np.pi * np.cumsum(frequency, axis=0) * PERIOD
+        )
         return robot.NOMINAL_Q + _eased(t) * swing
 
 

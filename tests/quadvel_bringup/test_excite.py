@@ -1,0 +1,128 @@
+"""Playing a motion on a robot: what it is sent, when that ends, and what is recorded of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quadvel_actuator.identify.excitation import FootLifting
+from quadvel_actuator.identify.log import read_log
+from quadvel_bringup.excite import RAMP, MotionError, Player
+from quadvel_description import robot
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
+
+PROGRAM = """
+import typer
+from quadvel_bringup.excite import excite_command
+app = typer.Typer(pretty_exceptions_enable=False)
+app.command()(excite_command)
+app()
+"""
+
+
+def state(seconds: float, q: np.ndarray = robot.LIE_Q, tilt: float = 0.0) -> RobotState:
+    quaternion = np.array([np.cos(tilt / 2), np.sin(tilt / 2), 0.0, 0.0])
+    rest = np.zeros(12)
+    return RobotState(
+        5.0 + seconds,
+        5000 + round(1e3 * seconds),
+        np.array(q),
+        rest,
+        rest,
+        quaternion,
+        rest[:3],
+        rest[:3],
+        rest[:4],
+    )
+
+
+def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
+    excitation = FootLifting(seconds=1.0)
+    player, targets = Player(excitation), excitation.targets()
+    first = player.answer(state(0.0))
+    np.testing.assert_allclose(first.q, robot.LIE_Q)
+    assert (first.mode, first.tick) == (MODE_SERVO, 5000)
+    near = robot.NOMINAL_Q
+    np.testing.assert_allclose(player.answer(state(RAMP, near)).q, targets[0], atol=1e-9)
+    np.testing.assert_allclose(player.answer(state(RAMP + 0.25, near)).q, targets[250], atol=1e-9)
+    assert not player.done
+    assert player.answer(state(RAMP + 1.0, near)).mode == MODE_DAMPING
+    assert player.done
+
+
+def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
+    player = Player(FootLifting())
+    player.answer(state(0.0))
+    asked = robot.KP * (player.answer(state(RAMP)).q - robot.LIE_Q)
+    assert (np.abs(asked) <= robot.TORQUE_LIMIT).all()
+
+
+def test_a_robot_that_tips_over_or_leaves_its_range_ends_the_motion() -> None:
+    with pytest.raises(MotionError, match=r"the trunk tilts by 0\.90 rad"):
+        Player(FootLifting()).answer(state(0.0, tilt=0.9))
+    q = robot.NOMINAL_Q.copy()
+    q[5] = robot.UPPER[5] + 0.2
+    with pytest.raises(MotionError, match=r"FL_calf_joint is 0\.20 rad beyond its range"):
+        Player(FootLifting()).answer(state(0.0, q))
+
+
+def excite(*arguments: object) -> list[str]:
+    return [sys.executable, "-c", PROGRAM, *map(str, arguments)]
+
+
+def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path, domain_id: int) -> None:
+    file = tmp_path / "solo.mcap"
+    ended = subprocess.run(
+        excite("solo", "--seconds", 0.6, "--out", file), capture_output=True, text=True, timeout=240
+    )
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    log = read_log(file)
+    np.testing.assert_allclose(np.diff(log.t), 0.001, atol=1e-9)
+    np.testing.assert_allclose(np.diff(log.t_cmd), 0.001, atol=1e-9)
+    assert log.t[-1] - log.t[0] >= RAMP + 0.6 - 0.002
+    assert log.kp is not None
+    assert (log.kp == robot.KP).all()
+    swing = np.ptp(log.q[round(1e3 * RAMP) :], axis=0)
+    assert swing.max() > 0.02
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["solo.mcap"]
+
+
+def test_ctrl_c_ends_it_and_leaves_no_file(tmp_path: Path, domain_id: int) -> None:
+    running = subprocess.Popen(excite("sweep", "--seconds", 600, "--out", tmp_path / "x.mcap"))
+    until = time.monotonic() + 120.0
+    while not list(tmp_path.glob(".x*")):
+        assert time.monotonic() < until, "it did not begin"
+        time.sleep(0.05)
+    time.sleep(0.5)
+    running.send_signal(signal.SIGINT)
+    running.send_signal(signal.SIGINT)
+    assert running.wait(60) == 130
+    assert os.listdir(tmp_path) == []
+
+
+def test_no_recording_is_written_over(tmp_path: Path) -> None:
+    file = tmp_path / "lift.mcap"
+    file.write_text("measured once")
+    ended = subprocess.run(excite("foot-lifting", "--out", file), capture_output=True, text=True)
+    assert ended.returncode != 0
+    assert f"{file} exists already" in ended.stderr
+    assert file.read_text() == "measured once"
+
+
+def test_after_a_report_it_says_what_to_record_next(tmp_path: Path) -> None:
+    report = {
+        "effects": [{"name": "coulomb_friction", "indistinguishable": ["stribeck_friction"]}],
+        "unexplained": {"verdict": "white", "depends_on": []},
+    }
+    (tmp_path / "report.json").write_text(json.dumps(report))
+    ended = subprocess.run(excite("--after", tmp_path / "report.json"), capture_output=True, text=True)
+    assert ended.returncode == 0, ended.stderr
+    assert "quadvel excite creep --seconds 40\n  for coulomb_friction, stribeck_friction" in ended.stdout
