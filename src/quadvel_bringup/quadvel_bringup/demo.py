@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -99,6 +99,7 @@ class _Run:
         """Run the script to its end; what went wrong, or "". Ctrl-C ends it with a typer.Exit."""
         quadvel_dds.install()
         import rclpy
+        from rclpy.executors import SingleThreadedExecutor
         from rclpy.parameter import Parameter
         from rclpy.signals import SignalHandlerOptions
         from std_msgs.msg import String
@@ -108,13 +109,16 @@ class _Run:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         use_sim_time = Parameter("use_sim_time", value=self._stack.use_sim_time)
         node = rclpy.create_node("demo", parameter_overrides=[use_sim_time])
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
         try:
             node.create_subscription(String, "planner/step", self._on_step, 10)
             with StopSignals() as signals, Recorder(node, self._recording) as recorder, self._bar:
                 for topic, kind in RECORDED.items():
                     recorder.record(topic, kind)
                 with ProcessGroup(self._say) as group:
-                    problem = self._spin(rclpy, node, group, signals)
+                    self._start(group)
+                    problem = self._wait(group, signals, lambda: recorder.serve(executor, LOOK))
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
@@ -122,18 +126,18 @@ class _Run:
             raise typer.Exit(128 + signals.received)
         return problem
 
-    def _spin(self, rclpy: Any, node: Any, group: ProcessGroup, signals: StopSignals) -> str:
-        """Start the nodes and record until one of them ends: the planner, if all goes well."""
+    def _start(self, group: ProcessGroup) -> None:
         for name, arguments in self._stack.arguments().items():
             group.start(name, command(name, arguments))
         planner = {"script": self._script, "use_sim_time": str(self._stack.use_sim_time).lower()}
         arguments = [word for name, value in planner.items() for word in ("-p", f"{name}:={value}")]
         group.start("planner", command("planner", ["--ros-args", *arguments]))
+
+    def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
+        """Record until one of the nodes ends: the planner, if all goes well."""
         ended: dict[str, int] = {}
         while not ended and not signals.received:
-            until = time.monotonic() + LOOK
-            while (left := until - time.monotonic()) > 0.0:
-                rclpy.spin_once(node, timeout_sec=left)
+            record()
             ended = group.ended()
         if ended == {"planner": 0}:
             self._bar.update(self._task, completed=len(self._steps), description="done")

@@ -26,6 +26,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     path.parent.mkdir(parents=True, exist_ok=True)
     quadvel_dds.install()
     import rclpy
+    from rclpy.executors import SingleThreadedExecutor
     from rclpy.signals import SignalHandlerOptions
 
     from .recorder import Recorder
@@ -33,17 +34,16 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     console = Console(stderr=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("recorder")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
     wanted = [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
-    started = looked = time.monotonic()
+    ends = float("inf") if seconds is None else time.monotonic() + seconds
     with StopSignals() as signals, console.status("recording; Ctrl-C stops") as status:
         with Recorder(node, path) as recorder:
-            recorder.record_all(wanted)
-            while not signals.received and (seconds is None or time.monotonic() - started < seconds):
-                rclpy.spin_once(node, timeout_sec=0.05)
-                if time.monotonic() - looked > LOOK:
-                    looked = time.monotonic()
-                    recorder.record_all(wanted)
-                    status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
+            while not signals.received and (left := ends - time.monotonic()) > 0.0:
+                recorder.record_all(wanted)
+                recorder.serve(executor, min(LOOK, left))
+                status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
         node.destroy_node()
         rclpy.try_shutdown()
     for topic in wanted:

@@ -5,6 +5,7 @@ Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 
 from __future__ import annotations
 
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from importlib import import_module
@@ -13,6 +14,7 @@ from types import TracebackType
 from typing import Any
 
 from mcap.writer import CompressionType, Writer
+from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
@@ -24,6 +26,7 @@ LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = ("/tf_static", "/robot_description")
 """Topics that are published once and kept for those who come later."""
 HIDDEN = ("/parameter_events", "/rosout")
+BATCH = 0.05  # s
 
 
 class Recorder:
@@ -70,6 +73,20 @@ class Recorder:
             except ValueError as error:
                 self._unknown.add(topic)
                 self._node.get_logger().warning(f"not recorded: {error}")
+
+    def serve(self, executor: Executor, seconds: float) -> None:
+        """Let the executor of our node write for so long what comes.
+
+        It looks once in BATCH, for all that waits: waking for each message would take from the processes that
+        are recorded several times what writing does.
+        """
+        until = time.monotonic() + seconds
+        while (left := until - time.monotonic()) > 0.0:
+            time.sleep(min(left, BATCH))
+            written = -1
+            while self.counts.total() > written:
+                written = self.counts.total()
+                executor.spin_once(timeout_sec=0.0)
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""
