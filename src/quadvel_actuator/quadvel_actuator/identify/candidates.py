@@ -1,0 +1,273 @@
+"""One candidate effect: where to start from, the joint fit with gains and delays, and the joints that it acts on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ..effects import EffectLaw
+from ..effects.commands import MOST
+from .eam import LONGEST_INPUT, LONGEST_OUTPUT
+from .model import Applied, Model, fit
+from .signals import Array, Bools
+
+BLOCK = 0.1  # s: differences of errors are summed over so long before they count as independent
+_BATCH = 12  # guesses evaluated at once
+_DELAY_MOVES = ((0.0, 0.0), (0.0, -0.001), (0.0, -0.002), (0.0, -0.004), (-0.002, 0.0), (-0.004, 0.0), (0.002, -0.002))
+_JOINT_LEVEL = 0.01  # p-value below which a joint counts as acted on
+
+
+@attrs.frozen(eq=False)
+class Judge:
+    """Rows to fit and rows to judge by, (N, J), and which rows count together."""
+
+    fit: Bools
+    judge: Bools
+    blocks: NDArray[np.intp]  # (N,), rows of the same number lie in the same BLOCK of the same log
+    count: int
+
+    @classmethod
+    def of(cls, samples: object, fit_rows: Bools, judge_rows: Bools) -> Judge:
+        """Blocks of consecutive rows of `samples` (`Samples`)."""
+        at = np.floor(samples.t / BLOCK).astype(int) + 10**7 * samples.log_of_row  # type: ignore[attr-defined]
+        names, blocks = np.unique(at, return_inverse=True)
+        return cls(fit_rows, judge_rows, blocks, len(names))
+
+    def gains(self, before: Array, after: Array) -> tuple[Array, Array]:
+        """Fall of the squared error (N, J): its sum in each block (count, J), and the rows it stands for."""
+        fall = np.where(self.judge, before**2 - after**2, 0.0)
+        sums = np.zeros((self.count, fall.shape[1]))
+        rows = np.zeros_like(sums)
+        np.add.at(sums, self.blocks, fall)
+        np.add.at(rows, self.blocks, self.judge)
+        return sums, rows
+
+
+def p_value(sums: Array, rows: Array) -> float:
+    """Is the mean fall above zero? One-sided, blocks being the units; 1 where there is nothing to go by."""
+    used = rows > 0
+    values = sums[used]
+    if len(values) < 4 or not np.any(values):
+        return 1.0
+    spread = float(np.std(values, ddof=1))
+    if spread == 0.0:
+        return 1.0 if values.mean() <= 0.0 else 0.0
+    return float(stats.t.sf(values.mean() / spread * np.sqrt(len(values)), len(values) - 1))
+
+
+@attrs.frozen(eq=False)
+class Candidate:
+    """A law fitted on top of a model, and what that is worth on the rows that judge."""
+
+    law: EffectLaw
+    model: Model
+    residual: Array  # (N, J)
+    gain: float  # mean fall of the squared error over all judged rows, N^2 m^2
+    p: float
+    joint_gain: Array  # (J,) mean fall over the joint's own rows
+
+    @property
+    def name(self) -> str:
+        return self.law.name
+
+    @property
+    def joints(self) -> Bools:
+        return self.model.applied[-1].active
+
+
+class About:
+    """What a law may ask of the model that it is to be added to."""
+
+    def __init__(self, model: Model, judge: Judge, noise: Array) -> None:
+        self.model, self.judge, self.noise = model, judge, noise
+        self.samples, self.signals = model.samples, model.signals
+        self.torque = model.predict()
+        self.residual = np.where(judge.fit | judge.judge, self.samples.tau - self.torque, 0.0)
+        self.fitted = np.where(judge.fit, self.residual, 0.0)
+
+    def strongest_neighbour(self, names: Sequence[str]) -> NDArray[np.intp]:
+        """For each joint the index (over names, then joints) of another joint's signal that its residual goes with.
+
+        What the joint's own signals explain linearly is taken out first.
+        """
+        s, joints = self.signals, len(self.samples.joints)
+        others = np.concatenate([getattr(s, name) for name in names], axis=1)
+        found = np.zeros(joints, dtype=np.intp)
+        for j in range(joints):
+            keep = self.judge.fit[:, j]
+            own = np.column_stack([np.ones(keep.sum()), s.q[keep, j], s.dq[keep, j], s.q_des[keep, j]])
+            basis, _ = np.linalg.qr(own)
+            left = others[keep] - basis @ (basis.T @ others[keep])
+            r = self.fitted[keep, j]
+            score = (left.T @ r) ** 2 / (np.einsum("nk,nk->k", left, left) + 1e-12)
+            score[j::joints] = -1.0
+            found[j] = int(np.argmax(score))
+        return found
+
+    def lost_commands(self, most: int = MOST) -> list[NDArray[np.intp]]:
+        """By how many commands the drive seems to lag, (N, 1) for all joints together; none where nothing is lost."""
+        return []
+
+
+def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candidate | None:
+    """The law fitted to all joints, and then to those that it acts on; None where it cannot start."""
+    model, judge = about.model, about.judge
+    grown = _started(about, law)
+    if grown is None:
+        return None
+    joints = np.arange(len(model.samples.joints))
+    grown = fit(grown, judge.fit, 4)
+    if law.shifts:
+        grown = moved(grown, judge.fit, (0.001, 0.0004))
+    everywhere = _judged(about, law, grown)
+    chosen = _acted_on(about, everywhere)
+    if chosen.all() or not chosen.any():
+        return everywhere
+    some = attrs.evolve(grown.applied[-1], active=chosen, groups=joints)
+    back = attrs.evolve(grown, applied=(*grown.applied[:-1], some))
+    if law.shifts:  # the delays that the effect moved belong to the joints without it, too
+        back = back.with_delays(model.input_delay, model.output_delay)
+    back = fit(back, judge.fit, 4)
+    if law.shifts:
+        back = moved(back, judge.fit, (0.001, 0.0004))
+    few = _judged(about, law, back)
+    return few if few.gain >= 0.95 * everywhere.gain else everywhere
+
+
+def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
+    residual = about.samples.tau - model.predict()
+    sums, rows = about.judge.gains(about.residual, residual)
+    joint_gain = sums.sum(axis=0) / np.maximum(rows.sum(axis=0), 1)
+    p = min(p_value(sums, rows), 1.0)
+    alone = min(p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1]))
+    p = min(p, alone * sums.shape[1])
+    return Candidate(law, model, residual, float(sums.sum() / max(rows.sum(), 1)), p, joint_gain)
+
+
+def _acted_on(about: About, candidate: Candidate) -> Bools:
+    """The joints whose own rows show the effect."""
+    sums, rows = about.judge.gains(about.residual, candidate.residual)
+    p = np.array([p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1])])
+    worth = candidate.joint_gain > 0.02 * about.noise
+    return (p < _JOINT_LEVEL) & worth
+
+
+def _started(about: About, law: EffectLaw) -> Model | None:
+    """The model with the law at the best of its starts, chosen for each joint on its own."""
+    model, rows = about.model, about.judge.fit
+    starts = law.starts(about.signals, about.torque, about.fitted)
+    if not starts:
+        return None
+    joints = len(model.samples.joints)
+    table = np.array(
+        [
+            [
+                np.broadcast_to(start.get(parameter.name, parameter.scale), joints).clip(parameter.low, parameter.high)
+                for parameter in law.parameters
+            ]
+            for start in starts
+        ]
+    )  # (starts, P, J)
+    empty = Applied(law, np.ones(joints, dtype=bool), table[0], np.arange(joints))
+    best: tuple[float, Model] | None = None
+    for move in _DELAY_MOVES if law.shifts else _DELAY_MOVES[:1]:
+        at = _shifted(model, *move)
+        if at is None:
+            continue
+        values, error = _screen(at.plus(empty), table, rows)
+        if best is None or error < best[0] * 0.999:
+            best = error, at.plus(attrs.evolve(empty, values=values))
+    assert best is not None
+    return best[1]
+
+
+def _shifted(model: Model, by_input: float, by_output: float) -> Model | None:
+    input_delay, output_delay = model.input_delay + by_input, model.output_delay + by_output
+    if (input_delay < -1e-9).any() or (output_delay < -1e-9).any():
+        return None
+    return model.with_delays(np.clip(input_delay, 0.0, None), np.clip(output_delay, 0.0, None))
+
+
+def _screen(model: Model, table: Array, rows: Bools) -> tuple[Array, float]:
+    """The values (P, J) of each joint's best start, gains and linear parameters free, and the error then."""
+    law = model.applied[-1].law
+    others = model.applied[:-1]
+    linear = [law.names.index(name) for name in getattr(law, "linear", ())]
+    kinds = [table.copy()]
+    for one in linear:
+        kinds[0][:, one] = 0.0
+    for one in linear:
+        unit = kinds[0].copy()
+        unit[:, one] = 1.0
+        kinds.append(unit)
+    if linear:
+        at_zero = model.evaluate(model.gains[None], [*(o.values[None] for o in others), kinds[0][:1]])
+    errors, found = [], []
+    for first in range(0, len(table), _BATCH):
+        part = slice(first, min(first + _BATCH, len(table)))
+
+        def run(values: Array, gains: Array = model.gains) -> Array:
+            every = np.repeat(gains[None], len(values), axis=0)
+            return model.evaluate(every, [*(np.repeat(o.values[None], len(values), axis=0) for o in others), values])
+
+        base = at_zero if linear else run(kinds[0][part])
+        columns = [run(kind[part]) - base for kind in kinds[1:]]
+        origin = kinds[0][:1] if linear else kinds[0][part]
+        for g in range(2):
+            gains = model.gains.copy()
+            gains[g] += 0.01
+            columns.append((run(origin, gains) - base) * 100.0)
+        error, solution = _regress(model.samples.tau - base, columns, rows)
+        errors.append(error)
+        found.append(solution)
+    error, solution = np.concatenate(errors), np.concatenate(found)
+    best = np.argmin(error, axis=0)
+    joint = np.arange(table.shape[2])
+    values = table[best, :, joint].T.copy()
+    for k, one in enumerate(linear):
+        values[one] = np.clip(solution[best, joint, k], law.parameters[one].low, law.parameters[one].high)
+    return values, float(error[best, joint].sum())
+
+
+def _regress(y: Array, columns: list[Array], rows: Bools) -> tuple[Array, Array]:
+    """Least squares of y (B or 1, N, J) on columns: sum of squares (B, J) and solution (B, J, K)."""
+    count = max(len(y), *(len(one) for one in columns))
+    shape = (count, *rows.shape)
+    wide = np.stack([np.broadcast_to(one, shape) for one in columns])  # (K, B, N, J)
+    wide = np.ascontiguousarray(wide.transpose(1, 3, 0, 2)) * rows.T[None, :, None]  # (B, J, K, N)
+    target = np.broadcast_to(y * rows, shape).transpose(0, 2, 1)  # (B, J, N)
+    gram = wide @ wide.transpose(0, 1, 3, 2)
+    size = np.einsum("bjkk->bjk", gram)
+    gram = gram + np.eye(gram.shape[-1]) * (1e-8 * size[..., None] + 1e-12)
+    right = np.einsum("bjkn,bjn->bjk", wide, target)
+    solution = np.linalg.solve(gram, right[..., None])[..., 0]
+    error = np.einsum("bjn,bjn->bj", target, target) - np.einsum("bjk,bjk->bj", solution, right)
+    return error, solution
+
+
+def moved(model: Model, rows: Bools, steps: Sequence[float]) -> Model:
+    """The model with delays that fit better: a pattern search, gains and effects refitted at every try."""
+    best, error = model, model.mse(rows)
+    for step in steps:
+        for _ in range(6):
+            tries = []
+            for group in np.unique(model.delay_groups):
+                here = (model.delay_groups == group).astype(float)
+                for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)):
+                    at_input, at_output = best.input_delay + a * step * here, best.output_delay + b * step * here
+                    inside = (at_input > -1e-9).all() and (at_output > -1e-9).all()
+                    if inside and (at_input <= 2 * LONGEST_INPUT).all() and (at_output <= 2 * LONGEST_OUTPUT).all():
+                        tries.append((np.maximum(at_input, 0.0), np.maximum(at_output, 0.0)))
+            fitted = [fit(best.with_delays(*one), rows, 1) for one in tries]
+            errors = [one.mse(rows) for one in fitted]
+            k = int(np.argmin(errors))
+            if errors[k] >= error * (1.0 - 1e-5):
+                break
+            best, error = fitted[k], errors[k]
+    return fit(best, rows, 2)
+
+

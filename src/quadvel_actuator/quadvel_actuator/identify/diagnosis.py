@@ -1,0 +1,169 @@
+"""Which effects a log shows: one is added at a time while held-out rows say that it pays, and then pruned.
+
+Every law of the registry is fitted on top of the model so far, together with gains and, where it looks like one, the
+delays. The law with the least held-out error is taken; laws that predict as well within the noise are named with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import attrs
+import numpy as np
+
+from ..effects import registry
+from .candidates import About, Candidate, Judge, moved, p_value, propose
+from .model import Model, fit
+from .signals import Array
+
+LEVEL = 0.01
+"""An effect is named if chance would bring its gain with less than this probability, all candidates counted."""
+
+WORTH = 0.03
+"""Least gain on the joints that the effect acts on, as a share of the noise."""
+
+MOST = 5
+"""Effects of one log at most."""
+
+_TIE_LEVEL = 0.02
+_TIE_SHARE = 0.03  # of the noise
+_TIES = 3
+
+Tick = Callable[[str], None]
+
+
+@attrs.frozen(eq=False)
+class Finding:
+    """An effect that stayed: applied[index] of the model."""
+
+    name: str
+    gain: float  # held-out error without it less that with it, N^2 m^2
+    p: float
+    indistinguishable: tuple[str, ...] = ()
+
+
+@attrs.frozen(eq=False)
+class Rejected:
+    """A law that did not."""
+
+    name: str
+    gain: float
+    reason: str
+
+
+@attrs.frozen(eq=False)
+class Diagnosis:
+    """The corrected model, its effects in the order of model.applied, and the laws that were turned down."""
+
+    model: Model
+    findings: tuple[Finding, ...]
+    rejected: tuple[Rejected, ...]
+
+
+def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
+    """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2."""
+    ties: list[tuple[str, ...]] = []
+    rejected: list[Rejected] = []
+    for number in range(MOST + 1):
+        candidates = ranked(About(model, judge, noise), tick, f"effect {number + 1}")
+        rejected = [_reason(one, noise, len(candidates)) for one in candidates]
+        if not candidates or not _pays(candidates[0], noise, len(candidates)) or number == MOST:
+            break
+        best, tied = _choice(candidates, judge, noise)
+        model = best.model
+        ties.append(tied)
+        model = fit(model, judge.fit, 4)
+    model, ties = _pruned(model, ties, judge, noise)
+    findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
+    known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
+    return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
+
+
+def ranked(about: About, tick: Tick, what: str) -> list[Candidate]:
+    """Every law of the registry on top of the model, the best form of each, least held-out error first."""
+    best: dict[str, Candidate] = {}
+    taken = {one.law.name for one in about.model.applied}
+    for name, law in registry().items():
+        tick(f"{what}: {name}")
+        if name in taken:
+            continue
+        for form in law.variants(about):
+            one = propose(about, form)
+            if one is not None and (name not in best or one.gain > best[name].gain):
+                best[name] = one
+    return sorted(best.values(), key=lambda one: -one.gain)
+
+
+def _pays(one: Candidate, noise: Array, tried: int) -> bool:
+    return one.p * tried < LEVEL and bool(one.gain > 0.0) and _worth(one, noise) > WORTH
+
+
+def _worth(one: Candidate, noise: Array) -> float:
+    """Gain on the joints that it acts on, as a share of their noise."""
+    return float(np.mean((one.joint_gain / noise)[one.joints]))
+
+
+def _reason(one: Candidate, noise: Array, tried: int) -> Rejected:
+    if one.p * tried >= LEVEL:
+        reason = f"not significant on held-out data (p = {min(one.p * tried, 1.0):.2g} after {tried} candidates)"
+    elif _worth(one, noise) <= WORTH:
+        reason = f"worth {100 * _worth(one, noise):.1f} % of the noise floor, below {100 * WORTH:.0f} %"
+    else:
+        reason = "nothing left for it once the named effects are in"
+    return Rejected(one.name, one.gain, reason)
+
+
+def _choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tuple[Candidate, tuple[str, ...]]:
+    """The best candidate, or the simplest one that predicts as well; and the names of the others that do."""
+    best = candidates[0]
+    equal = [best, *(one for one in candidates[1:] if _ties(best, one, judge, noise))]
+    size = {one.name: len(one.law.parameters) for one in equal}
+    chosen = best
+    for one in equal[1:]:
+        if size[one.name] < size[chosen.name] and best.gain - one.gain < 0.01 * float(noise.mean()):
+            chosen = one
+    return chosen, tuple(one.name for one in equal if one is not chosen)[: _TIES - 1]
+
+
+def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool:
+    """Is the other's held-out error the same within the noise?"""
+    if other.gain <= 0.5 * best.gain:
+        return False
+    sums, rows = judge.gains(other.residual, best.residual)
+    lost = float(sums.sum() / max(rows.sum(), 1))
+    return lost < 0.005 * float(noise.mean()) or (
+        p_value(sums, rows) > _TIE_LEVEL and lost < _TIE_SHARE * float(noise.mean())
+    )
+
+
+def _pruned(
+    model: Model, ties: list[tuple[str, ...]], judge: Judge, noise: Array
+) -> tuple[Model, list[tuple[str, ...]]]:
+    """Without the effects that the later ones made needless, and fitted once more with the delays."""
+    while model.applied:
+        losses = [_loss(model, k, judge) for k in range(len(model.applied))]
+        worst = int(np.argmin([loss for loss, _, _ in losses]))
+        loss, p, less = losses[worst]
+        active = model.applied[worst].active
+        if p * len(registry()) < LEVEL and loss > WORTH * float(noise[active].mean()) * float(active.mean()):
+            break
+        model = less
+        ties = [tied for k, tied in enumerate(ties) if k != worst]
+    return (moved(model, judge.fit, (0.0004, 0.0002)) if model.applied else model), ties
+
+
+def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
+    """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
+    less = fit(model.without(index), judge.fit, 4)
+    if model.applied[index].law.shifts:
+        less = moved(less, judge.fit, (0.001, 0.0004))
+    sums, rows = judge.gains(less.samples.tau - less.predict(), model.samples.tau - model.predict())
+    alone = min(p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1]))
+    return float(sums.sum() / max(rows.sum(), 1)), min(p_value(sums, rows), alone * sums.shape[1]), less
+
+
+def _finding(model: Model, index: int, judge: Judge, tied: tuple[str, ...]) -> Finding:
+    gain, p, _ = _loss(model, index, judge)
+    return Finding(model.applied[index].law.name, gain, p, tied)
+
+
