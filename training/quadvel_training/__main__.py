@@ -11,8 +11,11 @@ import cattrs
 import torch
 import typer
 import yaml
+from rich.progress import Progress, TextColumn
 
-from . import crl, distill, estimator, loop, student, teacher
+from quadvel_estimator.kalman import KalmanConfig
+
+from . import crl, distill, estimator, kalman_tuning, loop, student, teacher
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -113,6 +116,30 @@ def train_estimator(
     run = estimator.EstimatorRun(config, _actor(policy))
     loop.train(run, config.budget, out / "estimator.pt")
     run.export(out / "estimator.onnx", _recipe(config, run, "estimator"))
+
+
+@app.command("kalman")
+def tune_kalman(
+    policy: Annotated[Path, typer.Option(help="Checkpoint of the policy whose walks it is tuned on.")] = Path(
+        "out/training/student/student.pt"
+    ),
+    recipe: Recipe = None,
+) -> None:
+    """Tune the Kalman filter's noise on the same kind of walks; prints what belongs into `KalmanConfig`."""
+    config = _configured(kalman_tuning.TuningConfig, recipe, None)
+    recording = kalman_tuning.record(config, _actor(policy))
+    before = kalman_tuning.rmse(KalmanConfig(), recording)
+    with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[error]}")) as progress:
+        task = progress.add_task("kalman", total=config.evaluations, error="")
+        tuned = kalman_tuning.tune(
+            recording,
+            config.evaluations,
+            lambda error: progress.update(task, advance=1, error=f"{error.mean():.4f} m/s"),
+        )
+    for name, error in (("before", before), ("after", kalman_tuning.rmse(tuned, recording))):
+        print(f"{name}: RMSE flat {error[0].round(3)}, rough {error[1].round(3)} m/s")
+    for name in tuned.bounds():
+        print(f"{name}: {getattr(tuned, name):.3g}")
 
 
 if __name__ == "__main__":

@@ -18,11 +18,11 @@ from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
 from . import student
-from .env import CommandRange, EnvConfig, VelocityEnv
+from .env import CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State
 from .ppo import select
-from .walks import Walks
+from .walks import Walks, both_grounds
 
 MEMORY = 128
 HIDDEN = (64,)
@@ -97,13 +97,13 @@ class EstimatorConfig:
 
     budget: Budget = Budget(samples=8e6, minutes=15.0)
     n: int = 512
-    length: int = 32
+    length: int = 48  # ticks a sequence
+    epochs: int = 2  # learning costs less than walking
     learning_rate: float = 2e-3
     final_learning_rate: float = 1e-4
-    mini_batches: int = 4
+    mini_batches: int = 8
     truth_first: float = 0.4  # share of the budget before the policy walks on the estimate anywhere
     seed: int = 2
-    episode: float = 30.0  # s
     forget: float = 0.005  # share of the memories lost a sequence, as after a gap in the stream
     commands: CommandRange = CommandRange(vx=(-1.8, 2.6), vy=0.8, wz=1.6)
     rough: Terrain = Terrain(kind="rough", roughness=0.06, blend=10.0)
@@ -123,14 +123,6 @@ def loss_terms(
     return (square.sum(-1) * mask).sum() / alive, (likelihood.sum(-1) * mask).sum() / alive
 
 
-def both_grounds(config: EstimatorConfig, actor: Recurrent) -> list[Walks]:
-    """Walks on flat and on rough ground, half of the environments each."""
-    env = EnvConfig(n=config.n // 2, seed=config.seed, commands=config.commands, episode=config.episode)
-    return [
-        Walks(VelocityEnv(attrs.evolve(env, terrain=terrain)), actor) for terrain in (Terrain(), config.rough)
-    ]
-
-
 class EstimatorRun:
     """Walks on both grounds, one network, one optimiser."""
 
@@ -140,7 +132,10 @@ class EstimatorRun:
         self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.samples = 0
-        self.walks = [Walk(walks, self.network) for walks in both_grounds(config, actor)]
+        self.walks = [
+            Walk(walks, self.network)
+            for walks in both_grounds(config.n, config.seed, config.commands, config.rough, actor)
+        ]
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -162,7 +157,7 @@ class EstimatorRun:
         student.export(self.network, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:
-        """One sequence on each ground, and a step of the optimiser for each mini-batch of both."""
+        """One sequence on each ground, and steps of the optimiser for mini-batches of both."""
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
         for walk in self.walks:
@@ -170,15 +165,16 @@ class EstimatorRun:
             walk.on_estimate[1::2] = False
         data = [walk.sequence(c.length) for walk in self.walks]
         seen = {"flat": 0.0, "rough": 0.0, "nll": 0.0}
-        for ids in torch.randperm(c.n // 2).chunk(c.mini_batches):
-            for name, value in self._learn(ids, data).items():
-                seen[name] += value / c.mini_batches
+        for epoch in range(c.epochs):
+            for ids in torch.randperm(c.n // 2).chunk(c.mini_batches):
+                for name, value in self._learn(ids, data, remember=epoch == c.epochs - 1).items():
+                    seen[name] += value / (c.mini_batches * c.epochs)
         for walk in self.walks:
             walk.start_over(c.forget)
         self.samples += c.length * c.n
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 
-    def _learn(self, ids: torch.Tensor, data: list[Sequence]) -> dict[str, float]:
+    def _learn(self, ids: torch.Tensor, data: list[Sequence], remember: bool) -> dict[str, float]:
         """One step; returns the mean squared error an axis on each ground, and the likelihood."""
         losses, squares = [], []
         for walk, (inputs, truth, mask) in zip(self.walks, data, strict=True):
@@ -186,7 +182,8 @@ class EstimatorRun:
             square, likelihood = loss_terms(output, truth[:, ids], mask[:, ids])
             losses.append(10.0 * square + 0.1 * likelihood)
             squares.append(float(square.detach()) / 3)
-            walk.remember(ids, state)
+            if remember:
+                walk.remember(ids, state)
         loss = torch.stack(losses).mean()
         self.optimiser.zero_grad()
         loss.backward()

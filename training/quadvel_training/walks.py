@@ -17,9 +17,10 @@ from quadvel_description.state import RobotState
 from quadvel_policy.observation import DEFAULT_OBSERVATION, build_observation
 from quadvel_policy.supervisor import SupervisorConfig
 from quadvel_sim.config import SensorNoise
+from quadvel_sim.terrain import Terrain
 
 from . import student
-from .env import TICK, VelocityEnv
+from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .networks import Recurrent
 
 NOISE = np.repeat(attrs.astuple(SensorNoise()), (12, 12, 3, 3, 3))
@@ -28,6 +29,7 @@ BIAS_ACCELERATION = 0.1  # m/s^2, constant a walk
 BIAS_ANGULAR_VELOCITY = 0.01  # rad/s
 BIAS_TILT = 0.005  # rad
 FALL_TILT = 0.9  # rad
+EPISODE = 30.0  # s
 
 
 class Mode(IntEnum):
@@ -219,6 +221,15 @@ class Walks:
         self._forget(modes.advance(env.q))
         tilted = np.abs(env.roll_pitch).max(axis=1) > FALL_TILT
         self.over |= tilted | (env.fallen & modes.driven) | ~np.isfinite(env.height) | env.timed_out
+
+
+def both_grounds(
+    n: int, seed: int, commands: CommandRange, rough: Terrain, actor: Recurrent
+) -> tuple[Walks, Walks]:
+    """Walks of `n` robots in all, half on flat ground, half on `rough`."""
+    config = EnvConfig(n=n // 2, seed=seed, commands=commands, episode=EPISODE)
+    flat, uneven = (VelocityEnv(attrs.evolve(config, terrain=terrain)) for terrain in (Terrain(), rough))
+    return Walks(flat, actor), Walks(uneven, actor)
 
 
 def _multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
