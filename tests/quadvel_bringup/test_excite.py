@@ -79,9 +79,9 @@ def excite(*arguments: object) -> list[str]:
 
 
 def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path, domain_id: int) -> None:
-    file = tmp_path / "solo.mcap"
+    file = tmp_path / "steps.mcap"
     ended = subprocess.run(
-        excite("solo", "--seconds", 0.6, "--out", file), capture_output=True, text=True, timeout=240
+        excite("steps", "--seconds", 0.6, "--out", file), capture_output=True, text=True, timeout=240
     )
     assert ended.returncode == 0, ended.stdout + ended.stderr
     log = read_log(file)
@@ -92,7 +92,7 @@ def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path
     assert (log.kp == robot.KP).all()
     swing = np.ptp(log.q[round(1e3 * RAMP) :], axis=0)
     assert swing.max() > 0.02
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["solo.mcap"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["steps.mcap"]
 
 
 def test_ctrl_c_ends_it_and_leaves_no_file(tmp_path: Path, domain_id: int) -> None:

@@ -268,7 +268,7 @@ class _Session:
             raise MotionError(f"nothing came on low_state for {patience:g} s")
 
     def _on_state(self, message: Any) -> None:
-        if self._failure or (self._player.done and self._simulated):
+        if self._failure:
             return
         self._heard = time.monotonic()
         try:
@@ -278,6 +278,8 @@ class _Session:
         except (MessageError, MotionError) as error:
             self._failure = MotionError(str(error))
             answer = JointCommand.damping(tick=message.tick)
+        if self._player.done and self._simulated:
+            return
         stamp = message.stamp if self._simulated else self._node.get_clock().now().to_msg()
         command = self._message(stamp=stamp)
         write_low_cmd(answer, command)

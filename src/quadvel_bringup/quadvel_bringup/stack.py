@@ -7,6 +7,8 @@ from pathlib import Path
 
 import attrs
 
+from .nodes import command
+
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
 
@@ -61,6 +63,10 @@ class Stack:
     def arguments(self) -> dict[str, list[str]]:
         """The same as arguments of ROS 2."""
         return {name: self._arguments(values) for name, values in self.overrides().items()}
+
+    def commands(self) -> dict[str, list[str]]:
+        """The same as command lines, which run each node as a process of its own."""
+        return {name: command(name, arguments) for name, arguments in self.arguments().items()}
 
     def _arguments(self, values: Parameters) -> list[str]:
         arguments = ["--ros-args", "--params-file", str(self.parameters.resolve())]

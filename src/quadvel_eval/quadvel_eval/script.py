@@ -48,6 +48,17 @@ SCRIPTS: dict[str, tuple[Step, ...]] = {
         Drive("stop", (0.0, 0.0, 0.0), 4.0),
         LIE_DOWN,
     ),
+    "circuit": (
+        STAND_UP,
+        Drive("forward 0.5 m/s", (0.5, 0.0, 0.0), 5.0),
+        Drive("forward 1.0 m/s", (1.0, 0.0, 0.0), 5.0),
+        Drive("backward 0.4 m/s", (-0.4, 0.0, 0.0), 5.0),
+        Drive("left 0.3 m/s", (0.0, 0.3, 0.0), 5.0),
+        Drive("turn left 0.7 rad/s", (0.0, 0.0, 0.7), 5.0),
+        Drive("forward, right and turn", (0.6, -0.2, -0.4), 5.0),
+        Drive("stop", (0.0, 0.0, 0.0), 2.0),
+        LIE_DOWN,
+    ),
     "quick": (
         STAND_UP,
         Drive("forward 0.5 m/s", (0.5, 0.0, 0.0), 4.0),

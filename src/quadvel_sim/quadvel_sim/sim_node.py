@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import sys
 import time
+from collections.abc import Callable
 from threading import Thread
 from typing import Any
 
@@ -28,6 +29,7 @@ from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, run
+from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
 from quadvel_sim.parameters import SimParameters
 from quadvel_sim.simulator import Simulator, Truth
@@ -40,10 +42,10 @@ STAMP_TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart be
 class SimNode(Node):
     """Topics and services around a SimulationLoop, which runs in a thread of its own."""
 
-    def __init__(self) -> None:
+    def __init__(self, make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator) -> None:
         super().__init__("sim_node")
         self._settings = read_parameters(self, SimParameters)
-        simulator = Simulator(self._settings.config())
+        simulator = make_simulator(self._settings.config())
         simulator.reset(self._settings.keyframe)
         self._noise = simulator.config.noise
         self._refusals = Refusals()

@@ -11,6 +11,7 @@ foot forces follow from all these. A command given at t counts from t on.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import attrs
 import mujoco
@@ -120,7 +121,7 @@ class Simulator:
         if keyframe not in keyframes:
             raise ValueError(f"keyframe: found {keyframe!r}, expected one of {', '.join(keyframes)}")
         seeds = np.random.SeedSequence(self.config.seed if seed is None else seed).generate_state(2)
-        self.actuator = ActuatorModel(self.config.actuator, dt=DT, seed=int(seeds[0]))
+        self.actuator = self._make_actuator(int(seeds[0]))
         self._rng = np.random.default_rng(seeds[1])
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key(keyframe).id)
         if not self.config.hung:
@@ -132,6 +133,32 @@ class Simulator:
         self._sampled = False
         self._law = self._brake
         self._command_left = 0
+
+    def place(
+        self,
+        truth: Truth,
+        q: ArrayLike,
+        dq: ArrayLike,
+        past: Iterable[tuple[ArrayLike, ArrayLike, JointCommand]] = (),
+    ) -> None:
+        """Put the robot into a state that another one had: the trunk of `truth`, joints q (12,), dq (12,).
+
+        past: joint state and command of the ms before, the newest last; the drives live through it, so that
+        what is under way in them is there. Time and noise go on.
+        """
+        self.data.qpos[:] = np.concatenate([truth.position, truth.quaternion, q])
+        self.data.qvel[:3] = rotate(truth.quaternion, truth.linear_velocity)
+        self.data.qvel[3:6], self.data.qvel[6:] = truth.angular_velocity, dq
+        self.data.qacc_warmstart[:] = 0.0
+        self.actuator.reset()
+        for former_q, former_dq, command in past:
+            self.actuator.step(np.asarray(former_q), np.asarray(former_dq), *_law(command))
+            self.command(command)
+        self._sampled = False
+
+    def _make_actuator(self, seed: int) -> ActuatorModel:
+        """The drives; a plant with drives of another kind makes them here."""
+        return ActuatorModel(self.config.actuator, dt=DT, seed=seed)
 
     @property
     def time(self) -> float:
