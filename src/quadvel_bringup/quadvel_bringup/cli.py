@@ -154,6 +154,14 @@ def excite(context: typer.Context) -> None:
     _hand_on(context, "quadvel_bringup.excite:excite_command")
 
 
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def identify(context: typer.Context) -> None:
+    """Find what the actuator model lacks, from measured logs."""
+    from quadvel_actuator.identify.cli import app as command
+
+    command(context.args, prog_name=context.command_path)
+
+
 @app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)
 def evaluate(context: typer.Context) -> None:
     """Measure how well a policy tracks a grid of commands, faster than real time."""

@@ -11,7 +11,7 @@ from scipy import stats
 
 from ..effects import EffectLaw
 from ..effects.commands import MOST
-from .eam import LONGEST_INPUT, LONGEST_OUTPUT
+from .delays import fit_with_delays
 from .model import Applied, Model, fit
 from .signals import Array, Bools
 
@@ -122,7 +122,7 @@ def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candid
     joints = np.arange(len(model.samples.joints))
     grown = fit(grown, judge.fit, 4)
     if law.shifts:
-        grown = moved(grown, judge.fit, (0.001, 0.0004))
+        grown = fit_with_delays(grown, judge.fit)
     everywhere = _judged(about, law, grown)
     chosen = _acted_on(about, everywhere)
     if chosen.all() or not chosen.any():
@@ -131,11 +131,9 @@ def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candid
     back = attrs.evolve(grown, applied=(*grown.applied[:-1], some))
     if law.shifts:  # the delays that the effect moved belong to the joints without it, too
         back = back.with_delays(model.input_delay, model.output_delay)
-    back = fit(back, judge.fit, 4)
-    if law.shifts:
-        back = moved(back, judge.fit, (0.001, 0.0004))
+    back = fit_with_delays(back, judge.fit) if law.shifts else fit(back, judge.fit, 4)
     few = _judged(about, law, back)
-    return few if few.gain >= 0.95 * everywhere.gain else everywhere
+    return few if few.gain >= 0.98 * everywhere.gain else everywhere
 
 
 def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
@@ -149,10 +147,14 @@ def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
 
 
 def _acted_on(about: About, candidate: Candidate) -> Bools:
-    """The joints whose own rows show the effect."""
-    sums, rows = about.judge.gains(about.residual, candidate.residual)
+    """The joints that would be predicted worse without the effect, everything else staying as it is."""
+    last = candidate.model.applied[-1]
+    idle = candidate.model.without(len(candidate.model.applied) - 1)
+    # with delays that moved, the model without the effect is the one before
+    before = about.residual if last.law.shifts else about.samples.tau - idle.predict()
+    sums, rows = about.judge.gains(before, candidate.residual)
     p = np.array([p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1])])
-    worth = candidate.joint_gain > 0.02 * about.noise
+    worth = sums.sum(axis=0) / np.maximum(rows.sum(axis=0), 1) > 0.02 * about.noise
     return (p < _JOINT_LEVEL) & worth
 
 
@@ -247,27 +249,3 @@ def _regress(y: Array, columns: list[Array], rows: Bools) -> tuple[Array, Array]
     solution = np.linalg.solve(gram, right[..., None])[..., 0]
     error = np.einsum("bjn,bjn->bj", target, target) - np.einsum("bjk,bjk->bj", solution, right)
     return error, solution
-
-
-def moved(model: Model, rows: Bools, steps: Sequence[float]) -> Model:
-    """The model with delays that fit better: a pattern search, gains and effects refitted at every try."""
-    best, error = model, model.mse(rows)
-    for step in steps:
-        for _ in range(6):
-            tries = []
-            for group in np.unique(model.delay_groups):
-                here = (model.delay_groups == group).astype(float)
-                for a, b in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1)):
-                    at_input, at_output = best.input_delay + a * step * here, best.output_delay + b * step * here
-                    inside = (at_input > -1e-9).all() and (at_output > -1e-9).all()
-                    if inside and (at_input <= 2 * LONGEST_INPUT).all() and (at_output <= 2 * LONGEST_OUTPUT).all():
-                        tries.append((np.maximum(at_input, 0.0), np.maximum(at_output, 0.0)))
-            fitted = [fit(best.with_delays(*one), rows, 1) for one in tries]
-            errors = [one.mse(rows) for one in fitted]
-            k = int(np.argmin(errors))
-            if errors[k] >= error * (1.0 - 1e-5):
-                break
-            best, error = fitted[k], errors[k]
-    return fit(best, rows, 2)
-
-

@@ -12,7 +12,8 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, Judge, moved, p_value, propose
+from .candidates import About, Candidate, Judge, p_value, propose
+from .delays import fit_with_delays
 from .model import Model, fit
 from .signals import Array
 
@@ -149,14 +150,13 @@ def _pruned(
             break
         model = less
         ties = [tied for k, tied in enumerate(ties) if k != worst]
-    return (moved(model, judge.fit, (0.0004, 0.0002)) if model.applied else model), ties
+    return (fit_with_delays(model, judge.fit) if model.applied else model), ties
 
 
 def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
     """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
-    less = fit(model.without(index), judge.fit, 4)
-    if model.applied[index].law.shifts:
-        less = moved(less, judge.fit, (0.001, 0.0004))
+    shifts = model.applied[index].law.shifts
+    less = (fit_with_delays if shifts else fit)(model.without(index), judge.fit, 4)
     sums, rows = judge.gains(less.samples.tau - less.predict(), model.samples.tau - model.predict())
     alone = min(p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1]))
     return float(sums.sum() / max(rows.sum(), 1)), min(p_value(sums, rows), alone * sums.shape[1]), less

@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from . import excited, plausible
 from .findings import Finding, some
@@ -218,7 +217,7 @@ def _before_commands(log: Log) -> tuple[Bools, list[Finding]]:
 
 def _without_gain(log: Log) -> tuple[Bools, list[Finding]]:
     off = without_position_gain(log)
-    everywhere = off.all(axis=1)
+    everywhere: Any = off.all(axis=1)
     findings = []
     if everywhere.any():
         text = f"kp: 0 (damping, switched off or torque control) {_spans(everywhere, log.t)}; left out"
@@ -244,6 +243,6 @@ def _unanswered(log: Log) -> tuple[Bools, list[Finding]]:
     return lost[:, None], [Finding("warning", field, (), text)]
 
 
-def _spans(rows: NDArray[Any], t: Array) -> str:
+def _spans(rows: Any, t: Array) -> str:
     spans = stretches(rows, t)
     return f"{in_words(spans, t)} ({sum(last - first for first, last in spans):.2f} s)"

@@ -75,10 +75,14 @@ class Model:
         left: Array = np.where(rows, self.samples.tau - self.predict(), 0.0)
         return left
 
+    def error(self, rows: Bools) -> float:
+        """Sum of squared errors over `rows` (N, J)."""
+        left = self.residual(rows)
+        return float(np.sum(left * left))
+
     def mse(self, rows: Bools) -> float:
         """Mean squared error over `rows` (N, J)."""
-        left = self.residual(rows)
-        return float(np.sum(left * left) / max(int(rows.sum()), 1))
+        return self.error(rows) / max(int(rows.sum()), 1)
 
     def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
         """Torque (B, N, J) for a batch of gains (B, 2, J) and of each effect's values (B, P, J)."""
@@ -230,7 +234,7 @@ def fit(model: Model, rows: Bools, iterations: int = 5) -> Model:
         hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
         gradient = gather(slots, np.einsum("jan,nj->ja", slopes, left))
         theta = pack(model)
-        trials = np.stack([_step(slots, theta, hessian, gradient, damping) for damping in _DAMPING])
+        trials = np.stack([step(slots, theta, hessian, gradient, damping) for damping in _DAMPING])
         errors = _errors(model, trials, rows)
         best = int(np.argmin(errors))
         if not errors[best] < error:
@@ -247,7 +251,7 @@ def _errors(model: Model, theta: Array, rows: Bools) -> Array:
     return np.einsum("bnj,bnj->b", left, left)
 
 
-def _step(slots: Slots, theta: Array, hessian: Array, gradient: Array, damping: float) -> Array:
+def step(slots: Slots, theta: Array, hessian: Array, gradient: Array, damping: float) -> Array:
     """Slots (A, J) after one damped step; what would leave its bounds stays on them."""
     held = np.zeros(slots.count, dtype=bool)
     after = theta
