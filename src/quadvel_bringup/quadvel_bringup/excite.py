@@ -32,6 +32,7 @@ from .stack import PARAMETERS
 
 RAMP = 1.5  # s, from where the robot is to where the motion begins
 REST = 0.5  # s of damping at the end
+LOOK = 0.05  # s, from one look at recorder and processes to the next
 MAX_TILT = 0.8  # rad
 JOINT_MARGIN = 0.1  # rad, that a joint may pass its mechanical range by
 PATIENCE = 20.0  # s, for the first state
@@ -194,28 +195,37 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
         console.print(f"{name} | {line}", markup=False, highlight=False)
 
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("excite", parameter_overrides=[Parameter("use_sim_time", value=bool(nodes))])
+    clock = [Parameter("use_sim_time", value=bool(nodes))]
+    node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:
         with StopSignals() as signals, bar, replacing(path) as draft, ProcessGroup(say) as group:
             for name, line in nodes.items():
                 group.start(name, line)
-            session = _Session(node, player, simulated=bool(nodes))
+            session = _Session(node, recorder, player, simulated=bool(nodes))
             session.run(draft, group, signals, bar)
     finally:
         node.destroy_node()
+        recorder.destroy_node()
         rclpy.try_shutdown()
     console.print(f"written to {path}: {session.summary()}", highlight=False)
+
+
+def _spin(executor: Any, seconds: float) -> None:
+    until = time.monotonic() + seconds
+    while (left := until - time.monotonic()) > 0.0:
+        executor.spin_once(timeout_sec=left)
 
 
 class _Session:
     """A player on the topics of a robot, and a recorder beside it."""
 
-    def __init__(self, node: Any, player: Player, simulated: bool) -> None:
+    def __init__(self, node: Any, recorder_node: Any, player: Player, simulated: bool) -> None:
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         from quadvel_msgs.msg import LowCmd, LowState
 
-        self._node, self._player, self._simulated = node, player, simulated
+        self._node, self._recorder_node = node, recorder_node
+        self._player, self._simulated = player, simulated
         self._message = LowCmd
         self._started = time.monotonic()
         self._heard: float | None = None  # when the last state came, s
@@ -227,30 +237,31 @@ class _Session:
 
     def run(self, draft: Path, group: ProcessGroup, signals: StopSignals, bar: Progress) -> None:
         """Play to the end and record it in `draft`, then let a real robot sink to rest."""
+        from rclpy.executors import SingleThreadedExecutor
+
         from .recorder import Recorder
 
         task = bar.add_task("", total=self._player.total)
-        with Recorder(self._node, draft) as recorder:
+        playing, recording = SingleThreadedExecutor(), SingleThreadedExecutor()  # neither waits for the other
+        playing.add_node(self._node)
+        recording.add_node(self._recorder_node)
+        with Recorder(self._recorder_node, draft) as recorder:
             for topic, kind in RECORDED.items():
                 recorder.record(topic, kind)
             while not self._player.done:
-                self._spin(0.1)
+                _spin(playing, LOOK)
+                recorder.write_waiting(recording)
                 bar.update(task, completed=min(self._player.elapsed, self._player.total))
                 self._look(group, signals)
+            time.sleep(LOOK)  # what was sent last is under way
+            recorder.write_waiting(recording)
         self._counts = recorder.counts
         if not self._simulated:
-            self._spin(REST)
+            _spin(playing, REST)
 
     def summary(self) -> str:
         """What was recorded."""
         return ", ".join(f"{count} on {topic}" for topic, count in self._counts.items())
-
-    def _spin(self, seconds: float) -> None:
-        import rclpy
-
-        until = time.monotonic() + seconds
-        while (left := until - time.monotonic()) > 0.0:
-            rclpy.spin_once(self._node, timeout_sec=left)
 
     def _look(self, group: ProcessGroup, signals: StopSignals) -> None:
         """Raises what ends the motion early."""

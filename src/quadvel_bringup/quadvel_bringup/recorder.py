@@ -83,10 +83,14 @@ class Recorder:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             time.sleep(min(left, BATCH))
-            written = -1
-            while self.counts.total() > written:
-                written = self.counts.total()
-                executor.spin_once(timeout_sec=0.0)
+            self.write_waiting(executor)
+
+    def write_waiting(self, executor: Executor) -> None:
+        """Write all that waits now."""
+        written = -1
+        while self.counts.total() > written:
+            written = self.counts.total()
+            executor.spin_once(timeout_sec=0.0)
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -286,9 +287,10 @@ def _next(report: Mapping[str, Any]) -> str:
 
 
 def _findings(report: Mapping[str, Any]) -> str:
-    """What `inspect` said, where the report carries it."""
+    """What the logs said before anything was fitted."""
     rows = [
-        (escape(str(f.get("log", ""))), escape(f["kind"]), escape(f["text"]))
-        for f in report.get("findings", ())
+        (escape(Path(one["log"]).name), escape(finding["kind"]), escape(finding["text"]))
+        for one in report.get("data", ())
+        for finding in one["findings"]
     ]
     return table(("log", "", ""), rows) if rows else ""

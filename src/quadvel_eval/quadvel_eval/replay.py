@@ -1,0 +1,187 @@
+"""How well a model of the robot repeats a recorded run: open loop over short stretches, and in its velocity tracking.
+
+Arrays of a recording in, errors out. Over longer stretches open loop says little: a walking robot is unstable, and
+any two drift apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_dds.recordings import read_messages
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
+from quadvel_nodes.messages import seconds
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.supervisor import Supervisor
+from quadvel_sim.config import SensorNoise, SimulatorConfig
+from quadvel_sim.simulator import DT, Simulator, Truth
+
+from .recording import Recording
+from .robot_loop import PERIOD, RobotLoop, make_estimator
+from .segments import SETTLE, Segment, measure
+from .walk import Setup
+
+Array = NDArray[np.float64]
+
+STRETCH = 0.2  # s, of one replay
+STRIDE = 0.35  # s, from one to the next: no multiple of a step of the gait
+PAST = 60  # ms, that the drives live through before
+
+
+@attrs.frozen(eq=False)
+class Joints:
+    """Joint states and commands of a run, one row each ms, at `time` (n,) s; the command held at that instant."""
+
+    time: Array
+    q: Array  # (n, 12) rad
+    dq: Array  # (n, 12) rad/s
+    tau: Array  # (n, 12) N m
+    command: Array  # (n, 37): q, kp, kd (12 each), mode
+
+
+@attrs.frozen
+class ReplayError:
+    """Root mean square of replayed minus recorded, over all joints and stretches."""
+
+    q: float  # rad
+    dq: float  # rad/s
+    tau: float  # N m
+    stretches: int
+
+
+def read_joints(path: Path) -> Joints:
+    """The joints' part of a recording in lockstep at 1 kHz. ValueError where states are missing.
+
+    A command counts from the instant of the state that it answers, whatever its own stamp says.
+    """
+    states: dict[int, Any] = {}
+    commands: dict[int, Any] = {}
+    for topic, _, message in read_messages(path, lambda topic, _: topic in ("/low_state", "/low_cmd")):
+        (states if topic == "/low_state" else commands)[message.tick] = message
+    ticks = sorted(states)
+    if not ticks or not commands or np.any(np.diff(ticks) != round(1e3 * DT)):
+        raise ValueError(f"{path}: found {len(ticks)} states of low_state, expected one every ms")
+    held = np.full(37, np.nan)
+    command = np.zeros((len(ticks), 37))
+    for row, tick in enumerate(ticks):
+        if tick in commands:
+            answer = commands[tick]
+            held = np.concatenate([answer.q, answer.kp, answer.kd, [answer.mode]])
+        command[row] = held
+    rows = [states[tick] for tick in ticks]
+    time = np.array([seconds(message.stamp) for message in rows])
+    q, dq, tau = (
+        np.array([getattr(message, field) for message in rows], float) for field in ("q", "dq", "tau")
+    )
+    return Joints(time, q, dq, tau, command)
+
+
+def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end: float) -> float:
+    """Mean square of measured minus modelled torque, N^2 m^2, on the recorded motion between `start` and `end`."""
+    model = ActuatorModel(attrs.evolve(actuator, torque_noise=0.0), dt=DT)
+    begin, stop = np.searchsorted(joints.time, [start, end])
+    squares = []
+    for row in range(max(begin - PAST, 0), stop):
+        q, kp, kd = np.split(joints.command[row, :36], 3)
+        torque = model.step(joints.q[row], joints.dq[row], q, kp, kd)
+        if row >= begin:
+            squares.append(np.mean((joints.tau[row] - torque) ** 2))
+    return float(np.mean(squares))
+
+
+def open_loop(
+    actuator: ActuatorParameters, joints: Joints, truth: Callable[[float], Truth], start: float, end: float
+) -> ReplayError:
+    """Replay stretches of the commands between `start` and `end` (s) on a robot with `actuator`, without noise.
+
+    Each stretch begins in the recorded state; truth(t) tells the trunk's.
+    """
+    quiet = attrs.evolve(actuator, torque_noise=0.0)
+    simulator = Simulator(SimulatorConfig(actuator=quiet, noise=SensorNoise.none()))
+    errors = [
+        _stretch(simulator, joints, truth, row)
+        for row in np.searchsorted(joints.time, np.arange(start, end - STRETCH, STRIDE)).tolist()
+        if row >= PAST
+    ]
+    if not errors:
+        raise ValueError(f"nothing to replay between {start:.2f} and {end:.2f} s")
+    q, dq, tau = np.sqrt(np.mean(errors, axis=0))
+    return ReplayError(float(q), float(dq), float(tau), len(errors))
+
+
+def _stretch(
+    simulator: Simulator, joints: Joints, truth: Callable[[float], Truth], row: int
+) -> tuple[float, float, float]:
+    """Mean squares of the errors of q, dq and torque over one stretch that begins at `row`."""
+    past = [(joints.q[i], joints.dq[i], _command(joints, i)) for i in range(row - PAST, row)]
+    simulator.place(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
+    n = round(STRETCH / DT)
+    squares = np.zeros(3)
+    for i in range(row, row + n):
+        simulator.command(_command(joints, i))
+        state = simulator.state()
+        found = (joints.q[i] - state.q, joints.dq[i] - state.dq, joints.tau[i] - state.tau)
+        squares += [np.mean(error**2) for error in found]
+        simulator.step()
+    q, dq, tau = squares / n
+    return float(q), float(dq), float(tau)
+
+
+def _command(joints: Joints, row: int) -> JointCommand:
+    q, kp, kd = np.split(joints.command[row, :36], 3)
+    mode = MODE_SERVO if joints.command[row, 36] else MODE_DAMPING
+    return JointCommand(q=q, kp=kp, kd=kd, mode=mode)
+
+
+def trunk_at(recording: Recording) -> Callable[[float], Truth]:
+    """The recorded truth at the sample next to a time."""
+
+    def truth(time: float) -> Truth:
+        row = int(np.abs(recording.position.time - time).argmin())
+        velocity = recording.velocity.value[row]
+        return Truth(
+            time=time,
+            tick=0,
+            position=recording.position.value[row],
+            quaternion=recording.quaternion.value[row],
+            linear_velocity=velocity[:3],
+            angular_velocity=velocity[3:],
+            contact=np.zeros(4, bool),
+            contact_force=np.zeros((4, 3)),
+        )
+
+    return truth
+
+
+def predicted_tracking(
+    actuator: ActuatorParameters, commands: Sequence[tuple[Array, float]], seed: int
+) -> list[Segment]:
+    """The velocities that a model with `actuator` shows under the shipped policy: each command for its seconds."""
+    setup = Setup()
+    simulator = Simulator(SimulatorConfig(actuator=actuator, seed=seed))
+    simulator.reset("stand")
+    supervisor = Supervisor(PolicyFile(SHIPPED_POLICY))
+    loop = RobotLoop(simulator, supervisor, make_estimator(setup.estimator, simulator, setup.estimator_file))
+    loop.start_walking()
+    segments = []
+    for command, duration in commands:
+        begin, times, velocities = simulator.time, [], []
+        for _ in range(round(duration / PERIOD)):
+            truth = loop.tick(command).truth
+            times.append(truth.time)
+            velocities.append([*truth.linear_velocity[:2], truth.angular_velocity[2]])
+        segments.append(measure(times, velocities, command, begin + SETTLE, begin + duration))
+    return segments
+
+
+def tracking_gap(plant: Sequence[Segment], model: Sequence[Segment]) -> tuple[float, float]:
+    """Mean distance between the mean velocities of plant and model: in the plane (m/s), and of turning (rad/s)."""
+    apart = np.array([a.mean - b.mean for a, b in zip(plant, model, strict=True)])
+    return float(np.hypot(apart[:, 0], apart[:, 1]).mean()), float(np.abs(apart[:, 2]).mean())
