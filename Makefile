@@ -13,15 +13,18 @@ APT := on Debian 12 and Ubuntu 24.04: sudo apt install
 LOCKED := pyproject.toml setup.py requirements.lock
 INSTALL = $(PY) -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 
-.PHONY: help setup demo test lint format bench lock clean
+.PHONY: help setup demo close-the-loop test lint format bench lock clean
 
 help:  ## say what there is
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-8s %s\n", $$1, $$2}' Makefile
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
 
 setup: $(VENV)/.run  ## create .venv with what running needs (no torch) and the `quadvel` script
 
 demo: setup  ## walk a simulated robot through the nodes; results in out/demo
 	$(VENV)/bin/quadvel demo --out out/demo
+
+close-the-loop: setup  ## identify three plants that the model does not know; results in out/twin
+	$(VENV)/bin/quadvel twin --out out/twin
 
 test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile

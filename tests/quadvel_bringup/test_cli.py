@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from quadvel_bringup import cli
 
-COMMANDS = ("doctor", "run", "up", "drive", "record", "demo", "eval", "bench")
+COMMANDS = ("doctor", "run", "up", "drive", "record", "demo", "eval", "bench", "excite", "twin")
 
 
 def quadvel(*arguments: str) -> subprocess.CompletedProcess[str]:

@@ -162,6 +162,12 @@ def identify(context: typer.Context) -> None:
     command(context.args, prog_name=context.command_path)
 
 
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def twin(context: typer.Context) -> None:
+    """Close the loop on the stack itself: plants that its model does not know, identified from their walks."""
+    _hand_on(context, "quadvel_bringup.twin:twin_command")
+
+
 @app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)
 def evaluate(context: typer.Context) -> None:
     """Measure how well a policy tracks a grid of commands, faster than real time."""
