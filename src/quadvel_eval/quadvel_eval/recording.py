@@ -12,10 +12,9 @@ from typing import Any
 
 import attrs
 import numpy as np
-from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from quadvel_dds.messages import STORE
+from quadvel_dds.recordings import read_messages
 from quadvel_nodes.messages import seconds
 
 Array = NDArray[np.float64]
@@ -83,12 +82,8 @@ LOOP_FIGURES = (
 def read_recording(path: Path) -> Recording:
     """Raises ValueError, one sentence, where a topic that is needed was not recorded."""
     messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
-    with path.open("rb") as file:
-        for schema, channel, message in make_reader(file).iter_messages(TOPICS):
-            assert schema is not None  # every CDR channel has one
-            messages[channel.topic].append(
-                (1e-9 * message.log_time, STORE.deserialize_cdr(message.data, schema.name))
-            )
+    for topic, arrival, message in read_messages(path, lambda topic, _: topic in TOPICS):
+        messages[topic].append((1e-9 * arrival, message))
     for topic in TOPICS:
         if topic not in messages:
             raise ValueError(f"{path}: nothing was recorded on {topic}")
