@@ -40,7 +40,7 @@ class Bench:
     """The node under test and a peer that feeds it, served by one executor."""
 
     def __init__(self, arguments: list[str], standing: State) -> None:
-        rclpy.init(args=["--ros-args", *arguments])
+        rclpy.init(args=["--ros-args", "-p", "realtime_priority:=0", *arguments])
         self._standing = standing
         self._executor = SingleThreadedExecutor()
         peer = rclpy.create_node("peer", use_global_arguments=False)
@@ -150,7 +150,7 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
         ("kind:=psychic", "parameters: kind is 'psychic', expected learned or kalman"),
         ("reset_gap:=0.0", "parameters: reset_gap is 0.0, expected a time above 0 s"),
         ("reset_gap:=soon", "parameter reset_gap: "),
-        ("speed:=3", "unknown parameter speed, expected one of kind, model, reset_gap"),
+        ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, kind, model"),
     ],
 )
 def test_a_wrong_parameter_ends_the_start_with_one_sentence(

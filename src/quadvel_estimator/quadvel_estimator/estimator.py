@@ -5,6 +5,7 @@ How velocity is estimated is `learned`'s and `kalman`'s matter, which states are
 
 from __future__ import annotations
 
+import gc
 from pathlib import Path
 from time import perf_counter
 from typing import Any
@@ -24,6 +25,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.scheduling import Scheduling
 
 from . import features
 from .kalman import KalmanEstimator
@@ -41,7 +43,7 @@ def _parameter(default: Any, description: str) -> Any:
 
 
 @attrs.frozen
-class EstimatorParameters:
+class EstimatorParameters(Scheduling):
     """The node's parameters."""
 
     kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
@@ -83,6 +85,9 @@ class EstimatorNode(Node):
         self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
         self.create_timer(1.0, self._report)
+        if not self.get_parameter("use_sim_time").value:  # where time waits for the node there is no hurry
+            self._settings.apply(self.get_logger().info)
+        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of an estimate
 
     def _on_command(self, message: Any) -> None:
         try:

@@ -28,6 +28,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
 from .loop_stats import LoopStats
@@ -42,8 +43,8 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state 
 
 
 @attrs.frozen(kw_only=True)
-class ControllerParameters(SupervisorConfig):
-    """The supervisor's settings, and what the node adds to them."""
+class ControllerParameters(SupervisorConfig, Scheduling):
+    """The supervisor's settings and the scheduling, and what the node adds to them."""
 
     policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped", positive=False)
     max_velocity_age: float = setting(
@@ -75,6 +76,8 @@ class Controller(Node):
             "command": StampCheck(self._settings.command_timeout),
         }
         self._create_interfaces()
+        if not self._sim_time:  # where time waits for the node there is no hurry
+            self._settings.apply(self.get_logger().info)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a tick
 
     def _create_interfaces(self) -> None:

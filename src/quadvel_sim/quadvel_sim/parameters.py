@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.loop import MODES
 from quadvel_sim.terrain import KINDS, Terrain
@@ -20,7 +21,7 @@ def _parameter(default: Any, description: str) -> Any:
 
 
 @attrs.frozen
-class SimParameters:
+class SimParameters(Scheduling):
     """The node's parameters; what each record of the simulation may hold is that record's own matter."""
 
     mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
