@@ -165,9 +165,7 @@ class MemoryLaw(EffectLaw):
         """The memory of a joint that has rested at `x`, `u` since ever."""
         raise NotImplementedError
 
-    def advance(
-        self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory
-    ) -> tuple[Any, Memory]:
+    def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         """The value instead of `x` after `dt` (s), and the new memory."""
         raise NotImplementedError
 
@@ -177,7 +175,10 @@ class MemoryLaw(EffectLaw):
         given = x if pair else (x,)
         lead = np.broadcast_shapes(*(np.shape(one)[:-2] for one in (*given, *p.values())))
         rows, joints = given[0].shape[-2:]
-        xs = [np.ascontiguousarray(np.moveaxis(np.broadcast_to(one, (*lead, rows, joints)), -2, 0)) for one in given]
+        xs = [
+            np.ascontiguousarray(np.moveaxis(np.broadcast_to(one, (*lead, rows, joints)), -2, 0))
+            for one in given
+        ]
         us = [np.broadcast_to(getattr(s, name), (rows, joints)) for name in self.inputs]
         p = {name: np.squeeze(value, -2) if np.ndim(value) > 1 else value for name, value in p.items()}
         out = [np.empty_like(one) for one in xs]

@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Array, Errors, ErrorLaw, Parameter, Params, Start, View
+from .base import Array, ErrorLaw, Errors, Parameter, Params, Start, View
 
 MOST = 6
 """commands lost in a row that are looked for"""

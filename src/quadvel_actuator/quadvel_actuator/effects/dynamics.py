@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -19,18 +20,22 @@ def _lagged(x: Array, s: Any, time: Array) -> Array:
     dt = s.dt[:, 0]
     usual = float(np.median(dt))
     share = -np.expm1(-usual / time)
-    x, share = np.broadcast_arrays(x, share) if np.ndim(share) > 1 else (x, np.broadcast_to(share, x.shape[-1:]))
-    edges = np.flatnonzero(s.start[:, 0]).tolist() + [len(dt)]
+    x, share = (
+        np.broadcast_arrays(x, share) if np.ndim(share) > 1 else (x, np.broadcast_to(share, x.shape[-1:]))
+    )
+    edges = [*np.flatnonzero(s.start[:, 0]).tolist(), len(dt)]
     out = np.empty(x.shape)
     lead = np.reshape(x, (-1, *x.shape[-2:]))
     shares = np.broadcast_to(share, x.shape).reshape(-1, *x.shape[-2:])[:, 0]
     flat = out.reshape(lead.shape)
-    for first, last in zip(edges, edges[1:], strict=False):
+    for first, last in pairwise(edges):
         for b in range(len(lead)):
             for j in range(lead.shape[-1]):
                 a = shares[b, j]
                 begin = lead[b, first, j]
-                flat[b, first:last, j] = lfilter([a], [1.0, a - 1.0], lead[b, first:last, j], zi=[begin * (1.0 - a)])[0]
+                flat[b, first:last, j] = lfilter(
+                    [a], [1.0, a - 1.0], lead[b, first:last, j], zi=[begin * (1.0 - a)]
+                )[0]
     return out
 
 
@@ -121,7 +126,10 @@ class TimestampSkew(ErrorLaw):
     motion = _FAST
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        return [{"late": late} for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)]
+        return [
+            {"late": late}
+            for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)
+        ]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         return e[0], e[1] + s.dq - s.shifted("dq", p["late"])

@@ -8,7 +8,20 @@ from typing import Any
 import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View, rms
+from .base import (
+    AddedLaw,
+    Array,
+    ErrorLaw,
+    Errors,
+    Memory,
+    MemoryLaw,
+    Parameter,
+    Params,
+    Stage,
+    Start,
+    View,
+    rms,
+)
 
 _STILL = "small slow reversals about many postures, each held for a second"
 
@@ -20,7 +33,9 @@ class TorqueOffset(AddedLaw):
     parameters = (Parameter("offset", "N m", -20.0, 20.0, 0.3),)
     linear = ("offset",)
     signal = "q"
-    motion = "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
+    motion = (
+        "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
+    )
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]
@@ -179,7 +194,9 @@ class Hysteresis(MemoryLaw):
     motion = _STILL
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        return [{"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)]
+        return [
+            {"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)
+        ]
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return 0.0 * (u[0] + p["reach"]), u[0]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+
 import numpy as np
 
 from .base import AddedLaw, Array, Parameter, Params, Start, View, smooth_sign

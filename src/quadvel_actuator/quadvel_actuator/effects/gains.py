@@ -102,7 +102,9 @@ class SupplySag(TorqueLaw):
         if self.what == "gain":
             return sags
         return [
-            sag | {"limit": np.quantile(np.abs(torque), at, axis=0)} for sag in sags for at in (0.9, 0.97, 1.0)
+            sag | {"limit": np.quantile(np.abs(torque), at, axis=0)}
+            for sag in sags
+            for at in (0.9, 0.97, 1.0)
         ]
 
     def _strain(self, s: View) -> Array:

@@ -17,13 +17,23 @@ from .signals import Array, Bools
 
 BLOCK = 0.1  # s: differences of errors are summed over so long before they count as independent
 _BATCH = 12  # guesses evaluated at once
-_DELAY_MOVES = ((0.0, 0.0), (0.0, -0.001), (0.0, -0.002), (0.0, -0.004), (-0.002, 0.0), (-0.004, 0.0), (0.002, -0.002))
+_DELAY_MOVES = (
+    (0.0, 0.0),
+    (0.0, -0.001),
+    (0.0, -0.002),
+    (0.0, -0.004),
+    (-0.002, 0.0),
+    (-0.004, 0.0),
+    (0.002, -0.002),
+)
 _JOINT_LEVEL = 0.01  # p-value below which a joint counts as acted on
 
 
 @attrs.frozen(eq=False)
 class Judge:
     """Rows to fit and rows to judge by, (N, J), and which rows count together."""
+
+    joints: tuple[str, ...]
 
     fit: Bools
     judge: Bools
@@ -35,7 +45,7 @@ class Judge:
         """Blocks of consecutive rows of `samples` (`Samples`)."""
         at = np.floor(samples.t / BLOCK).astype(int) + 10**7 * samples.log_of_row  # type: ignore[attr-defined]
         names, blocks = np.unique(at, return_inverse=True)
-        return cls(fit_rows, judge_rows, blocks, len(names))
+        return cls(samples.joints, fit_rows, judge_rows, blocks, len(names))  # type: ignore[attr-defined]
 
     def gains(self, before: Array, after: Array) -> tuple[Array, Array]:
         """Fall of the squared error (N, J): its sum in each block (count, J), and the rows it stands for."""
@@ -168,7 +178,9 @@ def _started(about: About, law: EffectLaw) -> Model | None:
     table = np.array(
         [
             [
-                np.broadcast_to(start.get(parameter.name, parameter.scale), joints).clip(parameter.low, parameter.high)
+                np.broadcast_to(start.get(parameter.name, parameter.scale), joints).clip(
+                    parameter.low, parameter.high
+                )
                 for parameter in law.parameters
             ]
             for start in starts
@@ -214,7 +226,9 @@ def _screen(model: Model, table: Array, rows: Bools) -> tuple[Array, float]:
 
         def run(values: Array, gains: Array = model.gains) -> Array:
             every = np.repeat(gains[None], len(values), axis=0)
-            return model.evaluate(every, [*(np.repeat(o.values[None], len(values), axis=0) for o in others), values])
+            return model.evaluate(
+                every, [*(np.repeat(o.values[None], len(values), axis=0) for o in others), values]
+            )
 
         base = at_zero if linear else run(kinds[0][part])
         columns = [run(kind[part]) - base for kind in kinds[1:]]

@@ -106,7 +106,9 @@ def _worth(one: Candidate, noise: Array) -> float:
 
 def _reason(one: Candidate, noise: Array, tried: int) -> Rejected:
     if one.p * tried >= LEVEL:
-        reason = f"not significant on held-out data (p = {min(one.p * tried, 1.0):.2g} after {tried} candidates)"
+        reason = (
+            f"not significant on held-out data (p = {min(one.p * tried, 1.0):.2g} after {tried} candidates)"
+        )
     elif _worth(one, noise) <= WORTH:
         reason = f"worth {100 * _worth(one, noise):.1f} % of the noise floor, below {100 * WORTH:.0f} %"
     else:
@@ -165,5 +167,3 @@ def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
 def _finding(model: Model, index: int, judge: Judge, tied: tuple[str, ...]) -> Finding:
     gain, p, _ = _loss(model, index, judge)
     return Finding(model.applied[index].law.name, gain, p, tied)
-
-

@@ -27,8 +27,12 @@ def _local(values: Array, samples: Samples, rows: Bools) -> Array:
         differences = np.diff(values, order, axis=0)
         whole = rows[order:].copy()
         for back in range(1, order + 1):
-            whole &= rows[order - back : -back] & ~samples.start[order - back + 1 : len(rows) - back + 1, None]
-        found.append([_spread(differences[whole[:, j], j]) / comb(2 * order, order) for j in range(rows.shape[1])])
+            whole &= (
+                rows[order - back : -back] & ~samples.start[order - back + 1 : len(rows) - back + 1, None]
+            )
+        found.append(
+            [_spread(differences[whole[:, j], j]) / comb(2 * order, order) for j in range(rows.shape[1])]
+        )
     least: Array = np.min(found, axis=0)
     return least
 

@@ -93,7 +93,11 @@ class Model:
             if one.law.stage == Stage.ERRORS:
                 error = _pair(one, error, s, one.part(value))
         g = _lean(gains)
-        x = g[..., 0, :][..., None, :] * (s.kp * error[0]) + g[..., 1, :][..., None, :] * (s.kd * error[1]) + s.tau_ff
+        x = (
+            g[..., 0, :][..., None, :] * (s.kp * error[0])
+            + g[..., 1, :][..., None, :] * (s.kd * error[1])
+            + s.tau_ff
+        )
         for one, value in todo:
             if Stage.ERRORS < one.law.stage < Stage.ADDED:
                 law, p = one.law, one.part(value)
@@ -268,5 +272,3 @@ def step(slots: Slots, theta: Array, hessian: Array, gradient: Array, damping: f
             break
         held[slots.index[stuck]] = True
     return after
-
-

@@ -80,8 +80,8 @@ def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
 class _LogSignals:
     """One log, ready to be read at any time."""
 
-    def __init__(self, log: Log, kp: Array | None, kd: Array | None) -> None:
-        self.log = log
+    def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float) -> None:
+        self.log, self.origin = log, origin
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
         self.states["ddq"] = derivative(log, self.states["dq"])
         self.states["measured"] = _double(log.tau) if log.tau is not None else np.zeros_like(self.states["q"])
@@ -144,11 +144,19 @@ class Samples:
     """The rows of all `logs`, one after the other: measured torque, who judges what, and the signals behind it.
 
     `kp`, `kd` (J,) stand for logs that hold no gains; without either the gains count as 1, so that what is fitted
-    is the gain itself. `judged` (N, J) are the rows that a model has to explain.
+    is the gain itself. `origins` (s) are the times that `Signals.t` counts from, by default each log's first row.
+    `judged` (N, J) are the rows that a model has to explain.
     """
 
-    def __init__(self, logs: Sequence[Log], kp: Array | None = None, kd: Array | None = None) -> None:
-        self.logs = [_LogSignals(log, kp, kd) for log in logs]
+    def __init__(
+        self,
+        logs: Sequence[Log],
+        kp: Array | None = None,
+        kd: Array | None = None,
+        origins: Sequence[float] | None = None,
+    ) -> None:
+        origins = [float(log.t[0]) for log in logs] if origins is None else origins
+        self.logs = [_LogSignals(log, kp, kd, at) for log, at in zip(logs, origins, strict=True)]
         self.joints = logs[0].joints
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
@@ -172,11 +180,6 @@ class Samples:
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
         known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
         return start, steps, known
-
-    @property
-    def knows_gains(self) -> bool:
-        """Were all gains logged or given?"""
-        return all(one.gains["kp"].any() and not (one.gains["kp"] == 1.0).all() for one in self.logs)
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
@@ -212,9 +215,15 @@ class Samples:
             for name, values in one.gains.items():
                 parts.setdefault(name, []).append(values[row])
             packets.append((row + first)[:, None])
-            parts.setdefault("t", []).append((at - one.log.t[0])[:, None])
+            parts.setdefault("t", []).append((at - one.origin)[:, None])
         signals = {name: np.concatenate(part) for name, part in parts.items()}
         for name in ("temperature", "voltage"):
             if name not in signals or len(signals[name]) < len(self.t):
                 signals[name] = None  # type: ignore[assignment]  # not in every log
-        return Signals(dt=self.dt[:, None], start=self.start[:, None], packet=np.concatenate(packets), sent=self.sent, **signals)
+        return Signals(
+            dt=self.dt[:, None],
+            start=self.start[:, None],
+            packet=np.concatenate(packets),
+            sent=self.sent,
+            **signals,
+        )

@@ -1,0 +1,78 @@
+"""Delays fitted together with gains and effects.
+
+How a torque changes with a delay is taken from predictions a fraction of a millisecond apart, so that commands which
+step have a slope, too; a step that does not lessen the error is not taken.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+
+from .eam import LONGEST_INPUT, LONGEST_OUTPUT
+from .model import Model, Slots, gather, jacobian, pack, step, with_slots
+from .signals import Array, Bools
+
+SLOPE = 0.0003
+"""s, between the predictions that a slope is taken from, to either side"""
+
+_DAMPING = (1e-6, 1e-2, 1.0)
+_SETTLED = 2e-5
+_BOUNDS = (2 * LONGEST_INPUT, 2 * LONGEST_OUTPUT)
+
+
+def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
+    """Prediction (N, J), slopes (J, A + 2, N) along every slot and the delays, and these slots."""
+    slots = Slots.of(model)
+    predicted, slopes = jacobian(model, slots)
+    extra = []
+    for k in range(2):
+        high = _at(model, k, SLOPE)
+        low = _at(model, k, -SLOPE)
+        reach = (high.input_delay - low.input_delay) + (high.output_delay - low.output_delay)
+        extra.append((high.predict() - low.predict()) / reach)
+    both = np.stack(extra).transpose(2, 0, 1)
+    groups = model.delay_groups
+    index = np.stack([slots.count + groups, slots.count + int(groups.max()) + 1 + groups])
+    bound = np.broadcast_to(np.array(_BOUNDS)[:, None], index.shape)
+    wider = attrs.evolve(
+        slots,
+        index=np.concatenate([slots.index, index]),
+        low=np.concatenate([slots.low, np.zeros(index.shape)]),
+        high=np.concatenate([slots.high, bound]),
+        step=np.concatenate([slots.step, [SLOPE, SLOPE]]),
+        count=slots.count + 2 * (int(groups.max()) + 1),
+    )
+    return predicted, np.concatenate([slopes, both], axis=1), wider
+
+
+def _at(model: Model, which: int, by: float) -> Model:
+    delays = [model.input_delay, model.output_delay]
+    delays[which] = np.maximum(delays[which] + by, 0.0)
+    return model.with_delays(*delays)
+
+
+def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
+    """The model with delays, gains and effects fitted to `rows` (N, J)."""
+    for _ in range(iterations):
+        predicted, slopes, slots = jacobian_with_delays(model)
+        left = np.where(rows, model.samples.tau - predicted, 0.0)
+        error = float(np.sum(left * left))
+        slopes *= rows.T[:, None]
+        hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
+        gradient = gather(slots, np.einsum("jan,nj->ja", slopes, left))
+        theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
+        tries = []
+        for damping in _DAMPING:
+            after = step(slots, theta, hessian, gradient, damping)
+            tries.append(
+                with_slots(model, after[:-2]).with_delays(np.round(after[-2], 7), np.round(after[-1], 7))
+            )
+        errors = [one.error(rows) for one in tries]
+        best = int(np.argmin(errors))
+        if not errors[best] < error:
+            break
+        model = tries[best]
+        if errors[best] > error * (1.0 - _SETTLED):
+            break
+    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))

@@ -1,0 +1,84 @@
+"""What is computed on: logs that are too long as pieces spread over them, and stamps that arrived late set right.
+
+Receive times of messages that were sent at an even rate jitter; where a log's stamps do, its evenly sent times are
+restored and `identify` takes whichever explains the torque better.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import median_filter
+
+from .log import Array, Log
+
+PIECE = 5.0  # s
+LEAD = 0.1  # s of commands before a piece
+JITTER = 0.03
+"""Spacing that varies by more than this share of the usual one counts as jitter."""
+
+_WINDOW = 101, 31  # rows of states, of commands, over which lateness is a drift and not jitter
+_REACH = 200  # rows from which the true period is read
+
+
+@attrs.frozen(eq=False)
+class Piece:
+    """A stretch of a log, and when that log began (s)."""
+
+    log: Log
+    origin: float
+
+
+def pieces(log: Log, seconds: float) -> list[Piece]:
+    """The log, or stretches of it of `seconds` in all that are spread evenly."""
+    if log.duration <= seconds:
+        return [Piece(log, float(log.t[0]))]
+    count = max(int(seconds / PIECE), 1)
+    starts = np.linspace(float(log.t[0]), float(log.t[-1]) - PIECE, count)
+    found = (_cut(log, start, start + PIECE) for start in starts)
+    return [Piece(one, float(log.t[0])) for one in found if one is not None]
+
+
+def _cut(log: Log, start: float, stop: float) -> Log | None:
+    rows = slice(*np.searchsorted(log.t, [start, stop]))
+    first, last = np.searchsorted(log.t_cmd, [start - LEAD, stop])
+    sent = slice(max(int(first) - 1, 0), int(last))
+    taken = {}
+    for field in attrs.fields(Log):
+        value = getattr(log, field.name)
+        if isinstance(value, np.ndarray):
+            of_command = field.name in ("t_cmd", "q_des", "dq_des", "tau_ff", "kp", "kd")
+            taken[field.name] = value[sent if of_command else rows]
+    if len(taken["t"]) < 50 or len(taken["t_cmd"]) < 10:
+        return None
+    return attrs.evolve(log, **taken)
+
+
+def jitters(log: Log) -> bool:
+    """Do the stamps of states or commands vary more than an even clock's?"""
+    return any(_jitter(time) > JITTER for time in (log.t, log.t_cmd))
+
+
+def evened(log: Log) -> Log:
+    """The log with the stamps of an even sender; losses and slow drifts stay."""
+    t, t_cmd = (_even(time, window) for time, window in zip((log.t, log.t_cmd), _WINDOW, strict=True))
+    return attrs.evolve(log, t=t, t_cmd=t_cmd)
+
+
+def _jitter(time: NDArray[np.floating]) -> float:
+    steps = np.diff(time)
+    low, usual, high = np.percentile(steps, [10, 50, 90])
+    return float((high - low) / usual)
+
+
+def _even(time: NDArray[np.floating], window: int) -> Array:
+    reach = min(_REACH, len(time) // 3)
+    if reach < 20 or _jitter(time) <= JITTER:
+        return time
+    period = float(np.median(time[reach:] - time[:-reach])) / reach
+    clock = period * np.arange(len(time))
+    even: Array = clock + median_filter(np.asarray(time - clock, dtype=float), window, mode="nearest")
+    least = 1e-4 * period  # a clock that steps back would be no clock
+    rising: Array = np.maximum.accumulate(even) + least * np.arange(len(even)) / len(even)
+    return rising

@@ -1,0 +1,171 @@
+"""From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
+
+What the steps do stands in their own modules: `eam`, `floor`, `diagnosis`, `learned`, `residual`, `intervals`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import attrs
+import numpy as np
+
+from ..parameters import ActuatorParameters
+from .candidates import Judge, p_value
+from .delays import fit_with_delays
+from .diagnosis import diagnose
+from .eam import Eam, fit_eam, pd_torque
+from .excerpts import Piece, evened, jitters, pieces
+from .findings import Finding
+from .floor import noise_floor
+from .identification import Identification
+from .inspect import inspect
+from .intervals import intervals
+from .learned import Learned, learn
+from .log import Log, LogError
+from .model import Model
+from .outcome import Outcome, identification
+from .residual import remainder
+from .signals import Array, Samples
+
+Progress = Callable[[float, str], None]
+
+_HELD_OUT_EVERY = 3  # one block of three is kept aside where no log is given for it
+_BLOCKS = 20  # of a log, at least
+_SHORTEST_BLOCK, _LONGEST_BLOCK = 0.2, 2.0  # s
+_LEAST_ROWS = 30
+_CLEARLY = 0.97  # of the error
+
+
+@attrs.frozen
+class Options:
+    """What a user may ask for."""
+
+    gains: tuple[float, float] | None = None
+    """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
+    base: ActuatorParameters | None = None
+    """its torque limits go into the corrected model"""
+    seconds: float = 20.0
+    """of log that is fitted at most, in blocks spread over all of it"""
+
+
+def identify(
+    train: Sequence[Log],
+    heldout: Sequence[Log] = (),
+    options: Options | None = None,
+    progress: Progress | None = None,
+) -> Identification:
+    """Fit `train`, judge on `heldout`, or on blocks of `train` kept aside where there is none.
+
+    `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
+    """
+    options = options or Options()
+    tell = progress or (lambda share, text: None)
+    logs, findings = _checked([*train, *heldout])
+    kp, kd = (np.array([gain]) for gain in options.gains) if options.gains else (None, None)
+    parts = [
+        [Piece(one.log, one.origin) for one in pieces(log, options.seconds / len(train))] for log in logs
+    ]
+    chosen = [piece for part in parts for piece in part]
+    fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
+    tell(0.02, "gains and delays")
+    samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd)
+    findings += remark
+    before = _plain(samples, eam, judge)
+    noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
+    steps = iter(range(10**6))
+    diagnosis = diagnose(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
+    tell(0.88, "what no effect explains")
+    learned = learn(diagnosis.model, judge, noise)
+    rest = remainder(diagnosis.model, learned, judge)
+    tell(0.95, "intervals")
+    outcome = Outcome(
+        eam, before, diagnosis, learned, _worth(diagnosis.model, learned, judge), rest,
+        intervals(diagnosis.model, judge), pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0), noise, judge,
+        chosen, *_reference(samples), options.base or ActuatorParameters.default(),
+    )  # fmt: skip
+    found = identification(outcome, findings)
+    tell(1.0, "done")
+    return found
+
+
+def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]:
+    """The logs, `valid` narrowed to what a PD model can explain, and what was seen; refuses what cannot be used."""
+    inspected = [inspect(log) for log in logs]
+    for one in inspected:
+        one.raise_refusal()
+        if one.log.tau is None:
+            raise LogError(f"{one.log.name}: tau: not in the log, expected the measured torque (N m)")
+        if one.log.joints != logs[0].joints:
+            raise LogError(
+                f"{one.log.name}: joint_names: found {', '.join(one.log.joints)}, "
+                f"expected those of {logs[0].name}: {', '.join(logs[0].joints)}"
+            )
+    return [one.log for one in inspected], [(one.log.name, f) for one in inspected for f in one.findings]
+
+
+def _clocked(
+    chosen: Sequence[Piece], fitted: int, kp: Array | None, kd: Array | None
+) -> tuple[Samples, Judge, Eam, list[tuple[str, Finding]]]:
+    """Samples and the EAM, with the stamps as logged or as an even sender's, whichever explains the torque better."""
+
+    def tried(logs: Sequence[Log]) -> tuple[Samples, Judge, Eam]:
+        samples = Samples(logs, kp, kd, [piece.origin for piece in chosen])
+        judge = _rows(samples, fitted)
+        return samples, judge, fit_eam(samples, judge.fit)
+
+    logs = [piece.log for piece in chosen]
+    as_logged = tried(logs)
+    if not any(jitters(log) for log in logs):
+        return *as_logged, []
+    even = tried([evened(log) for log in logs])
+    if even[2].mse > _CLEARLY * as_logged[2].mse:
+        return *as_logged, []
+    text = "t: the stamps jitter as those of received messages do; the even clock of the sender explains the torque better"
+    return *even, [(logs[0].name, Finding("note", "t", (), f"{text} and was restored"))]
+
+
+def _rows(samples: Samples, fitted: int) -> Judge:
+    """Which rows are fitted and which judge: the first `fitted` pieces, or two of three blocks where that is all."""
+    if fitted < len(samples.logs):
+        first = (samples.log_of_row < fitted)[:, None]
+    else:
+        spans = [one.log.duration for one in samples.logs]
+        length = float(np.clip(min(spans) / _BLOCKS, _SHORTEST_BLOCK, _LONGEST_BLOCK))
+        first = (np.floor(samples.t / length).astype(int) % _HELD_OUT_EVERY != _HELD_OUT_EVERY - 1)[:, None]
+    for word, rows in (("fitted", samples.judged & first), ("held out", samples.judged & ~first)):
+        if (rows.sum(axis=0) < _LEAST_ROWS).any():
+            joint = samples.joints[int(np.argmin(rows.sum(axis=0)))]
+            raise LogError(
+                f"{samples.logs[0].log.name}: valid/{joint}: {int(rows.sum(axis=0).min())} rows to be {word}, "
+                f"expected {_LEAST_ROWS} or more"
+            )
+    return Judge.of(samples, samples.judged & first, samples.judged & ~first)
+
+
+def _plain(samples: Samples, eam: Eam, judge: Judge) -> Model:
+    """The EAM as a model that effects can be added to."""
+    joints = len(samples.joints)
+    one = np.zeros(joints, dtype=np.intp)
+    model = Model(
+        samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one
+    )
+    return fit_with_delays(model, judge.fit, 2)
+
+
+def _worth(model: Model, learned: Learned | None, judge: Judge) -> tuple[float, float]:
+    """Held-out gain of the learned terms together, and its p-value."""
+    if learned is None:
+        return 0.0, 1.0
+    left = model.samples.tau - model.predict()
+    sums, rows = judge.gains(left, left - learned.torque)
+    return float(sums.sum() / max(rows.sum(), 1)), p_value(sums[:, learned.joints], rows[:, learned.joints])
+
+
+def _reference(samples: Samples) -> tuple[float, float]:
+    """The gains that the deviations are given at: the usual ones of the log."""
+    kp, kd = (
+        float(np.median(np.concatenate([one.gains[name].ravel() for one in samples.logs])))
+        for name in ("kp", "kd")
+    )
+    return max(kp, 1e-6), max(kd, 1e-6)

@@ -1,0 +1,73 @@
+"""How sure the parameters are: 95 % intervals from the Jacobian, with residuals that may be correlated.
+
+Two covariances are compared and the wider one counts: that of white residuals, and the sandwich of sums over blocks of
+consecutive rows, which holds whatever the correlation within a block. The delays are unknowns of it, too.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from scipy import stats
+
+from .candidates import Judge
+from .delays import jacobian_with_delays
+from .model import Model, gather
+from .signals import Array
+
+LEVEL = 0.95
+
+
+@attrs.frozen(eq=False)
+class Intervals:
+    """Half widths (units of the parameter): of gains (2, J), of each effect's values (P, J), of delays (2, J)."""
+
+    gains: Array
+    effects: tuple[Array, ...]
+    delays: Array
+    on_bound: tuple[str, ...]
+
+
+def intervals(model: Model, judge: Judge) -> Intervals:
+    """Intervals of everything that was fitted to the rows `judge.fit`."""
+    predicted, slopes, slots = jacobian_with_delays(model)
+    left = np.where(judge.fit, model.samples.tau - predicted, 0.0)
+    slopes *= judge.fit.T[:, None]
+    hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
+    freedom = max(int(judge.fit.sum()) - slots.count, 1)
+    scale = np.sqrt(np.diagonal(hessian)) + 1e-12
+    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(
+        scale, scale
+    )
+    noise = np.array([np.sum(one**2) for one in left.T]) / np.maximum(judge.fit.sum(axis=0), 1)
+    white = gather(slots, noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
+    meat = np.zeros_like(hessian)
+    units = 0
+    for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
+        used = slots.index[:, j] >= 0
+        sums = np.zeros((judge.count, int(used.sum())))
+        np.add.at(sums, judge.blocks, moment[used].T)
+        units += int((np.bincount(judge.blocks, judge.fit[:, j], judge.count) > 0).sum())
+        at = slots.index[used, j]
+        np.add.at(meat, (at[:, None], at[None]), sums.T @ sums)
+    covariance = [inverse @ middle @ inverse for middle in (white, meat)]
+    variance = np.maximum(*(np.diagonal(one) for one in covariance)) * (1.0 + slots.count / freedom)
+    half = np.sqrt(np.maximum(variance, 0.0)) * stats.t.ppf(0.5 + LEVEL / 2, max(units - slots.count, 5))
+    wide = np.where(slots.index >= 0, half[slots.index], 0.0)
+    effects, first = [], 2
+    for one in model.applied:
+        effects.append(wide[first : first + len(one.law.parameters)])
+        first += len(one.law.parameters)
+    return Intervals(wide[:2], tuple(effects), wide[-2:], _on_bound(model))
+
+
+def _on_bound(model: Model) -> tuple[str, ...]:
+    """effect.parameter of those that sit on a bound of theirs."""
+    found = []
+    for one in model.applied:
+        for parameter, values in zip(one.law.parameters, one.values, strict=True):
+            reach = 1e-9 * max(abs(parameter.low), abs(parameter.high))
+            sits = (values <= parameter.low + reach) | (values >= parameter.high - reach)
+            if (sits & one.active).any():
+                found.append(f"{one.law.name}.{parameter.name}")
+    return tuple(found)

@@ -1,0 +1,308 @@
+"""Everything that was found, as the report, the corrected parameters, and the series for the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from ..parameters import ActuatorParameters, DelayPair, Effect
+from .candidates import Judge
+from .diagnosis import Diagnosis, Finding
+from .eam import Eam
+from .excerpts import Piece
+from .findings import Finding as LogFinding
+from .identification import Identification, Shape, Trace
+from .intervals import Intervals
+from .learned import Learned
+from .model import Applied, Model
+from .residual import Remainder
+from .signals import Array
+
+SCHEMA = 1
+UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
+_SHOWN = 4000  # points of a series in a picture
+_SIGNAL_UNITS = {
+    "q": "rad",
+    "q_des": "rad",
+    "dq": "rad/s",
+    "ddq": "rad/s^2",
+    "tau": "N m",
+    "t": "s",
+    "power": "W",
+}
+
+
+@attrs.frozen(eq=False)
+class Outcome:
+    """What the steps of an identification found."""
+
+    eam: Eam
+    before: Model
+    diagnosis: Diagnosis
+    learned: Learned | None
+    learned_gain: tuple[float, float]  # held-out gain and p-value of all terms together
+    rest: Remainder
+    widths: Intervals
+    ideal: Array  # (N, J), torque of the PD law as commanded
+    noise: Array  # (J,)
+    judge: Judge
+    pieces: Sequence[Piece]
+    kp_ref: float
+    kd_ref: float
+    base: ActuatorParameters
+
+    @property
+    def model(self) -> Model:
+        """The corrected model, without the learned terms."""
+        return self.diagnosis.model
+
+    @property
+    def after(self) -> Array:
+        """Torque of the corrected model, learned terms included, (N, J)."""
+        torque = self.model.predict()
+        return torque if self.learned is None else torque + self.learned.torque
+
+
+def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
+    """The report, the parameters and the series; `findings` are (log, finding)."""
+    report = _report(outcome)
+    report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
+    return Identification(report, parameters(outcome), _traces(outcome), _shapes(outcome))
+
+
+def _report(o: Outcome) -> dict[str, Any]:
+    samples, judge = o.model.samples, o.judge
+    before, after = o.before.predict(), o.after
+    errors = {
+        name: samples.tau - torque for name, torque in (("pd", o.ideal), ("before", before), ("after", after))
+    }
+    mses = {
+        name: {"train_mse": _mse(error, judge.fit), "heldout_mse": _mse(error, judge.judge)}
+        for name, error in errors.items()
+    }
+    for name in ("before", "after"):
+        mses[name]["per_joint"] = [
+            _mse(errors[name][:, [j]], judge.judge[:, [j]]) for j in range(len(samples.joints))
+        ]
+    floor = float(np.average(o.noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
+    removable = mses["before"]["heldout_mse"] - floor
+    left = mses["after"]["heldout_mse"] - floor
+    names = np.array(samples.joints)
+    effects = sorted(_effects(o), key=lambda one: -one["heldout_gain"])
+    report = {
+        "schema": SCHEMA,
+        "joints": list(samples.joints),
+        "units": UNITS,
+        "noise_floor": floor,
+        "pd": mses["pd"],
+        "before": mses["before"]
+        | {
+            "delta_kp": float((o.before.gains[0, 0] - 1.0) * o.kp_ref),
+            "delta_kd": float((o.before.gains[1, 0] - 1.0) * o.kd_ref),
+            "input_delay_ms": 1e3 * float(o.before.input_delay[0]),
+            "output_delay_ms": 1e3 * float(o.before.output_delay[0]),
+        },
+        "after": mses["after"] | _gains(o),
+        "effects": effects,
+        "rejected": [
+            {"name": one.name, "heldout_gain": one.gain, "reason": one.reason} for one in o.diagnosis.rejected
+        ],
+        "unexplained": {
+            "verdict": "structured" if o.rest.structured else "white",
+            "fraction": float(np.clip(left / removable, 0.0, 1.0)) if removable > 0.02 * floor else 0.0,
+            "depends_on": list(o.rest.depends_on),
+            "joints": names[o.rest.joints].tolist(),
+        },
+        "warnings": [
+            f"{name} sits on its bound: its value and interval are not to be trusted"
+            for name in o.widths.on_bound
+        ],
+        "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
+    }
+    report["decision"] = _decision(report)
+    return report
+
+
+def _mse(error: Array, rows: Any) -> float:
+    count = int(rows.sum())
+    return float(np.sum(np.where(rows, error, 0.0) ** 2) / count) if count else 0.0
+
+
+def _gains(o: Outcome) -> dict[str, Any]:
+    """Gain deviations and delays of the corrected model, a number, or one for each joint, with intervals."""
+    model, widths = o.model, o.widths
+    found: dict[str, Any] = {}
+    rows = {
+        "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
+        "delta_kd": ((model.gains[1] - 1.0) * o.kd_ref, widths.gains[1] * o.kd_ref),
+        "input_delay_ms": (1e3 * model.input_delay, 1e3 * widths.delays[0]),
+        "output_delay_ms": (1e3 * model.output_delay, 1e3 * widths.delays[1]),
+    }
+    for name, (values, half) in rows.items():
+        value, ci = _with_interval(values, half)
+        found[name], found[f"{name}_ci95"] = value, ci
+    return found
+
+
+def _with_interval(values: Array, half: Array) -> tuple[Any, Any]:
+    """Value and interval: numbers if all joints share them, else lists."""
+    low, high = values - half, values + half
+    if np.all(values == values[0]):
+        return float(values[0]), [float(low[0]), float(high[0])]
+    return values.tolist(), np.stack([low, high], axis=1).tolist()
+
+
+def _effects(o: Outcome) -> list[dict[str, Any]]:
+    joints = o.model.samples.joints
+    found = []
+    for finding, one, half in zip(o.diagnosis.findings, o.model.applied, o.widths.effects, strict=True):
+        found.append(_effect(finding, one, half, joints))
+    if o.learned is not None:
+        found.append(
+            {
+                "name": "learned_residual",
+                "joints": [name for name, acts in zip(joints, o.learned.joints, strict=True) if acts],
+                "params": {},
+                "indistinguishable": [],
+                "heldout_gain": o.learned_gain[0],
+                "p_value": o.learned_gain[1],
+                "inputs": o.learned.inputs,
+                "terms": [
+                    {
+                        "kind": term.basis.kind,
+                        "inputs": list(term.basis.inputs),
+                        "joints": [name for name, acts in zip(joints, term.joints, strict=True) if acts],
+                        "heldout_gain": term.gain,
+                    }
+                    for term in o.learned.terms
+                ],
+            }
+        )
+    return found
+
+
+def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
+    params = {}
+    for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
+        value, ci = _with_interval(values[one.active], width[one.active])
+        params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
+    settings = one.law.settings
+    entry: dict[str, Any] = {
+        "name": finding.name,
+        "joints": [name for name, acts in zip(joints, one.active, strict=True) if acts],
+        "params": params,
+        "indistinguishable": list(finding.indistinguishable),
+        "heldout_gain": finding.gain,
+        "p_value": finding.p,
+    }
+    if settings:
+        entry["form"] = settings
+    if finding.indistinguishable:
+        entry["separated_by"] = one.law.motion
+    return entry
+
+
+def _decision(report: Mapping[str, Any]) -> str:
+    before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
+    effects, rest = report["effects"], report["unexplained"]
+    if not effects and rest["verdict"] == "white":
+        return (
+            f"Nothing significant: the plain EAM explains the torque to {before:.3g} N^2 m^2 "
+            f"(noise floor {report['noise_floor']:.3g}), and no effect is added."
+        )
+    if not effects:
+        return (
+            f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on "
+            f"{', '.join(rest['depends_on'])}."
+        )
+    named = ", ".join(dict.fromkeys(one["name"] for one in effects))
+    cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
+    text = f"Add {named}: the held-out error falls by {cut:.0f} %, from {before:.3g} to {after:.3g} N^2 m^2"
+    more = (
+        f"; what was learned beyond them depends on {', '.join(rest['depends_on'])}"
+        if rest["depends_on"]
+        else ""
+    )
+    return f"{text} (noise floor {report['noise_floor']:.3g}){more}."
+
+
+def parameters(o: Outcome) -> ActuatorParameters:
+    """The corrected model as the stack loads it."""
+    model, joints = o.model, o.model.samples.joints
+    mse = _mse(model.samples.tau - o.after, o.judge.fit)
+    pair = DelayPair(
+        round(float(np.median(model.input_delay)), 7), round(float(np.median(model.output_delay)), 7), mse
+    )
+    effects = []
+    for one, half in zip(model.applied, o.widths.effects, strict=True):
+        values: dict[str, Any] = {}
+        ranges = {}
+        for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
+            value, ci = _with_interval(row[one.active], width[one.active])
+            values[parameter.name], ranges[parameter.name] = value, ci
+        values |= one.law.settings
+        units = {parameter.name: parameter.unit for parameter in one.law.parameters}
+        acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
+        effects.append(Effect(one.law.name, acts, values, units, ranges))
+    deviations = {
+        "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
+        "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
+    }
+    return attrs.evolve(
+        o.base,
+        name="identified",
+        kp_ref=o.kp_ref,
+        kd_ref=o.kd_ref,
+        pairs=(pair,),
+        torque_noise=mse,
+        effects=tuple(effects),
+        **{name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()},
+    )
+
+
+def _traces(o: Outcome) -> dict[str, Trace]:
+    samples, judge = o.model.samples, o.judge
+    before, after = o.before.predict(), o.after
+    rows = np.flatnonzero(judge.judge.any(axis=1))[:_SHOWN]
+    found = {}
+    for j, joint in enumerate(samples.joints):
+        series = [
+            np.where(judge.judge[rows, j], x[rows, j], np.nan) for x in (samples.tau, o.ideal, before, after)
+        ]
+        found[joint] = Trace(samples.t[rows], *series)
+    return found
+
+
+def _shapes(o: Outcome) -> tuple[Shape, ...]:
+    """The residual over the signal that explains it, of up to three joints an effect."""
+    samples, judge = o.model.samples, o.judge
+    before, after = samples.tau - o.before.predict(), samples.tau - o.after
+    rows = np.flatnonzero(judge.judge.any(axis=1))
+    rows = rows[:: max(1, len(rows) // _SHOWN)]
+    found = []
+    entries = [(one.law.name, one.law.signal, one.active) for one in o.model.applied]
+    if o.learned is not None:
+        entries += [("learned_residual", term.basis.inputs[0], term.joints) for term in o.learned.terms]
+    for name, signal, active in entries:
+        for j in np.flatnonzero(active)[:3]:
+            x, unit = _signal(o, signal, int(j))
+            found.append(
+                Shape(name, samples.joints[j], signal, unit, x[rows], before[rows, j], after[rows, j])
+            )
+    return tuple(found)
+
+
+def _signal(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
+    """A signal of the report by its name, and its unit."""
+    s, samples = o.model.signals, o.model.samples
+    owner, _, plain = name.rpartition("/")
+    j = samples.joints.index(owner) if owner else joint
+    kind = plain.partition("@")[0]
+    series: dict[str, Array] = {
+        "q": s.q, "dq": s.dq, "ddq": s.ddq, "q_des": s.q_des, "tau": samples.tau,
+        "t": np.broadcast_to(s.t, s.q.shape), "power": np.broadcast_to(s.power, s.q.shape),
+    }  # fmt: skip
+    return series[kind][:, j], _SIGNAL_UNITS[kind]

@@ -1,0 +1,62 @@
+"""Which joints share what: gains and delays for all, for each kind of joint, or for each joint; effects likewise.
+
+The paper has one set for all joints. A finer one is taken only where held-out rows say that it pays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import attrs
+import numpy as np
+
+from .candidates import Judge, p_value
+from .delays import fit_with_delays
+from .model import Groups, Model, fit
+from .signals import Array
+
+_LEVEL = 0.01
+_HARMLESS = 0.01  # of the noise: a loss that sharing may bring
+
+
+def kinds(joints: Sequence[str]) -> Groups:
+    """The same number for joints whose names differ in their first part only: FR_hip_joint, FL_hip_joint."""
+    names = [name.partition("_")[2] or name for name in joints]
+    found: Groups = np.unique(names, return_inverse=True)[1]
+    return found
+
+
+def regroupings(model: Model, judge: Judge) -> Iterator[tuple[str, Model]]:
+    """The model with gains or delays for each kind of joint, and for each joint, fitted."""
+    joints = model.samples.joints
+    each = np.arange(len(joints))
+    for word, groups in (("kind", kinds(joints)), ("joint", each)):
+        if len(np.unique(groups)) > len(np.unique(model.gain_groups[0])):
+            yield (
+                f"gains per {word}",
+                fit(attrs.evolve(model, gain_groups=np.array([groups, groups])), judge.fit, 4),
+            )
+        if len(np.unique(groups)) > len(np.unique(model.delay_groups)):
+            yield (
+                f"delays per {word}",
+                fit_with_delays(attrs.evolve(model, delay_groups=groups), judge.fit, 4),
+            )
+
+
+def pooled(model: Model, judge: Judge, noise: Array) -> Model:
+    """The model with the values of each effect shared by its joints, or by those of a kind, where that costs nothing."""
+    for k, one in enumerate(model.applied):
+        for groups in (np.zeros(len(one.active), dtype=np.intp), kinds(model.samples.joints)):
+            if len(np.unique(groups[one.active])) == int(one.active.sum()):
+                continue
+            mean = np.array([[row[one.active & (groups == g)].mean() if (one.active & (groups == g)).any() else 0.0
+                              for g in groups] for row in one.values])  # fmt: skip
+            common = attrs.evolve(one, groups=groups, values=mean)
+            applied = (*model.applied[:k], common, *model.applied[k + 1 :])
+            tried = fit(attrs.evolve(model, applied=applied), judge.fit, 5)
+            sums, rows = judge.gains(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())
+            lost = float(sums.sum() / max(rows.sum(), 1))
+            if lost < _HARMLESS * float(noise.mean()) or p_value(sums, rows) > _LEVEL:
+                model = tried
+                break
+    return model
