@@ -23,6 +23,8 @@ def read_messages(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tu
 
     Raises RecordingError for what is no whole recording, and OSError where there is no such file.
     """
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: there is no such file")
     try:
         with Reader(path) as reader:
             chosen = [
@@ -33,7 +35,7 @@ def read_messages(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tu
             # Without any chosen channel the reader would give all messages.
             for channel, time, data in reader.messages(chosen) if chosen else ():
                 yield channel.topic, time, STORE.deserialize_cdr(data, channel.msgtype)
-    except OSError:
+    except PermissionError:
         raise
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
         what = " ".join(str(error).split()) or type(error).__name__

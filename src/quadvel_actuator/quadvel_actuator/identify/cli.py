@@ -13,12 +13,10 @@ import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from typer.core import TyperCommand
 
 from ..parameters import ActuatorParameters
-from .findings import Finding
-from .holdout import split
 from .inspect import Inspection, inspect
 from .log import Log, LogError, read_log
 
@@ -59,7 +57,7 @@ def identify(
     holdout: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="LOG...", help="Logs to judge on.", show_default="a quarter of each LOG, in blocks"
+            metavar="LOG...", help="Logs to judge on.", show_default="a third of each LOG, in blocks"
         ),
     ] = None,
     base: Annotated[
@@ -120,18 +118,20 @@ def _run(
 ) -> None:
     _check_folder(out)
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
-    inspections = read([*logs, *holdout], joints, gains, messages)
-    train, heldout = _sides(inspections, len(logs))
+    fitted = read(logs, joints, gains, messages)
+    judged = read(holdout, joints, gains, messages, like=fitted[0])
     from .identify import Options, identify  # what is wrong with the files shows before the engine is loaded
     from .report import write
 
-    columns = (BarColumn(pulse_style="cyan"), TimeElapsedColumn(), TextColumn("{task.description}"))
+    columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*columns, console=messages, transient=True) as bar:
-        task = bar.add_task("", total=None)
+        task = bar.add_task("", total=1.0)
         found = identify(
-            train, heldout, Options(base=parameters), lambda what: bar.update(task, description=what)
+            fitted,
+            judged,
+            Options(gains=gains, base=parameters),
+            lambda share, text: bar.update(task, completed=share, description=text),
         )
-    found = attrs.evolve(found, report={**found.report, "data": [_as_data(one) for one in inspections]})
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
@@ -140,25 +140,25 @@ def _run(
 
 def read(
     paths: Sequence[Path],
-    joints: Sequence[str] | None = None,
-    gains: tuple[float, float] | None = None,
-    messages: Console | None = None,
-) -> list[Inspection]:
-    """The logs, looked at, their joints in the order of the first; what was found is said on `messages`.
+    joints: Sequence[str] | None,
+    gains: tuple[float, float] | None,
+    messages: Console,
+    like: Log | None = None,
+) -> list[Log]:
+    """The logs as they are, their joints in the order of `like`, the first one; what is found goes to `messages`.
 
     Raises LogError, one sentence, where a log is refused or does not fit the others.
     """
-    inspections: list[Inspection] = []
+    logs: list[Log] = []
     for path in paths:
         log = read_log(path, joints)
-        if inspections:
-            log = _like(log, inspections[0].log)
+        like = like or log
+        log = _like(log, like)
         inspection = inspect(_with_gains(log, gains))
-        if messages is not None:
-            say(inspection, messages)
+        say(inspection, messages)
         inspection.raise_refusal()
-        inspections.append(inspection)
-    return inspections
+        logs.append(log)
+    return logs
 
 
 def _like(log: Log, first: Log) -> Log:
@@ -182,30 +182,12 @@ def _with_gains(log: Log, gains: tuple[float, float] | None) -> Log:
     return attrs.evolve(log, kp=kp if log.kp is None else log.kp, kd=kd if log.kd is None else log.kd)
 
 
-def _sides(inspections: Sequence[Inspection], fitted: int) -> tuple[list[Log], list[Log]]:
-    """The logs to fit and those to judge on."""
-    logs = [one.log for one in inspections]
-    if len(logs) > fitted:
-        return logs[:fitted], logs[fitted:]
-    train, heldout = zip(*(split(log) for log in logs), strict=True)
-    return list(train), list(heldout)
-
-
 def say(inspection: Inspection, messages: Console) -> None:
     """Print what was found in a log."""
     messages.print(escape(inspection.log.name), style="bold", soft_wrap=True, highlight=False)
     for finding in inspection.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
-
-
-def _as_data(inspection: Inspection) -> dict[str, Any]:
-    """What the report says about a log."""
-
-    def record(finding: Finding) -> dict[str, Any]:
-        return {**attrs.asdict(finding), "joints": list(finding.joints)}
-
-    return {"log": inspection.log.name, "findings": [record(one) for one in inspection.findings]}
 
 
 def _check_folder(out: Path) -> None:

@@ -1,0 +1,111 @@
+"""Logs of joints under a PD law with delays, as arrays and as files; a second computation, without the model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mcap.writer import Writer
+
+from quadvel_dds.messages import STORE
+from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+
+KP, KD = 30.0, 0.5
+
+
+def fields(seconds: float = 4.0, rate: float = 500.0, seed: int = 0) -> dict[str, Any]:
+    """The named arrays of a clean log of 12 joints in motion, all on one time base."""
+    random = np.random.default_rng(seed)
+    t = np.arange(round(seconds * rate)) / rate
+    frequency, phase = random.uniform(0.5, 3.0, (2, 12, 2)) * [[[1.0]], [[2.0]]]
+    wave = [0.1 * np.sin(2.0 * np.pi * f * t[:, None] + p) for f, p in zip(frequency.T, phase.T, strict=True)]
+    slope = [
+        0.2 * np.pi * f * np.cos(2.0 * np.pi * f * t[:, None] + p)
+        for f, p in zip(frequency.T, phase.T, strict=True)
+    ]
+    q, dq = NOMINAL_Q + sum(wave), sum(slope)
+    q_des = np.round((q + 0.02 * dq + random.normal(0.0, 0.02, q.shape)) * 1e4) / 1e4
+    tau = KP * (q_des - q) - KD * dq + random.normal(0.0, 0.1, q.shape)
+    return {
+        "t": t,
+        "q": q,
+        "dq": dq,
+        "q_des": q_des,
+        "tau": tau,
+        "kp": KP,
+        "kd": KD,
+        "joint_names": JOINT_NAMES,
+    }
+
+
+def npz(path: Path, **changes: Any) -> Path:
+    """`fields` with some of them changed, or left out where None, as an archive."""
+    np.savez(path, **{name: value for name, value in (fields() | changes).items() if value is not None})
+    return path
+
+
+def csv(path: Path, log: dict[str, Any]) -> Path:
+    """Arrays (n, 12) and (n,) as columns; cells behind the end of a shorter one are empty."""
+    columns: dict[str, np.ndarray] = {}
+    for name, values in log.items():
+        if np.ndim(values) == 2:
+            columns |= {f"{name}/{joint}": values[:, j] for j, joint in enumerate(JOINT_NAMES)}
+        elif np.ndim(values) == 1 and name != "joint_names":
+            columns[name] = values
+    rows = max(len(values) for values in columns.values())
+    lines = [",".join(columns)]
+    for row in range(rows):
+        cells = (str(values[row]) if row < len(values) else "" for values in columns.values())
+        lines.append(",".join(cells))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def mcap(path: Path, log: dict[str, Any], mode: int = 10) -> Path:
+    """low_state and low_cmd as the stack sends them, each command 2 ms after its state."""
+    time_type = STORE.types["builtin_interfaces/msg/Time"]
+    state_type, command_type = (STORE.types[f"quadvel_msgs/msg/{name}"] for name in ("LowState", "LowCmd"))
+
+    def stamp(nanoseconds: int) -> Any:
+        return time_type(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+
+    def single(values: Any, size: int = 12) -> np.ndarray:
+        return np.broadcast_to(np.asarray(values, np.float32), (size,)).copy()
+
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        channels = {}
+        for topic, name in (("/low_state", "LowState"), ("/low_cmd", "LowCmd")):
+            text, _ = STORE.generate_msgdef(f"quadvel_msgs/msg/{name}", ros_version=2)
+            schema = writer.register_schema(f"quadvel_msgs/msg/{name}", "ros2msg", text.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for k, t in enumerate(log["t"]):
+            now = 1_700_000_000 * 10**9 + round(1e9 * t)
+            state = state_type(
+                stamp=stamp(now),
+                tick=k,
+                q=single(log["q"][k]),
+                dq=single(log["dq"][k]),
+                tau=single(log["tau"][k]),
+                orientation_wxyz=single([1.0, 0.0, 0.0, 0.0], 4),
+                angular_velocity=single(0.0, 3),
+                linear_acceleration=single(0.0, 3),
+                foot_force=single(0.0, 4),
+            )
+            command = command_type(
+                stamp=stamp(now + 2_000_000),
+                tick=k,
+                mode=mode,
+                q=single(log["q_des"][k]),
+                dq=single(0.0),
+                tau=single(0.0),
+                kp=single(log["kp"]),
+                kd=single(log["kd"]),
+            )
+            for topic, message in (("/low_state", state), ("/low_cmd", command)):
+                data = bytes(STORE.serialize_cdr(message, message.__msgtype__))
+                writer.add_message(channels[topic], now, data, now)
+        writer.finish()
+    return path

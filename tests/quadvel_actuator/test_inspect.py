@@ -1,0 +1,207 @@
+"""What is found in logs with one thing wrong, nothing in a clean one, and what measured logs say."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+
+from quadvel_actuator.identify.inspect import Inspection, inspect
+from quadvel_actuator.identify.log import Log, LogError, read_log
+from quadvel_description.robot import JOINT_NAMES
+
+sys.path.insert(0, str(Path(__file__).parent))
+from joint_logs import fields
+
+SHARE = np.pi / 180.0
+
+
+def log(**changes: Any) -> Log:
+    """The clean log with some arrays changed."""
+    given = fields()
+    shape = given["q"].shape
+    values: dict[str, Any] = {
+        **{name: given[name] for name in ("t", "q", "dq", "tau", "q_des")},
+        "t_cmd": given["t"],
+        "valid": np.ones(shape, bool),
+        "kp": np.full(shape, 30.0),
+        "kd": np.full(shape, 0.5),
+    }
+    return Log(name="a.npz", joints=JOINT_NAMES, **(values | changes))
+
+
+def said(inspection: Inspection, kind: str) -> list[str]:
+    return [finding.text for finding in inspection.findings if finding.kind == kind]
+
+
+def exchanged(values: np.ndarray, a: int = 0, b: int = 4) -> np.ndarray:
+    order = list(range(12))
+    order[a], order[b] = b, a
+    return values[:, order]
+
+
+def test_of_a_clean_log_only_its_rate_is_said() -> None:
+    inspection = inspect(log())
+    assert said(inspection, "warning") == []
+    assert said(inspection, "refusal") == []
+    assert "t: 2000 rows over 4.00 s, 500 Hz" in said(inspection, "note")[0]
+    assert inspection.log.valid.all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"q": fields()["q"] / SHARE}, "dq: the slope of q is 57.3 times dq"),
+        ({"dq": fields()["dq"] / SHARE}, "dq: the slope of q is 0.0175 times dq"),
+        ({"t": fields()["t"] * 1e3, "t_cmd": fields()["t"] * 1e3}, "dq: the slope of q is 0.001 times dq"),
+        ({name: fields()[name] / SHARE for name in ("q", "dq", "q_des")}, "q: up to 1"),
+        ({"q_des": fields()["q_des"] / SHARE}, "q_des: about 57 times as large as q: degrees?"),
+        ({"dq": -fields()["dq"]}, "dq: has the opposite sign"),
+        ({"tau": -fields()["tau"]}, "tau: has the sign against the position error"),
+        (
+            {"q_des": exchanged(fields()["q_des"])},
+            "q_des: a joint's q follows another joint's command (FR_hip",
+        ),
+        (
+            {"q_des": exchanged(fields()["q_des"]), "tau": None},
+            "q_des: a joint's q follows another joint's command (FR_hip_joint follows FL_thigh_joint",
+        ),
+        (
+            {"q": exchanged(fields()["q"]), "dq": exchanged(fields()["dq"])},
+            "q_des: a joint's q follows another",
+        ),
+        ({"q": np.zeros((2000, 12)), "dq": np.zeros((2000, 12))}, "q: no joint ever moves"),
+        ({"tau": np.zeros((2000, 12))}, "tau: never changes on any joint"),
+        ({"kp": np.zeros((2000, 12))}, "valid: 0.00 s under PD control are left"),
+        ({"kp": np.full((2000, 12), -30.0)}, "kp: found -30"),
+    ],
+)
+def test_a_log_that_would_mislead_is_refused(changes: dict[str, Any], sentence: str) -> None:
+    inspection = inspect(log(**changes))
+    assert any(text.startswith(sentence) for text in said(inspection, "refusal")), inspection.findings
+    with pytest.raises(LogError, match=r"^a\.npz: "):
+        inspection.raise_refusal()
+
+
+def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
+    t = fields()["t"]
+    keep = ((t < 1.0) | (t > 1.3)) & (np.arange(2000) % 50 != 7)
+    given = {name: fields()[name][keep] for name in ("t", "q", "dq", "tau", "q_des")}
+    for name in ("q", "dq", "tau"):
+        given[name][100:400:10] = given[name][99:399:10]
+    shape = given["q"].shape
+    same = {"kp": np.full(shape, 30.0), "kd": np.full(shape, 0.5), "valid": np.ones(shape, bool)}
+    warnings = said(inspect(log(**given, t_cmd=given["t"], **same)), "warning")
+    assert "t: 1 gap, the longest of 0.304 s at 1.00 s" in warnings
+    assert "t: about 37 rows were dropped, one at a time" in warnings
+    assert any(text.startswith("q: 30 rows (") for text in warnings)
+
+
+def test_clipped_channels_and_joints_at_rest_are_named() -> None:
+    dq, q = fields()["dq"], fields()["q"]
+    q[:, 7] = 0.6
+    dq[:, 7] = 0.0
+    tau = fields()["tau"]
+    tau[:, 2] = np.clip(tau[:, 2], -0.5, 0.5)
+    inspection = inspect(log(q=q, dq=dq, tau=tau))
+    found = {finding.text.split(":")[1].strip(): finding.joints for finding in inspection.findings}
+    assert found["never moves"] == ("RR_thigh_joint",)
+    assert found["clipped (N m)"] == ("FR_calf_joint",)
+
+
+def test_names_that_contradict_the_model_are_said() -> None:
+    order = list(np.roll(np.arange(12), 1))
+    moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}
+    warnings = said(inspect(log(**moved)), "warning")
+    assert any(text.startswith("joint_names: q contradicts the model's range") for text in warnings)
+    strange = attrs.evolve(log(), joints=(*JOINT_NAMES[:11], "RL_knee_joint"))
+    assert "joint_names: RL_knee_joint: not among" in " ".join(said(inspect(strange), "warning"))
+
+
+def test_a_gain_of_zero_is_left_out() -> None:
+    kp = np.full((2000, 12), 30.0)
+    kp[1000:] = 0.0
+    inspection = inspect(log(kp=kp))
+    assert (
+        "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in said(inspection, "warning")[0]
+    )
+    assert inspection.log.valid[:1000].all()
+    assert not inspection.log.valid[1000:].any()
+
+
+@pytest.mark.parametrize("gains_known", [True, False])
+@pytest.mark.parametrize("damping", [0.0, 5.0])
+def test_damping_and_switching_off_show_in_the_torque(gains_known: bool, damping: float) -> None:
+    given = fields()
+    off = given["t"] > 2.5
+    tau = np.where(off[:, None], -damping * given["dq"], given["tau"])
+    tau += np.random.default_rng(1).normal(0.0, 0.05, tau.shape)
+    q_des = np.where(off[:, None], given["q_des"][~off][-1] + 0.1, given["q_des"])
+    gains = {} if gains_known else {"kp": None, "kd": None}
+    inspection = inspect(log(tau=tau, q_des=q_des, **gains))
+    assert any("tau: the torque no longer answers" in text for text in said(inspection, "warning"))
+    valid = inspection.log.valid.any(axis=1)
+    assert not valid[off].any()
+    assert valid[given["t"] < 2.3].all()
+
+
+def test_saturation_and_friction_are_not_taken_for_damping() -> None:
+    given = fields()
+    tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)
+    assert inspect(log(tau=tau)).log.valid.all()
+
+
+def test_unknown_gains_and_missing_torque_are_said() -> None:
+    notes = said(inspect(log(kp=None, kd=None, tau=None)), "note")
+    assert "kp: not in the log; it is fitted" in notes
+    assert "kd: not in the log; it is fitted" in notes
+    assert any(text.startswith("tau: not in the log") for text in notes)
+
+
+def test_what_the_motion_cannot_tell_apart_is_said() -> None:
+    still = np.tile(fields()["q_des"].mean(axis=0), (2000, 1))
+    warnings = said(inspect(log(q_des=still)), "warning")
+    assert "q_des: the command never changes, so that no delay of the command can be identified" in warnings
+    slow = np.linspace(0.0, 4.0, 2000)[:, None] * np.ones(12)
+    steady = {"q": 0.1 * slow, "dq": np.full((2000, 12), 0.1), "q_des": 0.1 * slow + 0.05}
+    texts = " ".join(finding.text for finding in inspect(log(**steady, tau=None)).findings)
+    assert "kp and torque offset are separable only through changes of the position error" in texts
+
+
+MEASURED = Path(os.environ.get("QUADVEL_MEASURED", ""))
+measured = pytest.mark.skipif(
+    "QUADVEL_MEASURED" not in os.environ, reason="QUADVEL_MEASURED names no folder of measured logs"
+)
+
+
+@measured
+@pytest.mark.parametrize(("number", "begins"), [(1, 9.64), (2, 11.45)])
+@pytest.mark.parametrize("without", [(), ("kp", "kd"), ("tau",)])
+def test_the_damping_after_a_walk_is_noticed(number: int, begins: float, without: tuple[str, ...]) -> None:
+    walk = read_log(MEASURED / f"go2_walk_{number}.npz")
+    inspection = inspect(attrs.evolve(walk, **dict.fromkeys(without)))
+    inspection.raise_refusal()
+    valid = inspection.log.valid.any(axis=1)
+    assert not valid[walk.t > begins + 0.15].any()
+    before = (walk.t > walk.t_cmd[0]) & (walk.t < begins - 0.5)
+    assert valid[before].all()
+
+
+@measured
+def test_measured_logs_with_commands_are_accepted() -> None:
+    for name in ("go2_inair", "go2_replay_50hz"):
+        inspection = inspect(read_log(MEASURED / f"{name}.npz"))
+        inspection.raise_refusal()
+        assert inspection.log.valid.all()
+
+
+@measured
+@pytest.mark.parametrize("name", ["ak80_acrobot", "ak80_pendubot"])
+def test_measured_logs_of_torque_commands_are_refused(name: str) -> None:
+    with pytest.raises(LogError, match=rf"{name}\.npz: q_des: the field is missing"):
+        read_log(MEASURED / f"{name}.npz")
