@@ -1,0 +1,169 @@
+"""The plants of the twin: physics against closed form, hidden from all but their own process; and the page."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadvel_actuator import ActuatorParameters
+from quadvel_bringup import plant as plant_module
+from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
+from quadvel_bringup.twin import PLANTS, SHIPPED, plant_nodes
+from quadvel_bringup.twin_page import decision, twin_page
+from quadvel_description import robot
+from quadvel_description.state import JointCommand
+from quadvel_sim import SimulatorConfig
+
+DT = 0.001
+ZERO = np.zeros(12)
+
+
+def full(value: float) -> np.ndarray:
+    return np.full(12, value)
+
+
+@pytest.mark.parametrize("speed", [-3.0, 0.1, 0.4, 12.0])
+def test_a_dry_gear_turned_at_constant_speed_resists_with_its_stribeck_level(speed: float) -> None:
+    gear = DryGear(slip=full(0.7), stick=full(1.1))
+    for _ in range(400):
+        torque = gear.torque(ZERO, ZERO, full(speed), DT)
+    level = 0.7 + (1.1 - 0.7) * np.exp(-((speed / 0.25) ** 2))
+    np.testing.assert_allclose(torque, -np.sign(speed) * level, rtol=1e-3)
+
+
+def test_a_dry_gear_gives_way_like_a_spring_before_it_slips() -> None:
+    gear = DryGear(slip=full(0.7), stick=full(1.1), stiffness=250.0)
+    torque = [gear.torque(ZERO, ZERO, full(0.01), DT)[0] for _ in range(20)]
+    np.testing.assert_allclose(torque, [-250.0 * 0.01 * DT * (i + 1) for i in range(20)], rtol=0.05)
+
+
+def test_a_slow_current_answers_a_step_as_its_winding_lets_it() -> None:
+    drive = SlowCurrent(constant=full(0.005), droop=full(0.1))
+    drive.torque(ZERO, ZERO, ZERO, DT)
+    torque = np.array([drive.torque(full(4.0), ZERO, ZERO, DT)[0] for _ in range(30)])
+    edges = 4.0 * 0.005 * np.exp(-np.arange(31) * DT / 0.005)
+    np.testing.assert_allclose(torque, 4.0 + np.diff(edges) / DT, rtol=1e-9)  # the mean over each ms
+    held = [drive.torque(full(4.0), ZERO, full(2.0), DT)[0] for _ in range(100)]
+    assert held[-1] == pytest.approx(4.0 - 0.1 * 2.0)  # what the back-EMF takes off
+
+
+def test_a_cable_rubs_in_its_part_of_the_range_alone() -> None:
+    cable = ChafingCable(rub=full(2.0), begin=full(-1.35))
+    np.testing.assert_allclose(cable.torque(ZERO, full(-1.8), full(5.0), DT), 0.0, atol=1e-3)
+    np.testing.assert_allclose(cable.torque(ZERO, full(-0.9), full(5.0), DT), -2.0 * 1.4, atol=1e-3)
+    np.testing.assert_allclose(cable.torque(ZERO, full(-0.9), full(-5.0), DT), 2.0 * 0.6, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_reading_a_plants_state_does_not_alter_its_run(name: str) -> None:
+    physics = read_plant(PLANTS / f"{name}.yaml")
+    ends = []
+    for looks in (False, True):
+        plant = Plant(SimulatorConfig(seed=1), physics)
+        plant.reset("stand")
+        for step in range(120):
+            target = robot.NOMINAL_Q + 0.2 * np.sin(0.05 * step)
+            plant.command(JointCommand(q=target, kp=full(30.0), kd=full(0.5)))
+            if looks:
+                plant.state()
+            plant.step()
+        ends.append(plant.data.qpos.copy())
+    np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-12)
+
+
+def test_what_a_plant_reports_is_the_torque_that_its_joints_get() -> None:
+    plant = Plant(SimulatorConfig(seed=1), read_plant(PLANTS / "slow_current.yaml"))
+    plant.reset("stand")
+    plant.command(JointCommand(q=np.array(robot.NOMINAL_Q), kp=full(30.0), kd=full(0.5)))
+    plant.step(5)
+    reported = plant.state().tau
+    plant.step()
+    np.testing.assert_array_equal(reported, plant.data.ctrl)
+
+
+def test_the_noise_of_hidden_drives_is_that_of_the_stacks_model() -> None:
+    parameters = ActuatorParameters.default()
+    still = DryGear(slip=ZERO, stick=ZERO)
+    drives = HiddenDrives(parameters, still, DT, seed=0)
+    torque = [drives.step(ZERO, ZERO, ZERO, 30.0, 0.5) for _ in range(2000)]
+    assert np.var(torque) == pytest.approx(parameters.torque_noise, rel=0.05)
+
+
+def test_only_the_plants_process_is_told_of_its_file() -> None:
+    nodes = plant_nodes(PLANTS / "dry_gears.yaml", seed=4)
+    told = [name for name, line in nodes.items() if any("dry_gears" in word for word in line)]
+    assert told == ["sim_node"]
+    assert set(nodes) == {"sim_node", "estimator", "controller", "command_mux"}
+    assert "seed:=4" in nodes["sim_node"]
+
+
+def test_the_plants_physics_knows_nothing_of_what_identification_fits() -> None:
+    tree = ast.parse(Path(plant_module.__file__).read_text())
+    imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    assert not any("effects" in str(name) or "identify" in str(name) for name in imported)
+    for plant in PLANTS.glob("*.yaml"):
+        assert "_friction" not in plant.read_text()
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("kind: rust", "kind: found 'rust', expected one of dry_gear, slow_current, chafing_cable"),
+        ("kind: [", "no valid YAML"),
+        ("kind: dry_gear\nslip: {FR_knee: 1.0}\nstick: {}", "slip: joint names: found 'FR_knee'"),
+        (
+            "kind: dry_gear\nslip: much\nstick: {}",
+            "slip: found 'much', expected a number, or numbers by joint",
+        ),
+        ("kind: dry_gear\nslip: {}", "missing 1 required positional argument: 'stick'"),
+        ("kind: dry_gear\nslip: {}\nstick: {}\nwear: 1.0", "unexpected keyword argument 'wear'"),
+    ],
+)
+def test_a_file_that_describes_no_plant_is_refused(tmp_path: Path, text: str, sentence: str) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=f"^{re.escape(str(file))}: .*{re.escape(sentence)}"):
+        read_plant(file)
+
+
+def entry(name: str, after: float) -> dict[str, Any]:
+    def model(scale: float) -> dict[str, Any]:
+        tracking = {"xy": 0.05 * scale, "wz": 0.04 * scale}
+        errors = {"torque_mse": 0.8 * scale, "tau": 1.0 * scale, "q": 0.02 * scale, "dq": 0.9 * scale}
+        return {**errors, "stretches": 70, "tracking": tracking}
+
+    return {
+        "name": name,
+        "decision": f"Add friction to {name} <now>.",
+        "effects": ["stribeck_friction"],
+        "fit": {"eam": 0.7, "corrected": 0.07},
+        "noise_floor": 0.066,
+        "segments": [
+            {"command": [0.5, 0.0, 0.0], "plant": [0.44, 0, 0], "before": [0.5, 0, 0], "after": [0.45, 0, 0]}
+        ],
+        "repeat": {"xy": 0.004, "wz": 0.01},
+        "before": model(1.0),
+        "after": model(after),
+    }
+
+
+def test_the_page_says_by_how_much_the_corrected_models_are_nearer() -> None:
+    results = [entry("dry_gears", 0.1), entry("slow_current", 0.3)]
+    assert decision(results) == (
+        "With what was identified on 2 plants, the model's torque error falls by 80 %, its open-loop error of q by "
+        "80 % and of dq by 80 %, the gap of its velocity tracking by 80 %."
+    )
+    page = twin_page(results)
+    assert page.index("80 %") < page.index("dry_gears") < page.index("slow_current")
+    for text in (
+        "Add friction to dry_gears &lt;now&gt;.",
+        "dry_gears/identify/report.html",
+        "+0.440, +0.000",
+        "90 %",
+    ):
+        assert text in page

@@ -1,0 +1,71 @@
+"""Replaying a run with its own model errs by little, with another one by more."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from quadvel_actuator import ActuatorParameters
+from quadvel_description import robot
+from quadvel_description.state import MODE_SERVO, JointCommand
+from quadvel_eval.replay import Joints, open_loop, torque_error, tracking_gap
+from quadvel_eval.segments import Segment
+from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
+
+SECONDS = 1.5
+
+
+@pytest.fixture(scope="module")
+def run() -> tuple[Joints, Callable[[float], Truth]]:
+    """A robot with the shipped drives that sways on its feet under commands at 200 Hz; what its sensors say, exactly."""
+    simulator = Simulator(SimulatorConfig(noise=SensorNoise.none(), seed=3))
+    simulator.reset("stand")
+    states, truths, rows = [], [], []
+    sway = np.tile([0.1, 0.15, -0.2], 4)
+    for step in range(round(SECONDS * 1000)):
+        if step % 5 == 0:
+            target = robot.NOMINAL_Q + sway * np.sin(2 * np.pi * 2.0 * step * 0.001)
+            command = JointCommand(q=target, kp=np.full(12, robot.KP), kd=np.full(12, robot.KD))
+        simulator.command(command)
+        states.append(simulator.state())
+        truths.append(simulator.truth())
+        rows.append(np.concatenate([command.q, command.kp, command.kd, [MODE_SERVO]]))
+        simulator.step()
+    time = np.array([state.time for state in states])
+    q, dq, tau = (np.array([getattr(state, name) for state in states]) for name in ("q", "dq", "tau"))
+    return Joints(time, q, dq, tau, np.array(rows)), lambda t: truths[round(1000 * t)]
+
+
+def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
+    run: tuple[Joints, Callable[[float], Truth]],
+) -> None:
+    joints, _ = run
+    true, ideal = ActuatorParameters.default(), ActuatorParameters.ideal()
+    assert torque_error(true, joints, 0.2, SECONDS) == pytest.approx(true.torque_noise, rel=0.05)
+    assert torque_error(ideal, joints, 0.2, SECONDS) > 2 * true.torque_noise
+
+
+def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
+    run: tuple[Joints, Callable[[float], Truth]],
+) -> None:
+    joints, truth = run
+    true = open_loop(ActuatorParameters.default(), joints, truth, 0.2, SECONDS)
+    ideal = open_loop(ActuatorParameters.ideal(), joints, truth, 0.2, SECONDS)
+    assert true.stretches == ideal.stretches == 4
+    assert true.q < 0.003
+    assert true.dq < 0.7 * ideal.dq  # the noise of the torque alone makes half of it
+    assert true.q < 0.2 * ideal.q
+
+
+def test_a_stretch_without_a_past_is_not_replayed(run: tuple[Joints, Callable[[float], Truth]]) -> None:
+    with pytest.raises(ValueError, match=r"nothing to replay between 0\.00 and 0\.25 s"):
+        open_loop(ActuatorParameters.default(), *run, 0.0, 0.25)
+
+
+def test_the_gap_is_the_mean_distance_of_the_mean_velocities() -> None:
+    command = np.zeros(3)
+    plant = [Segment(command, np.array([0.5, 0.0, 0.1])), Segment(command, np.array([0.0, 0.2, 0.0]))]
+    model = [Segment(command, np.array([0.53, 0.04, 0.0])), Segment(command, np.array([0.0, 0.2, 0.3]))]
+    assert tracking_gap(plant, model) == pytest.approx((0.025, 0.2))
