@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from quadvel_description import robot, symmetry
+from quadvel_sim.terrain import Terrain
 
 from . import gait, student, teacher
 from .command_map import CommandMap, Tracking, fit_command_map, held_commands
@@ -114,6 +115,7 @@ class DistillConfig:
     correction_gain: float = 0.5  # 1/s, integral action of the teacher on top of the map
     seed: int = 1
     commands: CommandRange = CommandRange()
+    terrain: Terrain = Terrain()
 
 
 class DistillRun:
@@ -125,10 +127,10 @@ class DistillRun:
         torch.manual_seed(config.seed)
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
-        trial = held_commands(env_config)
+        trial = held_commands(env_config)  # on flat ground
         own = fit_command_map(Teacher(actor, VelocityEnv(trial), CommandMap(), gain=0.6))
         goal = fit_command_map(Student(start, VelocityEnv(trial), gain=0.6)) if start else CommandMap()
-        self.env = VelocityEnv(env_config)
+        self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain, goal)
         self.student = start or student.new_actor()
         self.map = student.action_map(self.env)
