@@ -18,14 +18,17 @@ def fields(seconds: float = 4.0, rate: float = 500.0, seed: int = 0) -> dict[str
     """The named arrays of a clean log of 12 joints in motion, all on one time base."""
     random = np.random.default_rng(seed)
     t = np.arange(round(seconds * rate)) / rate
-    frequency, phase = random.uniform(0.5, 3.0, (2, 12, 2)) * [[[1.0]], [[2.0]]]
-    wave = [0.1 * np.sin(2.0 * np.pi * f * t[:, None] + p) for f, p in zip(frequency.T, phase.T, strict=True)]
-    slope = [
-        0.2 * np.pi * f * np.cos(2.0 * np.pi * f * t[:, None] + p)
-        for f, p in zip(frequency.T, phase.T, strict=True)
-    ]
-    q, dq = NOMINAL_Q + sum(wave), sum(slope)
-    q_des = np.round((q + 0.02 * dq + random.normal(0.0, 0.02, q.shape)) * 1e4) / 1e4
+
+    def waves(amplitude: float) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of two sines (N, 12), and their slopes."""
+        pulse, phase = 2.0 * np.pi * random.uniform(0.5, 3.0, (2, 12)), random.uniform(0.0, 6.0, (2, 12))
+        angle = pulse * t[:, None, None] + phase
+        return amplitude * np.sin(angle).sum(axis=1), amplitude * (pulse * np.cos(angle)).sum(axis=1)
+
+    motion, dq = waves(0.1)
+    load, _ = waves(0.04)
+    q = NOMINAL_Q + motion
+    q_des = q + 0.02 * dq + load
     tau = KP * (q_des - q) - KD * dq + random.normal(0.0, 0.1, q.shape)
     return {
         "t": t,

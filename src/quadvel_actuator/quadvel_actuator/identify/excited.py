@@ -84,10 +84,16 @@ def _others(traces: dict[str, NDArray[np.float64]], *but: str) -> NDArray[np.flo
 
 
 def _apart(a: NDArray[np.float64], b: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Sine of the angle between two traces once the others are taken out of both; 1 where one of them is nothing."""
+    """Sine of the angle between two traces once the others are taken out of both.
+
+    1 where one of them is nothing at all, 0 where the others leave nothing of it.
+    """
+    whole = np.linalg.norm(a) * np.linalg.norm(b)
+    if whole < 1e-12:
+        return 1.0
     if others.shape[1]:
         a, b = (x - others @ np.linalg.lstsq(others, x, rcond=None)[0] for x in (a, b))
-    lengths = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
-    if lengths < 1e-12:
-        return 1.0
-    return float(np.sqrt(max(0.0, 1.0 - (float(np.sum(a * b)) / lengths) ** 2)))
+    left = np.linalg.norm(a) * np.linalg.norm(b)
+    if left < 1e-9 * whole:
+        return 0.0
+    return float(np.sqrt(max(0.0, 1.0 - (float(np.sum(a * b)) / left) ** 2)))

@@ -17,6 +17,7 @@ ROWS = 20_000
 DEGREE = np.pi / 180.0
 HALF_WIDTH = 0.005  # s, of the slope of q
 MOVING = 0.05  # rad/s
+LAGS = (0.0, 0.006, 0.012)  # s, from a command to its torque
 TURNS = 10.0  # rad; a joint of a leg does not reach so far
 REACH = 0.4  # rad beyond the model's range
 
@@ -151,7 +152,7 @@ def _by_torque(log: Log) -> dict[int, int]:
     """Joint and the one whose command or angle explains its torque far better than its own do."""
     row = rows_of(log)
     row = row[log.valid[row].any(axis=1)][:: max(1, len(row) // 4000)]
-    command = log.q_des[log.command_rows(log.t[row] - 0.005)].astype(float)
+    commands = [log.q_des[log.command_rows(log.t[row] - lag)].astype(float) for lag in LAGS]
     q, dq = log.q[row].astype(float), log.dq[row].astype(float)
     assert log.tau is not None
     tau = log.tau[row].astype(float)
@@ -160,14 +161,17 @@ def _by_torque(log: Log) -> dict[int, int]:
         total = float(np.var(tau[:, j]))
         if total < 1e-6:
             continue
-        own = _left(command[:, j] - q[:, j], dq[:, j], tau[:, j]) / total
+
+        def left(k: int, m: int, j: int = j, total: float = total) -> float:
+            """Share of the torque that the command of k and the motion of m leave."""
+            return min(_left(c[:, k] - q[:, m], dq[:, m], tau[:, j]) for c in commands) / total
+
+        own = left(j, j)
         if own < 0.3:
             continue
         others = [k for k in range(len(log.joints)) if k != j]
-        by_command = {k: _left(command[:, k] - q[:, j], dq[:, j], tau[:, j]) / total for k in others}
-        by_angle = {k: _left(command[:, j] - q[:, k], dq[:, k], tau[:, j]) / total for k in others}
-        left, k = min((left, k) for choice in (by_command, by_angle) for k, left in choice.items())
-        if left < 0.3 * own and left < 0.3:
+        least, k = min((min(left(k, j), left(j, k)), k) for k in others)
+        if least < 0.3 * own and least < 0.3:
             found[j] = k
     return found
 
