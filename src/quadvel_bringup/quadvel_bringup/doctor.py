@@ -34,6 +34,7 @@ def examine() -> Iterator[Finding]:
     yield _middleware()
     yield from map(_package, NEEDED)
     yield _clock()
+    yield _priority()
     yield _gl()
     yield _torch()
 
@@ -91,6 +92,14 @@ def gl_backend() -> str | None:
         if trial.returncode == 0:
             return backend
     return None
+
+
+def _priority() -> Finding:
+    """Real-time priority, tried in a process of its own, which ends at once."""
+    code = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
+    permitted = subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+    refused = "real time not permitted, so all programs share the cores alike; see rtprio in limits.conf(5)"
+    return Finding("priority", True, "real time is permitted" if permitted else refused)
 
 
 def _gl() -> Finding:

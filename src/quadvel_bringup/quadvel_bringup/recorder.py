@@ -77,20 +77,19 @@ class Recorder:
     def serve(self, executor: Executor, seconds: float) -> None:
         """Let the executor of our node write for so long what comes.
 
-        It looks once in BATCH, for all that waits: waking for each message would take from the processes that
-        are recorded several times what writing does.
+        In real time it looks once in BATCH, for all that waits: waking for each message would take from the
+        processes that are recorded several times what writing does. On simulated time, whose pace is not known,
+        messages are written as they come, since they are filed under the time of writing.
         """
+        pause = 0.0 if self._node.get_parameter("use_sim_time").value else BATCH
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
-            time.sleep(min(left, BATCH))
-            self.write_waiting(executor)
-
-    def write_waiting(self, executor: Executor) -> None:
-        """Write all that waits now."""
-        written = -1
-        while self.counts.total() > written:
-            written = self.counts.total()
-            executor.spin_once(timeout_sec=0.0)
+            time.sleep(min(left, pause))
+            timeout, written = left, -1
+            while self.counts.total() > written:
+                written = self.counts.total()
+                executor.spin_once(timeout_sec=timeout)
+                timeout = 0.0
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""

@@ -77,7 +77,7 @@ class Controller(Node):
         }
         self._create_interfaces()
         if not self._sim_time:  # where time waits for the node there is no hurry
-            self._settings.apply(self.get_logger().info)
+            self._settings.apply(self.get_logger().debug)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a tick
 
     def _create_interfaces(self) -> None:

@@ -64,7 +64,7 @@ class SimNode(Node):
         self.create_service(Push, "~/push", self._on_push)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self._settings.mode == REALTIME:
-            self._settings.apply(self.get_logger().info)
+            self._settings.apply(self.get_logger().debug)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
         self._thread = Thread(target=self._simulate, name="simulation")
         self._thread.start()
