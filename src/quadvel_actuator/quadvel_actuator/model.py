@@ -1,6 +1,7 @@
 """The empirical actuator model: what torque the joints give for a PD command (Eq. 1 and 2 of the paper).
 
-    command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff, clipped
+    command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff
+    asked torque --effects, if the parameters hold any--> clipped
     asked torque --output delay--> + noise, clipped = torque on the joint
 
 The law is evaluated every step on the present joint state, with the command held between its updates. One
@@ -16,6 +17,8 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_actuator.running import RunningEffects
+from quadvel_description.robot import JOINT_NAMES
 
 Array = NDArray[np.float64]
 Values = float | Array
@@ -57,11 +60,6 @@ class ActuatorModel:
     def __init__(
         self, parameters: ActuatorParameters, shape: tuple[int, ...] = (12,), dt: float = 0.001, seed: int = 0
     ) -> None:
-        if parameters.effects:  # they would act on the asked torque, in `_asked_torque`
-            names = ", ".join(effect.name for effect in parameters.effects)
-            raise ValueError(
-                f"actuator {parameters.name}: effects: found {names}, expected none (none is known)"
-            )
         self.parameters = parameters
         self.shape = shape
         self.dt = dt
@@ -76,6 +74,7 @@ class ActuatorModel:
         self._packets = DelayLine(shape, dt)  # kp_hat q_des + kd_hat dq_des + tau_ff
         self._gains = DelayLine((*shape[:-1], 2 * joints), dt)  # kp, kd; used while a change is under way
         self._torques = DelayLine(shape, dt)  # asked torque
+        self._effects = self._running_effects(seed)
         self._noise = np.zeros((0, *shape), dtype=np.float32)
         self._noise_used = 0
         self._scratch = np.zeros(shape)
@@ -91,6 +90,21 @@ class ActuatorModel:
         self._new = np.ones(shape[:-1], dtype=bool)
         self.reset()
 
+    def _running_effects(self, seed: int) -> RunningEffects | None:
+        """None where there are none: a model without effects costs no step more."""
+        parameters = self.parameters
+        if not parameters.effects:
+            return None
+        names = parameters.joints or JOINT_NAMES
+        if len(names) != self.shape[-1]:
+            raise ValueError(
+                f"actuator {parameters.name}: joints: found {len(names)} names, expected {self.shape[-1]}"
+            )
+        try:
+            return RunningEffects(parameters.effects, names, self.shape, self.dt, seed)
+        except ValueError as error:
+            raise ValueError(f"actuator {parameters.name}: {error}") from None
+
     @property
     def input_delay(self) -> Array:
         """Delay of the command on its way to the actuator (s), t_i."""
@@ -100,6 +114,8 @@ class ActuatorModel:
     def input_delay(self, seconds: Values) -> None:
         self._packets.delay = seconds
         self._gains.delay = seconds
+        if self._effects is not None:
+            self._effects.targets.delay = seconds
 
     @property
     def output_delay(self) -> Array:
@@ -220,11 +236,14 @@ class ActuatorModel:
         heads = [line.head for line in lines]
         memory = self._kp, self._kd, self._gain_age, self._any_new
         new = self._new.copy()
+        kept = None if self._effects is None else self._effects.remember()
         torque = self.step(q, dq, q_des, kp, kd, dq_des, tau_ff)
         for line, head in zip(lines, heads, strict=True):
             line.head = head  # what lay in the slots written since was too old to be read again
         self._kp, self._kd, self._gain_age, self._any_new = memory
         self._new[...] = new
+        if self._effects is not None:
+            self._effects.recall(kept)
         self._update_gains()
         if self._noisy:
             self._noise_used -= 1
@@ -241,6 +260,8 @@ class ActuatorModel:
             packet += tau_ff
         if self._any_new:
             self._packets.hold(self._new)
+        if self._effects is not None:
+            self._effects.send(q_des, dq_des, self._new if self._any_new else None)
 
     def _take_gains(self, kp: Values, kd: Values) -> None:
         """Note the commanded gains; their history is kept until a change has passed the longest delay."""
@@ -282,6 +303,8 @@ class ActuatorModel:
         torque = self._packets.read()
         torque -= np.multiply(kp_hat, q, out=self._scratch)
         torque -= np.multiply(kd_hat, dq, out=self._scratch)
+        if self._effects is not None:
+            torque = self._effects.apply(torque, q, dq, kp_hat, kd_hat, self._new if self._any_new else None)
         self._clip(torque, out=out)
 
     def _clip(self, torque: Array, out: Array) -> None:

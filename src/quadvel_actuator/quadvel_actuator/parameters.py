@@ -27,6 +27,7 @@ _COMMENTS = {
     "pairs": "Delays of command and torque (s), and the pair's mean squared torque error (N^2 m^2).",
     "torque_noise": "Variance of the torque noise (N^2 m^2).",
     "torque_limit": "Largest torque: one number, one per hip, thigh and calf, or one per joint (N m).",
+    "joints": "Names of the joints in order; without them those of the AlienGo.",
     "effects": "What the model adds to the PD law: name, joints, parameters, units and intervals of each.",
 }
 
@@ -50,12 +51,13 @@ def _number(expected: str, at_least: float = -np.inf, above: float = -np.inf) ->
 
 
 def _per_joint(expected: str, above: float = -np.inf) -> Any:
-    """A validator: a number, or a tuple of 3 (hip, thigh, calf) or 12 (every joint), each `above` a bound."""
+    """A validator: a number, or a tuple (3: hip, thigh, calf; else every joint), each `above` a bound."""
 
-    def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         values = list(value) if isinstance(value, tuple) else [value]
-        if isinstance(value, tuple) and len(value) not in (3, JOINTS):
-            _refuse(attribute.name, value, f"a number, 3 numbers or {JOINTS} numbers")
+        joints = len(instance.joints) or JOINTS
+        if isinstance(value, tuple) and len(value) not in (3, joints):
+            _refuse(attribute.name, value, f"a number, 3 numbers or {joints} numbers")
         for one in values:
             if not _is_number(one) or one <= above:
                 _refuse(attribute.name, one, expected)
@@ -100,6 +102,11 @@ class Effect:
     parameters: Mapping[str, Any] = attrs.field(validator=_mapping)
     units: Mapping[str, str] = attrs.field(factory=dict, validator=_mapping)
     intervals: Mapping[str, Any] = attrs.field(factory=dict, validator=_mapping)
+
+
+def _names_or_none(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    if value != ():
+        _names(instance, attribute, value)
 
 
 def _record(cls: Any, values: Any) -> Any:
@@ -172,6 +179,7 @@ class ActuatorParameters:
         converter=_tuple_if_list, validator=_per_joint("a torque above 0", above=0.0)
     )
     effects: tuple[Effect, ...] = attrs.field(converter=_effects, default=())
+    joints: tuple[str, ...] = attrs.field(converter=_tuple_if_list, validator=_names_or_none, default=())
 
     @property
     def best_pair(self) -> DelayPair:

@@ -93,8 +93,8 @@ class EffectLaw:
         return (cls(),)
 
     @classmethod
-    def configured(cls, settings: Mapping[str, Any]) -> EffectLaw:
-        """The form that a parameter file names: of its parameters those that are no numbers."""
+    def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
+        """The form that a parameter file names: of its parameters those that are no numbers; the robot's `joints`."""
         return cls(**settings)
 
     @property
@@ -113,6 +113,10 @@ class EffectLaw:
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""
         return p
+
+    def running(self, rng: np.random.Generator) -> EffectLaw:
+        """The law as a running model has it; what happens at random is drawn from `rng`."""
+        return self
 
     @property
     def names(self) -> tuple[str, ...]:

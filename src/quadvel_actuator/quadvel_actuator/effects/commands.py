@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .base import Array, ErrorLaw, Errors, Parameter, Params, Start, View
+from .base import Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
 
 MOST = 6
 """commands lost in a row that are looked for"""
@@ -51,6 +51,30 @@ class CommandHold(ErrorLaw):
         row = np.maximum(s.packet - self.behind, 0)
         old: Array = s.sent[row, np.arange(s.q.shape[-1])]
         return np.where(self.behind > 0, e[0] + old - s.q_des, e[0]), e[1]
+
+    def running(self, rng: np.random.Generator) -> _Losing:
+        return _Losing(rng)
+
+
+@attrs.frozen(eq=False)
+class _Losing(MemoryLaw):
+    """Each new command is lost with the probability `share`, for all joints of a robot at once."""
+
+    name = CommandHold.name
+    stage = Stage.ERRORS
+    parameters = CommandHold.parameters
+    inputs = ("q_des",)
+    rng: np.random.Generator
+
+    def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
+        return u[0], u[0]
+
+    def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
+        held, before = memory
+        fresh = (u[0] != before).any(axis=-1, keepdims=True)
+        lost = self.rng.random((*u[0].shape[:-1], 1)) < p["share"]
+        held = np.where(fresh & ~lost, u[0], held)
+        return (x[0] + held - u[0], x[1]), (held, u[0])
 
 
 LAWS = (CommandHold,)

@@ -138,9 +138,9 @@ class CrossCoupling(AddedLaw):
         return {"source": list(self.source)}
 
     @classmethod
-    def configured(cls, settings: Mapping[str, Any]) -> EffectLaw:
+    def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
         source = tuple(settings["source"])
-        return cls(source, tuple(cls._column(one, settings["all_joints"]) for one in source))
+        return cls(source, tuple(cls._column(one, joints) for one in source))
 
     @staticmethod
     def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:

@@ -1,0 +1,215 @@
+"""Effects at work in a running `ActuatorModel`, step by step, for one robot or a batch.
+
+Only what the registry's laws need is kept: their memories, the commands under way, and a few past states.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_actuator.delay import DelayLine
+from quadvel_actuator.effects import EffectLaw, MemoryLaw, Stage, registry
+from quadvel_actuator.parameters import Effect
+
+Array = NDArray[np.float64]
+
+_PAST = 0.03
+"""s of velocities that are kept"""
+
+_SLOPE_STEPS = 2
+"""steps over which the acceleration is taken"""
+
+
+class Instant:
+    """What the laws see of one step; see `quadvel_actuator.effects.base.View`."""
+
+    temperature = 25.0
+    voltage = np.inf
+    packet = sent = None
+
+    def __init__(self, shape: tuple[int, ...], dt: float) -> None:
+        self.dt = dt
+        self.t = np.zeros((*shape[:-1], 1))
+        self.q = self.dq = self.ddq = self.q_des = np.zeros(shape)
+        self.measured = np.zeros(shape)  # the torque of the step before
+        self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)
+
+    @property
+    def power(self) -> Array:
+        """Mechanical power that the joints draw together, (..., 1), W."""
+        power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)
+        return power
+
+    def shifted(self, name: str, late: Array) -> Array:
+        """The velocity `late` s ago, (J,); one of the future is not known and stays the present one."""
+        if name != "dq":
+            raise ValueError(f"shifted: found {name}, expected dq")
+        steps = np.clip(np.broadcast_to(late, self.dq.shape[-1:]) / self.dt, 0.0, len(self.past) - 1.0)
+        found = np.empty_like(self.dq)
+        for joint, back in enumerate(steps):
+            first = int(back)
+            share = back - first
+            older = self.past[min(first + 1, len(self.past) - 1)][..., joint]
+            found[..., joint] = (1.0 - share) * self.past[first][..., joint] + share * older
+        return found
+
+
+class _Running:
+    """One law with its parameters (J,) and its memory."""
+
+    def __init__(self, effect: Effect, joints: Sequence[str], rng: np.random.Generator) -> None:
+        if effect.name not in registry():
+            known = ", ".join(sorted(registry()))
+            raise ValueError(f"effects: found {effect.name}, expected one of {known}")
+        unknown = [name for name in effect.joints if name not in joints]
+        if unknown:
+            raise ValueError(
+                f"effects/{effect.name}/joints: found {unknown[0]}, expected one of {', '.join(joints)}"
+            )
+        numbers = {name: value for name, value in effect.parameters.items() if name not in _settings(effect)}
+        settings = {name: value for name, value in effect.parameters.items() if name in _settings(effect)}
+        form = registry()[effect.name].configured(settings, tuple(joints))
+        self.law: EffectLaw = form.running(rng)
+        self.active = np.array([name in effect.joints for name in joints])
+        self.everywhere = bool(self.active.all())
+        where = [joints.index(name) for name in effect.joints]
+        self.values = {
+            parameter.name: _column(effect, parameter.name, numbers, where, len(joints), parameter.scale)
+            for parameter in form.parameters
+        }
+        self.memory: tuple[Array, ...] = ()
+
+    def act(self, x: Any, now: Instant, new: NDArray[np.bool_] | None) -> Any:
+        """The value instead of `x`; environments that are `new` start from rest."""
+        law = self.law
+        if isinstance(law, MemoryLaw):
+            u = [getattr(now, name) for name in law.inputs]
+            if new is not None:
+                rest = law.rest(x, u, self.values)
+                whole = not self.memory or bool(new.all())
+                self.memory = (
+                    rest
+                    if whole
+                    else tuple(
+                        np.where(new[..., None], fresh, old)
+                        for fresh, old in zip(rest, self.memory, strict=True)
+                    )
+                )
+            after, self.memory = law.advance(x, u, now.dt, self.values, self.memory)
+        elif law.stage == Stage.ERRORS:
+            after = law.errors(x, now, self.values)  # type: ignore[attr-defined]
+        else:
+            after = law.torque(x, now, self.values)  # type: ignore[attr-defined]
+        if self.everywhere:
+            return after
+        if law.stage == Stage.ADDED:
+            return after * self.active
+        if isinstance(x, tuple):
+            return tuple(np.where(self.active, one, old) for one, old in zip(after, x, strict=True))
+        return np.where(self.active, after, x)
+
+
+def _settings(effect: Effect) -> list[str]:
+    """The parameters that say which form of the law it is, rather than how strong."""
+    return [name for name, value in effect.parameters.items() if _is_word(value) or name == "full"]
+
+
+def _is_word(value: Any) -> bool:
+    return isinstance(value, str) or (
+        isinstance(value, (list, tuple)) and any(isinstance(one, str) for one in value)
+    )
+
+
+def _column(
+    effect: Effect, name: str, numbers: dict[str, Any], where: Sequence[int], joints: int, idle: float
+) -> Array:
+    """A parameter as one number for each joint, (J,)."""
+    if name not in numbers:
+        raise ValueError(f"effects/{effect.name}/parameters: {name} is missing")
+    given = np.atleast_1d(np.asarray(numbers[name], dtype=float))
+    if given.size not in (1, len(where)):
+        raise ValueError(
+            f"effects/{effect.name}/parameters/{name}: found {given.size} numbers, expected 1 or {len(where)}"
+        )
+    column = np.full(joints, idle)
+    column[list(where)] = given
+    return column
+
+
+class RunningEffects:
+    """All effects of a model, in the order in which they act."""
+
+    def __init__(
+        self, effects: Sequence[Effect], joints: Sequence[str], shape: tuple[int, ...], dt: float, seed: int
+    ) -> None:
+        rng = np.random.default_rng([seed, 1])
+        self._all = sorted((_Running(one, joints, rng) for one in effects), key=lambda one: one.law.stage)
+        self._errors = [one for one in self._all if one.law.stage == Stage.ERRORS]
+        self._torques = [one for one in self._all if Stage.ERRORS < one.law.stage < Stage.ADDED]
+        self._added = [one for one in self._all if one.law.stage == Stage.ADDED]
+        self._now = Instant(shape, dt)
+        self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
+
+    def send(self, q_des: Any, dq_des: Any, new: NDArray[np.bool_] | None) -> None:
+        """The targets of this step go their way."""
+        slot = self.targets.push()
+        joints = slot.shape[-1] // 2
+        slot[..., :joints] = q_des
+        slot[..., joints:] = dq_des
+        if new is not None:
+            self.targets.hold(new)
+
+    def apply(
+        self, torque: Array, q: Array, dq: Array, kp_hat: Array, kd_hat: Array, new: NDArray[np.bool_] | None
+    ) -> Array:
+        """What the drive gives where the PD law asks for `torque`."""
+        now = self._observe(q, dq, new)
+        sent = self.targets.read()
+        joints = q.shape[-1]
+        now.q_des = sent[..., :joints]
+        if self._errors:
+            given = error = (now.q_des - q, sent[..., joints:] - dq)
+            for one in self._errors:
+                error = one.act(error, now, new)
+            torque = torque + kp_hat * (error[0] - given[0]) + kd_hat * (error[1] - given[1])
+        for one in self._torques:
+            torque = one.act(torque, now, new)
+        total = torque
+        for one in self._added:
+            total = total + one.act(torque, now, new)
+        now.measured = np.array(total)
+        return total
+
+    def _observe(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> Instant:
+        now = self._now
+        now.q, now.dq = np.array(q), np.broadcast_to(dq, q.shape).astype(float)
+        now.past.appendleft(now.dq)
+        now.t = now.t + now.dt
+        if new is not None:
+            now.t = np.where(new[..., None], 0.0, now.t)
+            now.past = deque((np.where(new[..., None], now.dq, old) for old in now.past), now.past.maxlen)
+        back = min(_SLOPE_STEPS, len(now.past) - 1)
+        now.ddq = (now.past[0] - now.past[back]) / (max(back, 1) * now.dt)
+        return now
+
+    def remember(self) -> Any:
+        """Everything that a step changes, for `recall`."""
+        now = self._now
+        return (
+            [one.memory for one in self._all],
+            now.t,
+            now.measured,
+            deque(now.past, now.past.maxlen),
+            self.targets.head,
+        )
+
+    def recall(self, kept: Any) -> None:
+        """Take steps since `remember` back."""
+        memories, self._now.t, self._now.measured, self._now.past, self.targets.head = kept
+        for one, memory in zip(self._all, memories, strict=True):
+            one.memory = memory
