@@ -33,20 +33,37 @@ REPORT: dict[str, Any] = {
         "input_delay_ms": 7.05,
         "output_delay_ms": 1.1,
     },
-    "after": {"train_mse": 0.068, "heldout_mse": 0.07, "per_joint": [0.07, 0.068, 0.072]},
+    "after": {
+        "train_mse": 0.068,
+        "heldout_mse": 0.07,
+        "per_joint": [0.07, 0.068, 0.072],
+        "delta_kp": [-0.71, -0.72, -0.73],
+        "delta_kp_ci95": [[-0.74, -0.68], [-0.75, -0.69], [-0.76, -0.7]],
+        "input_delay_ms": 7.01,
+        "input_delay_ms_ci95": [6.95, 7.07],
+    },
     "effects": [
         {
             "name": "stribeck_friction",
             "joints": JOINTS,
             "params": {"c": {"value": 0.4, "ci95": [0.38, 0.43], "unit": "N m"}},
             "indistinguishable": ["coulomb_friction"],
+            "separated_by": "slow motion around standstill",
             "heldout_gain": 0.2,
             "p_value": 1e-9,
         },
         {
             "name": "learned_residual",
             "joints": ["FR_calf_joint"],
-            "params": {"weight": {"value": [0.4, -0.1], "ci95": [[0.38, 0.43], [-0.2, 0.01]], "unit": "N m"}},
+            "params": {},
+            "terms": [
+                {
+                    "kind": "smooth",
+                    "inputs": ["FR_thigh_joint/dq"],
+                    "joints": ["FR_calf_joint"],
+                    "heldout_gain": 0.04,
+                }
+            ],
             "inputs": ["FR_thigh_joint/dq"],
             "indistinguishable": [],
             "heldout_gain": 0.04,
@@ -61,12 +78,16 @@ REPORT: dict[str, Any] = {
         "joints": ["FR_calf_joint"],
     },
     "decision": DECISION,
-    "data": [
+    "findings": [
         {
             "log": "logs/walk.mcap",
-            "findings": [{"kind": "warning", "field": "t", "joints": [], "text": "2 gaps of 30 ms <here>"}],
+            "kind": "warning",
+            "field": "t",
+            "joints": [],
+            "text": "2 gaps of 30 ms <here>",
         }
     ],
+    "warnings": ["stribeck_friction.c sits on its bound"],
 }
 
 
@@ -163,12 +184,16 @@ def test_the_page_says_the_decision_first_and_shows_what_it_stands_on(page: Page
     ]
     places = [text.index(DECISION), *(text.index(title) for title in order)]
     assert places == sorted(places)
-    words = ["backlash", "no gain on held-out blocks", "0.38 … 0.43", "2 gaps of 30 ms <here>", "structured"]
+    words = [
+        *("backlash", "no gain on held-out blocks", "0.38 … 0.43", "-0.76 … -0.7", "6.95 … 7.07"),
+        *("2 gaps of 30 ms <here>", "stribeck_friction.c sits on its bound", "structured", "smooth"),
+    ]
     for word in words:
         assert word in text
 
 
 def test_what_was_not_told_apart_comes_with_the_motion_that_would(page: Page) -> None:
+    assert "stribeck_friction and coulomb_friction come apart with slow motion around standstill" in page.text
     assert "stribeck_friction, coulomb_friction" in page.text
     assert "quadvel excite creep --seconds 40" in page.text
     assert "quadvel excite solo" in page.text
@@ -200,7 +225,6 @@ def test_a_report_without_effects_says_so(tmp_path: Path) -> None:
     for sentence in (
         "Nothing significant.",
         "No candidate was tried.",
-        "The plain EAM suffices",
         "Nothing is left open",
     ):
         assert sentence in text

@@ -214,25 +214,45 @@ def _taken(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
 
 
 def _parameters(report: Mapping[str, Any]) -> str:
+    """Gains, delays and the parameters of every effect, with their intervals, and what the fit warns of."""
     rows = []
+    after, joints = report["after"], report["joints"]
+    for name, title, unit in _EAM:
+        if f"{name}_ci95" in after:
+            rows += _values("EAM", title, after[name], after[f"{name}_ci95"], unit, joints)
     for effect in report["effects"]:
-        for name, parameter in effect["params"].items():
-            values, intervals = np.atleast_1d(parameter["value"]), np.atleast_2d(parameter["ci95"])
-            owners = _owners(len(values), effect["joints"])
-            for owner, value, (low, high) in zip(owners, values, intervals, strict=True):
-                rows.append(
-                    (
-                        escape(effect["name"]),
-                        escape(f"{name} {short(owner)}".strip()),
-                        number(value, 4),
-                        f"{number(low, 4)} … {number(high, 4)}",
-                        escape(parameter["unit"]),
-                        _interval(float(value), float(low), float(high)),
-                    )
-                )
+        for name, one in effect["params"].items():
+            rows += _values(effect["name"], name, one["value"], one["ci95"], one["unit"], effect["joints"])
+    text = "".join(f"<p>{escape(warning)}.</p>" for warning in report.get("warnings", ()))
     if not rows:
-        return "<p>The plain EAM suffices; its parameters are those above.</p>"
-    return table(("effect", "parameter", "#value", "#95 % interval", "unit", "from zero"), rows)
+        return text + "<p>The plain EAM suffices; its parameters are those above.</p>"
+    return text + table(("effect", "parameter", "#value", "#95 % interval", "unit", "from zero"), rows)
+
+
+_EAM = (
+    ("delta_kp", "ΔKp", "N m/rad"),
+    ("delta_kd", "ΔKd", "N m s/rad"),
+    ("input_delay_ms", "input delay", "ms"),
+    ("output_delay_ms", "output delay", "ms"),
+)
+
+
+def _values(
+    effect: str, name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Rows of the table: one where the joints share the value, else one for each."""
+    values, intervals = np.atleast_1d(value), np.atleast_2d(interval)
+    return [
+        (
+            escape(effect),
+            escape(f"{name} {short(owner)}".strip()),
+            number(one, 4),
+            f"{number(low, 4)} … {number(high, 4)}",
+            escape(unit),
+            _interval(float(one), float(low), float(high)),
+        )
+        for owner, one, (low, high) in zip(_owners(len(values), joints), values, intervals, strict=True)
+    ]
 
 
 def _owners(count: int, joints: Sequence[str]) -> Sequence[str]:
@@ -268,29 +288,47 @@ def _unexplained(report: Mapping[str, Any]) -> str:
         text += (
             f" Beyond the effects of the registry it depends on {signals}{f' at {where}' if where else ''}."
         )
+    text += "</p>"
     learned = next((e for e in report["effects"] if e["name"] == "learned_residual"), None)
     if learned:
         inputs = ", ".join(f"<code>{escape(signal)}</code>" for signal in learned["inputs"])
-        text += f" A bounded term took up what it could, with the inputs {inputs}."
-    return text + "</p>"
+        text += f"<p>A bounded term took up what it could, with the inputs {inputs}.</p>"
+        text += table(
+            ("term", "inputs", "joints", "#held-out gain, N² m²"),
+            [
+                (
+                    escape(str(term["kind"]).replace("_", " ")),
+                    ", ".join(f"<code>{escape(signal)}</code>" for signal in term["inputs"]),
+                    escape(", ".join(map(short, term["joints"]))),
+                    number(term["heldout_gain"]),
+                )
+                for term in learned.get("terms", ())
+            ],
+        )
+    return text
 
 
 def _next(report: Mapping[str, Any]) -> str:
-    proposals = propose(report)
-    if not proposals:
-        return "<p>Nothing is left open that another motion would settle.</p>"
+    """What could not be told apart, in the effects' own words, and the motions that would do it."""
+    text = "".join(
+        f"<p>{escape(effect['name'])} and {escape(', '.join(effect['indistinguishable']))} come apart with "
+        f"{escape(effect['separated_by'])}.</p>"
+        for effect in report["effects"]
+        if effect.get("separated_by")
+    )
     rows = [
         (escape(", ".join(one.separates)), escape(one.reason), f"<code>{escape(one.command)}</code>")
-        for one in proposals
+        for one in propose(report)
     ]
-    return table(("not told apart", "a motion that would", "to record it"), rows)
+    if not rows:
+        return "<p>Nothing is left open that another motion would settle.</p>"
+    return text + table(("not told apart", "a motion that would", "to record it"), rows)
 
 
 def _findings(report: Mapping[str, Any]) -> str:
     """What the logs said before anything was fitted."""
     rows = [
-        (escape(Path(one["log"]).name), escape(finding["kind"]), escape(finding["text"]))
-        for one in report.get("data", ())
-        for finding in one["findings"]
+        (escape(Path(finding["log"]).name), escape(finding["kind"]), escape(finding["text"]))
+        for finding in report.get("findings", ())
     ]
     return table(("log", "", ""), rows) if rows else ""
