@@ -40,6 +40,11 @@ class Instant:
         self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)
 
     @property
+    def ddq_smooth(self) -> Array:
+        """A running model has only the past to take an acceleration from."""
+        return self.ddq
+
+    @property
     def power(self) -> Array:
         """Mechanical power that the joints draw together, (..., 1), W."""
         power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)

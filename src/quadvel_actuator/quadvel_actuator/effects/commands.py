@@ -26,6 +26,7 @@ class CommandHold(ErrorLaw):
     name = "command_hold"
     parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
     signal = "q_des@history"
+    shifts = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
     behind: NDArray[np.intp] | None = attrs.field(default=None, repr=False)
 

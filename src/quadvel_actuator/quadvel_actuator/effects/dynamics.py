@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
+import attrs
 import numpy as np
 from scipy.signal import lfilter
 
@@ -95,8 +96,9 @@ class VelocityFilter(MemoryLaw):
         return x[0], x[1] + s.dq - _lagged(s.dq, s, p["T"])
 
 
+@attrs.frozen(eq=False)
 class Armature(AddedLaw):
-    """-J ddq"""
+    """-J ddq; `of` says how the acceleration is taken: a short slope of dq, or a smooth one for noisy or sparse logs"""
 
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)
@@ -104,12 +106,17 @@ class Armature(AddedLaw):
     signal = "ddq"
     shifts = True
     motion = _FAST
+    of: str = "ddq"
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[Armature]:
+        return cls("ddq"), cls("ddq_smooth")
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return -p["J"] * s.ddq
+        return -p["J"] * getattr(s, self.of)
 
 
 class TimestampSkew(ErrorLaw):

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from ..effects import EffectLaw
-from ..effects.commands import MOST
+from ..effects.commands import CommandHold
+from .backlog import backlog
 from .delays import fit_with_delays
 from .model import Applied, Model, fit
 from .signals import Array, Bools
@@ -118,9 +119,31 @@ class About:
             found[j] = int(np.argmax(score))
         return found
 
-    def lost_commands(self, most: int = MOST) -> list[NDArray[np.intp]]:
-        """By how many commands the drive seems to lag, (N, 1) for all joints together; none where nothing is lost."""
-        return []
+    def lost_commands(self, most: int) -> list[NDArray[np.intp]]:
+        """By how many commands the drive seems to lag: (N, 1) for all joints together, (N, J) for each of them.
+
+        Both are left out where next to nothing is lost.
+        """
+        found = []
+        for together in (True, False):
+            behind = backlog(self.model, self.noise, most, together)
+            if _share(behind, self.model) > _LOST_SHARE:
+                law = CommandHold(behind)
+                share = np.full((1, len(self.noise)), 0.05)
+                every = np.ones(len(self.noise), dtype=bool)
+                better = fit_with_delays(
+                    self.model.plus(Applied(law, every, share, np.arange(len(self.noise)))), self.judge.fit, 2
+                )
+                found.append(backlog(better.without(len(better.applied) - 1), self.noise, most, together))
+        return found
+
+
+_LOST_SHARE = 0.003
+
+
+def _share(behind: NDArray[np.intp], model: Model) -> float:
+    fresh = np.diff(model.signals.packet[:, 0], prepend=-1) > 0
+    return float((behind[fresh] > 0).mean())
 
 
 def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candidate | None:

@@ -15,6 +15,7 @@ from ..effects import registry
 from .candidates import About, Candidate, Judge, p_value, propose
 from .delays import fit_with_delays
 from .model import Model, fit
+from .sharing import pooled, regroupings
 from .signals import Array
 
 LEVEL = 0.01
@@ -68,6 +69,10 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     for number in range(MOST + 1):
         candidates = ranked(About(model, judge, noise), tick, f"effect {number + 1}")
         rejected = [_reason(one, noise, len(candidates)) for one in candidates]
+        finer = _finer(model, candidates, judge, noise)
+        if finer is not None:
+            model = finer
+            continue
         if not candidates or not _pays(candidates[0], noise, len(candidates)) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
@@ -75,6 +80,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         ties.append(tied)
         model = fit(model, judge.fit, 4)
     model, ties = _pruned(model, ties, judge, noise)
+    model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
@@ -97,6 +103,19 @@ def ranked(about: About, tick: Tick, what: str) -> list[Candidate]:
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:
     return one.p * tried < LEVEL and bool(one.gain > 0.0) and _worth(one, noise) > WORTH
+
+
+def _finer(model: Model, candidates: Sequence[Candidate], judge: Judge, noise: Array) -> Model | None:
+    """The model with gains or delays shared by fewer joints, if that pays clearly more than any effect does."""
+    best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(candidates)) else 0.0
+    chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
+    left = model.samples.tau - model.predict()
+    for _, tried in regroupings(model, judge):
+        sums, rows = judge.gains(left, tried.samples.tau - tried.predict())
+        gain = float(sums.sum() / max(rows.sum(), 1))
+        if gain > most and p_value(sums, rows) * len(registry()) < LEVEL:
+            chosen, most = tried, gain + 0.5 * WORTH * float(noise.mean())
+    return chosen
 
 
 def _worth(one: Candidate, noise: Array) -> float:

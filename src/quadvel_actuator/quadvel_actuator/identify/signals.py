@@ -25,6 +25,9 @@ GAP = 3.5
 SETTLING = 0.03
 """Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
 
+SMOOTH, SMOOTH_LATE = 0.006, 0.001
+"""The smooth acceleration is taken over so long to either side, and so much later, s."""
+
 _CACHED = 64
 
 
@@ -38,6 +41,7 @@ class Signals:
     q: Array
     dq: Array
     ddq: Array
+    ddq_smooth: Array
     q_des: Array
     dq_des: Array
     tau_ff: Array
@@ -77,6 +81,17 @@ def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
     return slope
 
 
+def smooth_derivative(log: Log, values: Array) -> Array:
+    """Slope of a parabola through SMOOTH s of `values` (N, J) to either side, by rows."""
+    reach = max(2, round(SMOOTH / log.period))
+    k = np.arange(-reach, reach + 1)
+    weight = (1.0 - (k / (reach + 1.0)) ** 2) * k
+    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
+    slope = sum(w * padded[i : i + len(values)] for i, w in enumerate(weight))
+    result: Array = slope / (float(np.sum(weight * k)) * log.period)
+    return result
+
+
 class _LogSignals:
     """One log, ready to be read at any time."""
 
@@ -84,6 +99,7 @@ class _LogSignals:
         self.log, self.origin = log, origin
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
         self.states["ddq"] = derivative(log, self.states["dq"])
+        self.states["ddq_smooth"] = smooth_derivative(log, self.states["dq"])
         self.states["measured"] = _double(log.tau) if log.tau is not None else np.zeros_like(self.states["q"])
         if log.temperature is not None:
             self.states["temperature"] = _double(log.temperature)
@@ -208,7 +224,9 @@ class Samples:
         for one, first in zip(self.logs, self._first_packet, strict=False):
             at = _double(one.log.t) - output_delay
             for name in one.states:
-                parts.setdefault(name, []).append(one.state(name, at))
+                parts.setdefault(name, []).append(
+                    one.state(name, at - SMOOTH_LATE if name == "ddq_smooth" else at)
+                )
             for name in one.commands:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window))
             row = one.log.command_rows(at - input_delay + 1e-9)

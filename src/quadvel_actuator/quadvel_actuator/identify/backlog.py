@@ -1,0 +1,70 @@
+"""Which commands never acted, or late: the likeliest course of the drive's backlog, read off the torque.
+
+A Viterbi search over "how many commands is the drive behind". A command that is lost costs a fixed number of nats, so
+that noise alone is next to never explained by losses.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .model import Model
+from .signals import Array
+
+LOST, STILL_LOST, LATE = 8.0, 4.0, 5.0
+"""nats: the first command lost, one more in a row, one that takes effect between two sendings"""
+
+
+def backlog(model: Model, noise: Array, most: int, together: bool) -> NDArray[np.intp]:
+    """By how many commands, 0 to `most`, the drive is behind at each row: (N, 1), or (N, J) unless `together`."""
+    s = model.signals
+    left = np.where(model.samples.judged, model.samples.tau - model.predict(), 0.0)
+    stiffness = model.gains[0] * s.kp
+    joint = np.arange(left.shape[1])
+    cost = []
+    for behind in range(most + 1):
+        old = s.sent[np.maximum(s.packet - behind, 0), joint]
+        change = stiffness * (old - s.q_des) if behind else 0.0
+        cost.append(np.where(model.samples.judged, (left - change) ** 2 / (2.0 * noise), 0.0))
+    emission = np.stack(cost, axis=-1)  # (N, J, M)
+    if together:
+        emission = emission.sum(axis=1, keepdims=True)
+    new = np.diff(s.packet[:, 0], prepend=s.packet[0, 0])
+    return _likeliest(emission, new.tolist())
+
+
+def _likeliest(emission: Array, new: list[int]) -> NDArray[np.intp]:
+    """The cheapest path (N, G) through costs (N, G, M), `new` commands arriving before each row."""
+    rows, groups, count = emission.shape
+    came_from = np.zeros((rows, groups, count), dtype=np.int8)
+    price = np.full((groups, count), np.inf)
+    price[:, 0] = 0.0
+    stay = np.arange(count)
+    for n in range(rows):
+        best = np.broadcast_to(stay, (groups, count)).copy()
+        if new[n] == 0:
+            after = price.copy()
+            for m in range(count - 1):  # a command that was held back arrives now
+                source = m + 1 + np.argmin(price[:, m + 1 :], axis=1)
+                late = np.take_along_axis(price, source[:, None], axis=1)[:, 0] + LATE
+                better = late < after[:, m]
+                after[better, m] = late[better]
+                best[better, m] = source[better]
+        else:
+            after = np.full_like(price, np.inf)
+            source = np.argmin(price, axis=1)
+            after[:, 0] = np.take_along_axis(price, source[:, None], axis=1)[:, 0]
+            best[:, 0] = source
+            d = min(new[n], count)
+            lost = price[:, : count - d] + np.where(stay[: count - d] == 0, LOST, STILL_LOST)
+            after[:, d:] = lost
+            best[:, d:] = stay[: count - d]
+        came_from[n] = best
+        price = after + emission[n]
+    path = np.zeros((rows, groups), dtype=np.intp)
+    at = np.argmin(price, axis=1)
+    for n in range(rows - 1, -1, -1):
+        path[n] = at
+        at = came_from[n][np.arange(groups), at]
+    return path
