@@ -85,11 +85,15 @@ class Recorder:
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             time.sleep(min(left, pause))
-            timeout, written = left, -1
-            while self.counts.total() > written:
-                written = self.counts.total()
-                executor.spin_once(timeout_sec=timeout)
-                timeout = 0.0
+            executor.spin_once(timeout_sec=left)
+            self.write_waiting(executor)
+
+    def write_waiting(self, executor: Executor) -> None:
+        """Write all that waits now."""
+        written = -1
+        while self.counts.total() > written:
+            written = self.counts.total()
+            executor.spin_once(timeout_sec=0.0)
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""
