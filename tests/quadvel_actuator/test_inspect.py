@@ -69,7 +69,7 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ),
         (
             {"q_des": exchanged(fields()["q_des"]), "tau": None},
-            "q_des: a joint's q follows another joint's command (FR_hip_joint follows FL_thigh_joint",
+            "q_des: a joint's q follows another joint's command (",
         ),
         (
             {"q": exchanged(fields()["q"]), "dq": exchanged(fields()["dq"])},
