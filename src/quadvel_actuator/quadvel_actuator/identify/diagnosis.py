@@ -67,13 +67,13 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
-        candidates = ranked(About(model, judge, noise), tick, f"effect {number + 1}")
-        rejected = [_reason(one, noise, len(candidates)) for one in candidates]
+        candidates, idle = ranked(About(model, judge, noise), tick, f"effect {number + 1}")
+        rejected = [*(_reason(one, noise, len(registry())) for one in candidates), *idle]
         finer = _finer(model, candidates, judge, noise)
         if finer is not None:
             model = finer
             continue
-        if not candidates or not _pays(candidates[0], noise, len(candidates)) or number == MOST:
+        if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
         model = best.model
@@ -86,8 +86,12 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
 
 
-def ranked(about: About, tick: Tick, what: str) -> list[Candidate]:
-    """Every law of the registry on top of the model, the best form of each, least held-out error first."""
+def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:
+    """Every law of the registry on top of the model, the best form of each, least held-out error first.
+
+    Second, those that do not come into question.
+    """
+    idle: dict[str, Rejected] = {}
     best: dict[str, Candidate] = {}
     taken = {one.law.name for one in about.model.applied}
     for name, law in registry().items():
@@ -96,9 +100,12 @@ def ranked(about: About, tick: Tick, what: str) -> list[Candidate]:
             continue
         for form in law.variants(about):
             one = propose(about, form)
-            if one is not None and (name not in best or one.gain > best[name].gain):
+            if one is None:
+                idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
+            elif name not in best or one.gain > best[name].gain:
                 best[name] = one
-    return sorted(best.values(), key=lambda one: -one.gain)
+    out = [one for name, one in idle.items() if name not in best]
+    return sorted(best.values(), key=lambda one: -one.gain), out
 
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:
@@ -107,7 +114,7 @@ def _pays(one: Candidate, noise: Array, tried: int) -> bool:
 
 def _finer(model: Model, candidates: Sequence[Candidate], judge: Judge, noise: Array) -> Model | None:
     """The model with gains or delays shared by fewer joints, if that pays clearly more than any effect does."""
-    best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(candidates)) else 0.0
+    best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(registry())) else 0.0
     chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
     left = model.samples.tau - model.predict()
     for _, tried in regroupings(model, judge):

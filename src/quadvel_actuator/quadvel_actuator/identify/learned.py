@@ -234,11 +234,12 @@ def _fitted(basis: Basis, residual: Array, rows: Bools) -> tuple[Array, Array]:
     joints = residual.shape[1]
     coefficients = np.empty((columns.shape[1], joints))
     torque = np.empty_like(residual)
-    patterns, which = np.unique(rows, axis=1, return_inverse=True)
-    for pattern in range(patterns.shape[1]):
-        keep = patterns[:, pattern]
-        members = np.flatnonzero(which.reshape(-1) == pattern)
-        for group in [members] if columns.ndim == 2 else [members[k : k + 1] for k in range(len(members))]:
+    alike: dict[bytes, list[int]] = {}
+    for j in range(joints):
+        alike.setdefault(rows[:, j].tobytes(), []).append(j)
+    for members in alike.values():
+        keep = rows[:, members[0]]
+        for group in [members] if columns.ndim == 2 else [[j] for j in members]:
             x = columns if columns.ndim == 2 else columns[:, :, group[0]]
             inside = x[keep]
             gram = inside.T @ inside
