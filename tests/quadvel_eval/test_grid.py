@@ -20,12 +20,19 @@ def walk(velocity: tuple[float, float, float], seconds: float = 6.0) -> Walk:
         targets=np.tile((0.5 * 0.002 * np.arange(n) ** 2)[:, None], (1, 12)),
         power=np.where(time < 2.0, 9e9, 250.0),
         estimate_errors={"learned": np.full((n, 3), [0.03, -0.04, 0.0])},
+        estimate_drifts={"learned": 0.3},
     )
 
 
 def result(command: tuple[float, float, float], mean: tuple[float, float, float]) -> CellResult:
     return CellResult(
-        Cell(command, 0), Segment(np.array(command), np.array(mean)), 0.01, 0.5, {"learned": np.full(3, 0.04)}
+        Cell(command, 0),
+        Segment(np.array(command), np.array(mean)),
+        0.01,
+        0.5,
+        {"learned": np.full(3, 0.04)},
+        {"learned": 0.1},
+        way=4.0,
     )
 
 
@@ -56,6 +63,8 @@ def test_a_cell_is_judged_over_its_last_four_seconds() -> None:
     assert judged.jitter == pytest.approx(0.002)
     assert judged.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
     np.testing.assert_allclose(judged.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
+    assert judged.estimator_drift == {"learned": 0.3}
+    assert judged.way == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
 
 
 def test_evaluation_has_the_fields_of_schema_1() -> None:
@@ -70,7 +79,7 @@ def test_evaluation_has_the_fields_of_schema_1() -> None:
         "fell": False,
     }
     assert evaluation["stance"] == {"drift_10s_m": 0.012}
-    assert evaluation["estimator"] == {"learned": {"rmse": [0.2, 0.2, 0.2]}}
+    assert evaluation["estimator"] == {"learned": {"rmse": [0.2, 0.2, 0.2], "drift": 0.025}}
     json.dumps(evaluation, allow_nan=False)
 
 

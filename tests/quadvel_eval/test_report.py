@@ -19,6 +19,8 @@ WALKED = CellResult(
     jitter=0.01,
     cot=0.5,
     estimator_mse={"learned": np.full(3, 0.04)},
+    estimator_drift={"learned": 0.1},
+    way=4.0,
 )
 FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
 EVALUATION = summarise([WALKED, FALLEN], [0.01])

@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 
 from quadvel_eval.robot_loop import RobotLoop
-from quadvel_eval.walk import Setup, cost_of_transport, drive_power, jitter, make_simulator, record
+from quadvel_eval.walk import (
+    Setup,
+    cost_of_transport,
+    dead_reckoning_error,
+    drive_power,
+    jitter,
+    make_simulator,
+    record,
+)
 
 G = 9.81
 
@@ -46,6 +54,13 @@ def test_jitter_of_a_parabola_is_its_second_difference_and_of_a_line_zero() -> N
     assert jitter(np.tile(3.0 * k[:, None], (1, 12))) == pytest.approx(0.0)
 
 
+def test_drift_is_where_the_velocities_lead_beside_where_the_robot_got_to() -> None:
+    time = np.arange(201) * 0.005
+    position = np.column_stack([np.sin(time), time, 0.1 * time])  # 1 s
+    velocity = np.column_stack([np.cos(time) + 0.03, np.full(201, 1.0 - 0.04), np.full(201, 9.0)])
+    assert dead_reckoning_error(velocity, position) == pytest.approx(0.05, abs=1e-4)
+
+
 def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Callable[..., RobotLoop]) -> None:
     walk = record(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
     assert walk is not None
@@ -53,6 +68,7 @@ def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Calla
     assert walk.targets.shape == (100, 12)
     assert np.abs(walk.velocity).max() < 0.2
     assert np.abs(walk.estimate_errors["kalman"]).max() < 0.2
+    assert walk.estimate_drifts["kalman"] < 0.01
     assert walk.power.min() > 0.0
 
 

@@ -13,6 +13,7 @@ from quadvel_description.state import JointCommand, RobotState  # noqa: E402
 from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
 from quadvel_estimator.learned import LearnedEstimator  # noqa: E402
+from quadvel_estimator.odometry import leg_velocity  # noqa: E402
 from quadvel_policy.modes import Posture, Tick  # noqa: E402
 from quadvel_policy.supervisor import SupervisorConfig  # noqa: E402
 from quadvel_training import kalman_tuning, student, walks  # noqa: E402
@@ -108,21 +109,61 @@ def test_readings_are_the_truth_but_for_noise_and_bias(monkeypatch, actor):
     assert np.abs(np.sum(sensed.quaternion * env.quaternion, axis=1)).min() > 0.999
 
 
-def test_the_network_can_believe_one_leg():
+KEEP = 4
+
+
+def believing(which: int) -> VelocityNetwork:
+    """A network that corrects nothing and gives all to one leg, 0 to 3, or to inertia, KEEP."""
     torch.manual_seed(0)
     network = VelocityNetwork()
     last = network.body[-1]
     with torch.no_grad():
         last.weight.zero_()
         last.bias.zero_()
-        last.bias[6 + 2] = 50.0
-    legs = np.linspace(-2.0, 3.0, 12)
-    size = features.DEFAULT_LAYOUT.size
-    x = np.zeros(size, np.float32)
-    x[-12:] = features.DEFAULT_LAYOUT.terms[-1].scale * legs
+        last.bias[6 + which] = 50.0
+    return network
+
+
+def seen(sensed: RobotState, ticks: int) -> torch.Tensor:
+    """The network's input (T, 1, 69) where the state stays as it is."""
+    x = features.build(sensed, np.zeros(12))
+    return torch.from_numpy(np.tile(x, (ticks, 1, 1)))
+
+
+def moving(**changes) -> RobotState:
+    still = RobotState(
+        time=0.0,
+        tick=0,
+        q=robot.NOMINAL_Q,
+        dq=np.linspace(-4.0, 3.0, 12),
+        tau=np.zeros(12),
+        quaternion=np.array([1.0, 0.0, 0.0, 0.0]),
+        angular_velocity=np.zeros(3),
+        linear_acceleration=np.array([0.0, 0.0, robot.GRAVITY]),
+        foot_force=np.zeros(4),
+    )
+    return attrs.evolve(still, **changes)
+
+
+def test_the_network_can_believe_one_leg():
+    network, state = believing(2), moving()
     with torch.no_grad():
-        output, _ = network(torch.from_numpy(x)[None, None])
-    np.testing.assert_allclose(output[0, 0, :3].numpy(), legs.reshape(4, 3)[2], atol=1e-5)
+        output, _ = network(seen(state, 2), network.initial_state(1))
+    np.testing.assert_allclose(output[1, 0, :3].numpy(), leg_velocity(state)[2], atol=1e-5)
+
+
+def test_the_network_can_go_on_by_inertia_alone():
+    """A body that spins at constant world velocity and falls: body frame velocity in closed form."""
+    network = believing(KEEP)
+    rate, ticks = 2.0, 100
+    spinning = moving(angular_velocity=np.array([0.0, 0.0, rate]), linear_acceleration=np.zeros(3))
+    state = network.initial_state(1)
+    state[0][0, 0, -3:] = torch.tensor([1.0, 0.5, 0.0])
+    with torch.no_grad():
+        output, _ = network(seen(spinning, ticks), state)
+    turned = (1.0 + 0.5j) * np.exp(-1j * rate * ticks * TICK)
+    expected = [turned.real, turned.imag, -robot.GRAVITY * ticks * TICK]
+    np.testing.assert_allclose(output[-1, 0, :3].numpy(), expected, rtol=0.02)
 
 
 def test_a_trained_network_runs_as_a_file(tmp_path, actor):

@@ -14,11 +14,12 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_description.robot import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
 from . import student
-from .env import CommandRange
+from .env import TICK, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State
 from .ppo import select
@@ -26,24 +27,61 @@ from .walks import Walks, both_grounds
 
 MEMORY = 128
 HIDDEN = (64,)
-LEGS = features.DEFAULT_LAYOUT.terms[-1]  # "leg_velocity", the last numbers of the input
+KEEP = 2.0  # logit of the share of inertia before training: the legs correct it within some ticks
 
 
 class VelocityNetwork(Recurrent):
-    """Network input to velocity (3) and log variance (3): a weighted mean of what the legs say, and a correction.
+    """A filter whose gains an LSTM sets: network input to velocity (3) and log variance (3).
 
-    Both the weights, of the four legs and of none, and the correction come from the LSTM.
+    At every tick the velocity of the tick before goes on by what the IMU says, and is mixed with what the four legs say; the
+    LSTM gives the five shares, a correction and the variance. The last three numbers of the state's first part are the
+    velocity, the last three of its second part are not used.
     """
 
     def __init__(self) -> None:
         super().__init__(features.DEFAULT_LAYOUT.size, 6 + 5, MEMORY, HIDDEN)
+        with torch.no_grad():
+            self.body[-1].bias[-1] = KEEP
+        spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
+        self.register_buffer(
+            "spin", spin.reshape(3, 9), persistent=False
+        )  # w @ spin is, as a matrix, b -> w x b for rows
 
-    def head(self, x: torch.Tensor, y: torch.Tensor) -> torch.Tensor:
-        """Output (..., 6) from the input (..., 69) and what the LSTM makes of it."""
-        correction, log_variance, weights = super().head(x, y).split([3, 3, 5], dim=-1)
-        legs = x[..., -LEGS.size :].unflatten(-1, (4, 3)) / LEGS.scale
-        share = weights.softmax(-1)[..., :4, None]
-        return torch.cat([correction + (share * legs).sum(-2), log_variance], dim=-1)
+    def initial_state(self, n: int) -> State:
+        """Zero state of `n` environments, at rest."""
+        zeros = torch.zeros(1, n, MEMORY + 3)
+        return zeros, zeros.clone()
+
+    def forward(self, x: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
+        """Output (T, N, 6) and the new state from x (T, N, 69) and the state (1, N, 131); N may be missing in all."""
+        h, c = (part.split([MEMORY, 3], dim=-1) for part in state)
+        y, (hidden, memory) = self.lstm(x, (h[0].contiguous(), c[0].contiguous()))
+        correction, log_variance, logits = self.body(torch.nn.functional.silu(y)).split([3, 3, 5], dim=-1)
+        share = logits.softmax(-1)
+        legs, keep = (
+            (share[..., :4, None] * _read(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
+            share[..., 4:],
+        )
+        gained = TICK * (_read(x, "linear_acceleration") + GRAVITY * _read(x, "gravity"))
+        # for rows: v - dt w x v = v (1 - dt [w]x)
+        turn = torch.eye(3) - TICK * (_read(x, "angular_velocity") @ self.spin).unflatten(-1, (3, 3))
+        carried, added = keep[..., None] * turn, keep * gained + legs + correction
+        velocity, track = h[1][0], []
+        for k in range(x.shape[0]):
+            velocity = (velocity[..., None, :] @ carried[k])[..., 0, :] + added[k]
+            track.append(velocity)
+        output = torch.cat([torch.stack(track), log_variance], dim=-1)
+        return output, (torch.cat([hidden, velocity[None]], dim=-1), torch.cat([memory, c[1]], dim=-1))
+
+
+def _read(x: torch.Tensor, name: str) -> torch.Tensor:
+    """The quantity `name` in its unit from the network input (..., 69), as far as it was not clipped."""
+    start = 0
+    for term in features.DEFAULT_LAYOUT.terms:
+        if term.name == name:
+            return x[..., start : start + term.size] / term.scale
+        start += term.size
+    raise KeyError(name)
 
 
 Sequence = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
@@ -153,7 +191,7 @@ class EstimatorRun:
 
     def export(self, path: Path, recipe: dict[str, Any]) -> None:
         """Write the estimator file."""
-        metadata = features.metadata((1, 1, MEMORY), recipe, student.commit())
+        metadata = features.metadata((1, 1, MEMORY + 3), recipe, student.commit())
         student.export(self.network, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:

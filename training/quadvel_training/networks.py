@@ -54,11 +54,7 @@ class Recurrent(nn.Module):
 
     def forward(self, x: Tensor, state: State | None = None) -> tuple[Tensor, State]:
         y, state = self.lstm(x, state)
-        return self.head(x, y), state
-
-    def head(self, x: Tensor, y: Tensor) -> Tensor:
-        """The output from the input and what the LSTM makes of it."""
-        return self.body(nn.functional.silu(y))
+        return self.body(nn.functional.silu(y)), state
 
 
 class Gaussian(nn.Module):

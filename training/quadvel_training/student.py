@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +19,7 @@ from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
 
 from .env import VelocityEnv
-from .networks import Recurrent
+from .networks import Recurrent, State
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 MEMORY = 256
@@ -45,26 +46,37 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
     )
 
 
-class _Step(nn.Module):
-    """One time step with the signature of the policy file.
+class _Cell(nn.Module):
+    """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
 
-    The cell is written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
+    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
     """
 
-    def __init__(self, network: Recurrent, outputs: int) -> None:
+    def __init__(self, lstm: nn.LSTM) -> None:
         super().__init__()
-        lstm = network.lstm
         weight = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
         self.weight = nn.Parameter(weight.detach().T.contiguous())
         self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
-        self.network, self.outputs = network, outputs
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        h, c = state
+        gates = torch.addmm(self.bias, torch.cat([x, h], dim=1), self.weight)
+        admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
+        memory = forget.sigmoid() * c + admit.sigmoid() * candidate.tanh()
+        hidden = release.sigmoid() * memory.tanh()
+        return hidden, (hidden, memory)
+
+
+class _Step(nn.Module):
+    """One time step with the signature of the policy file."""
+
+    def __init__(self, network: Recurrent, outputs: int) -> None:
+        super().__init__()
+        self.network, self.outputs = copy.deepcopy(network), outputs
+        self.network.lstm = _Cell(network.lstm)
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
-        gates = torch.addmm(self.bias, torch.cat([obs, h.flatten(0, 1)], dim=1), self.weight)
-        admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
-        memory = forget.sigmoid() * c.flatten(0, 1) + admit.sigmoid() * candidate.tanh()
-        hidden = release.sigmoid() * memory.tanh()
-        y = self.network.head(obs, hidden)
+        y, (hidden, memory) = self.network(obs, (h.flatten(0, 1), c.flatten(0, 1)))
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
 

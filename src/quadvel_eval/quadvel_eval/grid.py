@@ -50,6 +50,8 @@ class CellResult:
     jitter: float | None = None
     cot: float | None = None
     estimator_mse: dict[str, Array] = attrs.Factory(dict)  # (3,) (m/s)^2, over the whole walk
+    estimator_drift: dict[str, float] = attrs.Factory(dict)  # m, at its end
+    way: float = 0.0  # m, that the trunk went
 
     def to_json(self) -> dict[str, Any]:
         """The entry of `eval.json`."""
@@ -88,6 +90,8 @@ def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
         jitter(walk.targets[late]),
         cost_of_transport(float(walk.power[late].mean()), mass, segment.command, segment.mean),
         {name: np.square(error).mean(axis=0) for name, error in walk.estimate_errors.items()},
+        walk.estimate_drifts,
+        float(np.linalg.norm(np.diff(walk.position[:, :2], axis=0), axis=1).sum()),
     )
 
 
@@ -138,10 +142,14 @@ def _largest(drifts: Sequence[float | None]) -> Any:
 
 
 def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:
-    """Root mean square over all walks, m/s an axis; every walk has the same number of ticks."""
+    """Root mean square over all walks, m/s an axis (every walk has the same number of ticks); drift over way."""
     names = stood[0].estimator_mse if stood else ()
+    way = sum(r.way for r in stood)
     return {
-        name: {"rmse": rounded(np.sqrt(np.mean([r.estimator_mse[name] for r in stood], axis=0)))}
+        name: {
+            "rmse": rounded(np.sqrt(np.mean([r.estimator_mse[name] for r in stood], axis=0))),
+            "drift": rounded(sum(r.estimator_drift[name] for r in stood) / way),
+        }
         for name in names
     }
 

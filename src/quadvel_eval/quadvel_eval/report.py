@@ -113,6 +113,7 @@ def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
     for name, figures in evaluation["estimator"].items():
         rmse = ", ".join(f"{x:.3f}" for x in figures["rmse"])
         table.add_row(f"{name} estimator, RMSE x, y, z", f"{rmse} m/s")
+        table.add_row(f"{name} estimator, drift", f"{100 * figures['drift']:.1f} % of the way")
     return table
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description import robot
+from quadvel_description.kinematics import rotate
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -94,6 +95,7 @@ class Walk:
     targets: Array  # (n, 12) rad, what the joints were asked for
     power: Array  # (n,) W, of the 12 drives, heat included
     estimate_errors: dict[str, Array]  # (n, 3) m/s, estimate minus truth
+    estimate_drifts: dict[str, float]  # m, level, between the end of the walk and where the estimates lead
 
 
 def record(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> Walk | None:
@@ -117,15 +119,27 @@ def _walk(samples: Sequence[Sample]) -> Walk:
     time = np.array([s.truth.time for s in samples])
     true = np.array([s.truth.linear_velocity for s in samples])
     turning = np.array([s.truth.angular_velocity for s in samples])
-    names = samples[0].estimates
+    estimates = {name: np.array([s.estimates[name] for s in samples]) for name in samples[0].estimates}
+    quaternion = np.array([s.state.quaternion for s in samples])
+    position = np.array([s.truth.position for s in samples])
     return Walk(
         time=time - time[0],
-        position=np.array([s.truth.position for s in samples]),
+        position=position,
         velocity=np.column_stack([true[:, :2], turning[:, 2]]),
         targets=np.array([s.command.q for s in samples]),
         power=drive_power([s.state.tau for s in samples], [s.state.dq for s in samples]),
-        estimate_errors={name: np.array([s.estimates[name] for s in samples]) - true for name in names},
+        estimate_errors={name: velocity - true for name, velocity in estimates.items()},
+        estimate_drifts={
+            name: dead_reckoning_error(rotate(quaternion, velocity), position)
+            for name, velocity in estimates.items()
+        },
     )
+
+
+def dead_reckoning_error(velocity: Array, position: Array) -> float:
+    """Level distance (m) from the last of the positions to where the velocities lead from the first, (n, 3) each, world."""
+    led = 0.5 * PERIOD * (velocity[1:] + velocity[:-1]).sum(axis=0)
+    return float(np.linalg.norm((led - (position[-1] - position[0]))[:2]))
 
 
 def drive_power(torque: ArrayLike, speed: ArrayLike) -> Array:
