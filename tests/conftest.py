@@ -46,11 +46,15 @@ def nothing_left_running() -> Iterator[None]:
 
 
 @pytest.fixture(autouse=True)
-def ctrl_c_as_before() -> Iterator[None]:
-    """The main of a node takes SIGINT over for the rest of its process; here other tests follow."""
-    handler, mask = signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, ())
+def signals_as_before() -> Iterator[None]:
+    """The main of a node takes signals over for the rest of its process; here other tests follow."""
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    signal.set_wakeup_fd(socket := signal.set_wakeup_fd(-1))
     yield
-    signal.signal(signal.SIGINT, handler)
+    signal.set_wakeup_fd(socket)
+    for number, handler in handlers.items():
+        signal.signal(number, handler)
     signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 

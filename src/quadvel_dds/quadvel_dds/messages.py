@@ -23,9 +23,7 @@ from quadvel_dds import cdr
 from quadvel_dds.definitions import SERVICES
 
 HERE = Path(__file__).parent
-# Our own definitions: `interfaces` where pip installed us, else beside us in the source tree.
 OWN_PACKAGE = "quadvel_msgs"
-OWN_FILES = next(d for d in (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE) if (d / "msg").is_dir())
 # Default values, which the definitions carried by rosbags leave out.
 DEFAULTS = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
@@ -36,12 +34,20 @@ CHECK_FIELDS = os.environ.get("ROS_PYTHON_CHECK_FIELDS") == "1"
 Describe = tuple[type, cdr.Fields]
 
 
+def _own_definitions() -> Path:
+    """In `interfaces` where pip installed us, beside us in the source tree, or where colcon installed them."""
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
+    folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
+    return next(folder for folder in folders if (folder / "msg").is_dir())
+
+
 def _load_store() -> Any:
     """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
-    store = get_typestore(Stores.ROS2_JAZZY)
-    for file in sorted(OWN_FILES.glob("msg/*.msg")):
+    store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
+    for file in sorted(own_files.glob("msg/*.msg")):
         store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
-    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(OWN_FILES.glob("srv/*.srv"))}
+    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
     for name, text in {**SERVICES, **own}.items():
         package, _, short = name.split("/")
         # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.

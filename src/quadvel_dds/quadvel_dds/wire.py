@@ -40,6 +40,11 @@ from quadvel_dds import idl, messages
 ANY = SampleState.Any | ViewState.Any | InstanceState.Any
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
+# Cyclone drops what comes over other interfaces than these, and ROS 2 looks for nodes of its host on this one.
+LOOPBACK = '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
+# How often participants introduce themselves to their peers: ROS 2 may start later, and by default it calls
+# over multicast alone, which nodes that stay on this host do not hear.
+ANNOUNCEMENT = "2 s"
 _domains: dict[int, Domain] = {}
 
 
@@ -54,15 +59,17 @@ def domain_configuration() -> str:
     general = discovery = ""
     if reach == "LOCALHOST":
         peers.insert(0, "localhost")
+        general = LOOPBACK
     if reach in ("LOCALHOST", "OFF"):
-        general = "<General><AllowMulticast>false</AllowMulticast></General>"
+        general = f"<General>{general}<AllowMulticast>false</AllowMulticast></General>"
     if reach == "OFF":
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
     elif reach != "SYSTEM_DEFAULT":
-        addresses = "".join(f'<Peer address="{peer}"/>' for peer in peers)
+        addresses = "".join(f'<Peer address="{peer}" pruneDelay="inf"/>' for peer in peers)
         discovery = (
             "<ParticipantIndex>auto</ParticipantIndex>"
-            f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex><Peers>{addresses}</Peers>"
+            f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
+            f"<SPDPInterval>{ANNOUNCEMENT}</SPDPInterval><Peers>{addresses}</Peers>"
         )
     own = f"<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))

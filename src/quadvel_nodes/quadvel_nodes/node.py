@@ -5,6 +5,8 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable
+from socket import socket, socketpair
+from threading import Thread
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -14,9 +16,10 @@ from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 Config = TypeVar("Config")
-INTERRUPT = {signal.SIGINT}
+STOPS = (signal.SIGINT, signal.SIGTERM)
 
 
 class StartError(ValueError):
@@ -53,32 +56,48 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
     """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1.
 
-    For the main of a process, which ends with it. Ctrl-C may come at any moment and, where a launcher forwards
-    it, again: while the node starts SIGINT waits, then it shuts rclpy down, and while the node ends it is blocked.
+    For the main of a process, which ends with it. SIGINT and SIGTERM end `spin` between two callbacks, instead of
+    pulling the context away under it as rclpy's own handlers do: they may come at any moment, and again, and cut
+    neither start nor end short (Ctrl-C comes twice where a launcher forwards it).
     """
-    signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
-    signal.signal(signal.SIGINT, _leave_it_to_rclpy)
+    receiver, sender = socketpair()
+    sender.setblocking(False)
+    signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
+    for number in STOPS:
+        signal.signal(number, _nothing_more)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
     node = None
     try:
         node = _start(make_node, args)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
+        Thread(target=_stop_at, args=(receiver, rclpy.get_global_executor()), daemon=True).start()
         rclpy.spin(node)
     except ExternalShutdownException:
         pass
     finally:
-        signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        for number in STOPS:
+            signal.signal(number, signal.SIG_IGN)  # while the interpreter ends
 
 
 def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
     try:
-        rclpy.init(args=args)
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         return make_node()
     except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
         sys.exit(" ".join(str(error).split()))
 
 
-def _leave_it_to_rclpy(number: int, frame: FrameType | None) -> None:
-    """In the place of Python's own handler, whose KeyboardInterrupt would come on top, anywhere, and each time."""
+def _nothing_more(number: int, frame: FrameType | None) -> None:
+    """The handler of a signal, which has already written to the wake-up socket."""
+
+
+def _stop_at(receiver: socket, executor: Any) -> None:
+    """Wait for the first signal, then let the executor end `spin`."""
+    receiver.recv(1)
+    executor.create_task(_stop)
+
+
+def _stop() -> None:
+    raise ExternalShutdownException
