@@ -35,7 +35,9 @@ def run() -> tuple[Joints, Callable[[float], Truth]]:
         simulator.step()
     time = np.array([state.time for state in states])
     q, dq, tau = (np.array([getattr(state, name) for state in states]) for name in ("q", "dq", "tau"))
-    return Joints(time, q, dq, tau, np.array(rows)), lambda t: truths[round(1000 * t)]
+    return Joints(time, q, dq, tau, np.array(rows), np.ones(len(time), bool)), lambda t: truths[
+        round(1000 * t)
+    ]
 
 
 def test_on_the_recorded_motion_the_true_model_leaves_the_noise(

@@ -6,13 +6,14 @@ any two drift apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import interp1d
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_dds.recordings import read_messages
@@ -44,6 +45,11 @@ class Joints:
     dq: Array  # (n, 12) rad/s
     tau: Array  # (n, 12) N m
     command: Array  # (n, 37): q, kp, kd (12 each), mode
+    seen: NDArray[np.bool_]  # (n,), false: interpolated
+
+    def whole(self, begin: int, end: int) -> bool:
+        """Whether every state of the rows from `begin` to before `end` is there and was seen."""
+        return begin >= 0 and end <= len(self.seen) and bool(self.seen[begin:end].all())
 
 
 @attrs.frozen
@@ -57,30 +63,38 @@ class ReplayError:
 
 
 def read_joints(path: Path) -> Joints:
-    """The joints' part of a recording in lockstep at 1 kHz. ValueError where states are missing.
+    """The joints' part of a recording at 1 kHz; states that the recorder missed are marked, and interpolated.
 
-    A command counts from the instant of the state that it answers, whatever its own stamp says.
+    A command counts from the instant of the state that it answers, whatever its own stamp says. ValueError where
+    the recording holds nothing of that rate.
     """
     states: dict[int, Any] = {}
     commands: dict[int, Any] = {}
     for topic, _, message in read_messages(path, lambda topic, _: topic in ("/low_state", "/low_cmd")):
         (states if topic == "/low_state" else commands)[message.tick] = message
-    ticks = sorted(states)
-    if not ticks or not commands or np.any(np.diff(ticks) != round(1e3 * DT)):
-        raise ValueError(f"{path}: found {len(ticks)} states of low_state, expected one every ms")
-    held = np.full(37, np.nan)
-    command = np.zeros((len(ticks), 37))
-    for row, tick in enumerate(ticks):
-        if tick in commands:
-            answer = commands[tick]
-            held = np.concatenate([answer.q, answer.kp, answer.kd, [answer.mode]])
-        command[row] = held
-    rows = [states[tick] for tick in ticks]
-    time = np.array([seconds(message.stamp) for message in rows])
+    ticks = np.array(sorted(states))
+    period = np.median(np.diff(ticks)) * 1e-3 if len(ticks) > 1 else np.nan
+    if period != DT or not commands:
+        raise ValueError(
+            f"{path}: low_state: found a period of {period:g} s, expected {DT:g} s, and commands"
+        )
+    every = np.arange(ticks[0], ticks[-1] + 1)
+    rows = [states[tick] for tick in ticks.tolist()]
+    time = np.interp(every, ticks, [seconds(message.stamp) for message in rows])
     q, dq, tau = (
-        np.array([getattr(message, field) for message in rows], float) for field in ("q", "dq", "tau")
+        interp1d(ticks, np.array([getattr(message, field) for message in rows], float), axis=0)(every)
+        for field in ("q", "dq", "tau")
     )
-    return Joints(time, q, dq, tau, command)
+    return Joints(time, q, dq, tau, _held(commands, every), np.isin(every, ticks))
+
+
+def _held(commands: Mapping[int, Any], ticks: Array) -> Array:
+    """The command held at each of the ticks (n,), (n, 37); before the first one the robot brakes."""
+    sent = np.array(sorted(commands))
+    values = [np.concatenate([c.q, c.kp, c.kd, [c.mode]]) for c in map(commands.__getitem__, sent.tolist())]
+    table = np.array([np.zeros(37), *values], float)
+    held: Array = table[np.searchsorted(sent, ticks, side="right")]
+    return held
 
 
 def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end: float) -> float:
@@ -91,8 +105,10 @@ def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end
     for row in range(max(begin - PAST, 0), stop):
         q, kp, kd = np.split(joints.command[row, :36], 3)
         torque = model.step(joints.q[row], joints.dq[row], q, kp, kd)
-        if row >= begin:
+        if row >= begin and joints.whole(row - PAST, row + 1):
             squares.append(np.mean((joints.tau[row] - torque) ** 2))
+    if not squares:
+        raise ValueError(f"nothing was recorded without gaps between {start:.2f} and {end:.2f} s")
     return float(np.mean(squares))
 
 
@@ -108,7 +124,7 @@ def open_loop(
     errors = [
         _stretch(simulator, joints, truth, row)
         for row in np.searchsorted(joints.time, np.arange(start, end - STRETCH, STRIDE)).tolist()
-        if row >= PAST
+        if joints.whole(row - PAST, row + round(STRETCH / DT))
     ]
     if not errors:
         raise ValueError(f"nothing to replay between {start:.2f} and {end:.2f} s")
