@@ -15,7 +15,16 @@ from quadvel_estimator.odometry import leg_velocity
 
 DT = 0.005
 NOMINAL_FEET = foot_positions(NOMINAL_Q)
-CONFIG = KalmanConfig(contact_source="foot_force")
+CONFIG = KalmanConfig(
+    accelerometer=1.0,
+    foot_position=0.003,
+    foot_velocity=0.1,
+    foot_walk=0.01,
+    slip_gate=2.0,
+    contact_force=15.0,
+    contact_ramp=40.0,
+    contact_source="foot_force",
+)
 State = Callable[..., RobotState]
 Trot = Callable[[float, int], list[RobotState]]
 

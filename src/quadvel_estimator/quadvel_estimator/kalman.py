@@ -41,7 +41,8 @@ def _positive(low: float, default: float, high: float) -> Any:
 
 @attrs.frozen
 class KalmanConfig:
-    """Noise (standard deviations) and contact thresholds; the defaults are tuned on the training walks.
+    """Noise (standard deviations) and contact thresholds; the defaults are tuned on the training walks
+    by `python -m quadvel_training kalman`.
 
     accelerometer: m/s^2, of one sample, impacts included
     foot_position: m, of a foot against the trunk (encoders, elasticity)
@@ -53,13 +54,13 @@ class KalmanConfig:
     contact_source: what tells the force on a foot, its own sensor or the joint torques, which every robot has
     """
 
-    accelerometer: float = _positive(0.05, 1.0, 20.0)
-    foot_position: float = _positive(1e-4, 0.003, 0.05)
-    foot_velocity: float = _positive(0.01, 0.1, 1.0)
-    foot_walk: float = _positive(1e-4, 0.01, 0.5)
-    slip_gate: float = _positive(0.5, 2.0, 10.0)
-    contact_force: float = _positive(1.0, 15.0, 60.0)
-    contact_ramp: float = _positive(1.0, 40.0, 150.0)
+    accelerometer: float = _positive(0.05, 5.8, 50.0)
+    foot_position: float = _positive(1e-4, 0.014, 0.2)
+    foot_velocity: float = _positive(0.01, 0.35, 2.0)
+    foot_walk: float = _positive(1e-4, 0.0028, 0.5)
+    slip_gate: float = _positive(0.1, 0.5, 10.0)
+    contact_force: float = _positive(0.5, 1.6, 60.0)
+    contact_ramp: float = _positive(0.5, 2.2, 150.0)
     contact_source: Literal["foot_force", "torque"] = attrs.field(
         default="torque", validator=attrs.validators.in_(("foot_force", "torque"))
     )
