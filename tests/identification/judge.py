@@ -53,6 +53,7 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
         "within": after <= WITHIN.get(truth["group"], WITHIN_OTHERS) * truth["floor"],
         "unexplained": report["unexplained"]["verdict"],
         "depends_on": report["unexplained"]["depends_on"],
+        "all_signals": _all_signals(report, truth),
         "intervals": _intervals(effects, truth),
     }
     if truth["group"] == "outside" and row["verdict"] == "right" and row["removed"] < REMOVED_LEAST:
@@ -107,6 +108,12 @@ def _table_4(report: Report, truth: Truth) -> str:
 
 
 _VERDICTS = {"alone": _alone, "together": _together, "none": _none, "outside": _outside, "table 4": _table_4}
+
+
+def _all_signals(report: Report, truth: Truth) -> bool:
+    """The report names a signal for each that takes part in an effect outside the registry."""
+    named = set(report["unexplained"]["depends_on"])
+    return all(named & set(names) for true in truth["effects"] for names in true["signals"].get("all", []))
 
 
 def _right_joints(effects: list[dict[str, Any]], truth: Truth) -> bool:

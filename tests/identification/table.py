@@ -58,7 +58,9 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
         )
     if done:
         seconds = [row["seconds"] for row in done]
-        lines.append(f"\nSeconds a log: median {np.median(seconds):.1f}, most {max(seconds):.1f}.")
+        lines.append(
+            f"\nSeconds of computing a log: median {np.median(seconds):.1f}, most {max(seconds):.1f}."
+        )
     failed = len(rows) - len(done)
     if failed:
         lines.append(f"\n{failed} logs ended in an error.")
@@ -67,7 +69,7 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
 
 def _kinds_table(group: str, kinds: list[list[Row]]) -> str:
     lines = [
-        "| effect | logs | right | otherwise | added besides | right joints | before | after | within | intervals | s |",
+        "| effect | logs | right | otherwise | added besides | right joints (signals) | before | after | within | intervals | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for rows in kinds:
@@ -82,7 +84,7 @@ def _kinds_table(group: str, kinds: list[list[Row]]) -> str:
                     _counts(name for row in done for name in row["extra"])
                     if group in ("alone", "together")
                     else "",
-                    f"{sum(row['right_joints'] for row in done)}" if group in ("alone", "together") else "",
+                    str(sum(row["all_signals" if group == "outside" else "right_joints"] for row in done)),
                     _spread([row["before"] / row["floor"] for row in done]),
                     _spread([row["after"] / row["floor"] for row in done]),
                     f"{sum(row['within'] for row in done)}",

@@ -315,16 +315,23 @@ def _attempt(kind: str, index: int, seed: tuple[int, ...]) -> Case | None:
             s * float(np.clip(np.sqrt(aim / max(each, 1e-9)), 0.2, 5.0))
             for s, each in zip(strengths, size.each, strict=True)
         ]
+    if _noise(setting, size, slack=1.3) is None:
+        return None
     effects = _make_effects(setting, strengths, nominal)
     run = _run(setting, effects, setting.dt, setting.motion)
     size = _worth(setting, run, effects)
-    noise_var = float(np.clip(min(size.each) / setting.ratio, 0.02, 0.4))
-    low, high = min(size.each) / noise_var, size.left / noise_var
-    if np.abs(run.trace.dq).max() > FASTEST or not (
-        low >= LEAST and high <= MOST * (1 + 0.5 * (len(effects) > 1))
-    ):
+    noise_var = _noise(setting, size)
+    if np.abs(run.trace.dq).max() > FASTEST or noise_var is None:
         return None
     return _finish(kind, index, setting, effects, noise_var, run, size)
+
+
+def _noise(setting: Setting, size: Worth, slack: float = 1.0) -> float | None:
+    """Noise under which each effect is worth the ratio drawn, less where the whole would be too loud; None: no such."""
+    wanted = max(min(size.each) / setting.ratio, size.left / MOST)
+    noise = float(np.clip(wanted, 0.02, 0.4)) if np.isfinite(wanted) else np.inf
+    fits = min(size.each) * slack >= LEAST * noise and size.left <= MOST * noise * slack
+    return noise if fits else None
 
 
 def _finish(
