@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
+from mcap.writer import Writer
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_dds.messages import STORE
 from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand
-from quadvel_eval.replay import Joints, open_loop, torque_error, tracking_gap
+from quadvel_eval.replay import Joints, open_loop, read_joints, torque_error, tracking_gap
 from quadvel_eval.segments import Segment
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
 
 SECONDS = 1.5
+LowState, LowCmd = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 
 
 @pytest.fixture(scope="module")
@@ -38,6 +42,67 @@ def run() -> tuple[Joints, Callable[[float], Truth]]:
     return Joints(time, q, dq, tau, np.array(rows), np.ones(len(time), bool)), lambda t: truths[
         round(1000 * t)
     ]
+
+
+def write_recording(path: Path, ticks: list[int], answered: list[int]) -> None:
+    """States whose q is their tick in s, at `ticks`, and commands that answer `answered`, all stamped alike."""
+    zero = np.zeros(12, np.float32)
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        for topic, kind, sent in (("/low_state", LowState, ticks), ("/low_cmd", LowCmd, answered)):
+            text, _ = STORE.generate_msgdef(kind, ros_version=2)
+            channel = writer.register_channel(
+                topic, "cdr", writer.register_schema(kind, "ros2msg", text.encode())
+            )
+            for tick in sent:
+                fields = {"stamp": STORE.types["builtin_interfaces/msg/Time"](0, tick * 10**6), "tick": tick}
+                q = np.full(12, 1e-3 * tick, np.float32)
+                if kind == LowCmd:
+                    fields |= {
+                        "mode": MODE_SERVO,
+                        "q": q,
+                        "dq": zero,
+                        "tau": zero,
+                        "kp": zero + 30,
+                        "kd": zero,
+                    }
+                else:
+                    vectors = dict.fromkeys(
+                        ("angular_velocity", "linear_acceleration"), np.zeros(3, np.float32)
+                    )
+                    fields |= {
+                        "q": q,
+                        "dq": zero,
+                        "tau": zero,
+                        "orientation_wxyz": np.eye(4, dtype=np.float32)[0],
+                    }
+                    fields |= {**vectors, "foot_force": np.zeros(4, np.float32)}
+                data = bytes(STORE.serialize_cdr(STORE.types[kind](**fields), kind))
+                writer.add_message(channel, tick * 10**6, data, tick * 10**6)
+        writer.finish()
+
+
+def test_states_that_the_recorder_missed_are_marked_and_commands_held_over_them(tmp_path: Path) -> None:
+    write_recording(tmp_path / "walk.mcap", [5, 6, 7, 10, 11, 12], answered=[6, 10])
+    joints = read_joints(tmp_path / "walk.mcap")
+    np.testing.assert_allclose(joints.time, np.arange(5, 13) * 1e-3)
+    np.testing.assert_allclose(joints.q[:, 3], joints.time, atol=1e-8)
+    assert joints.seen.tolist() == [True] * 3 + [False] * 2 + [True] * 3
+    np.testing.assert_allclose(joints.command[:, 0], [0, 0.006, 0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
+    assert joints.command[:, 36].tolist() == [0] + [MODE_SERVO] * 7
+    assert joints.whole(0, 3)
+    assert not joints.whole(1, 5)
+    assert not joints.whole(-1, 2)
+    assert not joints.whole(6, 9)
+
+
+def test_a_recording_at_another_rate_is_refused(tmp_path: Path) -> None:
+    write_recording(tmp_path / "walk.mcap", [0, 5, 10], answered=[0])
+    with pytest.raises(
+        ValueError, match=r"walk\.mcap: low_state: found a period of 0\.005 s, expected 0\.001 s"
+    ):
+        read_joints(tmp_path / "walk.mcap")
 
 
 def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
