@@ -27,6 +27,7 @@ LATCHED = ("/tf_static", "/robot_description")
 """Topics that are published once and kept for those who come later."""
 HIDDEN = ("/parameter_events", "/rosout")
 BATCH = 0.05  # s
+OTHERS = 4  # callbacks that may come between two of ours although messages wait
 
 
 class Recorder:
@@ -89,11 +90,12 @@ class Recorder:
             self.write_waiting(executor)
 
     def write_waiting(self, executor: Executor) -> None:
-        """Write all that waits now."""
-        written = -1
-        while self.counts.total() > written:
+        """Write all that waits now. Other callbacks of our node, such as that of /clock, take turns with ours."""
+        in_vain = 0
+        while in_vain < OTHERS:
             written = self.counts.total()
             executor.spin_once(timeout_sec=0.0)
+            in_vain = 0 if self.counts.total() > written else in_vain + 1
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""
