@@ -24,7 +24,9 @@ import pytest
 from quadvel_bringup import nodes
 
 ROOT = Path(__file__).parents[2]
-DOMAINS = itertools.cycle(range(41, 50))  # the next for each test, so that none hears what another left
+FIRST_DOMAIN = int(os.environ.get("ROS_DOMAIN_ID", 41))
+DOMAINS = itertools.cycle(range(FIRST_DOMAIN, FIRST_DOMAIN + 9))
+"""The next for each test, so that none hears what another left."""
 RMW_IMPLEMENTATIONS = ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp")
 RMW_INDEX = Path("share/ament_index/resource_index/rmw_typesupport")
 
@@ -67,7 +69,7 @@ class Process:
         self._reader.join(5.0)
         return code
 
-    def interrupt(self, times: int = 1, patience: float = 15.0) -> int:
+    def interrupt(self, times: int = 1, patience: float = 60.0) -> int:
         """Ctrl-C, as a terminal sends it to the whole group; returns the exit code."""
         for _ in range(times):
             os.killpg(self._popen.pid, signal.SIGINT)
@@ -101,7 +103,7 @@ class Ros:
         self.processes.append(Process(command, self._ros))
         return self.processes[-1]
 
-    def call(self, *command: str, seconds: float = 30.0) -> str:
+    def call(self, *command: str, seconds: float = 60.0) -> str:
         """What a command of ROS 2 wrote. Fails the test if its exit code is not 0."""
         process = self.start(*command)
         code = process.wait(seconds)
@@ -116,12 +118,17 @@ class Ros:
         self.processes.append(Process(nodes.command(name, ros_arguments), self._embedded))
         return self.processes[-1]
 
+    def python(self, program: str) -> Process:
+        """Start a Python program on the embedded middleware."""
+        self.processes.append(Process([sys.executable, "-c", program], self._embedded))
+        return self.processes[-1]
+
     def echo(self, topic: str, kind: str, field: str) -> Callable[[], list[str]]:
         """Listen to one field of a topic; returns a function that gives the values that came so far."""
         process = self.start("ros2", "topic", "echo", "--csv", "--field", field, topic, kind)
-        return lambda: [line for line in process.lines if " " not in line]  # warnings have blanks
+        return lambda: [line for line in process.lines if line != "---" and " " not in line]  # no warnings
 
-    def wait_for_nodes(self, *names: str, seconds: float = 30.0) -> None:
+    def wait_for_nodes(self, *names: str, seconds: float = 90.0) -> None:
         found: list[str] = []
 
         def all_there() -> bool:
