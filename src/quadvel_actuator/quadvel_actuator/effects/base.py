@@ -84,6 +84,8 @@ class EffectLaw:
     """the signal over which its residual shows its shape"""
     shifts: ClassVar[bool] = False
     """looks like a delay, so that the delays have to be fitted anew with it"""
+    gainlike: ClassVar[bool] = False
+    """on all joints together it is a deviation of a gain: at least one joint is free of it"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
 

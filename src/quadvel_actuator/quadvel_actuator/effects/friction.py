@@ -35,6 +35,7 @@ class ViscousFriction(AddedLaw):
     name = "viscous_friction"
     parameters = (Parameter("b", "N m s/rad", 0.0, 10.0, 0.05),)
     linear = ("b",)
+    gainlike = True
     signal = "dq"
     motion = _SLOW
 

@@ -7,16 +7,15 @@ from collections.abc import Sequence
 import attrs
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from ..effects import EffectLaw
 from ..effects.commands import CommandHold
 from .backlog import backlog
 from .delays import fit_with_delays
+from .judging import Judge
 from .model import Applied, Model, fit
 from .signals import Array, Bools
 
-BLOCK = 0.1  # s: differences of errors are summed over so long before they count as independent
 _BATCH = 8  # guesses evaluated at once
 _GAIN_STEP = 0.01
 _PROMISE = (
@@ -32,46 +31,6 @@ _DELAY_MOVES = (
     (0.002, -0.002),
 )
 _JOINT_LEVEL = 0.01  # p-value below which a joint counts as acted on
-
-
-@attrs.frozen(eq=False)
-class Judge:
-    """Rows to fit and rows to judge by, (N, J), and which rows count together."""
-
-    joints: tuple[str, ...]
-
-    fit: Bools
-    judge: Bools
-    blocks: NDArray[np.intp]  # (N,), rows of the same number lie in the same BLOCK of the same log
-    count: int
-
-    @classmethod
-    def of(cls, samples: object, fit_rows: Bools, judge_rows: Bools) -> Judge:
-        """Blocks of consecutive rows of `samples` (`Samples`)."""
-        at = np.floor(samples.t / BLOCK).astype(int) + 10**7 * samples.log_of_row  # type: ignore[attr-defined]
-        names, blocks = np.unique(at, return_inverse=True)
-        return cls(samples.joints, fit_rows, judge_rows, blocks, len(names))  # type: ignore[attr-defined]
-
-    def gains(self, before: Array, after: Array) -> tuple[Array, Array]:
-        """Fall of the squared error (N, J): its sum in each block (count, J), and the rows it stands for."""
-        fall = np.where(self.judge, before**2 - after**2, 0.0)
-        sums = np.zeros((self.count, fall.shape[1]))
-        rows = np.zeros_like(sums)
-        np.add.at(sums, self.blocks, fall)
-        np.add.at(rows, self.blocks, self.judge)
-        return sums, rows
-
-
-def p_value(sums: Array, rows: Array) -> float:
-    """Is the mean fall above zero? One-sided, blocks being the units; 1 where there is nothing to go by."""
-    used = rows > 0
-    values = sums[used]
-    if len(values) < 4 or not np.any(values):
-        return 1.0
-    spread = float(np.std(values, ddof=1))
-    if spread == 0.0:
-        return 1.0 if values.mean() <= 0.0 else 0.0
-    return float(stats.t.sf(values.mean() / spread * np.sqrt(len(values)), len(values) - 1))
 
 
 @attrs.frozen(eq=False)
@@ -157,6 +116,10 @@ def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candid
     if grown is None:
         return None
     joints = np.arange(len(model.samples.joints))
+    if law.gainlike:
+        grown = _without_weakest(fit(grown, judge.fit, 4))
+        if grown is None:
+            return None
     grown = fit(grown, judge.fit, 4)
     if law.shifts:
         grown = fit_with_delays(grown, judge.fit)
@@ -173,14 +136,19 @@ def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candid
     return few if few.gain >= 0.98 * everywhere.gain else everywhere
 
 
+def _without_weakest(model: Model) -> Model | None:
+    """The last effect off the joint where it is weakest, which its gain then stands for; None of one joint."""
+    last = model.applied[-1]
+    if last.active.sum() < 2:
+        return None
+    active = last.active & (np.arange(len(last.active)) != np.argmin(last.values[0]))
+    return attrs.evolve(model, applied=(*model.applied[:-1], attrs.evolve(last, active=active)))
+
+
 def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
     residual = about.samples.tau - model.predict()
-    sums, rows = about.judge.gains(about.residual, residual)
-    joint_gain = sums.sum(axis=0) / np.maximum(rows.sum(axis=0), 1)
-    p = min(p_value(sums, rows), 1.0)
-    alone = min(p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1]))
-    p = min(p, alone * sums.shape[1])
-    return Candidate(law, model, residual, float(sums.sum() / max(rows.sum(), 1)), p, joint_gain)
+    found = about.judge.compare(about.residual, residual)
+    return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain)
 
 
 def _acted_on(about: About, candidate: Candidate) -> Bools:
@@ -189,10 +157,9 @@ def _acted_on(about: About, candidate: Candidate) -> Bools:
     idle = candidate.model.without(len(candidate.model.applied) - 1)
     # with delays that moved, the model without the effect is the one before
     before = about.residual if last.law.shifts else about.samples.tau - idle.predict()
-    sums, rows = about.judge.gains(before, candidate.residual)
-    p = np.array([p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1])])
-    worth = sums.sum(axis=0) / np.maximum(rows.sum(axis=0), 1) > 0.02 * about.noise
-    return (p < _JOINT_LEVEL) & worth
+    found = about.judge.compare(before, candidate.residual)
+    chosen: Bools = (found.p_joints < _JOINT_LEVEL) & (found.joint_gain > 0.02 * about.noise)
+    return chosen
 
 
 def _started(about: About, law: EffectLaw) -> Model | None:
@@ -225,7 +192,7 @@ def _started(about: About, law: EffectLaw) -> Model | None:
         if error.sum() < least * 0.999:
             least, lowest, best = float(error.sum()), error, at.plus(attrs.evolve(empty, values=values))
     promise = (bare - lowest) / (about.noise * np.maximum(rows.sum(axis=0), 1))
-    return best if promise.max() > _PROMISE else None
+    return best if law.gainlike or promise.max() > _PROMISE else None
 
 
 def _shifted(model: Model, by_input: float, by_output: float) -> Model | None:

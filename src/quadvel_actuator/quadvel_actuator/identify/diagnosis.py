@@ -12,8 +12,9 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, Judge, p_value, propose
+from .candidates import About, Candidate, propose
 from .delays import fit_with_delays
+from .judging import Judge
 from .model import Model, fit
 from .sharing import pooled, regroupings
 from .signals import Array
@@ -118,10 +119,9 @@ def _finer(model: Model, candidates: Sequence[Candidate], judge: Judge, noise: A
     chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
     left = model.samples.tau - model.predict()
     for _, tried in regroupings(model, judge):
-        sums, rows = judge.gains(left, tried.samples.tau - tried.predict())
-        gain = float(sums.sum() / max(rows.sum(), 1))
-        if gain > most and p_value(sums, rows) * len(registry()) < LEVEL:
-            chosen, most = tried, gain + 0.5 * WORTH * float(noise.mean())
+        found = judge.compare(left, tried.samples.tau - tried.predict())
+        if found.gain > most and found.p_any * len(registry()) < LEVEL:
+            chosen, most = tried, found.gain + 0.5 * WORTH * float(noise.mean())
     return chosen
 
 
@@ -158,10 +158,9 @@ def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool
     """Is the other's held-out error the same within the noise?"""
     if other.gain <= 0.5 * best.gain:
         return False
-    sums, rows = judge.gains(other.residual, best.residual)
-    lost = float(sums.sum() / max(rows.sum(), 1))
-    return lost < 0.005 * float(noise.mean()) or (
-        p_value(sums, rows) > _TIE_LEVEL and lost < _TIE_SHARE * float(noise.mean())
+    found = judge.compare(other.residual, best.residual)
+    return found.gain < 0.005 * float(noise.mean()) or (
+        found.p_any > _TIE_LEVEL and found.gain < _TIE_SHARE * float(noise.mean())
     )
 
 
@@ -185,9 +184,8 @@ def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
     """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
     shifts = model.applied[index].law.shifts
     less = (fit_with_delays if shifts else fit)(model.without(index), judge.fit, 4)
-    sums, rows = judge.gains(less.samples.tau - less.predict(), model.samples.tau - model.predict())
-    alone = min(p_value(sums[:, [j]], rows[:, [j]]) for j in range(sums.shape[1]))
-    return float(sums.sum() / max(rows.sum(), 1)), min(p_value(sums, rows), alone * sums.shape[1]), less
+    found = judge.compare(less.samples.tau - less.predict(), model.samples.tau - model.predict())
+    return found.gain, found.p_any, less
 
 
 def _finding(model: Model, index: int, judge: Judge, tied: tuple[str, ...]) -> Finding:

@@ -255,7 +255,15 @@ _REVEALING = {
 }
 """The excitation that shows an effect best; "steps", which hold most, for all others."""
 _LONG = {"thermal_drift": 300.0, "supply_sag": 60.0}  # s
-_BY_SIGNAL = {"t": "sweep", "q": "creep", "dq": "creep", "ddq": "chirp", "q_des": "steps", "tau": "sweep"}
+_BY_SIGNAL = {
+    "t": "sweep",
+    "q": "creep",
+    "dq": "creep",
+    "ddq": "chirp",
+    "q_des": "steps",
+    "tau": "sweep",
+    "power": "sweep",
+}
 
 
 def propose(report: Mapping[str, Any]) -> list[Proposal]:

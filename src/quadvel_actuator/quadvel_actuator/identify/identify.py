@@ -11,7 +11,6 @@ import attrs
 import numpy as np
 
 from ..parameters import ActuatorParameters
-from .candidates import Judge, p_value
 from .delays import fit_with_delays
 from .diagnosis import diagnose
 from .eam import Eam, fit_eam, pd_torque
@@ -21,6 +20,7 @@ from .floor import noise_floor
 from .identification import Identification
 from .inspect import inspect
 from .intervals import intervals
+from .judging import Judge
 from .learned import Learned, learn
 from .log import Log, LogError
 from .model import Model
@@ -158,8 +158,8 @@ def _worth(model: Model, learned: Learned | None, judge: Judge) -> tuple[float, 
     if learned is None:
         return 0.0, 1.0
     left = model.samples.tau - model.predict()
-    sums, rows = judge.gains(left, left - learned.torque)
-    return float(sums.sum() / max(rows.sum(), 1)), p_value(sums[:, learned.joints], rows[:, learned.joints])
+    found = judge.compare(left, left - learned.torque)
+    return found.gain, found.p_any
 
 
 def _reference(samples: Samples) -> tuple[float, float]:

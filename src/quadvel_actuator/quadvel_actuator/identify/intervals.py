@@ -10,8 +10,8 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from .candidates import Judge
 from .delays import jacobian_with_delays
+from .judging import Judge
 from .model import Model, gather
 from .signals import Array
 
@@ -45,9 +45,8 @@ def intervals(model: Model, judge: Judge) -> Intervals:
     units = 0
     for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
         used = slots.index[:, j] >= 0
-        sums = np.zeros((judge.count, int(used.sum())))
-        np.add.at(sums, judge.blocks, moment[used].T)
-        units += int((np.bincount(judge.blocks, judge.fit[:, j], judge.count) > 0).sum())
+        sums = judge.sums(moment[used].T)
+        units += int((judge.sums(judge.fit[:, j].astype(float)) > 0).sum())
         at = slots.index[used, j]
         np.add.at(meat, (at[:, None], at[None]), sums.T @ sums)
     covariance = [inverse @ middle @ inverse for middle in (white, meat)]

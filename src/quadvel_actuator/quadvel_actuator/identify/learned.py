@@ -14,9 +14,8 @@ import attrs
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.signal import lfilter
-from scipy.stats import t as student
 
-from .candidates import Judge
+from .judging import Judge
 from .model import Model
 from .signals import Array, Bools
 
@@ -206,26 +205,15 @@ def _best(bases: Iterator[Basis], residual: Array, judge: Judge, noise: Array) -
     count = _TRIED * residual.shape[1]
     for basis in bases:
         torque, coefficients = _fitted(basis, residual, judge.fit)
-        sums, rows = judge.gains(residual, residual - torque)
-        gain = sums.sum(axis=0) / np.maximum(rows.sum(axis=0), 1)
-        p = _p_values(sums, rows)
+        found = judge.compare(residual, residual - torque)
+        gain, p = found.joint_gain, found.p_joints
         taken = (p * count < LEVEL) & (gain > WORTH * noise)
         if basis.source:
             taken &= np.array([name != basis.source for name in judge.joints])
-        total = float((sums * taken).sum() / max(rows.sum(), 1))
+        total = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
         if taken.any() and (best is None or total > best.gain):
             best = Term(basis, taken, coefficients * taken, torque * taken, total, float(p[taken].min()))
     return best
-
-
-def _p_values(sums: Array, rows: Array) -> Array:
-    """One-sided p-value of the mean of each column's blocks being above zero, (J,)."""
-    used = rows > 0
-    n = np.maximum(used.sum(axis=0), 2)
-    mean = (sums * used).sum(axis=0) / n
-    spread = np.sqrt((np.square(sums - mean) * used).sum(axis=0) / (n - 1)) + 1e-30
-    p: Array = student.sf(mean / spread * np.sqrt(n), n - 1)
-    return p
 
 
 def _fitted(basis: Basis, residual: Array, rows: Bools) -> tuple[Array, Array]:

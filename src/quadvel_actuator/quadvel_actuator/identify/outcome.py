@@ -8,14 +8,16 @@ from typing import Any
 import attrs
 import numpy as np
 
+from quadvel_description.robot import JOINT_NAMES
+
 from ..parameters import ActuatorParameters, DelayPair, Effect
-from .candidates import Judge
 from .diagnosis import Diagnosis, Finding
 from .eam import Eam
 from .excerpts import Piece
 from .findings import Finding as LogFinding
 from .identification import Identification, Shape, Trace
 from .intervals import Intervals
+from .judging import Judge
 from .learned import Learned
 from .model import Applied, Model
 from .residual import Remainder
@@ -254,6 +256,8 @@ def parameters(o: Outcome) -> ActuatorParameters:
     return attrs.evolve(
         o.base,
         name="identified",
+        joints=joints,
+        torque_limit=_limits(o.base, joints),
         kp_ref=o.kp_ref,
         kd_ref=o.kd_ref,
         pairs=(pair,),
@@ -261,6 +265,16 @@ def parameters(o: Outcome) -> ActuatorParameters:
         effects=tuple(effects),
         **{name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()},
     )
+
+
+def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
+    """The base's torque limits for these joints: each its own where the base knows it, else the largest."""
+    limit = base.torque_limit
+    if not isinstance(limit, tuple):
+        return limit
+    names = list(base.joints or JOINT_NAMES)
+    every = limit if len(limit) == len(names) else limit * (len(names) // len(limit))
+    return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
 
 
 def _traces(o: Outcome) -> dict[str, Trace]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from .candidates import Judge
+from .judging import Judge
 from .learned import Learned
 from .model import Model
 from .signals import Array, Bools

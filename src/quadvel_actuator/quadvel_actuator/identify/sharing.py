@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import attrs
 import numpy as np
 
-from .candidates import Judge, p_value
 from .delays import fit_with_delays
+from .judging import Judge
 from .model import Groups, Model, fit
 from .signals import Array
 
@@ -54,9 +54,8 @@ def pooled(model: Model, judge: Judge, noise: Array) -> Model:
             common = attrs.evolve(one, groups=groups, values=mean)
             applied = (*model.applied[:k], common, *model.applied[k + 1 :])
             tried = fit(attrs.evolve(model, applied=applied), judge.fit, 5)
-            sums, rows = judge.gains(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())
-            lost = float(sums.sum() / max(rows.sum(), 1))
-            if lost < _HARMLESS * float(noise.mean()) or p_value(sums, rows) > _LEVEL:
+            lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())
+            if lost.gain < _HARMLESS * float(noise.mean()) or lost.p_any > _LEVEL:
                 model = tried
                 break
     return model
