@@ -37,7 +37,7 @@ def nothing_left_running() -> Iterator[None]:
     """Fails a test that leaves processes behind, and ends them. What wider fixtures started may stay."""
     before = _marked()
     yield
-    until = time.monotonic() + 2.0
+    until = time.monotonic() + 10.0
     while (left := _marked().items() - before.items()) and time.monotonic() < until:
         time.sleep(0.05)
     for pid, _ in left:

@@ -143,6 +143,8 @@ def test_stop_signals_are_noted_and_not_raised_however_often_they_come() -> None
         assert signals.wait(1.0)
         assert signals.received == signal.SIGTERM
     assert signal.getsignal(signal.SIGINT) is former
+    os.kill(os.getpid(), signal.SIGINT)  # does not come through to the clean-up that follows
+    assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
 
 
 def test_stop_signals_hear_what_was_held_back_and_hold_back_again() -> None:

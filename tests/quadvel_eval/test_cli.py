@@ -51,7 +51,7 @@ def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Pa
     for _ in range(2):
         os.killpg(process.pid, signal.SIGINT)
         time.sleep(0.1)
-    _, said = process.communicate(timeout=30)
+    _, said = process.communicate(timeout=60)
     assert process.returncode == 128 + signal.SIGINT
     assert "Traceback" not in said
     assert [path.name for path in tmp_path.iterdir()] == ["eval.json"]
