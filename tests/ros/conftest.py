@@ -118,6 +118,11 @@ class Ros:
         self.processes.append(Process(nodes.command(name, ros_arguments), self._embedded))
         return self.processes[-1]
 
+    def program(self, package: str, name: str, *arguments: str) -> Process:
+        """Start an installed program itself, as `ros2 launch` does; `ros2 run` would die of a second Ctrl-C."""
+        places = [Path(prefix, "lib", package, name) for prefix in self._ros["AMENT_PREFIX_PATH"].split(":")]
+        return self.start(str(next(place for place in places if place.exists())), *arguments)
+
     def python(self, program: str) -> Process:
         """Start a Python program on the embedded middleware."""
         self.processes.append(Process([sys.executable, "-c", program], self._embedded))
