@@ -6,10 +6,14 @@ import numpy as np
 from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
 from quadvel_actuator.identify.log import Log
 
-NAMES = tuple(
-    f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL") for part in ("hip", "thigh", "calf")
-)
-TABLE_4 = {"delta_kp": -0.706, "delta_kd": -0.021, "input_delay": 0.007, "output_delay": 0.001, "noise": 0.066}
+NAMES = tuple(f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL") for part in ("hip", "thigh", "calf"))
+TABLE_4 = {
+    "delta_kp": -0.706,
+    "delta_kd": -0.021,
+    "input_delay": 0.007,
+    "output_delay": 0.001,
+    "noise": 0.066,
+}
 
 
 def parameters(effects=(), joints=12, **values):

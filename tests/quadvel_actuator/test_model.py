@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair, Effect
+from quadvel_actuator import ActuatorModel, ActuatorParameters, DelayPair
 
 Q = np.linspace(-0.4, 0.5, 12)
 ZERO = np.zeros(12)
@@ -203,14 +203,6 @@ def test_a_delay_out_of_range_is_refused():
         model.input_delay = 0.051
     with pytest.raises(ValueError, match="delay: found"):
         model.output_delay = -0.001
-
-
-def test_an_effect_is_refused_by_name():
-    parameters = attrs.evolve(
-        ActuatorParameters.default(), effects=[Effect("backlash", ["FR_hip_joint"], {})]
-    )
-    with pytest.raises(ValueError, match="aliengo: effects: found backlash, expected none"):
-        ActuatorModel(parameters)
 
 
 def test_parameters_for_another_number_of_joints_are_refused():

@@ -76,13 +76,14 @@ class _Running:
             raise ValueError(
                 f"effects/{effect.name}/joints: found {unknown[0]}, expected one of {', '.join(joints)}"
             )
+        where = [joints.index(name) for name in effect.joints]
         numbers = {name: value for name, value in effect.parameters.items() if name not in _settings(effect)}
         settings = {name: value for name, value in effect.parameters.items() if name in _settings(effect)}
+        settings = {name: _everywhere(value, where, len(joints)) for name, value in settings.items()}
         form = registry()[effect.name].configured(settings, tuple(joints))
         self.law: EffectLaw = form.running(rng)
         self.active = np.array([name in effect.joints for name in joints])
         self.everywhere = bool(self.active.all())
-        where = [joints.index(name) for name in effect.joints]
         self.values = {
             parameter.name: _column(effect, parameter.name, numbers, where, len(joints), parameter.scale)
             for parameter in form.parameters
@@ -117,6 +118,16 @@ class _Running:
         if isinstance(x, tuple):
             return tuple(np.where(self.active, one, old) for one, old in zip(after, x, strict=True))
         return np.where(self.active, after, x)
+
+
+def _everywhere(value: Any, where: Sequence[int], joints: int) -> Any:
+    """A list with a word for each joint of the effect, as one with a word for each joint of the robot."""
+    if not isinstance(value, (list, tuple)):
+        return value
+    every = [value[0]] * joints
+    for joint, one in zip(where, value, strict=True):
+        every[joint] = one
+    return every
 
 
 def _settings(effect: Effect) -> list[str]:

@@ -23,7 +23,7 @@ def registry() -> dict[str, type[EffectLaw]]:
     """Every known law by its name; one that comes through an entry point may not take the name of another."""
     laws: dict[str, type[EffectLaw]] = {}
     for module in (friction, limits, dynamics, elastic, gains, commands):
-        laws |= {law.name: law for law in module.LAWS}  # type: ignore[attr-defined]
+        laws |= {law.name: law for law in module.LAWS}
     for entry in entry_points(group=GROUP):
         law = entry.load()
         if not (isinstance(law, type) and issubclass(law, EffectLaw)):

@@ -39,22 +39,30 @@ class Stage(enum.IntEnum):
 class View(Protocol):
     """What a law may look at: `quadvel_actuator.identify.signals.Signals`, or one step of a running model."""
 
-    t: Any
-    dt: Any
-    q: Array
-    dq: Array
-    ddq: Array
-    q_des: Array
-    measured: Array
-    temperature: Any
-    voltage: Any
-
-    sent: Any
-    packet: Any
-
+    @property
+    def t(self) -> Any: ...
+    @property
+    def dt(self) -> Any: ...
+    @property
+    def q(self) -> Array: ...
+    @property
+    def dq(self) -> Array: ...
+    @property
+    def ddq(self) -> Array: ...
+    @property
+    def q_des(self) -> Array: ...
+    @property
+    def measured(self) -> Array: ...
+    @property
+    def temperature(self) -> Any: ...
+    @property
+    def voltage(self) -> Any: ...
+    @property
+    def sent(self) -> Any: ...
+    @property
+    def packet(self) -> Any: ...
     @property
     def power(self) -> Array: ...
-
     def shifted(self, name: str, late: Array) -> Array: ...
 
 

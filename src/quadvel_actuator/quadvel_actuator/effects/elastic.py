@@ -163,7 +163,9 @@ class Backlash(MemoryLaw):
         return [{"gap": share * of + 2e-4} for share in (0.05, 0.1, 0.2, 0.4, 0.8)]
 
     def _seen(self, x: Any, u: Sequence[Array]) -> Array:
-        seen: Array = {"error": lambda: x[0], "q": lambda: u[0], "torque": lambda: x}[self.on]()
+        if self.on == "q":
+            return u[0]
+        seen: Array = x if self.on == "torque" else x[0]
         return seen
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .model import Model
 from .signals import Array
 
-LOST, STILL_LOST, LATE = 8.0, 4.0, 5.0
+LOST, STILL_LOST, LATE = 6.0, 3.0, 4.0
 """nats: the first command lost, one more in a row, one that takes effect between two sendings"""
 
 

@@ -8,6 +8,7 @@ summed once for each delay, not once for each pair, which is what makes the grid
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import attrs
 import numpy as np
@@ -77,7 +78,17 @@ class _Sums:
                     self._add(one, t[part], samples.tau[here], rows[here], totals, outputs, window, at)
             offset += len(t)
 
-    def _add(self, one, t, tau, rows, totals, outputs, window, at):  # type: ignore[no-untyped-def]
+    def _add(
+        self,
+        one: Any,
+        t: Array,
+        tau: Array,
+        rows: Bools,
+        totals: Array,
+        outputs: Array,
+        window: float,
+        at: float,
+    ) -> None:
         packet = one.log.command_rows(t - at)
         keep = rows.T[:, None].astype(float)  # (J, 1, N), like all below: joint, delay, row
         kp, kd = (one.gains[name][packet].T[:, None] * keep for name in ("kp", "kd"))

@@ -6,6 +6,8 @@ restored and `identify` takes whichever explains the torque better.
 
 from __future__ import annotations
 
+from typing import Any
+
 import attrs
 import numpy as np
 from numpy.typing import NDArray
@@ -44,7 +46,7 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
     rows = slice(*np.searchsorted(log.t, [start, stop]))
     first, last = np.searchsorted(log.t_cmd, [start - LEAD, stop])
     sent = slice(max(int(first) - 1, 0), int(last))
-    taken = {}
+    taken: dict[str, Any] = {}
     for field in attrs.fields(Log):
         value = getattr(log, field.name)
         if isinstance(value, np.ndarray):

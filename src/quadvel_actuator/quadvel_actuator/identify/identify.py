@@ -5,7 +5,8 @@ What the steps do stands in their own modules: `eam`, `floor`, `diagnosis`, `lea
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import attrs
 import numpy as np
@@ -24,7 +25,8 @@ from .judging import Judge
 from .learned import Learned, learn
 from .log import Log, LogError
 from .model import Model
-from .outcome import Outcome, identification
+from .motion import STRETCH, Rigid, implied, replayed
+from .outcome import Outcome, identification, parameters
 from .residual import remainder
 from .signals import Array, Samples
 
@@ -63,6 +65,10 @@ def identify(
     tell = progress or (lambda share, text: None)
     logs, findings = _checked([*train, *heldout])
     kp, kd = (np.array([gain]) for gain in options.gains) if options.gains else (None, None)
+    carried = None
+    if logs[0].tau is None:
+        tell(0.01, "the torque that the motion implies")
+        logs, carried = _moving(logs, kp, kd)
     parts = [
         [Piece(one.log, one.origin) for one in pieces(log, options.seconds / len(train))] for log in logs
     ]
@@ -85,6 +91,8 @@ def identify(
         chosen, *_reference(samples), options.base or ActuatorParameters.default(),
     )  # fmt: skip
     found = identification(outcome, findings)
+    if carried is not None:
+        found = attrs.evolve(found, report=_with_motion(found.report, outcome, carried))
     tell(1.0, "done")
     return found
 
@@ -94,14 +102,45 @@ def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]
     inspected = [inspect(log) for log in logs]
     for one in inspected:
         one.raise_refusal()
-        if one.log.tau is None:
-            raise LogError(f"{one.log.name}: tau: not in the log, expected the measured torque (N m)")
+        if (one.log.tau is None) != (logs[0].tau is None):
+            raise LogError(f"{one.log.name}: tau: expected it in every log or in none, as in {logs[0].name}")
         if one.log.joints != logs[0].joints:
             raise LogError(
                 f"{one.log.name}: joint_names: found {', '.join(one.log.joints)}, "
                 f"expected those of {logs[0].name}: {', '.join(logs[0].joints)}"
             )
     return [one.log for one in inspected], [(one.log.name, f) for one in inspected for f in one.findings]
+
+
+def _moving(logs: Sequence[Log], kp: Array | None, kd: Array | None) -> tuple[list[Log], Rigid]:
+    """The logs with the torque that their motion implies, and what the joints carry, from the first one."""
+    first, carried = implied(logs[0], kp, kd)
+    return [first, *(implied(log, kp, kd)[0] for log in logs[1:])], carried
+
+
+def _with_motion(report: Mapping[str, Any], o: Outcome, carried: Rigid) -> dict[str, Any]:
+    """The report with before and after in rad and rad/s, too."""
+    logs = [piece.log for piece in o.pieces]
+    before, after = (
+        replayed(logs, parameters(o, model), carried, o.judge.judge) for model in (o.before, o.model)
+    )
+    motion = {
+        "inertia": {"value": carried.inertia.tolist(), "unit": "kg m^2"},
+        "replayed_s": STRETCH,
+        "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
+        "the inertia and an encoder bias part of the torque offset.",
+    }
+    decision = (
+        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
+        f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
+    )
+    return {
+        **report,
+        "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
+        "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
+        "motion": motion,
+        "decision": decision,
+    }
 
 
 def _clocked(

@@ -8,6 +8,9 @@ over short stretches. Contacts with the ground are not in it: the robot hangs in
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import attrs
 import numpy as np
 
@@ -59,7 +62,8 @@ def implied(log: Log, kp: Array | None, kd: Array | None) -> tuple[Log, Rigid]:
                 "that turns freely (the robot hung in the air), or a measured tau"
             )
     s = samples.at(0.0, 0.0, 0.0)
-    return attrs.evolve(log, tau=rigid.inertia * s.ddq + rigid.load(s.q)), rigid
+    gains: dict[str, Any] = {name: np.array(samples.logs[0].gains[name]) for name in ("kp", "kd")}
+    return attrs.evolve(log, tau=rigid.inertia * s.ddq + rigid.load(s.q), **gains), rigid
 
 
 def _regressed(samples: Samples, delay: float) -> tuple[float, Rigid]:
@@ -80,27 +84,31 @@ def _regressed(samples: Samples, delay: float) -> tuple[float, Rigid]:
     return share, Rigid(*np.array(rows).T)
 
 
-def replay(log: Log, parameters: ActuatorParameters, rigid: Rigid, rows: Bools) -> dict[str, float]:
-    """Root mean square errors of q (rad) and dq (rad/s) over `rows` (N, J), replaying STRETCH at a time."""
+def replayed(
+    logs: Sequence[Log], parameters: ActuatorParameters, rigid: Rigid, rows: Bools
+) -> dict[str, float]:
+    """Root mean square errors of q (rad) and dq (rad/s) over `rows` (N, J) of all logs, replaying STRETCH at a time."""
+    errors = np.concatenate([_replay(log, parameters, rigid) for log in logs], axis=1)
+    count = max(int(rows.sum()), 1)
+    sizes = np.sqrt(np.sum(np.where(rows, errors, 0.0) ** 2, axis=(1, 2)) / count)
+    return {"q_rms_rad": float(sizes[0]), "dq_rms_rad_s": float(sizes[1])}
+
+
+def _replay(log: Log, parameters: ActuatorParameters, rigid: Rigid) -> Array:
+    """Errors (2, N, J) of q and dq."""
     dt = log.period
-    quiet = attrs.evolve(parameters, torque_noise=0.0)
-    model = ActuatorModel(quiet, (len(log.joints),), dt)
+    model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), (len(log.joints),), dt)
     packet = log.command_rows(log.t)
-    if log.kp is None or log.kd is None:
-        raise LogError(f"{log.name}: kp, kd: missing, expected the commanded gains")
-    q, dq = np.array(log.q[0], dtype=float), np.array(log.dq[0], dtype=float)
+    kp, kd = np.asarray(log.kp)[packet], np.asarray(log.kd)[packet]
+    q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
     errors = np.zeros((2, *log.q.shape))
     every = max(2, round(STRETCH / dt))
+    place, speed = q[0], dq[0]
     for n in range(len(log.t)):
         if n % every == 0:
-            q, dq = np.array(log.q[n], dtype=float), np.array(log.dq[n], dtype=float)
-        errors[:, n] = q - log.q[n], dq - log.dq[n]
-        sent = packet[n]
-        torque = model.step(q, dq, log.q_des[sent], log.kp[sent], log.kd[sent])
-        dq = dq + dt * (torque - rigid.load(q)) / rigid.inertia
-        q = q + dt * dq
-    count = max(int(rows.sum()), 1)
-    return {
-        name: float(np.sqrt(np.sum(np.where(rows, error, 0.0) ** 2) / count))
-        for name, error in zip(("q_rms_rad", "dq_rms_rad_s"), errors, strict=True)
-    }
+            place, speed = q[n], dq[n]
+        errors[:, n] = place - q[n], speed - dq[n]
+        torque = model.step(place, speed, log.q_des[packet[n]], kp[n], kd[n])
+        speed = speed + dt * (torque - rigid.load(place)) / rigid.inertia
+        place = place + dt * speed
+    return errors

@@ -81,7 +81,7 @@ def _report(o: Outcome) -> dict[str, Any]:
     errors = {
         name: samples.tau - torque for name, torque in (("pd", o.ideal), ("before", before), ("after", after))
     }
-    mses = {
+    mses: dict[str, dict[str, Any]] = {
         name: {"train_mse": _mse(error, judge.fit), "heldout_mse": _mse(error, judge.judge)}
         for name, error in errors.items()
     }
@@ -191,7 +191,7 @@ def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) 
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
         value, ci = _with_interval(values[one.active], width[one.active])
         params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
-    settings = one.law.settings
+    settings = _settings(one)
     entry: dict[str, Any] = {
         "name": finding.name,
         "joints": [name for name, acts in zip(joints, one.active, strict=True) if acts],
@@ -205,6 +205,16 @@ def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) 
     if finding.indistinguishable:
         entry["separated_by"] = one.law.motion
     return entry
+
+
+def _settings(one: Applied) -> dict[str, Any]:
+    """The form of a law; what it has for each joint, for those that it acts on."""
+    return {
+        name: [v for v, acts in zip(value, one.active, strict=True) if acts]
+        if isinstance(value, list)
+        else value
+        for name, value in one.law.settings.items()
+    }
 
 
 def _decision(report: Mapping[str, Any]) -> str:
@@ -231,27 +241,31 @@ def _decision(report: Mapping[str, Any]) -> str:
     return f"{text} (noise floor {report['noise_floor']:.3g}){more}."
 
 
-def parameters(o: Outcome) -> ActuatorParameters:
-    """The corrected model as the stack loads it."""
-    model, joints = o.model, o.model.samples.joints
-    mse = _mse(model.samples.tau - o.after, o.judge.fit)
+def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
+    """The corrected model as the stack loads it, or another one of the outcome's."""
+    model = o.model if model is None else model
+    joints = model.samples.joints
+    mse = _mse(model.samples.tau - (o.after if model is o.model else model.predict()), o.judge.fit)
     pair = DelayPair(
         round(float(np.median(model.input_delay)), 7), round(float(np.median(model.output_delay)), 7), mse
     )
     effects = []
-    for one, half in zip(model.applied, o.widths.effects, strict=True):
+    for one, half in zip(model.applied, o.widths.effects, strict=False):
         values: dict[str, Any] = {}
         ranges = {}
         for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
             value, ci = _with_interval(row[one.active], width[one.active])
             values[parameter.name], ranges[parameter.name] = value, ci
-        values |= one.law.settings
+        values |= _settings(one)
         units = {parameter.name: parameter.unit for parameter in one.law.parameters}
         acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
         effects.append(Effect(one.law.name, acts, values, units, ranges))
-    deviations = {
+    deviations: dict[str, Any] = {
         "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
         "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
+    }
+    deviations = {
+        name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()
     }
     return attrs.evolve(
         o.base,
@@ -263,7 +277,7 @@ def parameters(o: Outcome) -> ActuatorParameters:
         pairs=(pair,),
         torque_noise=mse,
         effects=tuple(effects),
-        **{name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()},
+        **deviations,
     )
 
 

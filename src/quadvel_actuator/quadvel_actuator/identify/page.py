@@ -215,20 +215,34 @@ def _taken(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
 
 def _parameters(report: Mapping[str, Any]) -> str:
     """Gains, delays and the parameters of every effect, with their intervals, and what the fit warns of."""
-    rows = []
     after, joints = report["after"], report["joints"]
-    for name, title, unit in _EAM:
-        if f"{name}_ci95" in after:
-            rows += _values("EAM", title, after[name], after[f"{name}_ci95"], unit, joints)
+    groups = [
+        (
+            "gains and delays",
+            [
+                row
+                for name, title, unit in _EAM
+                if f"{name}_ci95" in after
+                for row in _values(title, after[name], after[f"{name}_ci95"], unit, joints)
+            ],
+        )
+    ]
     for effect in report["effects"]:
-        for name, one in effect["params"].items():
-            rows += _values(effect["name"], name, one["value"], one["ci95"], one["unit"], effect["joints"])
+        each = effect["params"].items()
+        rows = [
+            r for name, p in each for r in _values(name, p["value"], p["ci95"], p["unit"], effect["joints"])
+        ]
+        groups.append((effect["name"], rows))
+    head = ("parameter", "#value", "#95 % interval", "unit", "from zero")
     text = "".join(f"<p>{escape(warning)}.</p>" for warning in report.get("warnings", ()))
-    if not rows:
-        return text + "<p>The plain EAM suffices; its parameters are those above.</p>"
-    return text + table(("effect", "parameter", "#value", "#95 % interval", "unit", "from zero"), rows)
+    return text + "".join(
+        f"<details{' open' if len(rows) <= _SHORT else ''}><summary>{escape(name)}</summary>{table(head, rows)}</details>"
+        for name, rows in groups
+        if rows
+    )
 
 
+_SHORT = 12  # rows of a table that is shown unfolded
 _EAM = (
     ("delta_kp", "ΔKp", "N m/rad"),
     ("delta_kd", "ΔKd", "N m s/rad"),
@@ -237,14 +251,11 @@ _EAM = (
 )
 
 
-def _values(
-    effect: str, name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]
-) -> list[tuple[str, ...]]:
+def _values(name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]) -> list[tuple[str, ...]]:
     """Rows of the table: one where the joints share the value, else one for each."""
     values, intervals = np.atleast_1d(value), np.atleast_2d(interval)
     return [
         (
-            escape(effect),
             escape(f"{name} {short(owner)}".strip()),
             number(one, 4),
             f"{number(low, 4)} … {number(high, 4)}",

@@ -195,7 +195,7 @@ class Samples:
         steps = np.where(start, self.period, steps)
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
         known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
-        return start, steps, known
+        return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""

@@ -1,0 +1,147 @@
+"""Every law of the registry: runs in the actuator model, and step by step the same as over a series."""
+
+import attrs
+import numpy as np
+import pytest
+from simulated_joints import NAMES, parameters
+
+from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
+from quadvel_actuator.effects import registry
+from quadvel_actuator.identify.log import Log
+from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.signals import Samples
+
+JOINTS = NAMES[:3]
+TRUTH = {
+    "coulomb_friction": {"c": 0.3, "v_0": 0.1},
+    "viscous_friction": {"b": 0.1},
+    "stribeck_friction": {"c": 0.2, "c_s": 0.5, "v_s": 0.4, "v_0": 0.05},
+    "quadratic_drag": {"c": 0.05},
+    "load_dependent_friction": {"mu": 0.1, "v_0": 0.1},
+    "torque_saturation": {"limit": 3.0},
+    "torque_speed_limit": {"stall": 6.0, "v_c": 0.5, "fall": 6.0},
+    "slew_limit": {"rate": 200.0},
+    "first_order_lag": {"T": 0.005},
+    "velocity_filter": {"T": 0.008},
+    "armature": {"J": 0.005},
+    "timestamp_skew": {"late": 0.0025},
+    "torque_offset": {"offset": 0.4},
+    "parallel_spring": {"k": 2.0, "q0": 0.1},
+    "cogging": {"a": 0.3, "n": 30.0, "phi": 1.0},
+    "deadband": {"width": 0.02, "share": 1.0},
+    "backlash": {"gap": 0.01, "on": "error"},
+    "hysteresis": {"F": 0.4, "reach": 0.05, "beta": 0.5},
+    "gain_asymmetry": {"a": 0.1},
+    "thermal_drift": {"rate": -0.05, "tau_t": 10.0, "of": "time"},
+    "supply_sag": {"sag": 0.002, "of": "power", "what": "gain", "full": 1.0},
+    "cross_coupling": {"a": 0.2, "source": ["FL_hip_joint/q"] * 3},
+    "command_hold": {"share": 0.1},
+}
+LATE = {"armature"}  # a running model takes the acceleration from the past alone
+UNLIKE = {"command_hold", "supply_sag"}  # random; the power is that of the step before
+
+
+def _motion(steps=800, dt=0.001):
+    """Smooth motion and commands (N, 4 joints) at 1 kHz, of three joints and a neighbour."""
+    t = np.arange(steps) * dt
+    phase = np.array([0.3, 1.1, 2.3, 4.0])
+    q = 0.3 * np.sin(2 * np.pi * 2.0 * t[:, None] + phase) + 0.1
+    dq = np.gradient(q, dt, axis=0)
+    q_des = q + 0.15 * np.sin(2 * np.pi * 3.0 * t[:, None] + 2 * phase)
+    return t, q, dq, q_des
+
+
+@pytest.mark.parametrize("name", sorted(set(registry()) - UNLIKE))
+def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
+    t, q, dq, q_des = _motion()
+    joints = (*JOINTS, NAMES[3])
+    effect = Effect(name, JOINTS, TRUTH[name])
+    truth = attrs.evolve(
+        parameters([effect], delta_kp=0.0, delta_kd=0.0, input_delay=0.0, output_delay=0.0, noise=0.0),
+        joints=joints,
+    )
+    model = ActuatorModel(truth, (4,))
+    steps = np.array([model.step(q[k], dq[k], q_des[k], 30.0, 0.5) for k in range(len(t))])
+
+    log = Log("steps", joints, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=steps,
+              kp=np.full(q.shape, 30.0), kd=np.full(q.shape, 0.5))  # fmt: skip
+    settings = {k: v for k, v in TRUTH[name].items() if isinstance(v, (str, list)) or k == "full"}
+    if name == "cross_coupling":
+        settings["source"] = [*settings["source"], settings["source"][0]]
+    law = registry()[name].configured(settings, joints)
+    values = np.array([np.full(4, TRUTH[name][parameter]) for parameter in law.names])
+    active = np.array([True, True, True, False])
+    zero = np.zeros(4, dtype=int)
+    series = Model(
+        Samples([log]), 0.0, np.ones((2, 4)), np.array([zero, zero]), np.zeros(4), np.zeros(4), zero,
+        (Applied(law, active, values, np.arange(4)),),
+    ).predict()  # fmt: skip
+    skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-9)
+    np.testing.assert_allclose(steps[skip:], series[skip:], atol=tolerance)
+    plain = 30.0 * (q_des - q) - 0.5 * dq
+    assert np.abs(steps[:, :3] - plain[:, :3]).max() > 0.05, "the law does something"
+    np.testing.assert_allclose(steps[:, 3], plain[:, 3], atol=1e-9)
+
+
+def test_every_law_has_a_truth_to_be_tested_with():
+    assert set(TRUTH) == set(registry())
+
+
+def test_an_environment_that_is_reset_forgets_its_memory_and_others_do_not():
+    effects = [Effect(name, JOINTS, TRUTH[name]) for name in ("hysteresis", "first_order_lag", "backlash")]
+    truth = attrs.evolve(parameters(effects, noise=0.0), joints=JOINTS)
+    _, q, dq, q_des = (x[..., :3] if np.ndim(x) > 1 else x for x in _motion(120))
+    whole, some = (ActuatorModel(truth, (2, 3)) for _ in range(2))
+    for k in range(100):
+        if k == 60:
+            some.reset([0])
+        both = [model.step(np.tile(q[k], (2, 1)), dq[k], q_des[k], 30.0, 0.5) for model in (whole, some)]
+    np.testing.assert_array_equal(both[0][1], both[1][1])
+    assert np.abs(both[0][0] - both[1][0]).max() > 1e-4
+
+
+def test_peeking_leaves_the_memory_of_effects_as_it_is():
+    effects = [Effect(name, JOINTS, TRUTH[name]) for name in ("hysteresis", "slew_limit", "timestamp_skew")]
+    truth = attrs.evolve(parameters(effects, noise=0.0), joints=JOINTS)
+    _, q, dq, q_des = (x[..., :3] if np.ndim(x) > 1 else x for x in _motion(60))
+    peeking, plain = (ActuatorModel(truth, (3,)) for _ in range(2))
+    for k in range(60):
+        peeking.peek(q[k] + 0.3, dq[k] - 1.0, q_des[k], 30.0, 0.5)
+        ours = peeking.step(q[k], dq[k], q_des[k], 30.0, 0.5)
+        np.testing.assert_array_equal(ours, plain.step(q[k], dq[k], q_des[k], 30.0, 0.5))
+
+
+def test_commands_are_lost_with_the_asked_share():
+    effect = Effect("command_hold", JOINTS, {"share": 0.2})
+    truth = attrs.evolve(
+        parameters([effect], delta_kp=0.0, delta_kd=0.0, input_delay=0.0, output_delay=0.0, noise=0.0),
+        joints=JOINTS,
+    )
+    model = ActuatorModel(truth, (3,), seed=3)
+    still = np.zeros(3)
+    torque = np.array([model.step(still, still, still + k, 0.01, 0.0) for k in range(4000)])
+    kept = np.isclose(torque[:, 0], 0.01 * np.arange(4000))
+    assert abs(1.0 - kept.mean() - 0.2) < 0.03
+
+
+def test_effects_survive_the_file(tmp_path):
+    effects = [Effect(name, JOINTS, value) for name, value in TRUTH.items()]
+    truth = attrs.evolve(parameters(effects), joints=NAMES[:4])
+    truth.save(tmp_path / "actuator.yaml")
+    loaded = ActuatorParameters.load(tmp_path / "actuator.yaml")
+    assert [effect.parameters for effect in loaded.effects] == list(TRUTH.values())
+    ActuatorModel(loaded, (4,))
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        (Effect("magic", JOINTS, {}), "effects: found magic, expected one of"),
+        (Effect("armature", ["wheel"], {"J": 0.1}), "effects/armature/joints: found wheel, expected one of"),
+        (Effect("armature", JOINTS, {}), "effects/armature/parameters: J is missing"),
+        (Effect("armature", JOINTS, {"J": [0.1, 0.2]}), "found 2 numbers, expected 1 or 3"),
+    ],
+)
+def test_an_effect_that_cannot_run_is_refused_by_name(effect, message):
+    with pytest.raises(ValueError, match=message):
+        ActuatorModel(attrs.evolve(parameters([effect]), joints=JOINTS), (3,))
