@@ -79,7 +79,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         best, tied = _choice(candidates, judge, noise)
         model = best.model
         ties.append(tied)
-        model = fit(model, judge.fit, 4)
+        model = fit_with_delays(model, judge.fit)
     model, ties = _pruned(model, ties, judge, noise)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
