@@ -21,6 +21,7 @@ Groups = NDArray[np.intp]
 _DAMPING = (1e-7, 1e-2, 1.0)
 _SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
 _GAIN_SLOPE = 0.01
+_KEPT = 12  # results of laws with memory
 _SETTLED = 1e-5  # relative fall of the error below which a fit has converged
 
 
@@ -91,7 +92,7 @@ class Model:
         error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
         for one, value in todo:
             if one.law.stage == Stage.ERRORS:
-                error = _pair(one, error, s, one.part(value))
+                error = self._errors(one, error, s, value)
         g = _lean(gains)
         x = (
             g[..., 0, :][..., None, :] * (s.kp * error[0])
@@ -111,6 +112,24 @@ class Model:
                 total = total + (extra if one.active.all() else extra * one.active)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *s.q.shape))
+
+    def _errors(
+        self, one: Applied, error: tuple[Array, Array], s: Signals, value: Array
+    ) -> tuple[Array, Array]:
+        """The errors after a law; those of one with memory are kept, as a fit of other parameters asks for them often."""
+        if not isinstance(one.law, MemoryLaw) or len(_lean(value)) > 1:
+            return _pair(one, error, s, one.part(value))
+        kept = self.samples.kept
+        key = (id(s), id(one.law), one.active.tobytes(), value[0].tobytes())
+        given = [k for k, o in enumerate(self.applied) if o.law.stage == Stage.ERRORS]
+        if len(given) > 1:  # what it is given depends on the others
+            return _pair(one, error, s, one.part(value))
+        if key not in kept:
+            if len(kept) >= _KEPT:
+                kept.pop(next(iter(kept)))
+            kept[key] = s, one.law, _pair(one, error, s, one.part(value))
+        after: tuple[Array, Array] = kept[key][-1]
+        return after
 
     def with_delays(self, input_delay: Array, output_delay: Array) -> Model:
         """The same model with other delays (J,)."""

@@ -9,6 +9,7 @@ that step, 0 for the instant itself. Rows are never resampled, so errors are tho
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import attrs
 import numpy as np
@@ -186,6 +187,7 @@ class Samples:
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._cache: dict[tuple[float, float, float], Signals] = {}
+        self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
         """Of each row: does a stretch begin there, the spacing to the row before, is the past known."""

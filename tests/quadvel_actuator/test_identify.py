@@ -1,0 +1,75 @@
+"""Identification against injected truth: short logs of two joints, so that it takes seconds."""
+
+import attrs
+import numpy as np
+import pytest
+from simulated_joints import NAMES, parameters, record
+
+from quadvel_actuator import Effect
+from quadvel_actuator.identify.eam import fit_eam
+from quadvel_actuator.identify.identify import identify
+from quadvel_actuator.identify.signals import Samples
+
+JOINTS = NAMES[:2]
+
+
+def _truth(*effects):
+    return attrs.evolve(parameters(effects), joints=JOINTS)
+
+
+def test_the_eam_finds_the_truth_of_table_4():
+    samples = Samples([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
+    eam = fit_eam(samples, samples.judged)
+    assert abs((eam.gains[0, 0] - 1) * 30 - -0.706) < 0.05 * 30 * 0.05
+    assert abs(eam.gains[1, 0] * 0.5 - 0.479) < 0.2 * 0.479
+    assert abs(eam.input_delay[0] + eam.output_delay[0] - 0.0081) < 2e-4
+    assert eam.mse < 1.05 * 0.066
+    assert all(pair.mse < 1.5 * eam.mse for pair in eam.pairs)
+
+
+def test_nothing_is_added_to_a_log_that_the_eam_explains():
+    report = identify([record(_truth(), 2, 3.0, 500, seed=4)]).report
+    assert report["effects"] == []
+    assert report["unexplained"] == {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
+    assert report["decision"].startswith("Nothing significant")
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("coulomb_friction", {"c": 0.35}),
+        ("quadratic_drag", {"c": 0.05}),
+        ("parallel_spring", {"k": 1.5, "q0": 0.1}),
+    ],
+)
+def test_an_effect_is_named_with_an_interval_that_holds_its_truth(name, truth):
+    injected = truth | ({"v_0": 0.1} if name == "coulomb_friction" else {})
+    found = identify([record(_truth(Effect(name, JOINTS, injected)), 2, 3.0, 500, seed=2)])
+    first = found.report["effects"][0]
+    assert first["name"] == name
+    assert first["joints"] == list(JOINTS)
+    for parameter, value in truth.items():
+        low, high = np.transpose(np.atleast_2d(first["params"][parameter]["ci95"]))
+        spread = (high - low) / 2  # one interval in twenty misses; none by its own width
+        assert np.all((low - spread < value) & (value < high + spread))
+    assert found.report["after"]["heldout_mse"] < 1.15 * 0.066
+    assert [effect.name for effect in found.parameters.effects] == [name]
+
+
+def test_friction_on_one_joint_is_found_there_only():
+    found = identify(
+        [record(_truth(Effect("viscous_friction", JOINTS[:1], {"b": 0.15})), 2, 3.0, 500, seed=1)]
+    )
+    assert [(one["name"], one["joints"]) for one in found.report["effects"]] == [
+        ("viscous_friction", [JOINTS[0]])
+    ]
+
+
+def test_hum_of_the_mains_is_told_as_a_line_in_time():
+    def hum(k, q, dq, tau):
+        return tau + 0.35 * np.sin(2 * np.pi * 50.0 * k * 0.001)
+
+    report = identify([record(_truth(), 2, 3.0, 500, seed=3, distort=hum)]).report
+    assert report["unexplained"]["verdict"] == "structured"
+    assert report["unexplained"]["depends_on"] == ["t"]
+    assert report["after"]["heldout_mse"] < 1.15 * 0.066
