@@ -38,7 +38,7 @@ def _local(values: Array, samples: Samples, rows: Bools) -> Array:
 
 
 _KEPT = 0.9
-_KEPT_SHARE = 0.6228  # of a normal variable's variance lies within its inner nine tenths
+_KEPT_SHARE = 0.5607  # of a normal variable's variance lies within its inner nine tenths
 
 
 def _spread(x: Array) -> float:

@@ -25,6 +25,9 @@ from .signals import Array
 
 SCHEMA = 1
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
+_REMOVABLE = 0.05
+"""Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
+
 _SHOWN = 4000  # points of a series in a picture
 _SIGNAL_UNITS = {
     "q": "rad",
@@ -114,7 +117,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         ],
         "unexplained": {
             "verdict": "structured" if o.rest.structured else "white",
-            "fraction": float(np.clip(left / removable, 0.0, 1.0)) if removable > 0.02 * floor else 0.0,
+            "fraction": float(np.clip(left / removable, 0.0, 1.0)) if removable > _REMOVABLE * floor else 0.0,
             "depends_on": list(o.rest.depends_on),
             "joints": names[o.rest.joints].tolist(),
         },
