@@ -110,13 +110,17 @@ class Setting:
 
 @dataclass(frozen=True)
 class Run:
-    """One simulation of a setting with its effects; `sent` (M,) says which commands got through."""
+    """One simulation of a setting with its effects.
+
+    `held` (K, J) are the targets as sent, at each tick; `hit` is the share of ticks at which another one was in force;
+    `voltage` (K,) is empty where none is measured.
+    """
 
     motion: Motion
     held: Array
-    targets: Array
     trace: Trace
     hit: float
+    voltage: Array
     dt: float
 
 
@@ -210,33 +214,34 @@ def _run(setting: Setting, effects: list[Effect], dt: float, motion: str, replay
     rng = setting.rng(1)
     legs = tuple(name.split("_")[0] for name in setting.names[::3])
     plan = make_motion(rng, motion, legs, dt, setting.duration, setting.kp)
-    drive, steps = setting.drive(dt), len(plan.load)
+    drive, joints, steps = setting.drive(dt), len(setting.names), len(plan.load)
+    body = Body(
+        scale=np.repeat(rng.uniform(0.8, 1.25, size=len(legs)), 3),
+        damping=rng.uniform(0.1, 0.35, size=joints) + 0.02 * drive.kd,
+    )
+    armature = np.zeros(joints)
+    for effect in effects:
+        armature[list(effect.joints)] += effect.armature
+    usual = arrivals(plan.ticks, drive.input_ticks, steps)
+    really = _arrivals(setting, effects, plan, drive, dt)
+    targets = plan.targets[really]
+    trace = simulate(drive, body, _hooks(effects, joints), armature, targets, plan.load, dt, replay)
+    held = plan.targets[arrivals(plan.ticks, 0, steps)]
+    voltage = np.array([volt for effect in effects for volt in effect.voltage or ()])
+    return Run(plan, held, trace, float(np.mean(usual != really)), voltage, dt)
+
+
+def _arrivals(
+    setting: Setting, effects: list[Effect], plan: Motion, drive: Drive, dt: float
+) -> NDArray[np.int64]:
+    """Which command is in force at each tick, with what effects lose or make late."""
     through, late = np.ones(len(plan.ticks), dtype=bool), np.zeros(len(plan.ticks))
     for effect in effects:
         if effect.lose is not None:
             through, late = effect.lose(setting.rng(3), len(plan.ticks))
-    usual = arrivals(plan.ticks, drive.input_ticks, steps)
-    delay = drive.input_ticks + np.round(late / dt).astype(int)
     kept = np.flatnonzero(through)
-    really = kept[arrivals(plan.ticks[kept], delay[kept], steps)]
-    trace = simulate(
-        drive,
-        Body(
-            scale=np.repeat(rng.uniform(0.8, 1.25, size=len(legs)), 3),
-            damping=rng.uniform(0.1, 0.35, size=len(setting.names)) + 0.02 * drive.kd,
-        ),
-        _hooks(effects, len(setting.names)),
-        sum(
-            (effect.armature * np.isin(np.arange(len(setting.names)), effect.joints) for effect in effects),
-            np.zeros(len(setting.names)),
-        ),
-        plan.targets[really],
-        plan.load,
-        dt,
-        replay,
-    )
-    held = plan.targets[arrivals(plan.ticks, 0, steps)]
-    return Run(plan, held, plan.targets[really], trace, float(np.mean(usual != really)), dt)
+    delay = drive.input_ticks + np.round(late[kept] / dt).astype(int)
+    return kept[arrivals(plan.ticks[kept], delay, len(plan.load))]
 
 
 def _hooks(effects: list[Effect], joints: int) -> dict[str, list[list[Any]]]:
@@ -420,8 +425,8 @@ def _log(
             cool = 32.0 + np.zeros(shape)
             cool[:, list(effect.joints)] = warm[:, None]
             log["temperature"] = cool + 0.05 * rng.standard_normal(shape)
-        if effect.voltage:
-            log["voltage"] = np.array(effect.voltage)[at] + 0.02 * rng.standard_normal(len(at))
+    if run.voltage.size:
+        log["voltage"] = run.voltage[at] + 0.02 * rng.standard_normal(len(at))
     drive = setting.drive(dt)
     return log, (drive.kp * q_noise) ** 2 + (drive.kd * dq_noise) ** 2
 
