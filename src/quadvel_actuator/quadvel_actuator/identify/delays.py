@@ -9,8 +9,9 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
+from ..effects import MemoryLaw
 from .eam import LONGEST_INPUT, LONGEST_OUTPUT
-from .model import Model, Slots, gather, jacobian, pack, step, with_slots
+from .model import Model, Slots, fit, gather, jacobian, pack, step, with_slots
 from .signals import Array, Bools
 
 SLOPE = 0.0003
@@ -76,3 +77,23 @@ def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
         if errors[best] > error * (1.0 - _SETTLED):
             break
     return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+
+
+_TOTALS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006)  # s, about the present sum of both delays
+_OUTPUTS = (0.0, 0.0015, 0.003, 0.0045)  # s
+
+
+def fit_anew(model: Model, rows: Bools) -> Model:
+    """Like `fit_with_delays`, but from the best pair of a coarse grid: an effect just found may have moved them far.
+
+    With laws that have a memory, which are slow, it starts from the present pair alone.
+    """
+    tries = [model]
+    if not any(isinstance(one.law, MemoryLaw) for one in model.applied):
+        total = model.input_delay + model.output_delay
+        for change in _TOTALS:
+            for output in _OUTPUTS:
+                if (total + change >= output).all():
+                    at = model.with_delays(np.round(total + change - output, 7), np.full(len(total), output))
+                    tries.append(fit(at, rows, 1))
+    return fit_with_delays(min(tries, key=lambda one: one.error(rows)), rows)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..effects import registry
 from .candidates import About, Candidate, propose
-from .delays import fit_with_delays
+from .delays import fit_anew, fit_with_delays
 from .judging import Judge
 from .model import Model, fit
 from .sharing import pooled, regroupings
@@ -79,7 +79,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         best, tied = _choice(candidates, judge, noise)
         model = best.model
         ties.append(tied)
-        model = fit_with_delays(model, judge.fit)
+        model = fit_anew(model, judge.fit)
     model, ties = _pruned(model, ties, judge, noise)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
