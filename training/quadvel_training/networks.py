@@ -52,7 +52,7 @@ class Recurrent(nn.Module):
         zeros = torch.zeros(1, n, self.lstm.hidden_size)
         return zeros, zeros.clone()
 
-    def forward(self, x: Tensor, state: State | None = None) -> tuple[Tensor, State]:
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         y, state = self.lstm(x, state)
         return self.body(nn.functional.silu(y)), state
 

@@ -153,7 +153,9 @@ class TeacherRun:
     def __init__(self, config: TeacherConfig) -> None:
         self.config = config
         torch.manual_seed(config.seed)
-        self.env = VelocityEnv(EnvConfig(n=config.n, seed=config.seed, commands=config.commands, terrain=config.terrain))
+        self.env = VelocityEnv(
+            EnvConfig(n=config.n, seed=config.seed, commands=config.commands, terrain=config.terrain)
+        )
         self.gait = GaitState(config.n)
         self.tracking = Tracking(config.n, gain=0.0)
         size = len(OBSERVATION_MIRROR.index)

@@ -96,4 +96,5 @@ def _apart(a: NDArray[np.float64], b: NDArray[np.float64], others: NDArray[np.fl
     left = np.linalg.norm(a) * np.linalg.norm(b)
     if left < 1e-9 * whole:
         return 0.0
-    return float(np.sqrt(max(0.0, 1.0 - (float(np.sum(a * b)) / left) ** 2)))
+    cosine = float(np.sum(a * b)) / float(left)
+    return float(np.sqrt(max(0.0, 1.0 - cosine**2)))
