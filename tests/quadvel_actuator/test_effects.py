@@ -20,7 +20,7 @@ TRUTH = {
     "load_dependent_friction": {"mu": 0.1, "v_0": 0.1},
     "torque_saturation": {"limit": 3.0},
     "torque_speed_limit": {"stall": 6.0, "v_c": 0.5, "fall": 6.0},
-    "slew_limit": {"rate": 200.0},
+    "slew_limit": {"rate": 40.0},
     "first_order_lag": {"T": 0.005},
     "velocity_filter": {"T": 0.008},
     "armature": {"J": 0.005},
