@@ -70,9 +70,8 @@ def test_an_effect_is_worth_between_a_third_and_some_times_the_noise(kind):
     worth, noise = case.truth["worth"]["left"], case.truth["noise_var"]
     asked, measured = _asked(case.log, case.truth)
     assert 0.3 * noise <= worth <= 6 * noise
-    assert np.mean((measured - asked) ** 2) >= 0.95 * (
-        worth + noise
-    )  # the fitted model leaves less than the true one
+    # The fitted model leaves less than the true one; the worth is taken on some of the rows.
+    assert np.mean((measured - asked) ** 2) >= 0.9 * (worth + noise)
     assert np.all(np.isfinite(case.log["q"]))
     assert np.abs(case.log["dq"]).max() < 30
 

@@ -108,3 +108,12 @@ def test_a_campaign_takes_up_what_is_there_and_refuses_another_seed(tmp_path):
     assert score.run_campaign(["none"], 1, 3, 1, tmp_path) == [row]
     with pytest.raises(score.typer.BadParameter, match="seed: found 3, expected 4"):
         score.run_campaign(["none"], 1, 4, 1, tmp_path)
+
+
+@pytest.mark.parametrize("kind", ["none", "load_dependent_friction"])
+def test_the_identification_names_what_is_there_and_nothing_else(kind):
+    row = score.score_case(kind, 0, 0)
+    assert row.get("error") is None
+    assert row["verdict"] == "right"
+    assert row["extra"] == []
+    assert row["within"]

@@ -16,7 +16,7 @@ from tests.identification.hidden.plant import Trace
 Array = NDArray[np.float64]
 Ticks = NDArray[np.int64]
 
-ROWS = 1500
+ROWS = 2500
 INPUT_MAX, OUTPUT_MAX = 0.020, 0.006  # s, what the paper's search covers
 
 
