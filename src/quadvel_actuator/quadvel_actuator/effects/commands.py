@@ -42,16 +42,16 @@ class CommandHold(ErrorLaw):
         if self.behind is None:
             return [{"share": 0.05}]
         fresh = np.diff(s.packet[:, 0], prepend=s.packet[0, 0] - 1) > 0
-        lost = (self.behind > 0) & fresh[:, None]
+        lost = (self.behind[: len(fresh)] > 0) & fresh[:, None]
         share = lost.sum(axis=0) / max(int(fresh.sum()), 1)
         return [{"share": np.broadcast_to(share, s.q.shape[-1:]).copy()}]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         if self.behind is None:
             return e
-        row = np.maximum(s.packet - self.behind, 0)
-        old: Array = s.sent[row, np.arange(s.q.shape[-1])]
-        return np.where(self.behind > 0, e[0] + old - s.q_des, e[0]), e[1]
+        behind = self.behind[: len(s.packet)]
+        old: Array = s.sent[np.maximum(s.packet - behind, 0), np.arange(s.q.shape[-1])]
+        return np.where(behind > 0, e[0] + old - s.q_des, e[0]), e[1]
 
     def running(self, rng: np.random.Generator) -> _Losing:
         return _Losing(rng)

@@ -3,47 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 import attrs
 import numpy as np
-from scipy.signal import lfilter
 
 from .base import AddedLaw, Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
 
 _FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
-_REGULAR = 0.2  # a spacing within this share of the usual one counts as regular
+_ROWS = 16  # summed at once
+_FADED = (
+    40.0  # time constants after which nothing is left; exp of as many for every row of a piece is a number
+)
 
 
 def _lagged(x: Array, s: Any, time: Array) -> Array:
-    """First-order lag of the rows of `x`, each value held over its step, beginning at rest."""
-    dt = s.dt[:, 0]
-    usual = float(np.median(dt))
-    share = -np.expm1(-usual / time)
-    x, share = (
-        np.broadcast_arrays(x, share) if np.ndim(share) > 1 else (x, np.broadcast_to(share, x.shape[-1:]))
-    )
-    edges = [*np.flatnonzero(s.start[:, 0]).tolist(), len(dt)]
-    out = np.empty(x.shape)
-    lead = np.reshape(x, (-1, *x.shape[-2:]))
-    shares = np.broadcast_to(share, x.shape).reshape(-1, *x.shape[-2:])[:, 0]
-    flat = out.reshape(lead.shape)
-    for first, last in pairwise(edges):
-        for b in range(len(lead)):
-            for j in range(lead.shape[-1]):
-                a = shares[b, j]
-                begin = lead[b, first, j]
-                flat[b, first:last, j] = lfilter(
-                    [a], [1.0, a - 1.0], lead[b, first:last, j], zi=[begin * (1.0 - a)]
-                )[0]
+    """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
+
+    y[k] = d[k] y[k-1] + (1 - d[k]) x[k] is summed over pieces of a few rows, all pieces at once: with D the product of
+    the d since the piece began, y / D grows by (1 - d) x / D at each row. Then the pieces are joined, one by one.
+    """
+    rate = np.minimum(s.dt, _FADED * time) / time  # (..., N, J)
+    rate = np.where(s.start, _FADED, rate)
+    rows, joints = x.shape[-2:]
+    lead = np.broadcast_shapes(x.shape[:-2], rate.shape[:-2])
+    pieces = -(-rows // _ROWS)
+
+    def pieced(values: Array) -> Array:
+        wide = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, pieces * _ROWS - rows), (0, 0)])
+        return wide.reshape(*values.shape[:-2], pieces, _ROWS, values.shape[-1])
+
+    faded = pieced(rate).cumsum(axis=-2)
+    left = np.exp(-faded)
+    added = left * np.cumsum(pieced(-np.expm1(-rate) * x) / left, axis=-2)
+    added = np.broadcast_to(added, (*lead, *added.shape[-3:]))
+    carried = np.empty((*lead, pieces, 1, joints))
+    before = np.broadcast_to(x[..., 0, :], (*lead, joints))
+    last = left[..., -1, :]
+    for k in range(pieces):
+        carried[..., k, 0, :] = before
+        before = added[..., k, -1, :] + last[..., k, :] * before
+    out: Array = (added + left * carried).reshape(*lead, pieces * _ROWS, joints)[..., :rows, :]
     return out
-
-
-def _is_regular(s: Any) -> bool:
-    """Are the spacings even enough, but for a few, that one share of the way stands for every step?"""
-    dt = s.dt[:, 0]
-    return bool(np.quantile(np.abs(dt / np.median(dt) - 1.0), 0.95) < _REGULAR)
 
 
 class FirstOrderLag(MemoryLaw):
@@ -67,7 +68,7 @@ class FirstOrderLag(MemoryLaw):
         return given, (given,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return _lagged(x, s, p["T"]) if _is_regular(s) else super().series(x, s, p)
+        return _lagged(x, s, p["T"])
 
 
 class VelocityFilter(MemoryLaw):
@@ -92,8 +93,6 @@ class VelocityFilter(MemoryLaw):
         return (x[0], x[1] + u[0] - filtered), (filtered,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        if not _is_regular(s):
-            return super().series(x, s, p)
         return x[0], x[1] + s.dq - _lagged(s.dq, s, p["T"])
 
 

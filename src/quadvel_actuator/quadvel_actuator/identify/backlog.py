@@ -40,31 +40,29 @@ def _likeliest(emission: Array, new: list[int]) -> NDArray[np.intp]:
     came_from = np.zeros((rows, groups, count), dtype=np.int8)
     price = np.full((groups, count), np.inf)
     price[:, 0] = 0.0
-    stay = np.arange(count)
+    stay, every = np.arange(count), np.arange(groups)
     for n in range(rows):
-        best = np.broadcast_to(stay, (groups, count)).copy()
+        best = came_from[n]
+        best[:] = stay
         if new[n] == 0:
             after = price.copy()
-            for m in range(count - 1):  # a command that was held back arrives now
-                source = m + 1 + np.argmin(price[:, m + 1 :], axis=1)
-                late = np.take_along_axis(price, source[:, None], axis=1)[:, 0] + LATE
-                better = late < after[:, m]
-                after[better, m] = late[better]
-                best[better, m] = source[better]
+            late = np.minimum.accumulate(price[:, :0:-1], axis=1)[:, ::-1] + LATE
+            for group, m in np.argwhere(late < price[:, :-1]):  # a command that was held back arrives now
+                after[group, m] = late[group, m]
+                best[group, m] = m + 1 + np.argmin(price[group, m + 1 :])
         else:
             after = np.full_like(price, np.inf)
             source = np.argmin(price, axis=1)
-            after[:, 0] = np.take_along_axis(price, source[:, None], axis=1)[:, 0]
+            after[:, 0] = price[every, source]
             best[:, 0] = source
             d = min(new[n], count)
             lost = price[:, : count - d] + np.where(stay[: count - d] == 0, LOST, STILL_LOST)
             after[:, d:] = lost
             best[:, d:] = stay[: count - d]
-        came_from[n] = best
         price = after + emission[n]
     path = np.zeros((rows, groups), dtype=np.intp)
     at = np.argmin(price, axis=1)
     for n in range(rows - 1, -1, -1):
         path[n] = at
-        at = came_from[n][np.arange(groups), at]
+        at = came_from[n][every, at]
     return path

@@ -109,17 +109,25 @@ def _share(behind: NDArray[np.intp], model: Model) -> float:
     return float((behind[fresh] > 0).mean())
 
 
-def propose(about: About, law: EffectLaw, starts: Model | None = None) -> Candidate | None:
-    """The law fitted to all joints, and then to those that it acts on; None where it cannot start."""
-    model, judge = about.model, about.judge
-    grown = _started(about, law)
-    if grown is None:
-        return None
+@attrs.frozen(eq=False)
+class Started:
+    """A law on a model at the best of its starts, only gains and linear parameters fitted."""
+
+    law: EffectLaw
+    model: Model
+    promise: float
+    """what it takes off the squared error of the fitted rows, each joint's in units of its noise"""
+
+
+def propose(about: About, started: Started) -> Candidate | None:
+    """The law fitted to all joints, and then to those that it acts on; None where that takes a joint it has not."""
+    model, judge, law, grown = about.model, about.judge, started.law, started.model
     joints = np.arange(len(model.samples.joints))
     if law.gainlike:
-        grown = _without_weakest(fit(grown, judge.fit, 4))
-        if grown is None:
+        fewer = _without_weakest(fit(grown, judge.fit, 4))
+        if fewer is None:
             return None
+        grown = fewer
     grown = fit(grown, judge.fit, 4)
     if law.shifts:
         grown = fit_with_delays(grown, judge.fit)
@@ -162,9 +170,9 @@ def _acted_on(about: About, candidate: Candidate) -> Bools:
     return chosen
 
 
-def _started(about: About, law: EffectLaw) -> Model | None:
-    """The model with the law at the best of its starts, chosen for each joint on its own."""
-    model, rows = about.model, about.judge.fit
+def start(about: About, law: EffectLaw) -> Started | None:
+    """The law at the best of its starts, chosen for each joint on its own; None where that takes nothing off the error."""
+    model, rows = about.model.reaching(about.judge.fit)
     starts = law.starts(about.signals, about.torque, about.fitted)
     if not starts:
         return None
@@ -191,8 +199,10 @@ def _started(about: About, law: EffectLaw) -> Model | None:
         bare = np.minimum(bare, without)
         if error.sum() < least * 0.999:
             least, lowest, best = float(error.sum()), error, at.plus(attrs.evolve(empty, values=values))
-    promise = (bare - lowest) / (about.noise * np.maximum(rows.sum(axis=0), 1))
-    return best if law.gainlike or promise.max() > _PROMISE else None
+    promise = (bare - lowest) / about.noise
+    if best is None or not (law.gainlike or (promise / np.maximum(rows.sum(axis=0), 1)).max() > _PROMISE):
+        return None
+    return Started(law, attrs.evolve(best, samples=about.samples), float(promise.sum()))
 
 
 def _shifted(model: Model, by_input: float, by_output: float) -> Model | None:

@@ -55,6 +55,7 @@ def _at(model: Model, which: int, by: float) -> Model:
 
 def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
     """The model with delays, gains and effects fitted to `rows` (N, J)."""
+    whole, model, rows = model.samples, *model.reaching(rows)
     for _ in range(iterations):
         predicted, slopes, slots = jacobian_with_delays(model)
         left = np.where(rows, model.samples.tau - predicted, 0.0)
@@ -76,7 +77,7 @@ def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
         model = tries[best]
         if errors[best] > error * (1.0 - _SETTLED):
             break
-    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+    return attrs.evolve(model, samples=whole, applied=tuple(one.tidied() for one in model.applied))
 
 
 _TOTALS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006)  # s, about the present sum of both delays
@@ -88,6 +89,7 @@ def fit_anew(model: Model, rows: Bools) -> Model:
 
     With laws that have a memory, which are slow, it starts from the present pair alone.
     """
+    whole, model, rows = model.samples, *model.reaching(rows)
     tries = [model]
     if not any(isinstance(one.law, MemoryLaw) for one in model.applied):
         total = model.input_delay + model.output_delay
@@ -96,4 +98,5 @@ def fit_anew(model: Model, rows: Bools) -> Model:
                 if (total + change >= output).all():
                     at = model.with_delays(np.round(total + change - output, 7), np.full(len(total), output))
                     tries.append(fit(at, rows, 1))
-    return fit_with_delays(min(tries, key=lambda one: one.error(rows)), rows)
+    best = fit_with_delays(min(tries, key=lambda one: one.error(rows)), rows)
+    return attrs.evolve(best, samples=whole)

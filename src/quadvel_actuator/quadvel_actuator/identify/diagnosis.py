@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, propose
+from .candidates import About, Candidate, Started, propose, start
 from .delays import fit_anew, fit_with_delays
 from .judging import Judge
 from .model import Model, fit
@@ -28,6 +28,8 @@ WORTH = 0.03
 MOST = 5
 """Effects of one log at most."""
 
+_FITTED = 5
+_PROMISING = 0.5  # of the most promising law: so much, or among the first few, and a law is fitted further
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3
@@ -94,17 +96,24 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
     """
     idle: dict[str, Rejected] = {}
     best: dict[str, Candidate] = {}
+    started: list[Started] = []
     taken = {one.law.name for one in about.model.applied}
     for name, law in registry().items():
         tick(f"{what}: {name}")
         if name in taken:
             continue
-        for form in law.variants(about):
-            one = propose(about, form)
-            if one is None:
-                idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
-            elif name not in best or one.gain > best[name].gain:
-                best[name] = one
+        idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
+        started += [one for one in (start(about, form) for form in law.variants(about)) if one is not None]
+    started.sort(key=lambda one: -one.promise)
+    for k, first in enumerate(started):
+        name = first.law.name
+        if k >= _FITTED and first.promise < _PROMISING * started[0].promise:
+            idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
+            continue
+        tick(f"{what}: {name}, fitted")
+        found = propose(about, first)
+        if found is not None and (name not in best or found.gain > best[name].gain):
+            best[name] = found
     out = [one for name, one in idle.items() if name not in best]
     return sorted(best.values(), key=lambda one: -one.gain), out
 

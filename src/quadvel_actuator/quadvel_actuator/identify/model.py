@@ -131,6 +131,11 @@ class Model:
         after: tuple[Array, Array] = kept[key][-1]
         return after
 
+    def reaching(self, rows: Bools) -> tuple[Model, Bools]:
+        """The model and `rows` (N, J) of it without the logs at the end that hold none of them."""
+        samples = self.samples.reaching(rows)
+        return attrs.evolve(self, samples=samples), rows[: len(samples.t)]
+
     def with_delays(self, input_delay: Array, output_delay: Array) -> Model:
         """The same model with other delays (J,)."""
         return attrs.evolve(self, input_delay=input_delay, output_delay=output_delay)
@@ -247,8 +252,8 @@ def gather(slots: Slots, local: Array) -> Array:
 
 def fit(model: Model, rows: Bools, iterations: int = 5) -> Model:
     """The model with gains and effects fitted to `rows` (N, J); the delays stay."""
+    whole, model, rows = model.samples, *model.reaching(rows)
     slots = Slots.of(model)
-    error = np.inf
     for _ in range(iterations):
         predicted, slopes = jacobian(model, slots)
         left = np.where(rows, model.samples.tau - predicted, 0.0)
@@ -265,7 +270,7 @@ def fit(model: Model, rows: Bools, iterations: int = 5) -> Model:
         model = with_slots(model, trials[best])
         if errors[best] > error * (1.0 - _SETTLED):
             break
-    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+    return attrs.evolve(model, samples=whole, applied=tuple(one.tidied() for one in model.applied))
 
 
 def _errors(model: Model, theta: Array, rows: Bools) -> Array:

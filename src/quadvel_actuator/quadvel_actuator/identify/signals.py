@@ -9,6 +9,7 @@ that step, 0 for the instant itself. Rows are never resampled, so errors are tho
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from typing import Any
 
 import attrs
@@ -187,6 +188,7 @@ class Samples:
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._cache: dict[tuple[float, float, float], Signals] = {}
+        self._parts: dict[int, Samples] = {}
         self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
@@ -198,6 +200,22 @@ class Samples:
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
         known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
         return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
+
+    def reaching(self, rows: Bools) -> Samples:
+        """These samples without the logs at the end that hold none of `rows` (N, J)."""
+        count = int(self.log_of_row[np.flatnonzero(rows.any(axis=1))[-1]]) + 1 if rows.any() else 1
+        if count == len(self.logs):
+            return self
+        if count not in self._parts:
+            part = copy(self)
+            part.logs = self.logs[:count]
+            stop = int(np.searchsorted(self.log_of_row, count))
+            for name in ("log_of_row", "t", "tau", "start", "dt", "judged"):
+                setattr(part, name, getattr(self, name)[:stop])
+            part.sent = self.sent[: self._first_packet[count]]
+            part._cache, part.kept, part._parts = {}, {}, {}
+            self._parts[count] = part
+        return self._parts[count]
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
