@@ -39,7 +39,7 @@ def test_nothing_is_added_to_a_log_that_the_eam_explains():
     [
         ("coulomb_friction", {"c": 0.35}),
         ("quadratic_drag", {"c": 0.05}),
-        ("parallel_spring", {"k": 1.5, "q0": 0.1}),
+        ("parallel_spring", {"k": 3.0, "q0": 0.1}),
     ],
 )
 def test_an_effect_is_named_with_an_interval_that_holds_its_truth(name, truth):

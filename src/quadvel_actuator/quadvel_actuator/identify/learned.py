@@ -7,7 +7,7 @@ outside the range that the log covers a smooth function stays at its end.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 
 import attrs
@@ -28,6 +28,7 @@ WORTH = 0.03
 MOST = 8
 """Terms at most."""
 
+_KEPT = 10  # inputs that come into question after the first look
 _RIDGE = 1e-5
 _TRIED = 60  # bases a joint that count as independent trials
 _HISTORY = 0.02  # s
@@ -91,12 +92,13 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     """Terms for what `model` leaves; None where nothing pays."""
     residual = model.residual(judge.fit | judge.judge)
     terms: list[Term] = []
-    for _ in range(MOST):
-        term = _best(library(model, residual, judge), residual, judge, noise)
-        if term is None:
-            break
+    found = _taken(library(model, residual, judge), residual, judge, noise)
+    while found and len(terms) < MOST:
+        term = found[0]
         terms.append(term)
         residual = residual - term.torque * (judge.fit | judge.judge)
+        bases = [one.basis for one in found if one.basis.kind != "line"]
+        found = _taken([*bases, *_lines(model, residual, judge)], residual, judge, noise)
     return Learned(tuple(terms)) if terms else None
 
 
@@ -199,9 +201,9 @@ def _peak(frequency: float, step: float, t: Array, residual: Array) -> float:
     return float(near[int(np.argmax((np.abs(waves @ residual) ** 2).sum(axis=1)))])
 
 
-def _best(bases: Iterator[Basis], residual: Array, judge: Judge, noise: Array) -> Term | None:
-    """The basis with the largest gain on the joints where it is significant, fitted."""
-    best: Term | None = None
+def _taken(bases: Iterable[Basis], residual: Array, judge: Judge, noise: Array) -> list[Term]:
+    """The bases fitted on the joints where they are significant, of the same inputs the best one; the best _KEPT."""
+    best: dict[tuple[str, ...], Term] = {}
     count = _TRIED * residual.shape[1]
     for basis in bases:
         torque, coefficients = _fitted(basis, residual, judge.fit)
@@ -211,9 +213,12 @@ def _best(bases: Iterator[Basis], residual: Array, judge: Judge, noise: Array) -
         if basis.source:
             taken &= np.array([name != basis.source for name in judge.joints])
         total = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
-        if taken.any() and (best is None or total > best.gain):
-            best = Term(basis, taken, coefficients * taken, torque * taken, total, float(p[taken].min()))
-    return best
+        before = best.get(basis.inputs)
+        if taken.any() and (before is None or total > before.gain):
+            term = Term(basis, taken, coefficients * taken, torque * taken, total, float(p[taken].min()))
+            ranked = sorted([*(best | {basis.inputs: term}).values()], key=lambda one: -one.gain)[:_KEPT]
+            best = {one.basis.inputs: one for one in ranked}
+    return sorted(best.values(), key=lambda one: -one.gain)
 
 
 def _fitted(basis: Basis, residual: Array, rows: Bools) -> tuple[Array, Array]:
