@@ -20,7 +20,7 @@ from rich.console import Console
 from quadvel_bringup.scripted_walk import ScriptedWalk
 from quadvel_bringup.twin import plant_nodes
 plant, out = map(Path, sys.argv[1:])
-sys.exit(ScriptedWalk(out, "quick", plant_nodes(plant, seed=1), True, Console()).run())
+sys.exit(ScriptedWalk(out, "quick", plant_nodes(plant, seed=1), True, Console()).run() or 0)
 """
 
 
