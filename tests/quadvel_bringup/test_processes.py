@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
+import textwrap
 import time
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from quadvel_bringup.processes import ProcessGroup, StopSignals
+from quadvel_bringup.processes import ProcessGroup
 
 SLEEPER = [
     sys.executable,
@@ -134,23 +134,33 @@ with ProcessGroup(lambda name, line: None) as group:
     wait_until(lambda: not (child / "cmdline").exists() or not (child / "cmdline").read_bytes())
 
 
+def _alone(program: str) -> None:
+    """Run `program` in a process of one thread: in a test runner a signal may come to any thread."""
+    head = "import os, signal\nfrom quadvel_bringup.processes import StopSignals\n"
+    subprocess.run([sys.executable, "-c", head + textwrap.dedent(program)], check=True, timeout=60)
+
+
 def test_stop_signals_are_noted_and_not_raised_however_often_they_come() -> None:
-    former = signal.getsignal(signal.SIGINT)
-    with StopSignals() as signals:
-        assert not signals.wait(0.0)
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
-            os.kill(os.getpid(), number)
-        assert signals.wait(1.0)
-        assert signals.received == signal.SIGTERM
-    assert signal.getsignal(signal.SIGINT) is former
-    os.kill(os.getpid(), signal.SIGINT)  # does not come through to the clean-up that follows
-    assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
+    _alone("""
+        former = signal.getsignal(signal.SIGINT)
+        with StopSignals() as signals:
+            assert not signals.wait(0.0)
+            for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
+                os.kill(os.getpid(), number)
+            assert signals.wait(1.0)
+            assert signals.received == signal.SIGTERM
+        assert signal.getsignal(signal.SIGINT) is former
+        os.kill(os.getpid(), signal.SIGINT)  # does not come through to the clean-up that follows
+        assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
+    """)
 
 
 def test_stop_signals_hear_what_was_held_back_and_hold_back_again() -> None:
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.kill(os.getpid(), signal.SIGINT)
-    with StopSignals() as signals:
-        assert signals.received == signal.SIGINT
-    os.kill(os.getpid(), signal.SIGINT)
-    assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
+    _alone("""
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        os.kill(os.getpid(), signal.SIGINT)
+        with StopSignals() as signals:
+            assert signals.received == signal.SIGINT
+        os.kill(os.getpid(), signal.SIGINT)
+        assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
+    """)

@@ -49,7 +49,7 @@ def interrupt_when_ready(monkeypatch: pytest.MonkeyPatch, times: int) -> None:
     def press() -> None:
         for _ in range(times):
             os.kill(os.getpid(), signal.SIGINT)
-            time.sleep(0.05)
+            time.sleep(0.005)
 
     monkeypatch.setattr(up, "PrefixedOutput", Output)
 
