@@ -22,6 +22,9 @@ os.environ.update([MARK.split("=")])
 HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 FIRST_DOMAIN = 51
 
+# A run in the background ignores Ctrl-C, and so would what it starts.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 
 @pytest.fixture
 def domain_id(monkeypatch: pytest.MonkeyPatch) -> int:
