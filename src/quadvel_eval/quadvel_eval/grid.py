@@ -197,6 +197,9 @@ def _interrupts_held_back() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
+    except BrokenPipeError:
+        if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
+            raise
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
