@@ -1,8 +1,9 @@
-"""What all tests share: one thread a process, a DDS domain of the test's own, and nothing left running."""
+"""What all tests share: one thread a process, DDS domains of the run's own, and nothing left running."""
 
 from __future__ import annotations
 
 import os
+import random
 import signal
 import time
 from collections.abc import Iterator
@@ -20,19 +21,16 @@ os.environ.update([MARK.split("=")])
 
 # Python's own helpers, which live as long as the process that runs the tests.
 HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
-FIRST_DOMAIN = 51
+
+# A DDS domain that no other worker has, nor a demo or another run of the tests on this machine. All nodes that a
+# test starts join it; above 100, DDS would need ports that the system hands out.
+DOMAIN_STEP = 4
+WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
+RUN = os.environ.setdefault("QUADVEL_TEST_RUN", str(random.SystemRandom().randrange(1, 25)))
+os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_STEP * int(RUN) + WORKER % DOMAIN_STEP)
 
 # A run in the background ignores Ctrl-C, and so would what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-@pytest.fixture
-def domain_id(monkeypatch: pytest.MonkeyPatch) -> int:
-    """A DDS domain that no other worker uses; set as ROS_DOMAIN_ID here and for child processes."""
-    base = int(os.environ.get("ROS_DOMAIN_ID", FIRST_DOMAIN))
-    number = base + int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
-    return number
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("demo")
 
 
-def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path, domain_id: int) -> None:
+def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
     (out / "notes.txt").write_text("mine")
     (out / "demo.mp4").write_text("of another walk")
     command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(out)]
@@ -56,7 +56,7 @@ def test_its_recording_holds_every_state_and_the_answer_to_it(out: Path) -> None
     assert {schema.name for schema in summary.schemas.values()} >= {"quadvel_msgs/msg/LowState"}
 
 
-def test_a_demo_whose_folder_is_a_file_starts_nothing(tmp_path: Path, domain_id: int) -> None:
+def test_a_demo_whose_folder_is_a_file_starts_nothing(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     command = [*QUADVEL, "demo", "--out", str(tmp_path / "out")]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)

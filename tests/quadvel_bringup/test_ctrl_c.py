@@ -30,9 +30,7 @@ def interrupt_first() -> None:
     [("up",), ("drive", "--vx", "0.5"), ("record", "--out", "walk.mcap"), *(("run", name) for name in NODES)],
     ids=" ".join,
 )
-def test_ctrl_c_during_start_up_ends_a_command_cleanly(
-    arguments: tuple[str, ...], tmp_path: Path, domain_id: int
-) -> None:
+def test_ctrl_c_during_start_up_ends_a_command_cleanly(arguments: tuple[str, ...], tmp_path: Path) -> None:
     ended = subprocess.run(
         [sys.executable, "-c", RUN, *arguments],
         cwd=tmp_path,
@@ -50,7 +48,7 @@ def test_ctrl_c_during_start_up_ends_a_command_cleanly(
 
 @pytest.mark.parametrize("arguments", [("drive",), ("record", "--out", "walk.mcap")], ids=" ".join)
 def test_ctrl_c_while_the_interpreter_ends_changes_nothing(
-    arguments: tuple[str, ...], tmp_path: Path, domain_id: int
+    arguments: tuple[str, ...], tmp_path: Path
 ) -> None:
     ended = subprocess.run(
         [sys.executable, "-c", INTERRUPTED_AT_THE_END, *arguments, "--seconds", "0.2"],

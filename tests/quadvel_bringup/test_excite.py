@@ -78,7 +78,7 @@ def excite(*arguments: object) -> list[str]:
     return [sys.executable, "-c", PROGRAM, *map(str, arguments)]
 
 
-def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path, domain_id: int) -> None:
+def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path) -> None:
     file = tmp_path / "steps.mcap"
     ended = subprocess.run(
         excite("steps", "--seconds", 0.6, "--out", file), capture_output=True, text=True, timeout=240
@@ -95,7 +95,7 @@ def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path
     assert sorted(path.name for path in tmp_path.iterdir()) == ["steps.mcap"]
 
 
-def test_ctrl_c_ends_it_and_leaves_no_file(tmp_path: Path, domain_id: int) -> None:
+def test_ctrl_c_ends_it_and_leaves_no_file(tmp_path: Path) -> None:
     running = subprocess.Popen(excite("sweep", "--seconds", 600, "--out", tmp_path / "x.mcap"))
     until = time.monotonic() + 120.0
     while not list(tmp_path.glob(".x*")):

@@ -28,8 +28,8 @@ from quadvel_msgs.msg import LowState  # noqa: E402
 
 
 @pytest.fixture
-def node(domain_id: int) -> Iterator[Node]:
-    rclpy.init(args=[], domain_id=domain_id)
+def node() -> Iterator[Node]:
+    rclpy.init(args=[])
     node = rclpy.create_node("tester")
     yield node
     node.destroy_node()

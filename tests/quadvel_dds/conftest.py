@@ -1,6 +1,5 @@
-"""The embedded middleware for the tests of this folder; each worker of pytest-xdist has its own domain."""
+"""The embedded middleware for the tests of this folder."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -13,12 +12,6 @@ import quadvel_dds
 if not quadvel_dds.install():
     # ROS 2 is here: what the two middlewares do together is tested in tests/ros.
     collect_ignore_glob = ["test_*.py"]
-
-
-@pytest.fixture(autouse=True)
-def own_domain(monkeypatch: pytest.MonkeyPatch) -> None:
-    worker = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(31 + worker % 9))
 
 
 @pytest.fixture

@@ -81,7 +81,7 @@ class Bench:
 
 @pytest.fixture
 def bench(
-    request: pytest.FixtureRequest, write_estimator: Callable[..., Path], standing: State, domain_id: int
+    request: pytest.FixtureRequest, write_estimator: Callable[..., Path], standing: State
 ) -> Iterator[Bench]:
     arguments = getattr(request, "param", ["-p", f"model:={write_estimator()}"])
     bench = Bench(arguments, standing)
@@ -153,9 +153,7 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
         ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, kind, model"),
     ],
 )
-def test_a_wrong_parameter_ends_the_start_with_one_sentence(
-    argument: str, sentence: str, domain_id: int
-) -> None:
+def test_a_wrong_parameter_ends_the_start_with_one_sentence(argument: str, sentence: str) -> None:
     with pytest.raises(SystemExit) as ended:
         estimator.main(["--ros-args", "-p", argument])
     assert str(ended.value.code).startswith(sentence)
@@ -172,14 +170,14 @@ def launch(*arguments: str) -> subprocess.Popen[str]:
     )
 
 
-def test_a_missing_network_ends_the_process_with_one_sentence(domain_id: int) -> None:
+def test_a_missing_network_ends_the_process_with_one_sentence() -> None:
     process = launch("-p", "model:=/nowhere.onnx")
     _, error = process.communicate(timeout=60)
     expected = "/nowhere.onnx: no such file, expected an ONNX network\n"
     assert (process.returncode, error) == (1, expected)
 
 
-def test_ctrl_c_that_arrives_twice_ends_it_with_exit_code_0(domain_id: int) -> None:
+def test_ctrl_c_that_arrives_twice_ends_it_with_exit_code_0() -> None:
     process = launch("-p", "kind:=kalman")
     rclpy.init(args=[])
     watcher = rclpy.create_node("watcher")

@@ -115,7 +115,7 @@ def test_stamped_twists_are_followed_and_old_ones_refused(graph: Callable[..., A
     ],
 )
 def test_parameters_that_make_no_sense_are_refused_in_one_sentence(parameter: str, sentence: str) -> None:
-    rclpy.init(args=["--ros-args", "-p", parameter], domain_id=79)
+    rclpy.init(args=["--ros-args", "-p", parameter])
     try:
         with pytest.raises((StartError, ValueError), match=sentence):
             CommandMuxNode()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -265,7 +264,7 @@ def test_set_mode_says_why_it_refuses(robot: Robot) -> None:
 
 def start(*parameters: str) -> None:
     arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
-    rclpy.init(args=["--ros-args", *arguments], domain_id=79)
+    rclpy.init(args=["--ros-args", *arguments])
     try:
         Controller().destroy_node()
     finally:
@@ -294,7 +293,6 @@ def process(*arguments: str) -> subprocess.Popen[str]:
         [sys.executable, "-c", PROGRAM, *arguments],
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ | {"ROS_DOMAIN_ID": "78"},
     )
 
 
@@ -307,7 +305,7 @@ def test_a_bad_start_ends_the_process_with_one_sentence() -> None:
 
 def test_ctrl_c_twice_ends_the_process_with_exit_code_0(write_policy: Callable[..., Path]) -> None:
     with process("--ros-args", "-p", f"policy:={write_policy()}") as child:
-        rclpy.init(args=[], domain_id=78)
+        rclpy.init(args=[])
         peer = rclpy.create_node("peer")
         while not peer.count_publishers("low_cmd"):
             rclpy.spin_once(peer, timeout_sec=0.05)

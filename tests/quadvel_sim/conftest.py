@@ -116,7 +116,7 @@ class Peer:
 
 
 @pytest.fixture
-def peer(domain_id: int) -> Iterator[Peer]:
+def peer() -> Iterator[Peer]:
     """A peer in this process."""
     rclpy.init(args=["test"])
     peer = Peer()
@@ -126,7 +126,7 @@ def peer(domain_id: int) -> Iterator[Peer]:
 
 
 @pytest.fixture
-def start(domain_id: int) -> Iterator[Callable[..., SimProcess]]:
+def start() -> Iterator[Callable[..., SimProcess]]:
     """Starts the node with parameters; it is killed after the test if it still runs."""
     started: list[SimProcess] = []
 

@@ -175,7 +175,7 @@ def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterato
     """Number and result of each job as they are done."""
     context = multiprocessing.get_context("spawn")  # forking a process with threads is not safe
     with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_end_on_interrupt) as pool:
-        with _interrupts_held_back():
+        with _without_windows(), _interrupts_held_back():
             futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
         try:
             for future in as_completed(futures):
@@ -185,6 +185,23 @@ def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterato
             raise
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+
+
+@contextmanager
+def _without_windows() -> Iterator[None]:
+    """Processes that are started in the block import MuJoCo without its windows.
+
+    It looks for GLFW in a process of its own otherwise, which takes longer than the rest of the import, and writes
+    a traceback where Ctrl-C ends the worker meanwhile.
+    """
+    before = os.environ.get("MUJOCO_GL")
+    os.environ["MUJOCO_GL"] = "disable"
+    try:
+        yield
+    finally:
+        del os.environ["MUJOCO_GL"]
+        if before is not None:
+            os.environ["MUJOCO_GL"] = before
 
 
 @contextmanager

@@ -150,6 +150,8 @@ class Executor:
             if self._has_changed:
                 self._look_up(waitset)
             timers, waiting = self._timers, self._waiting
+        if not self._context.ok():  # a signal came while there was no wait set yet that it could have woken
+            return
         wakes = [timer._wake_ns() for timer in timers if not timer.is_canceled()]
         wake_ns = min([deadline_ns, *(wake for wake in wakes if wake is not None)])
         keys = waitset.wait(max(0, wake_ns - time.monotonic_ns()) if wake_ns < FOREVER else FOREVER)
