@@ -14,6 +14,7 @@ from quadvel_eval.walk import (
     jitter,
     make_simulator,
     record,
+    record_to_the_fall,
 )
 
 G = 9.81
@@ -97,3 +98,21 @@ def test_the_robot_starts_on_its_feet_on_every_terrain(terrain: str) -> None:
 def test_an_unknown_terrain_is_refused() -> None:
     with pytest.raises(ValueError, match="sand"):
         Setup(terrain="sand")
+
+
+def test_what_is_given_of_the_plant_holds_whatever_was_drawn() -> None:
+    config = make_simulator(Setup(randomised=True, plant={"payload": 4.0}), seed=1).config
+    assert config.payload == 4.0
+    assert config.friction.tolist() == make_simulator(Setup(randomised=True), seed=1).config.friction.tolist()
+
+
+def test_a_walk_is_kept_up_to_the_fall(make_loop: Callable[..., RobotLoop]) -> None:
+    loop = make_loop()
+    loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
+    walk, stood = record_to_the_fall(loop, [((0.0, 0.0, 0.0), 3.0)])
+    assert not stood
+    assert walk is not None
+    assert 0.1 < walk.time[-1] < 2.0
+    assert walk.torque.shape == walk.joint_velocity.shape == (len(walk.time), 12)
+    assert walk.contact[0].all()
+    assert not walk.contact[-1].all()

@@ -5,19 +5,15 @@ Files and pictures are `report`'s matter.
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
-from multiprocessing import resource_tracker
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from .pool import Call, in_parallel
+from .robot_loop import RobotLoop
 from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
 from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record
 
@@ -73,11 +69,16 @@ def cells(grid: str, seeds: int) -> list[Cell]:
     return [Cell(command, seed) for seed in range(seeds) for command in commands]
 
 
-def run_cell(setup: Setup, cell: Cell) -> CellResult:
-    """One robot from standing through `DURATION` of one command."""
-    loop = make_loop(setup, cell.seed)
+def run_cell(setup: Setup, cell: Cell, beside: Sequence[str] = ("learned", "kalman")) -> CellResult:
+    """One robot from standing through `DURATION` of one command, with the estimators `beside`."""
+    loop = make_loop(setup, cell.seed, beside)
     walk = record(loop, [(cell.command, DURATION)])
-    return judge(walk, cell, float(loop.simulator.model.body_subtreemass[1])) if walk else CellResult(cell)
+    return judge(walk, cell, mass(loop)) if walk else CellResult(cell)
+
+
+def mass(loop: RobotLoop) -> float:
+    """Of the robot and its payload, kg."""
+    return float(loop.simulator.model.body_subtreemass[1])
 
 
 def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
@@ -155,73 +156,18 @@ def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:
 
 
 def evaluate(
-    setup: Setup, grid: str, seeds: int, progress: Callable[[int, int], None] = lambda done, total: None
+    setup: Setup,
+    grid: str,
+    seeds: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    cluster: str | None = None,
 ) -> dict[str, Any]:
-    """Run the whole grid over all cores; `progress` hears how many runs of how many are done.
-
-    A KeyboardInterrupt ends it; where only this process heard of it, once the runs under way are through.
-    """
+    """Run the whole grid as `pool.in_parallel` does; `progress` hears how many runs of how many are done."""
     todo = cells(grid, seeds)
-    jobs: list[tuple[Callable[..., Any], Setup, Any]] = [(run_cell, setup, cell) for cell in todo]
-    jobs += [(run_stance, setup, seed) for seed in range(seeds)]
-    results: list[Any] = [None] * len(jobs)
-    for done, (i, result) in enumerate(_in_parallel(jobs), start=1):
+    calls: list[Call] = [(run_cell, setup, cell) for cell in todo]
+    calls += [(run_stance, setup, seed) for seed in range(seeds)]
+    results: list[Any] = [None] * len(calls)
+    for done, (i, result) in enumerate(in_parallel(calls, cluster), start=1):
         results[i] = result
-        progress(done, len(jobs))
+        progress(done, len(calls))
     return summarise(results[: len(todo)], results[len(todo) :])
-
-
-def _in_parallel(jobs: Sequence[tuple[Callable[..., Any], Any, Any]]) -> Iterator[tuple[int, Any]]:
-    """Number and result of each job as they are done."""
-    context = multiprocessing.get_context("spawn")  # forking a process with threads is not safe
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_end_on_interrupt) as pool:
-        with _without_windows(), _interrupts_held_back():
-            futures = {pool.submit(function, *arguments): i for i, (function, *arguments) in enumerate(jobs)}
-        try:
-            for future in as_completed(futures):
-                yield futures[future], future.result()
-        except KeyboardInterrupt:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
-            raise
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-
-
-@contextmanager
-def _without_windows() -> Iterator[None]:
-    """Processes that are started in the block import MuJoCo without its windows.
-
-    It looks for GLFW in a process of its own otherwise, which takes longer than the rest of the import, and writes
-    a traceback where Ctrl-C ends the worker meanwhile.
-    """
-    before = os.environ.get("MUJOCO_GL")
-    os.environ["MUJOCO_GL"] = "disable"
-    try:
-        yield
-    finally:
-        del os.environ["MUJOCO_GL"]
-        if before is not None:
-            os.environ["MUJOCO_GL"] = before
-
-
-@contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """SIGINT waits until the end of the block, and in processes that are started in it until they allow it.
-
-    Ctrl-C reaches the whole group, and a worker that is hit while it still imports would write a traceback.
-    """
-    resource_tracker.ensure_running()  # it is started with the workers otherwise, and then lets signals through
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    except BrokenPipeError:
-        if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
-            raise
-    finally:
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-
-
-def _end_on_interrupt() -> None:
-    """In a worker: SIGINT ends it at once and without a word."""
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

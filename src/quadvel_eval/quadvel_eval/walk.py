@@ -5,7 +5,7 @@ A walk is a list of velocities with durations; `grid` makes many of them and jud
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description import robot
-from quadvel_description.kinematics import rotate
-from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_description.kinematics import rotate, yaw
+from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -34,17 +33,21 @@ DIAGONAL = 0.555  # m, l_c of Eq. 10: the distance between two diagonal feet
 
 @attrs.frozen(kw_only=True)
 class Setup:
-    """What a walk is made with. estimator: the one in the loop. randomised: draw the plant by the seed."""
+    """What a walk is made with. estimator: the one in the loop. randomised: draw the plant by the seed.
+
+    plant: fields of `SimulatorConfig` that are as given here, whatever is said or drawn for them elsewhere.
+    """
 
     policy: Path = SHIPPED_POLICY
     estimator: str = "learned"
     estimator_file: Path = SHIPPED_MODEL
     terrain: str = attrs.field(default="flat", validator=attrs.validators.in_(TERRAINS))
     randomised: bool = False
+    plant: Mapping[str, Any] = attrs.field(factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """As `eval.json` keeps it."""
-        fields = attrs.asdict(self)
+        """As `eval.json` keeps it; `plant` is for studies that say what they changed themselves."""
+        fields = attrs.asdict(self, filter=lambda field, _: field.name != "plant")
         return {name: str(value) if isinstance(value, Path) else value for name, value in fields.items()}
 
 
@@ -52,8 +55,8 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     """The robot standing; nominal, or with a plant and actuators drawn by `seed` (Sections 3.1 and 3.4)."""
     terrain = Terrain(kind=setup.terrain, slope=SLOPE if setup.terrain == "slope" else 0.0, seed=seed)
     rng = np.random.default_rng(seed)
-    plant = _draw_plant(rng) if setup.randomised else {}
-    simulator = Simulator(SimulatorConfig(terrain=terrain, seed=seed, **plant))
+    drawn = _draw_plant(rng) if setup.randomised else {}
+    simulator = Simulator(SimulatorConfig(**{"terrain": terrain, "seed": seed, **drawn, **setup.plant}))
     simulator.reset("stand")
     if setup.randomised:
         simulator.actuator.sample(rng=rng)
@@ -72,14 +75,14 @@ def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def make_loop(setup: Setup, seed: int) -> RobotLoop:
-    """The standing robot under the policy, with both estimators beside the one that is followed."""
+def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalman")) -> RobotLoop:
+    """The standing robot under the policy, with the estimators `beside` the one that is followed."""
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
         Supervisor(PolicyFile(setup.policy)),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
-        beside={"learned": LearnedEstimator(setup.estimator_file), "kalman": KalmanEstimator()},
+        beside={name: make_estimator(name, simulator, setup.estimator_file) for name in beside},
     )
     loop.start_walking()
     return loop
@@ -92,7 +95,11 @@ class Walk:
     time: Array  # (n,) s
     position: Array  # (n, 3) m, trunk, world
     velocity: Array  # (n, 3) vx, vy (m/s), wz (rad/s), true
+    heading: Array  # (n,) rad, of the trunk, without jumps
+    contact: NDArray[np.bool_]  # (n, 4) whether a foot touches the ground
     targets: Array  # (n, 12) rad, what the joints were asked for
+    joint_velocity: Array  # (n, 12) rad/s, measured
+    torque: Array  # (n, 12) N m
     power: Array  # (n,) W, of the 12 drives, heat included
     estimate_errors: dict[str, Array]  # (n, 3) m/s, estimate minus truth
     estimate_drifts: dict[str, float]  # m, level, between the end of the walk and where the estimates lead
@@ -103,16 +110,31 @@ def record(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> Walk
 
     A robot that the supervisor put to damping, or whose simulation diverged, counts as fallen.
     """
+    samples, stood = _attempt(loop, commands)
+    return _walk(samples) if stood else None
+
+
+def record_to_the_fall(
+    loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]
+) -> tuple[Walk | None, bool]:
+    """As `record`, with what there was of the walk where the robot fell, and whether it kept standing."""
+    samples, stood = _attempt(loop, commands)
+    return (_walk(samples) if samples else None), stood
+
+
+def _attempt(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> tuple[list[Sample], bool]:
+    """The samples until the end or the fall, and whether it was the end."""
     samples: list[Sample] = []
     for velocity, seconds in commands:
         for _ in range(round(seconds / PERIOD)):
             try:
-                samples.append(loop.tick(velocity))
+                sample = loop.tick(velocity)
             except FloatingPointError:
-                return None
-            if samples[-1].fallen or samples[-1].mode != "walk":
-                return None
-    return _walk(samples)
+                return samples, False
+            if sample.fallen or sample.mode != "walk":
+                return samples, False
+            samples.append(sample)
+    return samples, True
 
 
 def _walk(samples: Sequence[Sample]) -> Walk:
@@ -122,12 +144,17 @@ def _walk(samples: Sequence[Sample]) -> Walk:
     estimates = {name: np.array([s.estimates[name] for s in samples]) for name in samples[0].estimates}
     quaternion = np.array([s.state.quaternion for s in samples])
     position = np.array([s.truth.position for s in samples])
+    joint_velocity, torque = (np.array([getattr(s.state, name) for s in samples]) for name in ("dq", "tau"))
     return Walk(
         time=time - time[0],
         position=position,
         velocity=np.column_stack([true[:, :2], turning[:, 2]]),
+        heading=np.unwrap(yaw(np.array([s.truth.quaternion for s in samples]))),
+        contact=np.array([s.truth.contact for s in samples]),
         targets=np.array([s.command.q for s in samples]),
-        power=drive_power([s.state.tau for s in samples], [s.state.dq for s in samples]),
+        joint_velocity=joint_velocity,
+        torque=torque,
+        power=drive_power(torque, joint_velocity),
         estimate_errors={name: velocity - true for name, velocity in estimates.items()},
         estimate_drifts={
             name: dead_reckoning_error(rotate(quaternion, velocity), position)
