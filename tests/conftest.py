@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import signal
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,6 +45,15 @@ def nothing_left_running() -> Iterator[None]:
     for pid, _ in left:
         os.kill(pid, signal.SIGKILL)
     assert not left, f"left running: {', '.join(sorted(text for _, text in left))}"
+
+
+@pytest.fixture(autouse=True)
+def no_node_outlives_its_context() -> Iterator[None]:
+    """A node that refused to start half made stays on the domain for as long as its traceback is kept."""
+    yield
+    contexts = getattr(sys.modules.get("rclpy.context"), "_contexts", ())  # of the embedded rclpy alone
+    for node in [node for context in contexts if not context.ok() for node in context._nodes]:
+        node.destroy_node()
 
 
 @pytest.fixture(autouse=True)
