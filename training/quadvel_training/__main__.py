@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,7 @@ from rich.progress import Progress, TextColumn
 
 from quadvel_estimator.kalman import KalmanConfig
 
-from . import crl, distill, estimator, kalman_tuning, loop, student, teacher
+from . import crl, distill, env, estimator, kalman_tuning, loop, student, teacher
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -143,5 +142,5 @@ def tune_kalman(
 
 
 if __name__ == "__main__":
-    torch.set_num_threads(os.cpu_count() or 1)
+    torch.set_num_threads(env.cores())
     app()

@@ -15,7 +15,7 @@ import torch
 from quadvel_description import symmetry
 
 from . import student
-from .env import CommandRange, EnvConfig, VelocityEnv
+from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget
 from .networks import Gaussian, Mlp, Recurrent
 from .ppo import Ppo, PpoConfig, Rollout
@@ -32,7 +32,7 @@ class CrlConfig:
 
     budget: Budget = Budget(samples=6e7, minutes=600.0)
     n: int = 512
-    threads: int = 2
+    threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
     std: float = 0.1  # of the exploration, in the network's unit
     correlation: float = 0.9  # of the exploration from tick to tick

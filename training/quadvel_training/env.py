@@ -5,6 +5,8 @@ It knows no reward and no gait: trainers read `VelocityEnv`'s arrays. Frames and
 
 from __future__ import annotations
 
+import os
+
 import attrs
 import mujoco
 import numpy as np
@@ -19,6 +21,11 @@ from quadvel_sim.terrain import Terrain
 from .randomisation import PlantSampler, Randomisation, sample_actuators
 
 TICK = 0.005  # s, one policy sample
+
+
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
 @attrs.frozen
@@ -53,7 +60,7 @@ class EnvConfig:
     """One batch of environments."""
 
     n: int = 512
-    threads: int = 2
+    threads: int = attrs.field(factory=cores)
     seed: int = 0
     timestep: float = 0.0025  # s, of physics
     kp: float = robot.KP

@@ -18,6 +18,7 @@ OFFSET = np.array([0.0, 0.5, 0.5, 0.0])  # of a cycle: diagonal pairs
 LIFT = 0.08  # m
 LEAD = 0.025  # s, by which the soft gains lag behind a swing
 LEG_WEIGHT = np.tile([-1.07, 0.34, -0.27, 1.07, 0.34, -0.27], 2)  # N m, of a lifted leg
+CENTRING = 30.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
 _STAND = foot_positions(robot.NOMINAL_Q)
 
 
@@ -105,11 +106,12 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
         robot.MASS * (robot.GRAVITY + 100 * (HEIGHT - body.height) - 14 * body.vertical_speed)[:, None] * up
     )
     force[:, :2] += robot.MASS * 6.0 * error
-    w = body.angular_velocity
-    moment = np.stack(
-        [-250 * roll - 20 * w[:, 0], -400 * pitch - 30 * w[:, 1], 10 * (command[:, 2] - w[:, 2])], axis=-1
-    )
     feet = foot_positions(body.q)
+    place = _standing_place(feet) * (command[:, 3:] > 0.5)
+    force[:, :2] += robot.MASS * CENTRING * place[:, :2]
+    w = body.angular_velocity
+    twist = 10 * (command[:, 2] - w[:, 2]) + CENTRING * place[:, 2]
+    moment = np.stack([-250 * roll - 20 * w[:, 0], -400 * pitch - 30 * w[:, 1], twist], axis=-1)
     load = down / np.maximum(down.sum(-1, keepdims=True), 2)  # forces vanish on lifted feet
     map_ = np.zeros((n, 6, 4, 3))
     map_[:, :3] = np.eye(3)[None, :, None, :] * load[:, None, :, None]
@@ -126,3 +128,16 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
     bound = 0.6 * forces[..., 2:]
     forces[..., :2] = np.clip(forces[..., :2], -bound, bound)
     return forces
+
+
+def _standing_place(feet: np.ndarray) -> np.ndarray:
+    """Where the trunk would stand over its feet (n, 4, 3) as in the nominal posture: forward, left (m), yaw (rad), (n, 3).
+
+    Without this pull a standing trunk creeps: soft joints that are told to hold their force follow every lean.
+    """
+    centre, stand = feet[..., :2].mean(axis=1), _STAND[:, :2] - _STAND[:, :2].mean(axis=0)
+    arms = feet[..., :2] - centre[:, None]
+    turn = np.arctan2(
+        (stand[:, 0] * arms[..., 1] - stand[:, 1] * arms[..., 0]).sum(-1), (stand * arms).sum((-1, -2))
+    )
+    return np.concatenate([centre - _STAND[:, :2].mean(axis=0), turn[:, None]], axis=-1)
