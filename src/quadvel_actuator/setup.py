@@ -13,5 +13,5 @@ setup(
     ],
     entry_points={"console_scripts": [f"identify = {package}.identify.cli:main"]},
     license="Apache-2.0",
-    description="How the joints answer: the empirical actuator model and its parameter file.",
+    description="How the joints answer: the empirical actuator model, and what measured logs say it lacks.",
 )

@@ -38,7 +38,7 @@ _STYLE: Any = {
 }
 
 
-def _svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
+def svg(width: float, height: float, draw: Callable[[Figure], None]) -> str:
     """What `draw` puts on a figure of that size (inches), as an SVG element without ids that could clash."""
     with mpl.rc_context(_STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
@@ -75,7 +75,7 @@ def torque_figure(trace: Trace) -> str:
         zoom.set_xlabel(f"time, s (below: {start:.2f} to {start + _ZOOM:.2f} s)")
         whole.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4)
 
-    return _svg(9.5, 4.6, draw)
+    return svg(9.5, 4.6, draw)
 
 
 def _torques(panel: Axes, trace: Trace, within: Any, width: float) -> None:
@@ -153,7 +153,7 @@ def distribution_figure(traces: Mapping[str, Trace], floor: float) -> str:
         panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
         panel.grid(axis="y", alpha=0.2)
 
-    return _svg(max(5.0, 0.72 * len(traces) + 1.5), 3.6, draw)
+    return svg(max(5.0, 0.72 * len(traces) + 1.5), 3.6, draw)
 
 
 def shape_figure(shapes: Sequence[Shape]) -> str:
@@ -177,7 +177,7 @@ def shape_figure(shapes: Sequence[Shape]) -> str:
         figure.axes[0].set_ylabel("measured - predicted, N m")
         figure.axes[0].legend(loc="upper right", fontsize="small")
 
-    return _svg(0.6 + 3.1 * len(shapes), 2.9, draw)
+    return svg(0.6 + 3.1 * len(shapes), 2.9, draw)
 
 
 def _binned(x: Array, y: Array, bins: int = 32) -> tuple[Array, Array]:
@@ -199,4 +199,4 @@ def candidate_figure(names: Sequence[str], gains: Sequence[float], taken: Sequen
         panel.set_xlabel("held-out gain, N² m²")
         panel.grid(axis="x", alpha=0.2)
 
-    return _svg(7.0, 0.7 + 0.24 * len(names), draw)
+    return svg(7.0, 0.7 + 0.24 * len(names), draw)
