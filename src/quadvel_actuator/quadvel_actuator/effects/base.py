@@ -8,6 +8,7 @@ values broadcast, so that the same lines serve (N, J) rows, a batch (B, N, J) of
 from __future__ import annotations
 
 import enum
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Protocol
 
@@ -82,7 +83,7 @@ Start = Mapping[str, Any]
 
 
 @attrs.frozen(eq=False)
-class EffectLaw:
+class EffectLaw(ABC):
     """An entry of the registry. Subclass `ErrorLaw`, `TorqueLaw`, `AddedLaw` or one with memory, not this one."""
 
     name: ClassVar[str]
@@ -91,7 +92,9 @@ class EffectLaw:
     signal: ClassVar[str] = "tau"
     """the signal over which its residual shows its shape"""
     shifts: ClassVar[bool] = False
-    """looks like a delay, so that the delays have to be fitted anew with it"""
+    """looks like a delay"""
+    remembers: ClassVar[bool] = False
+    """looks at other rows than the one that it acts on"""
     gainlike: ClassVar[bool] = False
     """on all joints together it is a deviation of a gain: at least one joint is free of it"""
     motion: ClassVar[str] = "richer motion"
@@ -112,13 +115,13 @@ class EffectLaw:
         """What `configured` needs to make this form again."""
         return attrs.asdict(self)
 
+    @abstractmethod
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         """Guesses to search from.
 
         `torque` (N, J) is what the model without the effect gives, `residual` what is left of the measured torque,
         0 where it is not to be explained.
         """
-        raise NotImplementedError
 
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""
@@ -139,17 +142,17 @@ class ErrorLaw(EffectLaw):
 
     stage = Stage.ERRORS
 
+    @abstractmethod
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         """The errors that the drive sees instead of `e`."""
-        raise NotImplementedError
 
 
 class TorqueLaw(EffectLaw):
     """Changes the asked torque."""
 
+    @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
         """The torque instead of `x`."""
-        raise NotImplementedError
 
 
 class AddedLaw(EffectLaw):
@@ -158,9 +161,9 @@ class AddedLaw(EffectLaw):
     stage = Stage.ADDED
     linear: ClassVar[tuple[str, ...]]
 
+    @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
         """The torque to add, `x` being what the drive gives without it."""
-        raise NotImplementedError
 
 
 Memory = tuple[Array, ...]
@@ -172,16 +175,17 @@ class MemoryLaw(EffectLaw):
     At stage ERRORS `x` is the pair of errors, and so is what comes back; at ADDED it is the torque to add.
     """
 
+    remembers = True
     inputs: ClassVar[tuple[str, ...]] = ()
     """the signals that `advance` is given, by name"""
 
+    @abstractmethod
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         """The memory of a joint that has rested at `x`, `u` since ever."""
-        raise NotImplementedError
 
+    @abstractmethod
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         """The value instead of `x` after `dt` (s), and the new memory."""
-        raise NotImplementedError
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
         """All rows of a series, memory starting anew with every stretch."""

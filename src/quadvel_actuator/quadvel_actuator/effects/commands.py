@@ -27,6 +27,7 @@ class CommandHold(ErrorLaw):
     parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
     signal = "q_des@history"
     shifts = True
+    remembers = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
     behind: NDArray[np.intp] | None = attrs.field(default=None, repr=False)
 
@@ -66,6 +67,9 @@ class _Losing(MemoryLaw):
     parameters = CommandHold.parameters
     inputs = ("q_des",)
     rng: np.random.Generator
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return []  # it runs; what is searched for is `CommandHold`
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return u[0], u[0]
