@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import array
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
 
@@ -35,7 +36,7 @@ def is_numeric(description: Any) -> bool:
     return detail[0][1][0] not in NOT_NUMERIC
 
 
-class _Generator:
+class _Generator(ABC):
     """Walks the fields of a type in order, knows what is sure about the alignment, and collects scalar runs.
 
     The position is known to be `remainder` modulo `modulus`; alignment is relative to the end of the header.
@@ -117,26 +118,26 @@ class _Generator:
                 self.items(target, detail[0], count)
 
     # What writing and reading do differently.
-    def pad(self, size: int) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def pad(self, size: int) -> None: ...
 
-    def skip(self, padding: int) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def skip(self, padding: int) -> None: ...
 
-    def transfer(self, packer: str, targets: list[str]) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def transfer(self, packer: str, targets: list[str]) -> None: ...
 
-    def nested(self, typename: str, target: str) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def nested(self, typename: str, target: str) -> None: ...
 
-    def string(self, target: str) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def string(self, target: str) -> None: ...
 
-    def numbers(self, target: str, format_: str, count: int | None) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def numbers(self, target: str, format_: str, count: int | None) -> None: ...
 
-    def items(self, target: str, description: Any, count: int | None) -> None:
-        raise NotImplementedError
+    @abstractmethod
+    def items(self, target: str, description: Any, count: int | None) -> None: ...
 
     def compile(self, signature: str, result: str) -> Callable[..., Any]:
         self.flush()

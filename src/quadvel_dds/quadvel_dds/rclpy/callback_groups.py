@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from threading import Lock
 from typing import Any
 from weakref import WeakSet
 
 
-class CallbackGroup:
+class CallbackGroup(ABC):
     def __init__(self) -> None:
         self._entities: WeakSet[Any] = WeakSet()
         self._lock = Lock()
@@ -22,14 +23,17 @@ class CallbackGroup:
     def has_entity(self, entity: Any) -> bool:
         return entity in self._entities
 
+    @abstractmethod
     def can_execute(self, entity: Any) -> bool:
-        raise NotImplementedError
+        """Whether a callback of the entity may begin now."""
 
+    @abstractmethod
     def beginning_execution(self, entity: Any) -> bool:
-        raise NotImplementedError
+        """Reserve the group for a callback of the entity; False if it may not begin."""
 
+    @abstractmethod
     def ending_execution(self, entity: Any) -> None:
-        raise NotImplementedError
+        """Give back what `beginning_execution` reserved."""
 
 
 class ReentrantCallbackGroup(CallbackGroup):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import time
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future as ThreadFuture
@@ -30,7 +31,7 @@ class ExternalShutdownException(Exception):
     """The context was shut down while the executor waited."""
 
 
-class Executor:
+class Executor(ABC):
     def __init__(self, *, context: Any = None) -> None:
         self._context = context or get_default_context()
         self._nodes: list[Any] = []
@@ -115,8 +116,9 @@ class Executor:
         future.add_done_callback(lambda _: self.wake())
         self._spin_once(_deadline(timeout_sec), future.done)
 
+    @abstractmethod
     def _spin_once(self, deadline_ns: int, until: Callable[[], bool]) -> None:
-        raise NotImplementedError
+        """Run one callback, which `_next_work` waits for, or have it run."""
 
     def _next_work(self, deadline_ns: int, until: Callable[[], bool]) -> Work | None:
         """The next callback, its group entered; None at the deadline, after shutdown, or once `until` holds.
