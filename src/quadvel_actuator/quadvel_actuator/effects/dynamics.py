@@ -11,10 +11,15 @@ import numpy as np
 from .base import AddedLaw, Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
 
 _FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
+_TIME = Parameter("T", "s", 0.0002, 0.1, 0.004)
 _ROWS = 16  # summed at once
-_FADED = (
-    40.0  # time constants after which nothing is left; exp of as many for every row of a piece is a number
-)
+_FADED = 40.0
+"""time constants after which nothing is left; exp of as many for every row of a piece is a number"""
+
+
+def _lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
+    """One step of a first-order lag: from `before` towards `x`, which is held for `dt`."""
+    return before - np.expm1(-dt / time) * (x - before)
 
 
 def _lagged(x: Array, s: Any, time: Array) -> Array:
@@ -52,7 +57,7 @@ class FirstOrderLag(MemoryLaw):
 
     name = "first_order_lag"
     stage = Stage.FLOW
-    parameters = (Parameter("T", "s", 0.0002, 0.1, 0.004),)
+    parameters = (_TIME,)
     signal = "tau@history"
     shifts = True
     motion = _FAST
@@ -64,7 +69,7 @@ class FirstOrderLag(MemoryLaw):
         return (x,)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        given = memory[0] - np.expm1(-dt / p["T"]) * (x - memory[0])
+        given = _lag(memory[0], x, dt, p["T"])
         return given, (given,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
@@ -76,7 +81,7 @@ class VelocityFilter(MemoryLaw):
 
     name = "velocity_filter"
     stage = Stage.ERRORS
-    parameters = (Parameter("T", "s", 0.0002, 0.1, 0.004),)
+    parameters = (_TIME,)
     inputs = ("dq",)
     signal = "dq@history"
     shifts = True
@@ -89,7 +94,7 @@ class VelocityFilter(MemoryLaw):
         return (u[0],)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        filtered = memory[0] - np.expm1(-dt / p["T"]) * (u[0] - memory[0])
+        filtered = _lag(memory[0], u[0], dt, p["T"])
         return (x[0], x[1] + u[0] - filtered), (filtered,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
@@ -130,6 +135,7 @@ class TimestampSkew(ErrorLaw):
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
     signal = "dq@history"
     shifts = True
+    remembers = True
     motion = _FAST
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
