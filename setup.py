@@ -1,4 +1,4 @@
-"""All packages as one pip distribution. Each folder in src/ has a setup.py of its own, for colcon."""
+"""All packages as one pip distribution. Each folder in src/ is set up on its own by colcon."""
 
 from pathlib import Path
 

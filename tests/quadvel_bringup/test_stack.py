@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import ast
+from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,10 @@ SRC = Path(__file__).parents[2] / "src"
 
 
 def console_scripts(setup_file: Path) -> list[str]:
-    """The "name = module:function" of a setup.py, read without running it."""
-    strings = [
-        node.value for node in ast.walk(ast.parse(setup_file.read_text())) if isinstance(node, ast.Constant)
-    ]
-    return [text for text in strings if isinstance(text, str) and ":main" in text]
+    """The "name = module:function" of a setup.cfg."""
+    setup = ConfigParser()
+    setup.read(setup_file)
+    return setup["options.entry_points"]["console_scripts"].strip().splitlines()
 
 
 def declared_parameters() -> dict[str, dict[str, Any]]:
@@ -53,7 +52,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
 @pytest.mark.parametrize("name", nodes.NODES)
 def test_the_table_of_nodes_agrees_with_the_entry_points_for_ros(name: str) -> None:
     entry = nodes.NODES[name]
-    assert f"{name} = {entry.module}:main" in console_scripts(SRC / entry.package / "setup.py")
+    assert f"{name} = {entry.module}:main" in console_scripts(SRC / entry.package / "setup.cfg")
 
 
 def test_every_node_of_the_stack_is_in_the_table() -> None:

@@ -1,6 +1,6 @@
 """Which nodes there are, and how to start one: in this process, or as a process of its own.
 
-The one table of nodes; the entry points in the packages' setup.py files name the same modules.
+The one table of nodes; the entry points in the packages' setup.cfg files name the same modules.
 """
 
 from __future__ import annotations
