@@ -59,10 +59,10 @@ class OurLearner:
                 mean, self.state = self.actor(now[None], self.state)
                 means.append(mean[0])
             _, self.mirrored = self.actor(MIRROR_OBS(obs[:, : self.seen]), mirrored)
-        mean, none, never = torch.stack(means), torch.zeros(*shape, 12), torch.zeros(shape)
+        mean, never = torch.stack(means), torch.zeros(shape)
         action = mean + self.config.std * torch.randn_like(mean)
-        past = (obs, critic_obs[:-1], action, mean, none, torch.randn(shape), never, never, 1 - never)
-        self.ppo.update(Rollout(*past, critic_obs[-1], start, mirrored))
+        past = (obs, critic_obs[:-1], action, mean, torch.randn(shape), never, never, 1 - never)
+        self.ppo.update(Rollout(*past, torch.zeros_like(mean[0]), critic_obs[-1], start, mirrored))
 
 
 class Noise(cusrl.Environment):

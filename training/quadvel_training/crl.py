@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from quadvel_description import symmetry
+from quadvel_sim.terrain import Terrain
 
 from . import student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
@@ -23,7 +24,7 @@ from .randomisation import Randomisation
 from .rewards import RewardWeights, Table2
 from .teacher import torch_mirror
 
-PRIVILEGED = 8 + 3 + 4 + 1 + 12  # plant, true velocity, contacts, height, torque
+PRIVILEGED = 8 + 3 + 4 + 1 + 12 + 12  # plant, true velocity, contacts, height, torque, exploration under way
 
 
 @attrs.frozen
@@ -34,12 +35,12 @@ class CrlConfig:
     n: int = 512
     threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
-    std: float = 0.1  # of the exploration, in the network's unit
-    correlation: float = 0.9  # of the exploration from tick to tick
+    std: float = 0.06  # of what exploration draws anew in every tick, in the network's unit
     critic_first: int = 40  # updates of the critic alone
     timestep: float = 0.0025
     seed: int = 3
     commands: CommandRange = CommandRange()
+    terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
     ppo: PpoConfig = PpoConfig(
@@ -50,9 +51,10 @@ class CrlConfig:
         learning_rate=4e-6,
         max_learning_rate=2e-4,
         target_kl=0.004,
-        symmetry=0.05,
-        smoothness=0.003,
+        symmetry=0.02,
+        smoothness=0.001,
         symmetric_share=0.25,
+        correlation=0.9,
     )
 
 
@@ -68,6 +70,7 @@ class CrlRun:
             seed=c.seed,
             timestep=c.timestep,
             commands=c.commands,
+            terrain=c.terrain,
             randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config)
@@ -113,41 +116,47 @@ class CrlRun:
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
         env = self.env
-        true = [env.plants.drawn, env.velocity, env.contact, env.height[:, None], 0.05 * env.torque]
+        true = [
+            env.plants.drawn,
+            env.velocity,
+            env.contact,
+            env.height[:, None],
+            0.05 * env.torque,
+            self._noise,
+        ]
         return np.concatenate([obs, *true], axis=1).astype(np.float32)
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment."""
         c, env = self.config, self.env
-        names = ("obs", "critic_obs", "action", "mean", "offset", "reward", "ended", "cut", "mask")
+        names = ("obs", "critic_obs", "action", "mean", "reward", "ended", "cut", "mask")
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().numpy()
         alive = np.ones(c.n, bool)
         state, start, mirrored_start = self._state, self._state, self._mirrored
+        before = torch.from_numpy(self._noise)
         for _ in range(c.length):
             obs = student.observe(env, self._action)
             critic_obs = self._critic_obs(obs)
             with torch.no_grad():
                 mean, state = self.actor(torch.from_numpy(obs[None]), state)
             mean = mean[0].numpy()
-            # the draw is a normal step about the decayed noise: spread and offset as the learner sees them
-            offset = np.float32(c.correlation) * self._noise
             drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
-            self._noise = offset + std * drawn
+            self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
             action = mean + self._noise
             env.tick(self.map.targets(action))
             reward = self.rewards(action)
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
             for name, value in zip(
-                names, (obs, critic_obs, action, mean, offset, reward, fell, late, alive.copy()), strict=True
+                names, (obs, critic_obs, action, mean, reward, fell, late, alive.copy()), strict=True
             ):
                 keep[name].append(value)
             alive &= ~(fell | late)
         self.samples += c.length * c.n
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = torch.from_numpy(self._critic_obs(student.observe(env, self._action)))
-        rollout = Rollout(**t, last_critic_obs=last, state=start, mirrored_state=mirrored_start)
+        rollout = Rollout(**t, noise=before, last_critic_obs=last, state=start, mirrored_state=mirrored_start)
         self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
         error = env.command[:, :2] - env.velocity[:, :2]
         seconds = c.length * c.n * 0.005
@@ -166,6 +175,7 @@ class CrlRun:
         if len(over):
             self.env.reset(over)
             self.rewards.reset(over)
+            self._noise = self._noise.copy()  # the rollout holds the one before
             self._action[over] = self._noise[over] = 0.0
             self._state, self._mirrored = (tuple(m.clone() for m in pair) for pair in (state, mirrored))
             for memory in self._state:

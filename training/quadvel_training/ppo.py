@@ -33,6 +33,7 @@ class PpoConfig:
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8
     symmetric_share: float = 1.0  # of the environments, the first ones, that the symmetry term sees
+    correlation: float = 0.0  # of the exploration from sample to sample
     max_grad_norm: float = 1.0
 
 
@@ -44,11 +45,11 @@ class Rollout:
     critic_obs: Tensor  # (T, N, C)
     action: Tensor  # (T, N, A)
     mean: Tensor  # (T, N, A) of the policy that acted
-    offset: Tensor  # (T, N, A) what time-correlated exploration added to the mean, known before the draw
     reward: Tensor  # (T, N)
     ended: Tensor  # (T, N) 1 where the episode failed at the end of the sample
     cut: Tensor  # (T, N) 1 where it timed out instead
     mask: Tensor  # (T, N)
+    noise: Tensor  # (N, A) exploration at the sample before the first
     last_critic_obs: Tensor  # (N, C)
     state: State | None = None  # of the actor at the start
     mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
@@ -118,7 +119,7 @@ class Ppo:
         spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
         advantage = (advantage - mean) / (spread + 1e-6)
         with torch.no_grad():
-            old_log_prob = self.actor.log_prob(r.mean + r.offset, r.action)
+            old_log_prob = self._log_prob(r.action - r.mean, r.noise)
         total: dict[str, float] = {}
         batches = 0
         for ids in self._mini_batches(r.reward.shape[1]):
@@ -137,6 +138,19 @@ class Ppo:
         ].var().clamp(min=1e-8)
         return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
 
+    def _draws(self, noise: Tensor, before: Tensor) -> Tensor:
+        """What was drawn anew in every sample of correlated exploration (T, N, A), of which `before` (N, A) was the last."""
+        return noise - self.config.correlation * torch.cat([before[None], noise[:-1]])
+
+    def _log_prob(self, noise: Tensor, before: Tensor) -> Tensor:
+        """Log density of the exploration, (T, N).
+
+        Of the draws given the whole past: what the actions deviate by now depends on what the mean was then. With the
+        decayed noise taken as a given offset, the gradient would be that of a mean which changes along with the noise.
+        """
+        draws = self._draws(noise, before)
+        return self.actor.log_prob(torch.zeros_like(draws), draws)
+
     def _mini_batches(self, n: int) -> Iterator[Tensor]:
         for _ in range(self.config.epochs):
             yield from torch.randperm(n).chunk(self.config.mini_batches)
@@ -152,11 +166,12 @@ class Ppo:
         c, actor = self.config, self.actor
         alive = mask.sum().clamp(min=1)
         mean, _ = actor(r.obs[:, ids], select(r.state, ids))
-        ratio = (actor.log_prob(mean + r.offset[:, ids], r.action[:, ids]) - old_log_prob).exp()
+        ratio = (self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob).exp()
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
         surrogate = -(torch.minimum(ratio * advantage, clipped * advantage) * mask).sum() / alive
         variance = (2 * actor.log_std).exp().detach()
-        kl = (((mean - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1) * mask).sum().detach() / alive
+        shift = self._draws(mean.detach() - r.mean[:, ids], torch.zeros_like(r.noise[ids]))
+        kl = ((shift**2 / (2 * variance)).sum(-1) * mask).sum() / alive
 
         seen = ids < self.mirrored(r.reward.shape[1])
         mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), select(r.mirrored_state, ids[seen]))

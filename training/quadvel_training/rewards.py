@@ -12,7 +12,11 @@ HEAT = 0.2  # k_r of the energy term, W/(N m)^2
 
 @attrs.frozen
 class RewardWeights:
-    """Coefficients of Table 2; `action_smoothness` is Section 4.4's, for the recipes without constraints."""
+    """Coefficients of Table 2.
+
+    `action_smoothness` is Section 4.4's, for the recipes without constraints. Two are our own: `tracking_width`, within
+    which the tracking rewards tell errors apart (1 is Table 2's), and `stillness`, against motion in stance.
+    """
 
     linear_tracking: float = 0.5
     angular_tracking: float = 0.2
@@ -27,6 +31,8 @@ class RewardWeights:
     foot_lift_time: float = 1.0
     foot_clearance: float = 3.0
     action_smoothness: float = 0.0
+    stillness: float = 0.0
+    tracking_width: float = 1.0  # m/s, rad/s
 
 
 class Table2:
@@ -45,7 +51,7 @@ class Table2:
 
     def terms(self, action: np.ndarray) -> dict[str, np.ndarray]:
         """Each term of the state after a tick with `action` (n, 12), unweighted, (n,)."""
-        env, c = self.env, self.env.command
+        env, c, width = self.env, self.env.command, self.weights.tracking_width
         v, w = env.velocity, env.angular_velocity
         walking = c[:, 3] < 0.5
         decay = np.maximum(1.0 - np.sum(c[:, :2] ** 2, axis=1), 0.0) * walking
@@ -57,8 +63,8 @@ class Table2:
         power = np.maximum(HEAT * env.torque**2 + env.torque * env.dq, 0.0)
         bend = action - 2 * self._actions[0] + self._actions[1]
         terms = {
-            "linear_tracking": np.exp(-np.sum((c[:, :2] - v[:, :2]) ** 2, axis=1)),
-            "angular_tracking": np.exp(-(np.abs(c[:, 2] - w[:, 2]) ** 2)),
+            "linear_tracking": np.exp(-np.sum((c[:, :2] - v[:, :2]) ** 2, axis=1) / width**2),
+            "angular_tracking": np.exp(-((c[:, 2] - w[:, 2]) ** 2) / width**2),
             "orientation": -np.abs(env.roll_pitch).sum(axis=1),
             "torso_stability": -np.hypot(w[:, 0], w[:, 1]) - np.abs(v[:, 2]),
             "joint_velocity": -np.sum(env.dq**2, axis=1),
@@ -70,6 +76,7 @@ class Table2:
             "foot_lift_time": lift_time.sum(axis=1) * decay,
             "foot_clearance": clearance.sum(axis=1) * decay,
             "action_smoothness": -np.abs(bend).sum(axis=1),
+            "stillness": -(np.hypot(v[:, 0], v[:, 1]) + 0.05 * np.abs(env.dq).sum(axis=1)) * ~walking,
         }
         self._air_time = np.where(env.contact, 0.0, self._air_time + TICK)
         self._dq = env.dq

@@ -241,7 +241,7 @@ class TeacherRun:
             critic_obs=torch.cat([t["obs"], t["extra"]], dim=-1),
             action=t["action"],
             mean=t["mean"],
-            offset=torch.zeros_like(t["mean"]),
+            noise=torch.zeros_like(t["mean"][0]),
             reward=t["reward"],
             ended=t["ended"],
             cut=t["cut"],
