@@ -13,7 +13,7 @@ APT := on Debian 12 and Ubuntu 24.04: sudo apt install
 LOCKED := pyproject.toml setup.py requirements.lock
 INSTALL = $(PY) -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
 
-.PHONY: help setup demo close-the-loop test lint format bench lock clean
+.PHONY: help setup demo close-the-loop paper test lint format bench lock clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -25,6 +25,9 @@ demo: setup  ## walk a simulated robot through the nodes; results in out/demo
 
 close-the-loop: setup  ## identify three plants that the model does not know; results in out/twin
 	$(VENV)/bin/quadvel twin --out out/twin
+
+paper: setup  ## measure what the paper's figures show; goes on where it was stopped; results in docs/results/paper
+	$(VENV)/bin/quadvel paper --out docs/results/paper
 
 test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile

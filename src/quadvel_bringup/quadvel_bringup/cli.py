@@ -175,6 +175,18 @@ def evaluate(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
+def compare(context: typer.Context) -> None:
+    """Show two evaluations side by side."""
+    _hand_on(context, "quadvel_eval.cli:compare_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def paper(context: typer.Context) -> None:
+    """Measure what the paper's figures show: a page, pictures, tables."""
+    _hand_on(context, "quadvel_eval.cli:paper_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
 def bench(context: typer.Context) -> None:
     """Measure the speed of simulator, policy and loop on this machine."""
     _hand_on(context, "quadvel_eval.cli:bench_command")

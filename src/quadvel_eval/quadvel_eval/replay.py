@@ -34,6 +34,7 @@ Array = NDArray[np.float64]
 STRETCH = 0.2  # s, of one replay
 STRIDE = 0.35  # s, from one to the next: no multiple of a step of the gait
 PAST = 60  # ms, that the drives live through before
+GROWTH = 10  # ms, from one point to the next of how an error grows
 
 
 @attrs.frozen(eq=False)
@@ -54,12 +55,16 @@ class Joints:
 
 @attrs.frozen
 class ReplayError:
-    """Root mean square of replayed minus recorded, over all joints and stretches."""
+    """Root mean square of replayed minus recorded, over all joints and stretches.
+
+    growth: the same of q (rad), over each GROWTH ms after the stretch's begin.
+    """
 
     q: float  # rad
     dq: float  # rad/s
     tau: float  # N m
     stretches: int
+    growth: tuple[float, ...]
 
 
 def read_joints(path: Path) -> Joints:
@@ -128,26 +133,24 @@ def open_loop(
     ]
     if not errors:
         raise ValueError(f"nothing to replay between {start:.2f} and {end:.2f} s")
-    q, dq, tau = np.sqrt(np.mean(errors, axis=0))
-    return ReplayError(float(q), float(dq), float(tau), len(errors))
+    squares = np.mean(errors, axis=0)
+    q, dq, tau = np.sqrt(squares.mean(axis=0)).tolist()
+    growth = np.sqrt(squares[:, 0].reshape(-1, GROWTH).mean(axis=1))
+    return ReplayError(q, dq, tau, len(errors), tuple(growth.tolist()))
 
 
-def _stretch(
-    simulator: Simulator, joints: Joints, truth: Callable[[float], Truth], row: int
-) -> tuple[float, float, float]:
-    """Mean squares of the errors of q, dq and torque over one stretch that begins at `row`."""
+def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Truth], row: int) -> Array:
+    """Mean squares over the joints of the errors of q, dq and torque, (n, 3), a row each ms from `row` on."""
     past = [(joints.q[i], joints.dq[i], _command(joints, i)) for i in range(row - PAST, row)]
     simulator.place(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
-    n = round(STRETCH / DT)
-    squares = np.zeros(3)
-    for i in range(row, row + n):
+    squares = np.empty((round(STRETCH / DT), 3))
+    for i, square in enumerate(squares, start=row):
         simulator.command(_command(joints, i))
         state = simulator.state()
         found = (joints.q[i] - state.q, joints.dq[i] - state.dq, joints.tau[i] - state.tau)
-        squares += [np.mean(error**2) for error in found]
+        square[:] = [np.mean(error**2) for error in found]
         simulator.step()
-    q, dq, tau = squares / n
-    return float(q), float(dq), float(tau)
+    return squares
 
 
 def _command(joints: Joints, row: int) -> JointCommand:

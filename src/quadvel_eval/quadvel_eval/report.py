@@ -14,7 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 from rich.table import Table
 
 CSV_COLUMNS = (
@@ -73,28 +75,44 @@ def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
 
 def heatmap(cells: Sequence[Mapping[str, Any]]) -> Figure:
     """Tracking error over vx and vy, a panel a yaw rate, mean over the seeds; a cross where a robot fell."""
-    vx, vy, wz = (sorted({cell["command"][axis] for cell in cells}) for axis in range(3))
-    errors = [cell["error_xy"] for cell in cells if not cell["fell"]]
-    figure = Figure(figsize=(1.5 + 4.0 * len(wz), 1.6 + 0.32 * len(vx)), layout="constrained")
-    panels = figure.subplots(1, len(wz), sharey=True, squeeze=False)[0]
-    for panel, rate in zip(panels, wz, strict=True):
-        image = np.full((len(vx), len(vy)), np.nan)
-        for i, x in enumerate(vx):
-            for j, y in enumerate(vy):
-                here = [cell for cell in cells if cell["command"] == [x, y, rate]]
-                stood = [cell["error_xy"] for cell in here if not cell["fell"]]
-                if stood:
-                    image[i, j] = np.mean(stood)
-                if len(stood) < len(here):
-                    panel.text(j, i, "×", ha="center", va="center", color="tab:red", size="large")
-        shown = panel.imshow(image, origin="lower", aspect="auto", vmin=0.0, vmax=max(errors, default=1.0))
+    rates = sorted({cell["command"][2] for cell in cells})
+    return heatmaps({f"wz = {rate:g} rad/s": [c for c in cells if c["command"][2] == rate] for rate in rates})
+
+
+def heatmaps(panels: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """A panel a title with the cells (command, error_xy, fell) of one grid over vx and vy; one colour scale."""
+    cells = [cell for some in panels.values() for cell in some]
+    vx, vy = (sorted({cell["command"][axis] for cell in cells}) for axis in range(2))
+    largest = max((cell["error_xy"] for cell in cells if not cell["fell"]), default=1.0)
+    figure = Figure(figsize=(1.5 + 4.0 * len(panels), 1.6 + 0.32 * len(vx)), layout="constrained")
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for panel, (title, some) in zip(axes, panels.items(), strict=True):
+        shown = panel.imshow(
+            _mean_errors(panel, some, vx, vy), origin="lower", aspect="auto", vmin=0.0, vmax=largest
+        )
         panel.set_xticks(range(len(vy)), [f"{y:g}" for y in vy])
         panel.set_yticks(range(len(vx)), [f"{x:g}" for x in vx])
         panel.set_xlabel("vy, m/s")
-        panel.set_title(f"wz = {rate:g} rad/s")
-    panels[0].set_ylabel("vx, m/s")
-    figure.colorbar(shown, ax=panels, label="error of the mean velocity, m/s")
+        panel.set_title(title)
+    axes[0].set_ylabel("vx, m/s")
+    figure.colorbar(shown, ax=axes, label="error of the mean velocity, m/s")
     return figure
+
+
+def _mean_errors(
+    panel: Axes, cells: Sequence[Mapping[str, Any]], vx: Sequence[float], vy: Sequence[float]
+) -> NDArray[np.float64]:
+    """Mean over the seeds, nan where all fell (vx, vy); draws a cross where any did."""
+    image = np.full((len(vx), len(vy)), np.nan)
+    for i, x in enumerate(vx):
+        for j, y in enumerate(vy):
+            here = [cell for cell in cells if list(cell["command"][:2]) == [x, y]]
+            stood = [cell["error_xy"] for cell in here if not cell["fell"]]
+            if stood:
+                image[i, j] = np.mean(stood)
+            if len(stood) < len(here):
+                panel.text(j, i, "×", ha="center", va="center", color="tab:red", size="large")
+    return image
 
 
 def evaluation_table(evaluation: Mapping[str, Any]) -> Table:

@@ -1,0 +1,152 @@
+"""The files of a section, NAME.csv, NAME.png and NAME.json, and the page that shows all sections of a folder.
+
+The JSON file is written last and says what the section was made with: where it agrees, the section is done.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import attrs
+
+from quadvel_policy.policy_file import PolicyFile
+
+from ..report import replacing, write_figure, write_json
+from .section import Record, Row, Section, Study, distinct
+
+SCHEMA = 1
+PAGE = "README.md"
+DIGEST = 12  # letters of a SHA-256 that tell one file from another
+
+
+def made_with(section: Section, study: Study) -> dict[str, Any]:
+    """All that a section's result depends on, as JSON keeps it; networks by the digest of their files."""
+    return {
+        "policies": {name: _digest(path) for name, path in study.policies.items()},
+        "estimator": study.estimator,
+        "estimator_file": _digest(study.estimator_file),
+        "seeds": study.seeds,
+        "settings": json.loads(json.dumps(attrs.asdict(section))),
+    }
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGEST]
+
+
+def is_done(folder: Path, section: Section, study: Study) -> bool:
+    """Whether the folder holds this section, made with just these networks, seeds and settings."""
+    path = folder / f"{section.name}.json"
+    return path.exists() and bool(json.loads(path.read_text())["made_with"] == made_with(section, study))
+
+
+def write_section(folder: Path, section: Section, study: Study, records: Sequence[Record]) -> None:
+    """CSV, picture and JSON of a section; picture and table are made of what the CSV says."""
+    write_records(folder / f"{section.name}.csv", records)
+    kept = read_records(folder / f"{section.name}.csv")
+    write_figure(folder / f"{section.name}.png", section.figure(kept))
+    rows = [attrs.asdict(row) for row in section.rows(kept)]
+    about = {name: _about(path) for name, path in study.policies.items()}
+    content = {"made_with": made_with(section, study), "policies": about, "rows": rows}
+    write_json(folder / f"{section.name}.json", {"schema": SCHEMA, **content})
+
+
+def _about(path: Path) -> dict[str, Any]:
+    """What a policy says of itself."""
+    metadata = PolicyFile(path).metadata
+    limits = {axis: list(bounds) for axis, bounds in metadata.command_limits.items()}
+    return {"file": path.name, "command_limits": limits, "recipe": metadata.recipe}
+
+
+def write_records(path: Path, records: Sequence[Record]) -> None:
+    """The records as CSV: numbers with six digits, nothing where there is None."""
+    with replacing(path) as draft, draft.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(records[0]) if records else [], lineterminator="\n")
+        writer.writeheader()
+        for record in records:
+            writer.writerow({name: _text(value) for name, value in record.items()})
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return ""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def read_records(path: Path) -> list[Record]:
+    """What `write_records` wrote."""
+    with path.open(newline="") as file:
+        return [{name: _value(text) for name, text in line.items()} for line in csv.DictReader(file)]
+
+
+def _value(text: str) -> Any:
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            pass
+    return text or None
+
+
+def write_page(folder: Path, sections: Sequence[Section]) -> None:
+    """The page with those of the sections that the folder holds."""
+    lines = [
+        "# Section 4 of the paper, in simulation",
+        "",
+        "Written by `quadvel paper`; do not edit. The paper's values are those of its CRL-EAM on the robot, ours those of",
+        "simulated robots with actuator model, sensor noise, delays and the estimator in the loop. In brackets: ours minus",
+        "the paper's. Figures that fall short stand here as they are.",
+        "",
+    ]
+    for section in sections:
+        path = folder / f"{section.name}.json"
+        if path.exists():
+            lines += _chapter(section, json.loads(path.read_text()))
+    with replacing(folder / PAGE) as draft:
+        draft.write_text("\n".join(lines))
+
+
+def _chapter(section: Section, content: Mapping[str, Any]) -> list[str]:
+    made = content["made_with"]
+    policies = ", ".join(f"{name} ({digest})" for name, digest in made["policies"].items())
+    seeds = "1 seed" if made["seeds"] == 1 else f"{made['seeds']} seeds"
+    return [
+        f"## {section.title}",
+        "",
+        section.method,
+        "",
+        *_table([Row(**row) for row in content["rows"]]),
+        "",
+        f"![{section.title}]({section.name}.png)",
+        "",
+        f"[{section.name}.csv]({section.name}.csv); {policies}; {made['estimator']} estimator; up to {seeds}.",
+        "",
+    ]
+
+
+def _table(rows: Sequence[Row]) -> list[str]:
+    policies = distinct([{"policy": name} for row in rows for name in row.ours], "policy")
+    lines = [
+        f"| | paper | {' | '.join(policies)} |",
+        f"|---|{'---|' * (1 + len(policies))}",
+    ]
+    for row in rows:
+        what = f"{row.what}, {row.unit}" if row.unit else row.what
+        cells = [_cell(row, row.ours.get(name)) for name in policies]
+        lines.append(f"| {what} | {_number(row, row.paper)} | {' | '.join(cells)} |")
+    return lines
+
+
+def _cell(row: Row, value: float | None) -> str:
+    if value is None or row.paper is None:
+        return _number(row, value)
+    return f"{_number(row, value)} ({value - row.paper:+.{row.digits}f})"
+
+
+def _number(row: Row, value: float | None) -> str:
+    return "–" if value is None else f"{value:.{row.digits}f}"

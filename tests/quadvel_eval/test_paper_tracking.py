@@ -1,0 +1,66 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadvel_eval.grid import Cell, CellResult
+from quadvel_eval.paper.cells import cell_record, reach, within
+from quadvel_eval.paper.section import Study
+from quadvel_eval.paper.sustained import Sustained
+from quadvel_eval.paper.tracking import Tracking, left_right
+from quadvel_eval.segments import Segment
+
+LIMITS = {"vx": (-1.0, 2.0), "vy": (-0.5, 0.5), "wz": (-1.0, 1.0)}
+
+
+def answer(vx: float, vy: float, error: float | None, inside: int = 1) -> tuple[dict, CellResult]:
+    cell = Cell((vx, vy, 0.0), 0)
+    labels = {"policy": "mine", "grid": "paper", "within": inside}
+    if error is None:
+        return labels, CellResult(cell)
+    return labels, CellResult(
+        cell, Segment(np.array(cell.command), np.array([vx - error, vy, 0.0])), 0.01, 0.5
+    )
+
+
+def test_commands_beyond_the_limits_of_a_policy_are_told_from_those_within() -> None:
+    assert within((2.0, -0.5, 1.0), LIMITS)
+    assert not within((2.0, -0.6, 0.0), LIMITS)
+    assert reach((-1.0, 0.0, 0.0), LIMITS) == 1.0
+    assert reach((0.0, 0.0, 1.0), LIMITS) == 1.0
+
+
+def test_left_right_is_the_largest_difference_between_mirrored_commands() -> None:
+    records = [cell_record(*answer(*one)) for one in ((1.0, 0.4, 0.05), (1.0, -0.4, 0.08), (1.0, 0.0, 0.3))]
+    assert left_right(records) == pytest.approx(0.03)
+    assert np.isnan(left_right(records[2:]))
+
+
+def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() -> None:
+    section = Tracking()
+    answers = [answer(1.0, 0.0, 0.02), answer(1.0, 0.4, None), answer(2.5, 0.0, 0.5, inside=0)]
+    records = section.judge(answers)
+    ours = {row.what: row.ours["mine"] for row in section.rows(records)}
+    assert ours["paper grid, runs"] == 3
+    assert ours["paper grid, falls"] == 1
+    assert ours["paper grid, largest error"] == pytest.approx(0.5)
+    assert ours["paper grid, largest error of these"] == pytest.approx(0.02)
+    assert ours["paper grid, left-right difference of these"] is None
+    assert len(section.figure(records).axes) == 2  # the grid and its scale
+
+
+def test_the_grid_has_every_command_with_every_seed() -> None:
+    jobs = Tracking(grids=("paper",)).jobs(Study(seeds=3))
+    assert len(jobs) == 363
+    assert {job.labels["policy"] for job in jobs} == {"crl_eam"}
+
+
+def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
+    section = Sustained()
+    labels = {"policy": "mine", "direction": "forward", "limit": 4.0}
+    records = section.judge([({**labels, "command": 3.0}, 2.9), ({**labels, "command": 4.0}, None)])
+    rows = {row.what: row for row in section.rows(records)}
+    assert rows["forward, reached"].ours == {"mine": 2.9}
+    assert rows["forward, reached"].paper == 4.2
+    assert rows["falls"].ours == {"mine": 1.0}
+    section.figure(records)
