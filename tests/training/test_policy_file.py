@@ -9,6 +9,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import student  # noqa: E402
+from quadvel_training.command_map import CommandMap  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 
 
@@ -37,6 +38,23 @@ def test_onnx_and_torch_agree_over_500_steps_with_a_reset(exported):
             expected, state = actor(torch.from_numpy(obs)[None, None], state)
         worst = max(worst, float(np.abs(policy.step(obs) - expected.numpy()[0, 0]).max()))
     assert worst < 1e-5
+
+
+def test_a_command_map_stands_in_front_of_the_network(exported, tmp_path):
+    actor, env, _ = exported
+    rng = np.random.default_rng(2)
+    command_map = CommandMap(0.1 * rng.normal(size=(20, 3)))
+    student.export_policy(actor, env, tmp_path / "mapped.onnx", {}, command_map)
+    for stance in (0.0, 1.0):
+        obs = rng.normal(size=(1, 48)).astype(np.float32)
+        obs[0, 3] = stance
+        given = obs.copy()
+        given[:, :4] = command_map(obs[:, :4])
+        assert (np.abs(given - obs).max() > 0.01) == (stance < 0.5)
+        with torch.no_grad():
+            expected, _ = actor(torch.from_numpy(given)[None], actor.initial_state(1))
+        found = PolicyFile(tmp_path / "mapped.onnx").step(obs[0])
+        assert np.abs(found - expected.numpy()[0, 0]).max() < 1e-5
 
 
 def test_metadata_says_how_to_run_it(exported):

@@ -1,18 +1,22 @@
 """Which command a walker has to be given to walk at the one wanted: its steady-state error, found and taken out.
 
-Used twice in stage 2: for the teacher, and, once there is a student, for the student, whose averaging of what it cannot know
-costs it some speed.
+Used three times: for the teacher; once there is a student, for the student, whose averaging of what it cannot know costs
+it some speed; and for the finished policy, whose file carries its map along.
 """
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 import attrs
 import numpy as np
+import torch
 
 from .env import TICK, EnvConfig, VelocityEnv
 
+T = TypeVar("T", np.ndarray, torch.Tensor)
+TERMS = 20
+BOUND = 0.6  # m/s, rad/s, of what the map adds
 STRIDE = 0.35  # s, time constant of velocities averaged over a stride
 
 
@@ -48,25 +52,22 @@ class Tracking:
         return np.concatenate([command[:, :3] + self.correction * moving, command[:, 3:]], axis=1)
 
 
+def terms(x: T, y: T, r: T) -> list[T]:
+    """The polynomial's, of vx, vy, wz: first those that mirroring leaves as they are, then as many that it turns round."""
+    even = [x * 0 + 1, x, x * x, y * y, r * r, y * r, x**3, x * y * y, x * r * r, x * y * r]
+    odd = [y, r, x * y, x * r, y**3, r**3, y * r * r, y * y * r, x * x * y, x * x * r]
+    return even + odd
+
+
 class CommandMap:
     """Which command the teacher needs to walk at the wanted one: wanted + polynomial of it, odd under mirroring where due."""
 
     def __init__(self, weights: np.ndarray | None = None) -> None:
-        self.weights = (
-            np.zeros((self._features(np.zeros((1, 3))).shape[1], 3)) if weights is None else weights
-        )
-
-    @staticmethod
-    def _features(c: np.ndarray) -> np.ndarray:
-        x, y, r = np.moveaxis(c[..., :3], -1, 0)
-        one = np.ones_like(x)
-        even = [one, x, x * x, y * y, r * r, y * r, x**3, x * y * y, x * r * r, x * y * r]
-        odd = [y, r, x * y, x * r, y**3, r**3, y * r * r, y * y * r, x * x * y, x * x * r]
-        return np.stack(even + odd, axis=-1)
+        self.weights = np.zeros((TERMS, 3)) if weights is None else weights
 
     def fit(self, wanted: np.ndarray, given: np.ndarray) -> float:
         """Ridge regression of given - wanted, (n, 3) each; returns the residual's RMS."""
-        a = self._features(wanted)
+        a = np.stack(terms(*wanted[:, :3].T), -1)
         b = given - wanted
         half = a.shape[1] // 2
         self.weights = np.zeros((a.shape[1], 3))
@@ -80,8 +81,24 @@ class CommandMap:
         """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
         given = command.copy()
         moving = command[:, 3] < 0.5
-        given[:, :3] += (self._features(command) @ self.weights).clip(-0.6, 0.6) * moving[:, None]
+        added = np.stack(terms(*command[:, :3].T), -1) @ self.weights
+        given[:, :3] += added.clip(-BOUND, BOUND) * moving[:, None]
         return given
+
+
+class CommandMapped(torch.nn.Module):
+    """The map in front of a policy: observations (n, 48) whose first four numbers are the command, to the same."""
+
+    weights: torch.Tensor
+
+    def __init__(self, command_map: CommandMap) -> None:
+        super().__init__()
+        self.register_buffer("weights", torch.as_tensor(command_map.weights, dtype=torch.float32))
+
+    def forward(self, obs: torch.Tensor) -> torch.Tensor:
+        command, stance, rest = obs.split((3, 1, obs.shape[-1] - 4), dim=-1)
+        added = torch.stack(terms(*command.unbind(-1)), -1) @ self.weights
+        return torch.cat([command + added.clamp(-BOUND, BOUND) * (stance < 0.5), stance, rest], dim=-1)
 
 
 class Walker(Protocol):

@@ -37,6 +37,13 @@ class Randomisation:
         one, nil = (1.0, 1.0), (0.0, 0.0)
         return cls((0.8, 0.8), nil, 0.0, one, one, one, one, nil, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
 
+    @classmethod
+    def calm(cls) -> Randomisation:
+        """The nominal plant on ordinary grounds, with the noise of good sensors, without pushes."""
+        return attrs.evolve(
+            cls.none(), foot_friction=(0.6, 1.0), noise_q=0.005, noise_dq=0.05, noise_velocity=0.02
+        )
+
 
 class PlantSampler:
     """Writes per-environment model fields into a batch; keeps what was drawn for the critic to see."""

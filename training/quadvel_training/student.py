@@ -18,6 +18,7 @@ from quadvel_description import robot
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
 
+from .command_map import CommandMap, CommandMapped
 from .env import VelocityEnv
 from .networks import Recurrent, State
 
@@ -70,25 +71,30 @@ class _Cell(nn.Module):
 class _Step(nn.Module):
     """One time step with the signature of the policy file."""
 
-    def __init__(self, network: Recurrent, outputs: int) -> None:
+    def __init__(self, network: Recurrent, outputs: int, before: nn.Module) -> None:
         super().__init__()
-        self.network, self.outputs = copy.deepcopy(network), outputs
+        self.network, self.outputs, self.before = copy.deepcopy(network), outputs, before
         self.network.lstm = _Cell(network.lstm)
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
-        y, (hidden, memory) = self.network(obs, (h.flatten(0, 1), c.flatten(0, 1)))
+        y, (hidden, memory) = self.network(self.before(obs), (h.flatten(0, 1), c.flatten(0, 1)))
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
 
 
-def export(network: Recurrent, path: Path, outputs: Sequence[str], metadata: str) -> None:
-    """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all."""
+def export(
+    network: Recurrent, path: Path, outputs: Sequence[str], metadata: str, before: nn.Module | None = None
+) -> None:
+    """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
+
+    `before`: what the observation goes through first.
+    """
     size = network.lstm.input_size
     state = network.initial_state(1)
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.onnx.export(
-        _Step(network, len(outputs)).eval(),
+        _Step(network, len(outputs), before or nn.Identity()).eval(),
         (torch.zeros(1, size), *state),
         str(part),
         input_names=["obs", "h_in", "c_in"],
@@ -110,8 +116,14 @@ def commit() -> str:
     return result.stdout.strip() or "unknown"
 
 
-def export_policy(actor: Recurrent, env: VelocityEnv, path: Path, recipe: dict[str, Any]) -> None:
-    """Write the policy file of `actor` as it was trained in `env`."""
+def export_policy(
+    actor: Recurrent,
+    env: VelocityEnv,
+    path: Path,
+    recipe: dict[str, Any],
+    command_map: CommandMap | None = None,
+) -> None:
+    """Write the policy file of `actor` as it was trained in `env`, behind a command map if given."""
     c = env.config.commands
     metadata = PolicyMetadata(
         action_offset=tuple(env.stand_q),
@@ -125,4 +137,5 @@ def export_policy(actor: Recurrent, env: VelocityEnv, path: Path, recipe: dict[s
         recipe=recipe,
         commit=commit(),
     )
-    export(actor, path, ["actions"], metadata.to_json())
+    before = CommandMapped(command_map) if command_map else None
+    export(actor, path, ["actions"], metadata.to_json(), before)
