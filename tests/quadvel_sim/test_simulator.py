@@ -144,6 +144,15 @@ def test_a_payload_adds_its_weight_and_moves_the_centre_of_mass() -> None:
     np.testing.assert_allclose(laden.data.subtree_com[1], moment / (robot.MASS + 5.0), atol=1e-9)
 
 
+def test_a_negative_payload_is_taken_off_the_trunk_and_leaves_its_centre_of_mass() -> None:
+    bare, light = simulator(), simulator(payload=-2.0)
+    trunk = bare.model.body("trunk").id
+    share = 1.0 - 2.0 / bare.model.body_mass[trunk]
+    assert light.model.body_subtreemass[1] == pytest.approx(robot.MASS - 2.0)
+    np.testing.assert_allclose(light.model.body_inertia[trunk], share * bare.model.body_inertia[trunk])
+    np.testing.assert_allclose(light.model.body_ipos[trunk], bare.model.body_ipos[trunk])
+
+
 @pytest.mark.parametrize(("friction", "slides"), [(0.15, True), ((0.9, 0.9, 0.9, 0.9), False)])
 def test_on_a_slope_the_robot_slides_where_friction_is_too_low(friction: float, slides: bool) -> None:
     sim = simulator(friction=friction, terrain=Terrain("slope", slope=0.3))

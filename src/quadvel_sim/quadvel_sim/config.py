@@ -39,8 +39,8 @@ class SimulatorConfig:
     """Of torque and sensor noise; the ground has its own."""
     friction: NDArray[np.float64] = attrs.field(default=0.8, **numbers(4, low=0.0))
     """Sliding friction coefficient of each foot, (4,), FR FL RR RL."""
-    payload: float = attrs.field(default=0.0, **number(0.0, 50.0))
-    """Mass on the trunk, kg."""
+    payload: float = attrs.field(default=0.0, **number(-8.0, 50.0))
+    """Mass on the trunk, kg; below zero it is taken off the trunk, evenly."""
     payload_position: NDArray[np.float64] = attrs.field(default=(0.0, 0.0, 0.1), **numbers(3))
     """Centre of mass of the payload in the trunk frame, m."""
     armature: NDArray[np.float64] = attrs.field(factory=lambda: robot.ARMATURE, **numbers(12, low=1e-4))

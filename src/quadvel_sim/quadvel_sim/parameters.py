@@ -39,7 +39,7 @@ class SimParameters(Scheduling):
     friction: tuple[float, ...] = _parameter(
         tuple(_CONFIG.friction.tolist()), "sliding friction of the feet: one number, or FR, FL, RR, RL"
     )
-    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg")
+    payload: float = _parameter(_CONFIG.payload, "mass on the trunk, kg; below zero it is taken off")
     payload_position: tuple[float, ...] = _parameter(
         tuple(_CONFIG.payload_position.tolist()), "centre of that mass in the trunk frame, m"
     )

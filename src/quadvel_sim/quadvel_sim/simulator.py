@@ -77,6 +77,11 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
             inertia=np.full(3, 0.4 * config.payload * _PAYLOAD_RADIUS**2),
             explicitinertial=True,
         )
+    if config.payload < 0.0:
+        trunk = spec.body("trunk")
+        share = 1.0 + config.payload / trunk.mass
+        trunk.mass *= share
+        trunk.fullinertia *= share
     model = spec.compile()
     for leg, friction in zip(robot.LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
