@@ -2,8 +2,10 @@
 
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -29,6 +31,20 @@ def ros() -> Iterator[Callable[..., None]]:
     for node in [node for context in contexts for node in list(context._nodes)]:
         node.destroy_node()
     rclpy.try_shutdown()
+
+
+@pytest.fixture
+def spin_until() -> Callable[..., bool]:
+    """Spins a node until a condition holds or the time is up, and says whether it holds."""
+    import rclpy
+
+    def spin(node: Any, condition: Callable[[], Any], timeout: float = 20.0) -> bool:
+        deadline = time.monotonic() + timeout
+        while not condition() and time.monotonic() < deadline:
+            rclpy.spin_once(node, timeout_sec=0.1)
+        return bool(condition())
+
+    return spin
 
 
 @pytest.fixture

@@ -1,0 +1,118 @@
+"""Time: timers, simulated time, points in time and spans."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import suppress
+
+import pytest
+import rclpy
+from rclpy.clock import Clock, ClockType
+from rclpy.duration import Duration
+from rclpy.exceptions import ROSInterruptException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock as ClockMessage
+
+Start = Callable[..., None]
+SpinUntil = Callable[..., bool]
+
+
+def drive_clock(node: Node, seconds: float) -> None:
+    """Set simulated time as /clock does, and let the node act on it."""
+    message = ClockMessage()
+    message.clock = Time(seconds=seconds).to_msg()
+    node._on_clock(message)
+    for _ in range(10):
+        rclpy.spin_once(node, timeout_sec=0.0)
+
+
+def test_timer_keeps_its_grid_and_leaves_out_missed_deadlines(ros: Start) -> None:
+    ros("--ros-args", "-p", "use_sim_time:=true")
+    node, calls = Node("control", start_parameter_services=False), []
+    timer = node.create_timer(0.1, lambda: calls.append(node.get_clock().now().nanoseconds / 1e9))
+    for now in (0.05, 0.13, 0.2, 0.26, 0.95, 1.0):
+        drive_clock(node, now)
+    assert calls == [0.13, 0.2, 0.95, 1.0]  # not shifted by the lateness of 0.13 and 0.95
+    timer.cancel()
+    drive_clock(node, 2.0)
+    timer.reset()
+    drive_clock(node, 2.05)
+    assert len(calls) == 4
+    drive_clock(node, 2.1)
+    assert len(calls) == 5
+
+
+def test_simulated_time_comes_from_the_clock_topic(ros: Start, spin_until: SpinUntil) -> None:
+    ros()
+    node = Node("control", parameter_overrides=[Parameter("use_sim_time", value=True)])
+    assert node.get_clock().now().nanoseconds == 0
+    message = ClockMessage()
+    message.clock.sec = 42
+    node.create_publisher(ClockMessage, "/clock", 1).publish(message)
+    assert spin_until(node, lambda: node.get_clock().now().nanoseconds == 42 * 10**9)
+    node.set_parameters([Parameter("use_sim_time", value=False)])
+    assert abs(node.get_clock().now().nanoseconds - time.time_ns()) < 10**10
+
+
+def test_sleep_lasts_until_the_clock_reaches_the_time_or_communication_ends(ros: Start) -> None:
+    ros("--ros-args", "-p", "use_sim_time:=true")
+    node, outcomes = Node("control", start_parameter_services=False), []
+    clock = node.get_clock()
+    drive_clock(node, 0.5)
+    target = Time(seconds=1.0, clock_type=ClockType.ROS_TIME)
+    first = threading.Thread(target=lambda: outcomes.append(clock.sleep_until(target)))
+    second = threading.Thread(target=lambda: outcomes.append(clock.sleep_for(Duration(seconds=100.0))))
+    first.start()
+    second.start()
+    drive_clock(node, 0.99)
+    first.join(timeout=0.05)
+    assert first.is_alive()
+    drive_clock(node, 1.0)
+    first.join(timeout=20.0)
+    assert outcomes == [True]
+    rclpy.shutdown()
+    second.join(timeout=20.0)
+    assert outcomes == [True, False]
+
+
+def test_rate_sleeps_to_its_deadlines_until_communication_ends(ros: Start) -> None:
+    ros("--ros-args", "-p", "use_sim_time:=true")
+    node, woken = Node("control", start_parameter_services=False), []
+    rate = node.create_rate(10.0)
+
+    def sleep_on() -> None:
+        with suppress(ROSInterruptException):
+            while True:
+                rate.sleep()
+                woken.append(node.get_clock().now().nanoseconds / 1e9)
+
+    thread = threading.Thread(target=sleep_on)
+    thread.start()
+    drive_clock(node, 0.09)
+    thread.join(timeout=0.05)
+    assert not woken
+    for tenths in range(1, 1000):
+        drive_clock(node, tenths / 10)
+        thread.join(timeout=0.01)
+        if len(woken) > 1:
+            break
+    rclpy.shutdown()
+    thread.join(timeout=20.0)
+    assert not thread.is_alive()
+    assert len(woken) > 1
+    assert woken[0] >= 0.1
+
+
+def test_times_and_durations_compute() -> None:
+    start, span = Time(seconds=10, nanoseconds=5), Duration(seconds=1.5)
+    assert start + span - start == span
+    assert (start - span).seconds_nanoseconds() == (8, 500_000_005)
+    assert Time.from_msg(start.to_msg(), ClockType.SYSTEM_TIME) == start
+    assert Duration.from_msg(Duration(nanoseconds=-1).to_msg()).nanoseconds == -1
+    assert start < start + span
+    with pytest.raises(TypeError, match="different clock types"):
+        _ = start < Clock(clock_type=ClockType.STEADY_TIME).now()
+    with pytest.raises(ValueError, match="negative"):
+        Time(seconds=-1)
