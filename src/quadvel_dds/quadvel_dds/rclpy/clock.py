@@ -84,10 +84,6 @@ class ROSClock(Clock):
     def __init__(self, *, clock_type: ClockType = ClockType.ROS_TIME) -> None:
         self._simulated_ns: int | None = None
 
-    @property
-    def ros_time_is_active(self) -> bool:
-        return self._simulated_ns is not None
-
     def _is_simulated(self) -> bool:
         return self._simulated_ns is not None
 

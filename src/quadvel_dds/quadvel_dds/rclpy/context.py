@@ -61,9 +61,6 @@ class Context:
     def ok(self) -> bool:
         return self._running
 
-    def get_domain_id(self) -> int:
-        return self._domain_id
-
     @property
     def participant(self) -> wire.Participant:
         """The process's place on the domain, taken when it is first needed."""

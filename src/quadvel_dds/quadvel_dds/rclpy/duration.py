@@ -52,6 +52,3 @@ class Duration:
         return cls(seconds=msg.sec, nanoseconds=msg.nanosec)
 
     get_c_duration = unsupported("Duration.get_c_duration")
-
-
-Infinite = Duration(nanoseconds=2**63 - 1)

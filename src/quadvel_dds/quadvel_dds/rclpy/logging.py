@@ -4,7 +4,11 @@ from __future__ import annotations
 
 from enum import IntEnum
 
+from quadvel_dds.errors import module_getattr
+
 from .impl.rcutils_logger import RcutilsLogger, levels
+
+__getattr__ = module_getattr(__name__)
 
 
 class LoggingSeverity(IntEnum):
@@ -20,15 +24,6 @@ def get_logger(name: str) -> RcutilsLogger:
     if not name:
         raise ValueError("Logger name must not be empty.")
     return RcutilsLogger(name)
-
-
-def set_logger_level(name: str, level: int, detailed_error: bool = False) -> bool:
-    levels[name] = int(level)
-    return True
-
-
-def get_logger_effective_level(name: str) -> LoggingSeverity:
-    return LoggingSeverity(RcutilsLogger(name).get_effective_level())
 
 
 def set_levels(texts: dict[str, str]) -> None:

@@ -1,8 +1,8 @@
-"""Quality of service: policies, profiles and the presets of ROS 2."""
+"""Quality of service: policies, and the profiles of ROS 2."""
 
 from __future__ import annotations
 
-from enum import Enum, IntEnum
+from enum import IntEnum
 from typing import Any
 
 from quadvel_dds.errors import module_getattr, unsupported
@@ -12,28 +12,14 @@ from .duration import Duration
 __getattr__ = module_getattr(__name__)
 
 
-class QoSPolicyEnum(IntEnum):
-    @classmethod
-    def short_keys(cls) -> list[str]:
-        return [name.lower() for name in cls.__members__]
-
-    @classmethod
-    def get_from_short_key(cls, name: str) -> Any:
-        return cls[name.upper()].value
-
-    @property
-    def short_key(self) -> str:
-        return self.name.lower()
-
-
-class HistoryPolicy(QoSPolicyEnum):
+class HistoryPolicy(IntEnum):
     SYSTEM_DEFAULT = 0
     KEEP_LAST = 1
     KEEP_ALL = 2
     UNKNOWN = 3
 
 
-class ReliabilityPolicy(QoSPolicyEnum):
+class ReliabilityPolicy(IntEnum):
     SYSTEM_DEFAULT = 0
     RELIABLE = 1
     BEST_EFFORT = 2
@@ -41,7 +27,7 @@ class ReliabilityPolicy(QoSPolicyEnum):
     BEST_AVAILABLE = 4
 
 
-class DurabilityPolicy(QoSPolicyEnum):
+class DurabilityPolicy(IntEnum):
     SYSTEM_DEFAULT = 0
     TRANSIENT_LOCAL = 1
     VOLATILE = 2
@@ -49,18 +35,13 @@ class DurabilityPolicy(QoSPolicyEnum):
     BEST_AVAILABLE = 4
 
 
-class LivelinessPolicy(QoSPolicyEnum):
+class LivelinessPolicy(IntEnum):
     SYSTEM_DEFAULT = 0
     AUTOMATIC = 1
     MANUAL_BY_TOPIC = 3
     UNKNOWN = 4
     BEST_AVAILABLE = 5
 
-
-QoSHistoryPolicy = HistoryPolicy
-QoSReliabilityPolicy = ReliabilityPolicy
-QoSDurabilityPolicy = DurabilityPolicy
-QoSLivelinessPolicy = LivelinessPolicy
 
 # Name, type and default of each policy; a duration of zero means "not set".
 _POLICIES: dict[str, tuple[type, Any]] = {
@@ -135,7 +116,6 @@ def _policy_property(name: str, type_: type) -> property:
 for _name, (_type, _) in _POLICIES.items():
     setattr(QoSProfile, _name, _policy_property(_name, _type))
 
-qos_profile_default = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10)
 qos_profile_system_default = QoSProfile(
     history=HistoryPolicy.SYSTEM_DEFAULT,
     reliability=ReliabilityPolicy.SYSTEM_DEFAULT,
@@ -148,20 +128,3 @@ qos_profile_parameter_events = QoSProfile(depth=1000)
 qos_profile_rosout_default = QoSProfile(
     depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10)
 )
-
-
-class QoSPresetProfiles(Enum):
-    DEFAULT = qos_profile_default
-    SYSTEM_DEFAULT = qos_profile_system_default
-    SENSOR_DATA = qos_profile_sensor_data
-    SERVICES_DEFAULT = qos_profile_services_default
-    PARAMETERS = qos_profile_parameters
-    PARAMETER_EVENTS = qos_profile_parameter_events
-
-    @classmethod
-    def short_keys(cls) -> list[str]:
-        return [name.lower() for name in cls.__members__]
-
-    @classmethod
-    def get_from_short_key(cls, name: str) -> Any:
-        return cls[name.upper()].value
