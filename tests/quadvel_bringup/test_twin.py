@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -135,7 +137,8 @@ def entry(name: str, after: float) -> dict[str, Any]:
     def model(scale: float) -> dict[str, Any]:
         tracking = {"xy": 0.05 * scale, "wz": 0.04 * scale}
         errors = {"torque_mse": 0.8 * scale, "tau": 1.0 * scale, "q": 0.02 * scale, "dq": 0.9 * scale}
-        return {**errors, "stretches": 70, "tracking": tracking}
+        growth = [0.002 * scale * step for step in range(20)]
+        return {**errors, "stretches": 70, "growth": growth, "tracking": tracking}
 
     return {
         "name": name,
@@ -155,8 +158,8 @@ def entry(name: str, after: float) -> dict[str, Any]:
 def test_the_page_says_by_how_much_the_corrected_models_are_nearer() -> None:
     results = [entry("dry_gears", 0.1), entry("slow_current", 0.3)]
     assert decision(results) == (
-        "With what was identified on 2 plants, the model's torque error falls by 80 %, its open-loop error of q by "
-        "80 % and of dq by 80 %, the gap of its velocity tracking by 80 %."
+        "With what was identified on 2 plants, the model's torque error falls by 80 %, its open-loop error of q "
+        "falls by 80 % and of dq falls by 80 %, the gap of its velocity tracking falls by 80 %."
     )
     page = twin_page(results)
     assert page.index("80 %") < page.index("dry_gears") < page.index("slow_current")
@@ -165,5 +168,23 @@ def test_the_page_says_by_how_much_the_corrected_models_are_nearer() -> None:
         "dry_gears/identify/report.html",
         "+0.440, +0.000",
         "90 %",
+        "0.8 → <b>0.24</b>",
     ):
         assert text in page
+    ids = re.findall(r' id="([^"]+)"', page)
+    assert len(ids) == len(set(ids))
+
+
+def test_the_page_owns_up_to_a_model_that_got_worse() -> None:
+    assert "torque error grows by 25 %" in decision([entry("dry_gears", 1.25)])
+    assert "-25 %" in twin_page([entry("dry_gears", 1.25)])
+
+
+def test_a_file_that_is_no_plant_ends_its_process_in_one_sentence(tmp_path: Path) -> None:
+    file = tmp_path / "plant.yaml"
+    file.write_text("kind: rust")
+    line = [sys.executable, "-m", "quadvel_bringup.plant", str(file)]
+    ended = subprocess.run(line, capture_output=True, text=True, timeout=60)
+    assert ended.returncode == 1
+    assert ended.stderr.startswith(f"plant: {file}: kind: found 'rust'")
+    assert ended.stderr.count("\n") == 1

@@ -169,7 +169,10 @@ def main() -> None:
     from quadvel_sim.sim_node import SimNode
 
     path, *arguments = sys.argv[1:]
-    physics = read_plant(Path(path))
+    try:
+        physics = read_plant(Path(path))
+    except ValueError as error:
+        sys.exit(f"plant: {error}")
     run(lambda: SimNode(lambda config: Plant(config, physics)), ["plant", *arguments])
 
 

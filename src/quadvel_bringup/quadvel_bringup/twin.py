@@ -8,7 +8,6 @@ predicts is held against what the plant did. The plant's file is read by the pla
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,14 +17,17 @@ import attrs
 import numpy as np
 import typer
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_eval import demo_summary, replay
+from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import output_folder, replacing, write_json
 from quadvel_eval.segments import Segment, rounded
 
+from .processes import run_attended
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 from .twin_page import ROWS, twin_page
@@ -49,22 +51,26 @@ def twin_command(
 ) -> None:
     """Walk plants that the model does not know, identify what it lacks, and hold the corrected model against them.
 
+    A plant walks a circuit twice, as processes over DDS; `quadvel identify` sees the recordings alone. OUT/twin.html
+    says what was found in each plant, and how far the model was from it before and after.
+
     \b
     For example:
       quadvel twin dry_gears --out out/twin
+      quadvel twin my_plant.yaml
     """
-    folder, console = output_folder(out), Console(soft_wrap=True)
     files = [_plant_file(plant) for plant in plants or SHIPPED]
+    folder, console = output_folder(out), Console(soft_wrap=True)
     results = []
     for file in files:
         console.rule(file.stem)
         here = output_folder(folder / file.stem)
         for seed, walk in enumerate(WALKS):
             if not (reuse and (here / f"{walk}.mcap").exists()):
+                console.print(f"walk {seed + 1} of {len(WALKS)}")
                 _walk(file, here / f"{walk}.mcap", seed, console)
         _identify(here)
-        with console.status("replaying"):
-            results.append({"name": file.stem, **judge(here)})
+        results.append({"name": file.stem, **judge(here, console)})
         console.print(_table(results[-1]))
     write_json(folder / "twin.json", {"schema": SCHEMA, "plants": results})
     with replacing(folder / "twin.html") as draft:
@@ -93,7 +99,7 @@ def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
     with replacing(recording) as draft:
         problem = ScriptedWalk(draft, SCRIPT, plant_nodes(file, seed), True, console).run()
         if problem:
-            console.print(f"[bold red]{problem}")
+            console.print(f"[bold red]{file.stem} did not walk to the end: {problem}")
             raise typer.Exit(1)
 
 
@@ -101,9 +107,8 @@ def _identify(folder: Path) -> None:
     """`quadvel identify` on the recordings, as a process that sees nothing else."""
     fitted, held_out = (str(folder / f"{walk}.mcap") for walk in WALKS)
     line = ["identify", fitted, "--holdout", held_out, "--out", str(folder / "identify")]
-    ended = subprocess.run([sys.executable, "-m", "quadvel_bringup", *line])
-    if ended.returncode:
-        raise typer.Exit(ended.returncode)
+    if code := run_attended([sys.executable, "-m", "quadvel_bringup", *line]):
+        raise typer.Exit(code)
 
 
 @attrs.frozen(eq=False)
@@ -121,10 +126,14 @@ def read_walk(path: Path) -> Walked:
     recording = read_recording(path)
     moving = [c for c in demo_summary.commands(recording.planned.time, recording.planned.value) if c[2].any()]
     segments = [segment for segment in demo_summary.segments(recording) if segment.command.any()]
+    if not moving:
+        raise ValueError(
+            f"{path}: cmd_vel: found no velocity that was commanded for long enough to be judged"
+        )
     return Walked(recording, replay.read_joints(path), moving, segments)
 
 
-def judge(folder: Path) -> dict[str, Any]:
+def judge(folder: Path, console: Console) -> dict[str, Any]:
     """What the stack's model and the corrected one make of the plant's walks: an entry of `twin.json`."""
     report = json.loads((folder / "identify" / "report.json").read_text())
     models = {
@@ -133,10 +142,6 @@ def judge(folder: Path) -> dict[str, Any]:
     }
     walks = [read_walk(folder / f"{walk}.mcap") for walk in WALKS]
     plant = _average([walk.segments for walk in walks])
-    held_out = walks[1]
-    begin, end = held_out.stretches[0][0], held_out.stretches[-1][1]
-    truth = replay.trunk_at(held_out.recording)
-    commands = [(velocity, stop - start) for start, stop, velocity in held_out.stretches]
     entry: dict[str, Any] = {
         "decision": report["decision"],
         "effects": [effect["name"] for effect in report["effects"]],
@@ -146,18 +151,44 @@ def judge(folder: Path) -> dict[str, Any]:
         "segments": [{"command": rounded(s.command), "plant": rounded(s.mean)} for s in plant],
         "repeat": _gap(walks[0].segments, walks[1].segments),
     }
-    for name, model in models.items():
-        predicted = _average([replay.predicted_tracking(model, commands, seed) for seed in SEEDS])
-        error = replay.open_loop(model, held_out.joints, truth, begin, end)
-        torque = replay.torque_error(model, held_out.joints, begin, end)
+    commands = [(velocity, stop - start) for start, stop, velocity in walks[1].stretches]
+    calls: list[Call] = []
+    for model in models.values():
+        calls += [(replay.predicted_tracking, model, commands, seed) for seed in SEEDS]
+        calls.append((_replayed, model, folder / f"{WALKS[1]}.mcap"))
+    answers = _answers(calls, console)
+    for name in models:
+        *runs, (torque, error) = (answers.pop(0) for _ in range(len(SEEDS) + 1))
+        predicted = _average(runs)
         entry[name] = {
             "torque_mse": rounded(torque),
-            **attrs.asdict(error),
+            **attrs.asdict(error, filter=attrs.filters.exclude("growth")),
+            "growth": rounded(error.growth),
             "tracking": _gap(plant, predicted),
         }
         for segment, model_segment in zip(entry["segments"], predicted, strict=True):
             segment[name] = rounded(model_segment.mean)
     return entry
+
+
+def _replayed(model: ActuatorParameters, recording: Path) -> tuple[float, replay.ReplayError]:
+    """Torque error (N^2 m^2) and open-loop error of a model against the walk recorded there."""
+    walk = read_walk(recording)
+    begin, end = walk.stretches[0][0], walk.stretches[-1][1]
+    torque = replay.torque_error(model, walk.joints, begin, end)
+    return torque, replay.open_loop(model, walk.joints, replay.trunk_at(walk.recording), begin, end)
+
+
+def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
+    """What the calls return, in their order; they run on all cores, under a bar."""
+    answers: list[Any] = [None] * len(calls)
+    columns = (TextColumn("before and after"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    with Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("", total=len(calls))
+        for i, answer in in_parallel(calls):
+            answers[i] = answer
+            bar.advance(task)
+    return answers
 
 
 def _average(runs: Sequence[Sequence[Segment]]) -> list[Segment]:
@@ -174,7 +205,6 @@ def _gap(plant: Sequence[Segment], model: Sequence[Segment]) -> dict[str, float]
 
 def _table(result: dict[str, Any]) -> Table:
     table = Table("error of the model against the plant", "before", "after", title=result["decision"])
-    for name, value in ROWS:
-        before, after = value(result["before"]), value(result["after"])
-        table.add_row(name, f"{before:.4g}", f"{after:.4g}")
+    for row in ROWS:
+        table.add_row(row.title, *(f"{row.error(result[when]):.4g}" for when in ("before", "after")))
     return table

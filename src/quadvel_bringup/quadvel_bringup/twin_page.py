@@ -6,80 +6,157 @@ from collections.abc import Callable, Mapping, Sequence
 from html import escape
 from typing import Any
 
+import attrs
+import numpy as np
+from matplotlib.figure import Figure
+
+from quadvel_actuator.identify.figures import AFTER, BEFORE, MEASURED, svg
 from quadvel_actuator.identify.page import document, number, table, tiles
+from quadvel_eval.replay import GROWTH
 
 Entry = Mapping[str, Any]
 
-ROWS: tuple[tuple[str, Callable[[Entry], float]], ...] = (
-    ("torque on the recorded motion, mean square, N² m²", lambda model: model["torque_mse"]),
-    ("open loop: torque, N m", lambda model: model["tau"]),
-    ("open loop: q, rad", lambda model: model["q"]),
-    ("open loop: dq, rad/s", lambda model: model["dq"]),
-    ("velocity that it predicts, m/s", lambda model: model["tracking"]["xy"]),
-    ("yaw rate that it predicts, rad/s", lambda model: model["tracking"]["wz"]),
+
+@attrs.frozen
+class Row:
+    """A quantity in which model and plant are compared."""
+
+    name: str
+    unit: str
+    error: Callable[[Entry], float]
+    """of an entry's "before" or "after\""""
+    floor: Callable[[Entry], float | None] = lambda entry: None
+    """of an entry: what no model can undercut, where that is known"""
+
+    @property
+    def title(self) -> str:
+        """Name and unit."""
+        return f"{self.name}, {self.unit}"
+
+
+TORQUE = Row(
+    "torque on the recorded motion", "N² m²", lambda m: m["torque_mse"], lambda entry: entry["noise_floor"]
 )
-"""What is compared with the plant: name, and where it stands in an entry's "before" and "after"."""
+Q = Row("q in open loop", "rad", lambda m: m["q"])
+DQ = Row("dq in open loop", "rad/s", lambda m: m["dq"])
+VELOCITY = Row(
+    "predicted velocity", "m/s", lambda m: m["tracking"]["xy"], lambda entry: entry["repeat"]["xy"]
+)
+YAW = Row("predicted yaw rate", "rad/s", lambda m: m["tracking"]["wz"], lambda entry: entry["repeat"]["wz"])
+ROWS = (TORQUE, Q, DQ, VELOCITY, YAW)
 
 NOTE = (
     "Before: the stack's own model. After: the model that `quadvel identify` made of one recorded walk. All errors are "
-    "on a second walk that was not fitted. Open loop: the recorded commands are replayed over stretches of 0.2 s, each "
-    "from the recorded state; root mean square over all joints. Velocity: the shipped policy walks the same commands in "
-    "the model; mean distance to the plant's mean velocities."
+    "on a second walk that was not fitted. Torque: mean square, on the recorded motion; its floor is the noise of the "
+    "drives. Open loop: the recorded commands are replayed over stretches of 0.2 s, each from the recorded state; root "
+    "mean square over all joints. Velocity: the shipped policy walks the same commands in the model; mean distance to "
+    "the plant's mean velocities; its floor is the plant against itself, one walk and the other."
 )
 
 
 def twin_page(results: Sequence[Entry]) -> str:
     """The page as HTML. results: the plants' entries of `twin.json`."""
-    body = f'<p class="note">{escape(NOTE)}</p>' + "".join(map(_plant, results))
+    body = _overview(results) + f'<p class="note">{escape(NOTE)}</p>' + "".join(map(_plant, results))
     return document("Closing the loop on the stack itself", decision(results), body)
 
 
 def decision(results: Sequence[Entry]) -> str:
     """One sentence: how much nearer the corrected models are to their plants."""
-    cuts = [
-        100 * (1 - sum(value(one["after"]) / value(one["before"]) for one in results) / len(results))
-        for _, value in ROWS
-    ]
+
+    def cut(row: Row) -> str:
+        share = float(np.mean([row.error(one["after"]) / row.error(one["before"]) for one in results]))
+        return f"falls by {100 * (1 - share):.0f} %" if share < 1.0 else f"grows by {100 * (share - 1):.0f} %"
+
     plants = "the plant" if len(results) == 1 else f"{len(results)} plants"
     return (
-        f"With what was identified on {plants}, the model's torque error falls by {cuts[0]:.0f} %, its open-loop error "
-        f"of q by {cuts[2]:.0f} % and of dq by {cuts[3]:.0f} %, the gap of its velocity tracking by {cuts[4]:.0f} %."
+        f"With what was identified on {plants}, the model's torque error {cut(TORQUE)}, its open-loop error of q "
+        f"{cut(Q)} and of dq {cut(DQ)}, the gap of its velocity tracking {cut(VELOCITY)}."
     )
+
+
+def _overview(results: Sequence[Entry]) -> str:
+    rows = [
+        (
+            f'<a href="#{escape(one["name"])}">{escape(one["name"])}</a>',
+            escape(", ".join(dict.fromkeys(one["effects"])) or "nothing"),
+            *(_before_after(one, row) for row in ROWS),
+        )
+        for one in results
+    ]
+    head = ("plant", "identified", *(f"#{row.title}" for row in ROWS))
+    return svg(9.5, 2.9, lambda figure: draw_overview(figure, results)) + table(head, rows)
+
+
+def _before_after(entry: Entry, row: Row) -> str:
+    return f"{number(row.error(entry['before']))} → <b>{number(row.error(entry['after']))}</b>"
+
+
+def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
+    """A panel for each quantity: error before beside after, plant by plant, and the floor."""
+    places = np.arange(len(results))
+    for panel, row in zip(figure.subplots(1, len(ROWS)), ROWS, strict=True):
+        for shift, colour, when in ((-0.19, BEFORE, "before"), (0.19, AFTER, "after")):
+            panel.bar(
+                places + shift, [row.error(one[when]) for one in results], 0.36, color=colour, label=when
+            )
+        for place, one in zip(places, results, strict=True):
+            if (floor := row.floor(one)) is not None:
+                panel.hlines(floor, place - 0.42, place + 0.42, MEASURED, lw=2.0, label="floor")
+        panel.set_title(f"{row.name}\n{row.unit}", fontsize="small", loc="left")
+        panel.set_xticks(places, [one["name"] for one in results], rotation=30, ha="right")
+        panel.grid(axis="y", alpha=0.2)
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    known = dict(zip(labels, handles, strict=True))
+    figure.legend(known.values(), known, loc="outside upper left", ncols=len(known))
+
+
+def draw_plant(figure: Figure, entry: Entry) -> None:
+    """How the open-loop error of q grows, and how far the predicted velocities are off, command by command."""
+    growth, velocity = figure.subplots(1, 2, width_ratios=(2, 3))
+    commands = [f"{x:g}, {y:g}, {w:g}" for x, y, w in (s["command"] for s in entry["segments"])]
+    places = np.arange(len(commands))
+    for shift, colour, when in ((-0.19, BEFORE, "before"), (0.19, AFTER, "after")):
+        error = entry[when]["growth"]
+        growth.plot(GROWTH * (np.arange(len(error)) + 0.5), error, color=colour, lw=1.8, label=when)
+        off = [np.hypot(*np.subtract(s[when], s["plant"])[:2]) for s in entry["segments"]]
+        velocity.bar(places + shift, off, 0.36, color=colour, label=when)
+    velocity.axhline(entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="plant against itself, mean")
+    growth.set(xlabel="time in open loop, ms", ylabel="error of q, rad", ylim=(0.0, None), xlim=(0.0, None))
+    velocity.set(xlabel="command vx, vy, wz", ylabel="error of the mean velocity, m/s")
+    velocity.set_xticks(places, commands, fontsize="small")
+    for panel in (growth, velocity):
+        panel.grid(alpha=0.2)
+        panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3)
 
 
 def _plant(entry: Entry) -> str:
-    before, after = entry["before"], entry["after"]
-    rows = [
-        (escape(name), number(value(before)), number(value(after)), f"{_cut(value(before), value(after))} %")
-        for name, value in ROWS
-    ]
-    repeat = entry["repeat"]
+    rows = []
+    for row in ROWS:
+        before, after = row.error(entry["before"]), row.error(entry["after"])
+        floor = number(row.floor(entry))
+        rows.append((escape(row.title), number(before), number(after), _cut(before, after), floor))
+    name = escape(entry["name"])
     text = (
-        f"<section><h2>{escape(entry['name'])}</h2><p><b>{escape(entry['decision'])}</b> "
-        f'<a href="{escape(entry["name"])}/identify/report.html">The report</a>.</p>'
+        f'<section id="{name}"><h2>{name}</h2><p><b>{escape(entry["decision"])}</b> '
+        f'<a href="{name}/identify/report.html">The report</a>.</p>'
     )
     text += tiles(
         [
-            (escape(", ".join(entry["effects"]) or "nothing"), "identified"),
             (number(entry["fit"]["eam"]), "held-out error of the plain EAM, N² m²"),
             (number(entry["fit"]["corrected"]), "of the corrected model, N² m²"),
             (number(entry["noise_floor"]), "noise floor, N² m²"),
         ]
     )
-    text += table(("error of the model against the plant", "#before", "#after", "#less"), rows)
-    text += (
-        f'<p class="note">The plant against itself, one walk and the other: {number(repeat["xy"])} m/s, '
-        f"{number(repeat['wz'])} rad/s.</p>"
-    )
+    text += table(("error of the model against the plant", "#before", "#after", "#less", "#floor"), rows)
+    text += svg(9.5, 2.9, lambda figure: draw_plant(figure, entry))
     columns = ("command vx, vy, wz", "#plant", "#model before", "#model after")
     keys = ("command", "plant", "before", "after")
-    return (
-        text + table(columns, [[_velocity(s[key]) for key in keys] for s in entry["segments"]]) + "</section>"
-    )
+    velocities = table(columns, [[_velocity(s[key]) for key in keys] for s in entry["segments"]])
+    return f"{text}<details><summary>mean velocities, m/s and rad/s</summary>{velocities}</details></section>"
 
 
 def _cut(before: float, after: float) -> str:
-    return f"{100 * (1 - after / before):.0f}" if before else "–"
+    return f"{100 * (1 - after / before):.0f} %" if before else "–"
 
 
 def _velocity(values: Sequence[float]) -> str:
