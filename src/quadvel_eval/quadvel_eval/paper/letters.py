@@ -133,7 +133,7 @@ class Letters(Section):
             panel.set_aspect("equal")
             panel.set_xlabel("x, m")
             panel.set_ylabel("y, m")
-            panel.legend(fontsize="small")
+            panel.legend(fontsize="small", loc="upper left", bbox_to_anchor=(0.0, -0.18), ncols=4)
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:

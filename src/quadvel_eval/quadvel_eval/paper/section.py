@@ -66,6 +66,7 @@ class Row:
     digits: int = 3
 
 
+@attrs.frozen
 class Section(ABC):
     """A part of the evaluation. Its fields (attrs) are what a short run may make smaller."""
 

@@ -15,14 +15,35 @@ from typing import Any
 import attrs
 
 from ..pool import in_parallel
+from .energy import Energy
+from .estimator import Estimator
 from .files import PAGE, is_done, write_page, write_section
 from .gait import Gait
+from .gap import Gap
+from .identification import Identification
+from .jitter import Jitter
 from .letters import Letters
+from .robustness import Robustness
 from .section import Section, Study
+from .stance import Stance
 from .sustained import Sustained
+from .symmetry import Symmetry
 from .tracking import Tracking
 
-SECTIONS: tuple[Section, ...] = (Gait(), Tracking(), Sustained(), Letters())
+SECTIONS: tuple[Section, ...] = (
+    Identification(),
+    Gait(),
+    Symmetry(),
+    Jitter(),
+    Tracking(),
+    Sustained(),
+    Letters(),
+    Energy(),
+    Robustness(),
+    Gap(),
+    Stance(),
+    Estimator(),
+)
 """in the order of the page"""
 
 __all__ = ["PAGE", "SECTIONS", "Progress", "run"]

@@ -1,0 +1,67 @@
+"""Sections that walk the same commands on many plants: what a condition is, and how survival and error are shown."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..grid import DURATION, Cell, CellResult, judge, mass
+from ..walk import Setup, make_loop, record
+from .cells import Command
+from .section import Record, column, distinct, mean, select
+
+COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
+"""ahead, sideways, along an arc; m/s, rad/s"""
+PUSH_TIME, PUSH_SECONDS = 1.0, 0.2  # s after the start of a walk, and for how long
+
+
+@attrs.frozen
+class Condition:
+    """What differs from the nominal robot on flat ground."""
+
+    group: str
+    level: str
+    plant: Mapping[str, Any] = attrs.field(factory=dict)
+    """fields of SimulatorConfig"""
+    push: tuple[float, float, float] | None = None
+    """N on the trunk, world frame, for PUSH_SECONDS"""
+
+    @property
+    def labels(self) -> Record:
+        """As records hold it."""
+        return {"group": self.group, "level": self.level}
+
+
+def walk_under(setup: Setup, cell: Cell, push: tuple[float, float, float] | None) -> CellResult:
+    """As `grid.run_cell`, without estimators beside, and pushed after PUSH_TIME where there is a push."""
+    loop = make_loop(setup, cell.seed, ())
+    if push is not None:
+        if record(loop, [(cell.command, PUSH_TIME)]) is None:
+            return CellResult(cell)
+        loop.simulator.push("trunk", push, duration=PUSH_SECONDS)
+    walk = record(loop, [(cell.command, DURATION)])
+    return judge(walk, cell, mass(loop)) if walk else CellResult(cell)
+
+
+def survival(records: Sequence[Record]) -> float:
+    """Share of the robots that did not fall, %; nan without any."""
+    return 100.0 * (1.0 - mean(records, "fell"))
+
+
+def draw(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
+    """Mean error and survival of each policy over the levels of one group."""
+    levels = distinct(records, "level")
+    policies = distinct(records, "policy")
+    places, width = np.arange(len(levels)), 0.8 / len(policies)
+    for k, policy in enumerate(policies):
+        groups = [select(records, policy=policy, level=level) for level in levels]
+        left = places + k * width
+        error.bar(left, [mean(group, "error_xy") for group in groups], width, label=policy, align="edge")
+        stood.bar(left, [survival(group) for group in groups], width, align="edge")
+    for panel in (error, stood):
+        panel.set_xticks(places + 0.4, [str(level) for level in levels])
+    stood.set_ylim(0.0, 105.0)

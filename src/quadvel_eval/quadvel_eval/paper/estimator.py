@@ -1,0 +1,122 @@
+"""The velocity estimators by speed and ground: the learned one, and the Kalman filter beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import attrs
+import numpy as np
+from matplotlib.figure import Figure
+
+from quadvel_sim.terrain import Terrain
+
+from ..walk import Setup, Walk, make_loop, record_to_the_fall
+from .cells import limits
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, mean, select
+
+BANDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)  # m/s, where a band of true speed begins; the last one ends at TOP
+TOP = 2.5  # m/s: commands go no further
+HOLD = 2.5  # s of each command
+BESIDE = ("learned", "kalman")
+GROUNDS = ("flat", "rough")
+
+
+def wander(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]], seconds: float) -> Walk | None:
+    """A walk of random commands within the bounds and the ellipsoid that they span; as far as the robot got."""
+    rng = np.random.default_rng(seed)
+    low, high = np.array(list(bounds.values())).T
+    commands = []
+    for _ in range(round(seconds / HOLD)):
+        direction = rng.standard_normal(3)
+        direction *= rng.uniform() ** (1.0 / 3.0) / np.linalg.norm(direction)
+        command = np.where(direction > 0, direction * high, -direction * low)
+        commands.append((np.clip(command, -TOP, TOP), HOLD))
+    walk, _ = record_to_the_fall(make_loop(setup, seed, BESIDE), commands)
+    return walk
+
+
+@attrs.frozen
+class Estimator(Section):
+    """Random walks on both grounds, s each."""
+
+    name: ClassVar[str] = "estimator"
+    title: ClassVar[str] = "Velocity estimator"
+    method: ClassVar[str] = (
+        "Walks of 20 s with a random command each 2.5 s, on flat and rough ground (humps of 3 cm), every estimator on the same "
+        "walks. Root mean square error an axis against the true velocity, by bands of true speed; drift: distance between "
+        "where the integrated estimate leads and where the robot got to, over the way. The paper gives no figure."
+    )
+    seconds: float = 20.0
+    grounds: tuple[str, ...] = GROUNDS
+
+    def jobs(self, study: Study) -> list[Job]:
+        jobs = []
+        for policy in study.policies:
+            bounds = limits(study, policy)
+            for ground in self.grounds:
+                for seed in range(study.seeds):
+                    setup = study.setup(policy, terrain=Terrain(kind=ground, roughness=0.03, seed=seed))
+                    call = (wander, setup, seed, bounds, self.seconds)
+                    jobs.append(Job({"policy": policy, "ground": ground, "seed": seed}, call))
+        return jobs
+
+    def judge(self, answers: Answers) -> list[Record]:
+        found = [({**labels}, walk) for labels, walk in answers if walk is not None]
+        records: list[Record] = []
+        for labels, walk in found:
+            way = float(np.linalg.norm(np.diff(walk.position[:, :2], axis=0), axis=1).sum())
+            speed = np.hypot(*walk.velocity[:, :2].T)
+            for name, error in walk.estimate_errors.items():
+                whole = {"estimator": name, "way": way, "drift": walk.estimate_drifts[name]}
+                for band in BANDS:
+                    inside = (band <= speed) & (speed < band + 0.5)
+                    squares = np.square(error[inside]).sum(axis=0)
+                    sums = dict(zip(("x", "y", "z"), squares.tolist(), strict=True))
+                    records.append({**labels, **whole, "band": band, "samples": int(inside.sum()), **sums})
+        return records
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        grounds = distinct(records, "ground")
+        figure = Figure(figsize=(4.5 * len(grounds), 3.4), layout="constrained")
+        panels = figure.subplots(1, len(grounds), sharey=True, squeeze=False)[0]
+        for panel, ground in zip(panels, grounds, strict=True):
+            for policy in distinct(records, "policy"):
+                for name, style in zip(BESIDE, ("o-", "s--"), strict=True):
+                    mine = select(records, ground=ground, policy=policy, estimator=name)
+                    values = [rmse(select(mine, band=band)) for band in BANDS]
+                    panel.plot(np.array(BANDS) + 0.25, values, style, label=f"{name}, walks of {policy}")
+            panel.set_title(f"{ground} ground")
+            panel.set_xlabel("true speed, m/s")
+            panel.set_ylim(0.0, None)
+        panels[0].set_ylabel("RMSE of the worst axis, m/s")
+        panels[0].legend(fontsize="small")
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        rows = []
+        for ground in distinct(records, "ground"):
+            for name in BESIDE:
+                mine = select(records, ground=ground, estimator=name)
+                what = f"{ground} ground, {name}"
+                rows += [
+                    Row(f"{what}: RMSE of the worst axis", "m/s", None, by_policy(mine, rmse)),
+                    Row(f"{what}: drift", "% of the way", None, by_policy(mine, drift), 1),
+                ]
+        return rows
+
+
+def rmse(records: Sequence[Record]) -> float:
+    """Of the worst axis over all samples of the records, m/s; nan without any."""
+    samples = column(records, "samples").sum()
+    return (
+        float(np.sqrt(max(column(records, axis).sum() for axis in "xyz") / samples))
+        if samples
+        else float("nan")
+    )
+
+
+def drift(records: Sequence[Record]) -> float:
+    """Over the way, %, each walk once."""
+    once = select(records, band=BANDS[0])
+    return 100.0 * mean(once, "drift") / mean(once, "way")

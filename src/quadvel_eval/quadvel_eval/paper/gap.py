@@ -1,0 +1,113 @@
+"""The gap: policies on plants whose drives hold effects that training never saw."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import attrs
+from matplotlib.figure import Figure
+
+from quadvel_actuator import ActuatorParameters, Effect
+from quadvel_description.robot import JOINT_NAMES
+
+from ..grid import Cell
+from .cells import Command, cell_record
+from .conditions import Condition, draw, walk_under
+from .section import (
+    Answers,
+    Job,
+    Record,
+    Row,
+    Section,
+    Study,
+    by_policy,
+    column,
+    distinct,
+    largest,
+    mean,
+    select,
+)
+
+MORE_DELAY = 0.003  # s
+COMMANDS: tuple[Command, ...] = (
+    (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 1.0),
+    (0.0, 0.0, -1.0), (1.0, 0.4, 0.0), (1.0, -0.4, 0.0), (0.8, 0.0, 0.8), (0.8, 0.0, -0.8),
+)  # fmt: skip
+
+
+def _with(name: str, settings: Mapping[str, Any] | None = None, **parameters: float) -> ActuatorParameters:
+    """The shipped actuator model with an effect on all joints."""
+    effect = Effect(name, JOINT_NAMES, {**(settings or {}), **parameters})
+    return attrs.evolve(ActuatorParameters.default(), name=f"aliengo with {name}", effects=(effect,))
+
+
+def _delayed() -> ActuatorParameters:
+    """The shipped actuator model with commands that take MORE_DELAY longer."""
+    default = ActuatorParameters.default()
+    pairs = tuple(attrs.evolve(p, input_delay_s=p.input_delay_s + MORE_DELAY) for p in default.pairs)
+    return attrs.evolve(default, name="aliengo with more delay", pairs=pairs)
+
+
+def plants() -> list[Condition]:
+    """The plant of training, and those that it never saw."""
+    drives = {
+        "as in training": ActuatorParameters.default(),
+        "friction": _with("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
+        "torque-speed limit": _with("torque_speed_limit", stall=35.0, v_c=6.0, fall=14.0),
+        "3 ms more delay": _delayed(),
+        "backlash": _with("backlash", {"on": "q"}, gap=0.015),
+    }
+    return [Condition("drives", name, {"actuator": parameters}) for name, parameters in drives.items()]
+
+
+@attrs.frozen
+class Gap(Section):
+    """Every plant with every command and seed."""
+
+    name: ClassVar[str] = "gap"
+    title: ClassVar[str] = "The gap: drives that training never saw"
+    method: ClassVar[str] = (
+        "Ten commands of 6 s on the plant of training and on four whose drives hold, in addition, dry friction (1.2 N m, 1.8 "
+        "at rest), a torque limit of 35 N m that falls from 6 rad/s to nothing at 20 rad/s, 3 ms more delay of the commands, "
+        "and a backlash of ±15 mrad. Errors are those of the robots that did not fall. The paper's own gap is that between "
+        "simulation and robot: RL-PD fell 3 times there, the EAM policies never."
+    )
+    commands: tuple[Command, ...] = COMMANDS
+
+    def jobs(self, study: Study) -> list[Job]:
+        return [
+            Job(
+                {"policy": policy, **one.labels},
+                (walk_under, study.setup(policy, **one.plant), Cell(command, seed), None),
+            )
+            for policy in study.policies
+            for one in plants()
+            for command in self.commands
+            for seed in range(study.seeds)
+        ]
+
+    def judge(self, answers: Answers) -> list[Record]:
+        return [cell_record(labels, result) for labels, result in answers]
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        figure = Figure(figsize=(8.0, 5.0), layout="constrained")
+        error, stood = figure.subplots(2, 1, sharex=True)
+        draw(error, stood, records)
+        error.set_ylabel("mean error, m/s")
+        stood.set_ylabel("survival, %")
+        error.legend()
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        rows = []
+        for level in distinct(records, "level"):
+            mine = select(records, level=level)
+            rows += [
+                Row(f"{level}, falls", "", 0.0, by_policy(mine, lambda r: column(r, "fell").sum()), 0),
+                Row(f"{level}, mean error", "m/s", None, by_policy(mine, lambda r: mean(r, "error_xy"))),
+                Row(
+                    f"{level}, largest error", "m/s", 0.084, by_policy(mine, lambda r: largest(r, "error_xy"))
+                ),
+            ]
+        return rows

@@ -1,0 +1,103 @@
+"""Robustness: friction, payload, slopes, rough ground and pushes; who survives and how well it tracks."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import attrs
+import numpy as np
+from matplotlib.figure import Figure
+
+from quadvel_sim.terrain import Terrain
+
+from ..grid import Cell
+from .cells import Command, cell_record
+from .conditions import COMMANDS, Condition, draw, survival, walk_under
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, largest, mean, select
+
+FORCE = 60.0  # N
+XLABELS = {
+    "friction": "friction coefficient",
+    "payload": "payload, kg",
+    "slope": "slope, degrees",
+    "rough ground": "height of the humps, cm",
+    "push": f"push of {FORCE:g} N for 0.2 s",
+}
+
+
+def conditions(seed: int) -> list[Condition]:
+    """All of them; the seed is that of rough ground."""
+    found = [Condition("friction", f"{f:g}", {"friction": np.full(4, f)}) for f in (0.3, 0.5, 0.8, 1.0)]
+    found += [Condition("payload", f"{m:g}", {"payload": m}) for m in (-2.0, 0.0, 2.5, 5.0)]
+    for degrees in (-15.0, -7.5, 7.5, 15.0):
+        terrain = Terrain(kind="slope", slope=float(np.radians(degrees)))
+        found.append(Condition("slope", f"{degrees:g}", {"terrain": terrain}))
+    for roughness in (0.03, 0.06):
+        terrain = Terrain(kind="rough", roughness=roughness, seed=seed)
+        found.append(Condition("rough ground", f"{100 * roughness:g}", {"terrain": terrain}))
+    for name, push in (
+        ("ahead", (1, 0, 0)),
+        ("back", (-1, 0, 0)),
+        ("left", (0, 1, 0)),
+        ("right", (0, -1, 0)),
+    ):
+        found.append(Condition("push", name, push=(FORCE * push[0], FORCE * push[1], 0.0)))
+    return found
+
+
+@attrs.frozen
+class Robustness(Section):
+    """Every condition with every command and seed."""
+
+    name: ClassVar[str] = "robustness"
+    title: ClassVar[str] = "Robustness"
+    method: ClassVar[str] = (
+        "Walks of 6 s ahead (1 m/s), sideways (0.5 m/s) and along an arc (0.6 m/s, 0.6 rad/s), each with one thing changed: "
+        "friction of all feet, a mass on the trunk or taken off it, a slope (positive: uphill at the start), rough ground "
+        "(Perlin noise), a push of 60 N for 0.2 s on the trunk after 1 s. Survival: share of the robots that did not fall. "
+        "The paper shows such walks and gives no figures."
+    )
+    groups: tuple[str, ...] = tuple(XLABELS)
+    commands: tuple[Command, ...] = COMMANDS
+
+    def jobs(self, study: Study) -> list[Job]:
+        return [
+            Job(
+                {"policy": policy, **one.labels},
+                (walk_under, study.setup(policy, **one.plant), Cell(command, seed), one.push),
+            )
+            for policy in study.policies
+            for seed in range(study.seeds)
+            for one in conditions(seed)
+            if one.group in self.groups
+            for command in self.commands
+        ]
+
+    def judge(self, answers: Answers) -> list[Record]:
+        return [cell_record(labels, result) for labels, result in answers]
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        groups = distinct(records, "group")
+        figure = Figure(figsize=(3.2 * len(groups), 4.6), layout="constrained")
+        panels = figure.subplots(2, len(groups), sharey="row", squeeze=False)
+        for (error, stood), group in zip(panels.T, groups, strict=True):
+            draw(error, stood, select(records, group=group))
+            stood.set_xlabel(XLABELS[group])
+        panels[0, 0].set_ylabel("mean error, m/s")
+        panels[1, 0].set_ylabel("survival, %")
+        panels[0, 0].legend()
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        rows = []
+        for group in distinct(records, "group"):
+            mine = select(records, group=group)
+            rows += [
+                Row(f"{group}, survival", "%", None, by_policy(mine, survival), 1),
+                Row(f"{group}, mean error", "m/s", None, by_policy(mine, lambda r: mean(r, "error_xy"))),
+                Row(
+                    f"{group}, largest error", "m/s", None, by_policy(mine, lambda r: largest(r, "error_xy"))
+                ),
+            ]
+        return rows

@@ -1,0 +1,143 @@
+"""Standing still: drift, steps and chatter, beside the same robot under constant targets."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import ClassVar
+
+import attrs
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from quadvel_description.state import JointCommand
+
+from ..grid import STANCE_WALK, drift
+from ..robot_loop import PERIOD, STEPS, RobotLoop
+from ..walk import Setup, make_loop, record
+from .gait import contacts, touchdowns
+from .section import (
+    Answers,
+    Job,
+    Record,
+    Row,
+    Section,
+    Study,
+    by_policy,
+    column,
+    distinct,
+    largest,
+    mean,
+    select,
+)
+
+Array = NDArray[np.float64]
+
+SETTLE = 1.0  # s, from the command to stand still until it counts
+STILL = (0.0, 0.0, 0.0)
+
+
+def stand(setup: Setup, seed: int, seconds: float) -> tuple[Array, float, int, float, float] | None:
+    """After a short walk: position (n, 3) m, its drift (m), steps, joint speed, and that under constant targets (rad/s).
+
+    Joint speeds are true, root mean squares over joints. None where the robot fell.
+    """
+    loop = make_loop(setup, seed, ())
+    if record(loop, [*STANCE_WALK, (STILL, SETTLE)]) is None:
+        return None
+    speeds, places, touching, targets = [], [], [], []
+    for _ in range(round(seconds / PERIOD)):
+        sample = loop.tick(STILL)
+        if sample.fallen or sample.mode != "walk":
+            return None
+        speeds.append(loop.simulator.data.qvel[6:].copy())
+        places.append(sample.truth.position)
+        touching.append(sample.truth.contact)
+        targets.append(sample.command)
+    steady = contacts(np.array(touching))
+    steps = sum(len(touchdowns(steady[:, foot])) for foot in range(4))
+    position = np.array(places)
+    constant = _held(loop, np.mean([command.q for command in targets], axis=0), targets[-1], 5.0)
+    return position, drift(position), steps, _rms(speeds), constant
+
+
+def _held(loop: RobotLoop, target: Array, like: JointCommand, seconds: float) -> float:
+    """Joint speed where the robot goes on with one constant target at the gains of `like`, rad/s."""
+    command = JointCommand(q=target, kp=like.kp, kd=like.kd)
+    speeds = []
+    for _ in range(round((SETTLE + seconds) / PERIOD)):
+        loop.simulator.command(command)
+        loop.simulator.step(STEPS)
+        speeds.append(loop.simulator.data.qvel[6:].copy())
+    return _rms(speeds[round(SETTLE / PERIOD) :])
+
+
+def _rms(values: Sequence[Array]) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+@attrs.frozen
+class Stance(Section):
+    """Half a minute of standing a policy and seed."""
+
+    name: ClassVar[str] = "stance"
+    title: ClassVar[str] = "Standing still"
+    method: ClassVar[str] = (
+        "After a short walk the robot is told to stand for 30 s, of which the first second does not count. Drift: the largest "
+        "distance from where it stood then. Steps: touchdowns of feet. Joint speed: true, root mean square, beside that of "
+        "the same robot with its targets frozen at their mean, which the torque noise alone moves. The paper gives no figure."
+    )
+    seconds: float = 29.0
+
+    def jobs(self, study: Study) -> list[Job]:
+        return [
+            Job({"policy": policy, "seed": seed}, (stand, study.setup(policy), seed, self.seconds))
+            for policy in study.policies
+            for seed in range(study.seeds)
+        ]
+
+    def judge(self, answers: Answers) -> list[Record]:
+        records: list[Record] = []
+        for labels, answer in answers:
+            if answer is None:
+                whole = dict.fromkeys(("drift", "steps", "joint_speed", "constant_speed"))
+                records.append({**labels, **whole, "fell": 1, "time": None, "x": None, "y": None})
+                continue
+            position, *numbers = answer
+            whole = dict(zip(("drift", "steps", "joint_speed", "constant_speed"), numbers, strict=True))
+            for i in range(0, len(position), 40):
+                x, y = (position[i] - position[0])[:2].tolist()
+                records.append({**labels, **whole, "fell": 0, "time": round(i * PERIOD, 3), "x": x, "y": y})
+        return records
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        figure = Figure(figsize=(7.0, 3.0), layout="constrained")
+        panel = figure.subplots()
+        for policy in distinct(records, "policy"):
+            for seed in distinct(records, "seed"):
+                mine = select(records, policy=policy, seed=seed)
+                way = np.hypot(column(mine, "x"), column(mine, "y"))
+                panel.plot(column(mine, "time"), 100.0 * way, label=f"{policy}, seed {seed}")
+        panel.set_xlabel("time, s")
+        panel.set_ylabel("distance from the start, cm")
+        panel.set_ylim(0.0, None)
+        panel.legend(fontsize="small")
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        def over_constant(mine: Sequence[Record]) -> float:
+            return mean(mine, "joint_speed") / mean(mine, "constant_speed")
+
+        return [
+            Row(
+                "drift in 30 s, largest",
+                "cm",
+                None,
+                by_policy(records, lambda r: 100.0 * largest(r, "drift")),
+                2,
+            ),
+            Row("steps, most", "", None, by_policy(records, lambda r: largest(r, "steps")), 0),
+            Row("joint speed", "rad/s", None, by_policy(records, lambda r: mean(r, "joint_speed"))),
+            Row("joint speed over that of constant targets", "", None, by_policy(records, over_constant), 2),
+            Row("falls", "", 0.0, by_policy(records, lambda r: largest(r, "fell")), 0),
+        ]

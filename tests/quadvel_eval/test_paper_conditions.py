@@ -1,0 +1,98 @@
+"""Sections on changed plants: what is changed, and how survival and error are counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_eval.grid import Cell, CellResult
+from quadvel_eval.paper.energy import Energy
+from quadvel_eval.paper.gap import Gap, plants
+from quadvel_eval.paper.jitter import Jitter
+from quadvel_eval.paper.robustness import Robustness, conditions
+from quadvel_eval.paper.section import Study
+from quadvel_eval.segments import Segment
+from quadvel_sim.simulator import Simulator, SimulatorConfig
+
+
+def answer(labels: dict, command: tuple[float, float, float], error: float | None) -> tuple[dict, CellResult]:
+    cell = Cell(command, 0)
+    if error is None:
+        return labels, CellResult(cell)
+    mean = np.array(command) - [error, 0.0, 0.0]
+    return labels, CellResult(cell, Segment(np.array(command), mean), 0.002, 0.8)
+
+
+def test_every_condition_is_a_plant_that_stands() -> None:
+    found = conditions(seed=1)
+    assert {one.group for one in found} == {"friction", "payload", "slope", "rough ground", "push"}
+    for one in found:
+        simulator = Simulator(SimulatorConfig(**one.plant))
+        simulator.reset("stand")
+        assert not simulator.fallen, one.labels
+
+
+def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> None:
+    drives = {one.level: one.plant["actuator"] for one in plants()}
+    trained = drives.pop("as in training")
+    assert trained == ActuatorParameters.default()
+    assert {len(p.effects) + (p.best_pair != trained.best_pair) for p in drives.values()} == {1}
+    assert drives["3 ms more delay"].best_pair.input_delay_s == pytest.approx(0.010)
+    q, fast = np.zeros(12), np.full(12, 15.0)
+    slow_drive, limited = (ActuatorModel(p, seed=1) for p in (trained, drives["torque-speed limit"]))
+    for _ in range(20):
+        strong, weak = (m.step(q, fast, np.full(12, 2.0), 30.0, 0.5) for m in (slow_drive, limited))
+    assert (np.abs(weak) < np.abs(strong)).all()
+
+
+def test_survival_counts_the_robots_that_did_not_fall() -> None:
+    section = Robustness()
+    labels = {"policy": "mine", "group": "slope", "level": "15"}
+    command = (1.0, 0.0, 0.0)
+    records = section.judge(
+        [answer(labels, command, 0.1), answer(labels, command, 0.3), answer(labels, command, None)]
+    )
+    ours = {row.what: row.ours["mine"] for row in section.rows(records)}
+    assert ours["slope, survival"] == pytest.approx(100.0 * 2 / 3)
+    assert ours["slope, mean error"] == pytest.approx(0.2)
+    section.figure(records)
+
+
+def test_the_gap_is_told_plant_by_plant() -> None:
+    section = Gap()
+    command = (1.0, 0.0, 0.0)
+    records = section.judge(
+        [
+            answer({"policy": name, "group": "drives", "level": level}, command, error)
+            for name, level, error in (
+                ("a", "friction", 0.2),
+                ("b", "friction", None),
+                ("a", "backlash", 0.1),
+            )
+        ]
+    )
+    rows = {row.what: row.ours for row in section.rows(records)}
+    assert rows["friction, falls"] == {"a": 0.0, "b": 1.0}
+    assert rows["friction, largest error"] == {"a": pytest.approx(0.2), "b": None}
+    section.figure(records)
+
+
+def test_the_least_cost_is_that_of_the_best_speed() -> None:
+    section = Energy()
+    labels = {"policy": "mine"}
+    records = section.judge([answer(labels, (1.0, 0.0, 0.0), 0.1), answer(labels, (0.0, 0.0, 1.0), 0.1)])
+    records[0]["cot"] = 0.5
+    ours = {row.what: row.ours["mine"] for row in section.rows(records)}
+    assert ours["cost of transport, the least"] == 0.5
+    assert ours["cost of turning at 1 rad/s"] == 0.8
+    section.figure(records)
+
+
+def test_only_speeds_that_the_policy_takes_are_walked() -> None:
+    study = Study(seeds=1)
+    speeds = [job.call[2].command[0] for job in Jitter(speeds=(0.5, 99.0)).jobs(study)]
+    assert speeds == [0.5]
+    records = Jitter().judge([answer({"policy": "mine"}, (0.5, 0.0, 0.0), 0.0)])
+    assert Jitter().rows(records)[0].ours["mine"] == pytest.approx(2.0)
+    Jitter().figure(records)

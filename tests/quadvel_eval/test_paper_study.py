@@ -1,0 +1,127 @@
+"""How sections are run and kept, with one that needs no robot."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import attrs
+import pytest
+from matplotlib.figure import Figure
+
+from quadvel_eval.cli import paper_command
+from quadvel_eval.paper import files, study
+from quadvel_eval.paper.section import Answers, Job, Record, Row, Section, Study, by_policy, largest
+from quadvel_eval.pool import Call
+from quadvel_policy.policy_file import SHIPPED_POLICY
+
+
+@attrs.frozen
+class Powers(Section):
+    """Powers of two by jobs."""
+
+    name: ClassVar[str] = "powers"
+    title: ClassVar[str] = "Powers"
+    method: ClassVar[str] = "Counted."
+    count: int = 3
+
+    def jobs(self, study: Study) -> list[Job]:
+        return [
+            Job({"policy": name, "k": k}, (pow, 2, k)) for name in study.policies for k in range(self.count)
+        ]
+
+    def judge(self, answers: Answers) -> list[Record]:
+        return [{**labels, "value": float(answer), "none": None} for labels, answer in answers]
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        figure = Figure(figsize=(1.0, 1.0))
+        figure.subplots().plot([record["value"] for record in records])
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        return [Row("largest", "m", 5.0, by_policy(records, lambda r: largest(r, "value")), 1)]
+
+
+@pytest.fixture
+def page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(study, "SECTIONS", (Powers(),))
+
+
+@pytest.fixture
+def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    def one_by_one(calls: Sequence[Call], cluster: str | None) -> Iterator[tuple[int, Any]]:
+        return enumerate(function(*arguments) for function, *arguments in calls)
+
+    monkeypatch.setattr(study, "in_parallel", one_by_one)
+
+
+TWO = Study(policies={"a": SHIPPED_POLICY, "b": SHIPPED_POLICY})
+
+
+def test_a_section_leaves_csv_picture_json_and_the_page(tmp_path: Path, page: None) -> None:
+    heard: list[study.Progress] = []
+    assert study.run(TWO, [Powers()], tmp_path, tell=heard.append) == ["powers"]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "README.md",
+        "powers.csv",
+        "powers.json",
+        "powers.png",
+    ]
+    assert (tmp_path / "powers.csv").read_text().splitlines()[:2] == ["policy,k,value,none", "a,0,1,"]
+    assert "| largest, m | 5.0 | 4.0 (-1.0) | 4.0 (-1.0) |" in (tmp_path / "README.md").read_text()
+    assert [progress.done for progress in heard] == [1, 2, 3, 4, 5, 6]
+    assert [progress.completed for progress in heard] == [None] * 5 + ["powers"]
+
+
+def test_what_is_done_is_kept_until_it_is_asked_for_or_something_changes(
+    tmp_path: Path, page: None, in_this_process: None
+) -> None:
+    study.run(TWO, [Powers()], tmp_path)
+    assert study.run(TWO, [Powers()], tmp_path) == []
+    assert study.run(TWO, [Powers()], tmp_path, again=True) == ["powers"]
+    assert study.run(attrs.evolve(TWO, seeds=1), [Powers()], tmp_path) == ["powers"]
+    assert study.run(TWO, [Powers(count=4)], tmp_path) == ["powers"]
+
+
+def test_another_network_makes_a_section_anew(tmp_path: Path) -> None:
+    other = tmp_path / "other.onnx"
+    other.write_bytes(SHIPPED_POLICY.read_bytes() + b"\0")
+    first, second = (files.made_with(Powers(), Study(policies={"a": p})) for p in (SHIPPED_POLICY, other))
+    assert first["policies"] != second["policies"]
+    assert first == json.loads(json.dumps(first))
+
+
+def test_records_come_back_from_the_csv_as_they_went_in(tmp_path: Path) -> None:
+    records = [{"policy": "a", "k": 3, "value": 0.25, "none": None}]
+    files.write_records(tmp_path / "records.csv", records)
+    assert files.read_records(tmp_path / "records.csv") == records
+
+
+@pytest.mark.parametrize("text", ["nowhere.onnx", "=file", "name="])
+def test_a_policy_without_name_or_file_is_refused(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ValueError, match="NAME=FILE"):
+        paper_command(tmp_path / "out", policy=[text])
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_section_is_refused_by_its_name(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"'figure13', expected one of identification, gait, "):
+        paper_command(tmp_path / "out", only=["figure13"])
+
+
+def test_a_section_that_is_stopped_leaves_the_old_one_whole(
+    tmp_path: Path, page: None, in_this_process: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study.run(TWO, [Powers()], tmp_path)
+    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
+
+    def stopped(calls: Sequence[Call], cluster: str | None) -> Iterator[tuple[int, Any]]:
+        yield 0, (1, 0.1)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(study, "in_parallel", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        study.run(TWO, [Powers()], tmp_path, again=True)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
