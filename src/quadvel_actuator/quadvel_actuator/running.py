@@ -13,7 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_actuator.delay import DelayLine
-from quadvel_actuator.effects import EffectLaw, MemoryLaw, Stage, registry
+from quadvel_actuator.effects import DRIVE, JOINT, EffectLaw, MemoryLaw, Stage, registry
+from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.effects.terms import RunningTerms
 from quadvel_actuator.parameters import Effect
 
 Array = NDArray[np.float64]
@@ -21,8 +23,8 @@ Array = NDArray[np.float64]
 _PAST = 0.03
 """s of velocities that are kept"""
 
-_SLOPE_STEPS = 2
-"""steps over which the acceleration is taken"""
+SLOPE = 0.002
+"""s over which the acceleration is taken, all of them past"""
 
 
 class Instant:
@@ -157,6 +159,14 @@ def _column(
     return column
 
 
+def _terms(effect: Effect, joints: Sequence[str], dt: float) -> RunningTerms:
+    """The terms that an effect of the name `learned_residual` holds."""
+    try:
+        return RunningTerms(effect.parameters.get("terms"), joints, dt)
+    except ValueError as error:
+        raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
+
+
 class RunningEffects:
     """All effects of a model, in the order in which they act."""
 
@@ -164,10 +174,14 @@ class RunningEffects:
         self, effects: Sequence[Effect], joints: Sequence[str], shape: tuple[int, ...], dt: float, seed: int
     ) -> None:
         rng = np.random.default_rng([seed, 1])
-        self._all = sorted((_Running(one, joints, rng) for one in effects), key=lambda one: one.law.stage)
+        laws = [one for one in effects if one.name != TERMS]
+        self._all = sorted((_Running(one, joints, rng) for one in laws), key=lambda one: one.law.stage)
         self._errors = [one for one in self._all if one.law.stage == Stage.ERRORS]
         self._torques = [one for one in self._all if Stage.ERRORS < one.law.stage < Stage.ADDED]
-        self._added = [one for one in self._all if one.law.stage == Stage.ADDED]
+        added = [one for one in self._all if one.law.stage == Stage.ADDED]
+        self._added = [one for one in added if one.law.at == DRIVE]
+        self._at_joint = [one for one in added if one.law.at == JOINT]
+        self._terms = [_terms(one, joints, dt) for one in effects if one.name == TERMS]
         self._now = Instant(shape, dt)
         self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
 
@@ -198,7 +212,16 @@ class RunningEffects:
         total = torque
         for one in self._added:
             total = total + one.act(torque, now, new)
+        for terms in self._terms:
+            total = total + terms.act(total, now, new)
         now.measured = np.array(total)
+        return total
+
+    def at_joint(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
+        """What the joints get, now, of the drives' `torque`, which comes an output delay after it was asked for."""
+        total = torque
+        for one in self._at_joint:
+            total = total + one.act(torque, self._now, new)
         return total
 
     def _observe(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> Instant:
@@ -209,15 +232,19 @@ class RunningEffects:
         if new is not None:
             now.t = np.where(new[..., None], 0.0, now.t)
             now.past = deque((np.where(new[..., None], now.dq, old) for old in now.past), now.past.maxlen)
-        back = min(_SLOPE_STEPS, len(now.past) - 1)
+        back = min(max(1, round(SLOPE / now.dt)), len(now.past) - 1)
         now.ddq = (now.past[0] - now.past[back]) / (max(back, 1) * now.dt)
         return now
+
+    @property
+    def _memories(self) -> list[_Running | RunningTerms]:
+        return [*self._all, *self._terms]
 
     def remember(self) -> Any:
         """Everything that a step changes, for `recall`."""
         now = self._now
         return (
-            [one.memory for one in self._all],
+            [one.memory for one in self._memories],
             now.t,
             now.measured,
             deque(now.past, now.past.maxlen),
@@ -227,5 +254,5 @@ class RunningEffects:
     def recall(self, kept: Any) -> None:
         """Take steps since `remember` back."""
         memories, self._now.t, self._now.measured, self._now.past, self.targets.head = kept
-        for one, memory in zip(self._all, memories, strict=True):
+        for one, memory in zip(self._memories, memories, strict=True):
             one.memory = memory

@@ -1,6 +1,6 @@
 """From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
 
-What the steps do stands in their own modules: `eam`, `floor`, `diagnosis`, `learned`, `residual`, `intervals`.
+What the steps do stands in their own modules: `eam`, `floor`, `diagnosis`, `learned`, `simplest`, `residual`, `intervals`.
 """
 
 from __future__ import annotations
@@ -22,13 +22,14 @@ from .identification import Identification
 from .inspect import inspect
 from .intervals import intervals
 from .judging import Judge
-from .learned import Learned, learn
+from .learned import Learned
 from .log import Log, LogError
 from .model import Model
 from .motion import STRETCH, Rigid, implied, replayed
 from .outcome import Outcome, identification, parameters
 from .residual import remainder
 from .signals import Array, Samples
+from .simplest import account
 
 Progress = Callable[[float, str], None]
 
@@ -82,12 +83,14 @@ def identify(
     steps = iter(range(10**6))
     diagnosis = diagnose(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
     tell(0.88, "what no effect explains")
-    learned = learn(diagnosis.model, judge, noise)
+    named = diagnosis.model
+    ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
+    diagnosis, learned = account(before, diagnosis, judge, noise)
     rest = remainder(diagnosis.model, learned, judge)
     tell(0.95, "intervals")
     outcome = Outcome(
-        eam, before, diagnosis, learned, _worth(diagnosis.model, learned, judge), rest,
-        intervals(diagnosis.model, judge), pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0), noise, judge,
+        eam, before, diagnosis, learned, _worth(named, learned, judge), rest,
+        intervals(diagnosis.model if learned is None else learned.beside, judge), ideal, noise, judge,
         chosen, *_reference(samples), options.base or ActuatorParameters.default(),
     )  # fmt: skip
     found = identification(outcome, findings)
@@ -193,11 +196,11 @@ def _plain(samples: Samples, eam: Eam, judge: Judge) -> Model:
 
 
 def _worth(model: Model, learned: Learned | None, judge: Judge) -> tuple[float, float]:
-    """Held-out gain of the learned terms together, and its p-value."""
+    """Held-out gain of the learned terms over `model`, fitted without them, and its p-value."""
     if learned is None:
         return 0.0, 1.0
-    left = model.samples.tau - model.predict()
-    found = judge.compare(left, left - learned.torque)
+    tau = model.samples.tau
+    found = judge.compare(tau - model.predict(), tau - learned.model.predict() - learned.torque)
     return found.gain, found.p_any
 
 

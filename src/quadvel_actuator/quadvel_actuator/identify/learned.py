@@ -1,23 +1,24 @@
 """What no named effect explains: readable terms of named signals, taken while held-out rows say that they pay.
 
-A term is a smooth function of one signal (also times the direction of motion, or times the torque), a short linear
-filter of one signal's history, a resonance that a signal excites, or lines of a spectrum in time. Each is bounded:
-outside the range that the log covers a smooth function stays at its end.
+One term is taken at a time: of those whose gain is as good as the best one's, the simplest. Gains, delays and the
+effects named so far are free while it is fitted, so that a term is not paid for what they can explain. In the end
+terms that the others made needless go, and the model is fitted once more beside those that stay.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
+from copy import copy
 
 import attrs
 import numpy as np
-from scipy.interpolate import BSpline
-from scipy.signal import lfilter
 
-from .judging import Judge
-from .model import Model
-from .signals import Array, Bools
+from ..effects.terms import Curve, Filter, Resonance, Shape, Term, Wave, factor, inputs, read
+from ..running import SLOPE
+from .delays import jacobian_with_delays
+from .judging import Comparison, Judge
+from .model import Model, gather, pack, step, with_slots
+from .signals import Array, Bools, Signals
 
 LEVEL = 0.01
 """A term is taken if chance would bring its gain with less than this probability, all that were tried counted."""
@@ -28,216 +29,413 @@ WORTH = 0.03
 MOST = 8
 """Terms at most."""
 
-_KEPT = 10  # inputs that come into question after the first look
-_RIDGE = 1e-5
-_TRIED = 60  # bases a joint that count as independent trials
+_TRIED = 100  # features a joint that count as independent trials
+_KEPT = 12  # features that come into question after a look at all of them
+_AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
+_RIDGE = 1e-6
+_STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model and terms together
 _HISTORY = 0.02  # s
 _FREQUENCIES = np.geomspace(3.0, 110.0, 26)  # Hz
-_DAMPING = (0.02, 0.07, 0.2)
+_DAMPING, _MOST_DAMPED = (0.02, 0.07, 0.2), 0.7
+_TUNING = (1.06, 1.03, 1.015, 1.007)  # steps of a resonance's frequency
+_RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
+_COARSE, _MIDDLE, _FINE = 3, 6, 25  # pieces of a curve
 
 
 @attrs.frozen(eq=False)
-class Basis:
-    """Columns (N, K), or (N, K, J) where every joint has its own, that a term is a sum of; `inputs` in the joint's words."""
+class Feature:
+    """A shape of a signal, times something."""
 
-    inputs: tuple[str, ...]
-    kind: str
-    columns: Array
-    own: bool
-    source: str = ""  # the joint that an absolute signal belongs to
+    signal: str
+    times: str
+    shape: Shape
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Features with the same one stand for each other: the best of them comes into question."""
+        return inputs(self.signal, self.times, self.shape)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """How much it says: signals, then numbers."""
+        return len(self.key), self.shape.count
 
 
-@attrs.frozen(eq=False)
-class Term:
-    """A basis at work on some joints, with its torque (N, J)."""
+class Scene:
+    """A model's rows as terms see them: the signals, what is left, and how that moves with the model's parameters."""
 
-    basis: Basis
-    joints: Bools
-    coefficients: Array  # (K, J)
-    torque: Array
-    gain: float  # over all judged rows
-    p: float
+    def __init__(self, model: Model, judge: Judge) -> None:
+        self.model, self.judge = model, judge
+        self.joints: Sequence[str] = model.samples.joints
+        self.rows = judge.fit | judge.judge
+        self.asked, self.slopes, self.slots = jacobian_with_delays(model)  # (N, J), (J, A, N)
+        self.residual = np.where(self.rows, model.samples.tau - self.asked, 0.0)
+        self.dt = model.samples.period
+        self.start = model.samples.start
+        self.view = _past_only(model.signals, self.dt)
 
-    def inputs(self, joints: Sequence[str]) -> list[str]:
-        """The signals as the report names them."""
-        return list(self.basis.inputs)
+    def columns(self, feature: Feature) -> Array:
+        """What the feature is a sum of, (N, K, J)."""
+        u = read(feature.signal, self.view, self.asked, self.joints)
+        columns = feature.shape.columns(u, self.start, self.dt)
+        by = factor(feature.times, self.view, self.asked)
+        return columns if isinstance(by, float) else columns * by[:, None]
+
+
+def _past_only(s: Signals, dt: float) -> Signals:
+    """The signals with an acceleration that a running model can have, too."""
+    back = max(1, round(SLOPE / dt))
+    n = np.arange(len(s.dq))
+    began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
+    slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
+    return attrs.evolve(s, ddq=slope)
 
 
 @attrs.frozen(eq=False)
 class Learned:
-    """The terms that were taken."""
+    """The terms that were taken, and the model fitted beside them."""
 
+    model: Model
     terms: tuple[Term, ...]
+    torque: Array  # (N, J), of all terms, N m
+    gains: tuple[float, ...]  # of each term: held-out error without it less that with it, N^2 m^2
 
     @property
-    def torque(self) -> Array:
-        """Of all terms, (N, J), N m."""
-        total: Array = np.sum([term.torque for term in self.terms], axis=0)
-        return total
+    def beside(self) -> Model:
+        """The model on what was measured less the terms."""
+        samples = copy(self.model.samples)
+        samples.tau, samples._parts = samples.tau - self.torque, {}
+        return attrs.evolve(self.model, samples=samples)
 
     @property
     def joints(self) -> Bools:
         """Those on which any term acts."""
-        acts: Bools = np.any([term.joints for term in self.terms], axis=0)
+        acts: Bools = np.any([term.active for term in self.terms], axis=0)
         return acts
 
     @property
     def inputs(self) -> list[str]:
         """All signals that the terms depend on, the weightiest first."""
-        ranked = sorted(self.terms, key=lambda term: -term.gain)
-        return list(dict.fromkeys(name for term in ranked for name in term.basis.inputs))
+        ranked = sorted(zip(self.gains, self.terms, strict=True), key=lambda pair: -pair[0])
+        return list(dict.fromkeys(name for _, term in ranked for name in term.inputs))
+
+
+@attrs.frozen(eq=False)
+class _Pick:
+    """A feature at work on the joints where it pays."""
+
+    feature: Feature
+    joints: Bools
+    gain: float
+    columns: Array
 
 
 def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     """Terms for what `model` leaves; None where nothing pays."""
-    residual = model.residual(judge.fit | judge.judge)
-    terms: list[Term] = []
-    found = _taken(library(model, residual, judge), residual, judge, noise)
-    while found and len(terms) < MOST:
-        term = found[0]
-        terms.append(term)
-        residual = residual - term.torque * (judge.fit | judge.judge)
-        bases = [one.basis for one in found if one.basis.kind != "line"]
-        found = _taken([*bases, *_lines(model, residual, judge)], residual, judge, noise)
-    return Learned(tuple(terms)) if terms else None
+    scene = Scene(model, judge)
+    picks: list[_Pick] = []
+    kept: list[_Pick] = []
+    left = scene.residual
+    while len(picks) < MOST:
+        fresh = [one for one in kept if one.feature.signal != "t"]
+        kept = _paying(_again(fresh, scene, left), picks, scene, noise) if fresh else []
+        if not kept:
+            kept = _paying(library(scene, left), picks, scene, noise)
+        if not kept:
+            break
+        picks.append(_simplest(kept))
+        left = _Joint(picks, scene).left
+    picks = _pruned(picks, scene, noise)
+    return _fitted_beside(picks, scene) if picks else None
 
 
-def library(model: Model, residual: Array, judge: Judge) -> Iterator[Basis]:
-    """Every basis that is tried on the residual."""
-    s, joints = model.signals, model.samples.joints
-    asked = model.predict()
-    own = {"q": s.q, "dq": s.dq, "ddq": s.ddq, "q_des": s.q_des, "tau": asked}
-    direction = np.tanh(s.dq / 0.05)
-    for name, u in own.items():
-        yield Basis((name,), "smooth", _smooth(u, 9), True)
-        if name in ("q", "tau"):
-            yield Basis((name, "dq"), "friction", _smooth(u, 7) * direction[:, None], True)
-        if name in ("q", "dq"):
-            yield Basis((name, "tau"), "gain", _smooth(u, 6) * asked[:, None], True)
-    yield Basis(("q",), "fine", _smooth(s.q, 28), True)
-    yield Basis(("q_des", "q"), "smooth", _smooth(s.q_des - s.q, 9), True)
-    clock = model.samples.t[:, None] - model.samples.t.min()
-    yield Basis(("t",), "smooth", _smooth(clock, 10)[:, :, 0], False)
-    yield Basis(("t", "tau"), "gain", _smooth(clock, 6) * asked[:, None], True)
-    for name, u in (("tau", asked), ("q_des", s.q_des), ("q", s.q), ("dq", s.dq)):
-        yield Basis((f"{name}@history",), "filter", _taps(u, model), True)
-    for name, u in (("tau", asked), ("q", s.q)):
-        yield from (Basis((f"{name}@history",), "resonance", one, True) for one in _resonances(u, model))
-    others = {"q": s.q, "dq": s.dq, "tau": s.measured}
-    for k, joint in enumerate(joints if len(joints) > 1 else ()):
-        for name, u in others.items():
-            label = f"{joint}/{name}"
-            plain = _smooth(u[:, k : k + 1], 9)
-            yield Basis((label,), "smooth", plain[:, :, 0], False, joint)
-            if name == "q":
-                yield Basis((label,), "fine", _smooth(u[:, k : k + 1], 28)[:, :, 0], False, joint)
-            yield Basis((label, "dq"), "friction", plain[:, ::2] * direction[:, None], True, joint)
-            yield Basis((label, "tau"), "gain", plain[:, ::2] * asked[:, None], True, joint)
-    yield from _lines(model, residual, judge)
+def library(scene: Scene, left: Array) -> Iterator[Feature]:
+    """Everything that is tried on what is left (N, J)."""
+    curve = _Curves(scene)
+    for name in ("q", "dq", "ddq", "q_des", "tau", "error", "t"):
+        yield curve(name, "", _MIDDLE)
+    for times, names in (("direction", ("q", "tau", "t")), ("tau", ("q", "dq", "t")), ("dq", ("q", "t"))):
+        for name in names:
+            yield curve(name, times, _MIDDLE)
+    for times in ("", "direction", "dq"):
+        yield curve("q", times, _FINE)
+    rows = max(round(_HISTORY / scene.dt), 4)
+    edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
+    for name in ("tau", "q_des", "q", "dq"):
+        yield Feature(name, "", Filter(edges))
+    for name in ("tau", "q"):
+        for frequency in _FREQUENCIES[0.35 / scene.dt > _FREQUENCIES]:
+            yield from (Feature(name, "", Resonance(float(frequency), damping)) for damping in _DAMPING)
+    for joint in scene.joints if len(scene.joints) > 1 else ():
+        for name in ("q", "dq", "tau"):
+            yield curve(f"{joint}/{name}", "", _MIDDLE)
+            yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau"))
+        yield curve(f"{joint}/q", "", _FINE)
+        yield from _ripples(scene, left, f"{joint}/q")
+    yield from _lines(scene, left)
 
 
-def _smooth(u: Array, count: int) -> Array:
-    """Cubic B-splines over the range of each column of `u` (N, C), as (N, count, C)."""
-    low, high = np.quantile(u, 0.005, axis=0), np.quantile(u, 0.995, axis=0)
-    knots = np.linspace(0.0, 1.0, count - 2)
-    padded = np.concatenate([np.zeros(3), knots, np.ones(3)])
-    out = np.empty((len(u), count, u.shape[1]))
-    for c in range(u.shape[1]):
-        x = np.clip((u[:, c] - low[c]) / max(high[c] - low[c], 1e-9), 0.0, 1.0 - 1e-9)
-        out[:, :, c] = BSpline.design_matrix(x, padded, 3).toarray()
-    return out
+class _Curves:
+    """Makes curves over the range that a signal had."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._ranges: dict[str, tuple[Array, Array]] = {}
+
+    def __call__(self, signal: str, times: str, pieces: int) -> Feature:
+        if signal not in self._ranges:
+            u = read(signal, self._scene.view, self._scene.asked, self._scene.joints)
+            low, high = np.quantile(u, (0.005, 0.995), axis=0)
+            self._ranges[signal] = low, np.maximum(high, low + 1e-9)
+        return Feature(signal, times, Curve(*self._ranges[signal], pieces))
 
 
-def _taps(u: Array, model: Model) -> Array:
-    """Means of `u` over growing stretches of its past, up to _HISTORY, less its present value, (N, K, J)."""
-    rows = max(round(_HISTORY / model.samples.period), 4)
-    edges = np.unique(np.round(np.geomspace(1, rows, 7)).astype(int))
-    sums = np.concatenate([np.zeros((1, u.shape[1])), np.cumsum(u, axis=0)])
-    n = np.arange(len(u))
-    columns = [u]
-    for near, far in pairwise(edges):
-        a, b = np.maximum(n - far + 1, 0), np.maximum(n - near + 1, 1)
-        columns.append((sums[b] - sums[a]) / np.maximum(b - a, 1)[:, None] - u)
-    return np.stack(columns, axis=1)
+def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
+    """A wave along the angle of another joint: the rate with which most of what is left goes."""
+    u = read(signal, scene.view, scene.asked, scene.joints)
+    least = 2.0 * np.pi / max(float(np.ptp(u)), 1e-3)
+    rates = _RATES[1.5 * least < _RATES]
+    if rates.size:
+        power = np.abs(np.exp(-1j * rates[:, None] * u[:, 0]) @ np.where(scene.judge.fit, left, 0.0)) ** 2
+        yield Feature(signal, "", Wave(rates[np.argmax(power.max(axis=1))], 2))
 
 
-def _resonances(u: Array, model: Model) -> Iterator[Array]:
-    """What damped resonances make of `u`: place and speed of each, (N, 2, J)."""
-    dt = model.samples.period
-    centred = u - u.mean(axis=0)
-    for frequency in _FREQUENCIES:
-        if frequency > 0.35 / dt:
-            continue
-        for damping in _DAMPING:
-            pole = np.exp(2.0 * np.pi * frequency * dt * (-damping + 1j * np.sqrt(1.0 - damping**2)))
-            answer = lfilter([1.0 - abs(pole)], [1.0, -2.0 * pole.real, abs(pole) ** 2], centred, axis=0)
-            yield np.stack([answer, np.gradient(answer, axis=0)], axis=1)
-
-
-def _lines(model: Model, residual: Array, judge: Judge) -> Iterator[Basis]:
-    """The strongest lines of the residual's spectrum in time, each with two overtones."""
-    t = model.samples.t - model.samples.t.min()
-    span = float(np.ptp(t))
-    step = 0.5 / span
-    top = 0.45 / model.samples.period
-    grid = np.arange(max(2.0, 3.0 / span), top, step)
-    even = np.arange(0.0, span, model.samples.period)
+def _lines(scene: Scene, left: Array) -> Iterator[Feature]:
+    """The strongest lines of the spectrum in time of what is left, each with two overtones."""
+    t = scene.view.t[:, 0]
+    span, period = float(np.ptp(t)), scene.dt
+    grid = np.arange(max(2.0, 3.0 / span), 0.45 / period, 0.5 / span)
+    even = np.arange(t.min(), t.max(), period)
+    order = np.argsort(t, kind="stable")
+    fitted = np.where(scene.judge.fit, left, 0.0)
     power = np.zeros(len(grid))
-    fitted = np.where(judge.fit, residual, 0.0)
-    for j in range(residual.shape[1]):
-        spectrum = np.fft.rfft(np.interp(even, t, fitted[:, j]), 2 * len(even))
-        frequencies = np.fft.rfftfreq(2 * len(even), model.samples.period)
-        power = np.maximum(power, np.interp(grid, frequencies, np.abs(spectrum)))
+    for one in fitted.T:
+        spectrum = np.fft.rfft(np.interp(even, t[order], one[order]), 2 * len(even))
+        power = np.maximum(power, np.interp(grid, np.fft.rfftfreq(2 * len(even), period), np.abs(spectrum)))
     for best in np.argsort(-power)[:3]:
-        frequency = _peak(grid[best], step, t, fitted)
-        angles = 2.0 * np.pi * frequency * np.outer(t, [1.0, 2.0, 3.0])
-        yield Basis(("t",), "line", np.concatenate([np.sin(angles), np.cos(angles)], axis=1), False)
+        near = grid[best] + np.linspace(-0.5 / span, 0.5 / span, 21)
+        waves = np.exp(-2j * np.pi * np.outer(near, t)) @ fitted
+        frequency = near[int(np.argmax((np.abs(waves) ** 2).sum(axis=1)))]
+        yield Feature("t", "", Wave(2.0 * np.pi * frequency, 3))
 
 
-def _peak(frequency: float, step: float, t: Array, residual: Array) -> float:
-    """The frequency near by at which the line is strongest."""
-    near = frequency + np.linspace(-step, step, 21)
-    waves = np.exp(-2j * np.pi * np.outer(near, t))
-    return float(near[int(np.argmax((np.abs(waves @ residual) ** 2).sum(axis=1)))])
+def _again(kept: Sequence[_Pick], scene: Scene, left: Array) -> Iterator[Feature]:
+    yield from (one.feature for one in kept)
+    yield from _lines(scene, left)
 
 
-def _taken(bases: Iterable[Basis], residual: Array, judge: Judge, noise: Array) -> list[Term]:
-    """The bases fitted on the joints where they are significant, of the same inputs the best one; the best _KEPT."""
-    best: dict[tuple[str, ...], Term] = {}
-    count = _TRIED * residual.shape[1]
-    for basis in bases:
-        torque, coefficients = _fitted(basis, residual, judge.fit)
-        found = judge.compare(residual, residual - torque)
-        gain, p = found.joint_gain, found.p_joints
-        taken = (p * count < LEVEL) & (gain > WORTH * noise)
-        if basis.source:
-            taken &= np.array([name != basis.source for name in judge.joints])
-        total = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
-        before = best.get(basis.inputs)
-        if taken.any() and (before is None or total > before.gain):
-            term = Term(basis, taken, coefficients * taken, torque * taken, total, float(p[taken].min()))
-            ranked = sorted([*(best | {basis.inputs: term}).values()], key=lambda one: -one.gain)[:_KEPT]
-            best = {one.basis.inputs: one for one in ranked}
-    return sorted(best.values(), key=lambda one: -one.gain)
+def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
+    """Those that pay beside the picks, of the same signals the best one, best first."""
+    trial = _Trial(picks, scene)
+    best: dict[tuple[str, ...], _Pick] = {}
+    for feature in features:
+        pick = _pick(feature, trial, noise)
+        before = best.get(feature.key)
+        if pick is not None and (before is None or pick.gain > before.gain):
+            ranked = sorted([*(best | {feature.key: pick}).values()], key=lambda one: -one.gain)[:_KEPT]
+            best = {one.feature.key: one for one in ranked}
+    found = [_tuned(one, trial, noise) for one in best.values()]
+    return sorted(found, key=lambda one: -one.gain)
 
 
-def _fitted(basis: Basis, residual: Array, rows: Bools) -> tuple[Array, Array]:
-    """Least squares of the residual on the basis: torque (N, J) and coefficients (K, J)."""
-    columns = basis.columns
-    joints = residual.shape[1]
-    coefficients = np.empty((columns.shape[1], joints))
-    torque = np.empty_like(residual)
-    alike: dict[bytes, list[int]] = {}
-    for j in range(joints):
-        alike.setdefault(rows[:, j].tobytes(), []).append(j)
-    for members in alike.values():
-        keep = rows[:, members[0]]
-        for group in [members] if columns.ndim == 2 else [[j] for j in members]:
-            x = columns if columns.ndim == 2 else columns[:, :, group[0]]
-            inside = x[keep]
-            gram = inside.T @ inside
-            gram[np.diag_indices_from(gram)] += _RIDGE * np.trace(gram) / len(gram) + 1e-12
-            solution = np.linalg.solve(gram, inside.T @ residual[keep][:, group])
-            coefficients[:, group] = solution
-            torque[:, group] = x @ solution
-    return torque, coefficients
+def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
+    """The feature on the joints where it pays; None where there are none."""
+    columns = trial.scene.columns(feature)
+    found = trial.compare(feature, columns)
+    taken = (found.p_joints * _TRIED * len(noise) < LEVEL) & (found.joint_gain > WORTH * noise)
+    owner = feature.signal.rpartition("/")[0]
+    taken &= np.array([name != owner for name in trial.scene.joints])
+    gain = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
+    return _Pick(feature, taken, gain, columns) if taken.any() else None
+
+
+def _tuned(pick: _Pick, trial: _Trial, noise: Array) -> _Pick:
+    """A resonance with the frequency and damping with which it says most of the fitted rows; another pick as it is."""
+    shape = pick.feature.shape
+    if not isinstance(shape, Resonance):
+        return pick
+    least = trial.error(pick.feature, pick.columns, pick.joints)
+    for size in _TUNING:
+        for by_frequency, by_damping in ((1, 0), (-1, 0), (0, 1), (0, -1)):
+            damping = min(shape.damping * size ** (4 * by_damping), _MOST_DAMPED)
+            moved = Resonance(shape.frequency * size**by_frequency, damping)
+            tried = attrs.evolve(pick.feature, shape=moved)
+            error = trial.error(tried, trial.scene.columns(tried), pick.joints)
+            if error < least:
+                least, shape = error, moved
+    best = attrs.evolve(pick.feature, shape=shape)
+    found = _pick(best, trial, noise)
+    return pick if found is None or found.gain < pick.gain else found
+
+
+class _Trial:
+    """What a feature would add to the picks: each joint's torque on the feature, the model and the picks left free."""
+
+    def __init__(self, picks: Sequence[_Pick], scene: Scene) -> None:
+        self.scene = scene
+        parts = _Joint(picks, scene).parts
+        self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows
+        self.inverse = []
+        self.bare = np.empty_like(scene.residual)
+        for j in range(len(scene.joints)):
+            x = np.column_stack([scene.slopes[j].T, *(part[:, j] for part in parts)])
+            keep = scene.judge.fit[:, j]
+            x = x / (np.sqrt(np.mean(x[keep] ** 2, axis=0)) + 1e-12)
+            gram = x[keep].T @ x[keep]
+            gram[np.diag_indices_from(gram)] += _RIDGE * keep.sum()
+            self.others.append(x)
+            self.inverse.append(np.linalg.inv(gram))
+            self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
+
+    def _without(self, j: int, values: Array) -> Array:
+        """What the other columns do not explain of `values` (N, K)."""
+        x, keep = self.others[j], self.scene.judge.fit[:, j]
+        left: Array = values - x @ (self.inverse[j] @ (x[keep].T @ values[keep]))
+        return left
+
+    def compare(self, feature: Feature, columns: Array) -> Comparison:
+        """Held-out residuals without and with the feature."""
+        return self.scene.judge.compare(self.bare, self._after(feature, columns))
+
+    def error(self, feature: Feature, columns: Array, joints: Bools) -> float:
+        """Sum of squares that the feature leaves of the fitted rows of these joints."""
+        left = (self._after(feature, columns) * self.scene.judge.fit)[:, joints]
+        return float(np.sum(left * left))
+
+    def _after(self, feature: Feature, columns: Array) -> Array:
+        """Residual (N, J) with the feature fitted to each joint."""
+        after = np.empty_like(self.bare)
+        for j in range(self.bare.shape[1]):
+            own = self._without(j, columns[:, :, min(j, columns.shape[2] - 1)])
+            keep = self.scene.judge.fit[:, j]
+            inverse = _inverse(own[keep], [feature.shape.penalty])
+            after[:, j] = self.bare[:, j] - own @ (inverse @ (own[keep].T @ self.bare[keep, j]))
+        return after
+
+
+def _inverse(x: Array, penalties: Sequence[Array]) -> Array:
+    """Of the second moments of x (N, K), each block of columns with its penalty, in shares of its mean square."""
+    gram: Array = x.T @ x
+    first = 0
+    for penalty in penalties:
+        last = first + len(penalty)
+        size = float(np.trace(gram[first:last, first:last])) / len(penalty)
+        gram[first:last, first:last] += size * penalty + 1e-12 * np.eye(len(penalty))
+        first = last
+    inverse: Array = np.linalg.inv(gram)
+    return inverse
+
+
+class _Joint:
+    """Picks fitted together to what the scene leaves; with `free` the model's parameters move, too, shared as they are."""
+
+    def __init__(self, picks: Sequence[_Pick], scene: Scene, free: bool = True) -> None:
+        joints = range(len(scene.joints))
+        fit, slots = scene.judge.fit, scene.slots
+        mine = [[k for k, pick in enumerate(picks) if pick.joints[j]] for j in joints]
+        columns = [
+            np.concatenate([np.zeros((len(fit), 0)), *(_column(picks[k], j) for k in mine[j])], axis=1)
+            for j in joints
+        ]
+        inverse = [
+            _inverse(columns[j][fit[:, j]], [picks[k].feature.shape.penalty for k in mine[j]]) for j in joints
+        ]
+
+        def onto(j: int, values: Array) -> Array:
+            """Weights of the joint's columns that come closest to `values` (N, ...)."""
+            keep = fit[:, j]
+            weights: Array = inverse[j] @ (columns[j][keep].T @ values[keep])
+            return weights
+
+        left = scene.residual.copy()
+        self.hessian, self.gradient = np.zeros((slots.count, slots.count)), np.zeros(slots.count)
+        if free:
+            slopes = np.stack([scene.slopes[j] - (columns[j] @ onto(j, scene.slopes[j].T)).T for j in joints])
+            slopes *= fit.T[:, None]
+            rest = np.stack([left[:, j] - columns[j] @ onto(j, left[:, j]) for j in joints], axis=1)
+            self.hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
+            self.gradient = gather(slots, np.einsum("jan,nj->ja", slopes, rest))
+            size = np.diagonal(self.hessian) * _RIDGE + 1e-9
+            moved = np.linalg.solve(self.hessian + np.diag(size), self.gradient)
+            change = np.where(slots.index >= 0, moved[slots.index], 0.0)  # (A, J)
+            left -= np.einsum("jan,aj->nj", scene.slopes, change)
+        self.weights = [np.zeros((pick.feature.shape.count, len(joints))) for pick in picks]
+        self.parts = [np.zeros_like(left) for _ in picks]
+        for j in joints:
+            solution, first = onto(j, left[:, j]), 0
+            for k in mine[j]:
+                last = first + picks[k].feature.shape.count
+                self.weights[k][:, j] = solution[first:last]
+                self.parts[k][:, j] = columns[j][:, first:last] @ solution[first:last]
+                first = last
+        self.left = np.where(scene.rows, left - sum(self.parts, start=np.zeros_like(left)), 0.0)
+
+
+def _column(pick: _Pick, j: int) -> Array:
+    return pick.columns[:, :, min(j, pick.columns.shape[2] - 1)]
+
+
+def _simplest(kept: Sequence[_Pick]) -> _Pick:
+    """Of those that are as good as the best one, the one that says least."""
+    good = [one for one in kept if one.gain >= _AS_GOOD * kept[0].gain]
+    return min(good, key=lambda one: (*one.feature.size, -one.gain))
+
+
+def _pruned(picks: list[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
+    """Without those that the others made needless."""
+    while len(picks) > 1:
+        whole = _Joint(picks, scene).left
+        losses = []
+        for k in range(len(picks)):
+            less = _Joint(picks[:k] + picks[k + 1 :], scene).left
+            found = scene.judge.compare(less, whole)
+            on = picks[k].joints
+            worth = float(np.max(np.where(on, found.joint_gain / noise, 0.0)))
+            losses.append((worth if float(found.p_joints[on].min()) * _TRIED < LEVEL else 0.0, k))
+        worst, k = min(losses)
+        if worst > WORTH:
+            break
+        picks = picks[:k] + picks[k + 1 :]
+    return picks
+
+
+def _fitted_beside(picks: Sequence[_Pick], scene: Scene) -> Learned:
+    """The model fitted beside the terms, and the terms beside it."""
+    judge = scene.judge
+    best, least = scene, float(np.sum((_Joint(picks, scene, free=False).left * judge.fit) ** 2))
+    for _ in range(_STEPS):
+        joint = _Joint(picks, best)
+        theta = np.concatenate(
+            [pack(best.model), best.model.input_delay[None], best.model.output_delay[None]]
+        )
+        error = least
+        for damping in _DAMPINGS:
+            after = step(best.slots, theta, joint.hessian, joint.gradient, damping)
+            moved = with_slots(best.model, after[:-2]).with_delays(*np.round(after[-2:], 7))
+            tried = Scene(moved, judge)
+            again = _seen(picks, tried)
+            left = float(np.sum((_Joint(again, tried, free=False).left * judge.fit) ** 2))
+            if left < least:
+                least, best, picks = left, tried, again
+                break
+        if least > error * (1.0 - _SETTLED):
+            break
+    return _as_terms(picks, best)
+
+
+def _seen(picks: Sequence[_Pick], scene: Scene) -> list[_Pick]:
+    """The picks with the columns that another scene gives them."""
+    return [attrs.evolve(one, columns=scene.columns(one.feature)) for one in picks]
+
+
+def _as_terms(picks: Sequence[_Pick], scene: Scene) -> Learned:
+    joint, terms, parts = _Joint(picks, scene, free=False), [], []
+    for pick, weights, torque in zip(picks, joint.weights, joint.parts, strict=True):
+        bound = np.max(np.abs(torque) * scene.judge.fit, axis=0)
+        feature = pick.feature
+        terms.append(Term(feature.signal, feature.times, feature.shape, pick.joints, weights, bound))
+        parts.append(np.clip(torque, -bound, bound))
+    total: Array = np.sum(parts, axis=0)
+    left = scene.residual - total
+    gains = [scene.judge.compare(left + part, left).gain for part in parts]
+    return Learned(scene.model, tuple(terms), total, tuple(gains))

@@ -10,6 +10,7 @@ import numpy as np
 
 from quadvel_description.robot import JOINT_NAMES
 
+from ..effects.terms import NAME as TERMS
 from ..parameters import ActuatorParameters, DelayPair, Effect
 from .diagnosis import Diagnosis, Finding
 from .eam import Eam
@@ -27,6 +28,9 @@ SCHEMA = 1
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
 _REMOVABLE = 0.05
 """Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
+
+STEP = 0.001
+"""s, of the models that run with the parameters"""
 
 _SHOWN = 4000  # points of a series in a picture
 _SIGNAL_UNITS = {
@@ -168,7 +172,7 @@ def _effects(o: Outcome) -> list[dict[str, Any]]:
     if o.learned is not None:
         found.append(
             {
-                "name": "learned_residual",
+                "name": TERMS,
                 "joints": [name for name, acts in zip(joints, o.learned.joints, strict=True) if acts],
                 "params": {},
                 "indistinguishable": [],
@@ -177,12 +181,12 @@ def _effects(o: Outcome) -> list[dict[str, Any]]:
                 "inputs": o.learned.inputs,
                 "terms": [
                     {
-                        "kind": term.basis.kind,
-                        "inputs": list(term.basis.inputs),
-                        "joints": [name for name, acts in zip(joints, term.joints, strict=True) if acts],
-                        "heldout_gain": term.gain,
+                        "kind": term.shape.kind,
+                        "inputs": list(term.inputs),
+                        "joints": [name for name, acts in zip(joints, term.active, strict=True) if acts],
+                        "heldout_gain": gain,
                     }
-                    for term in o.learned.terms
+                    for term, gain in zip(o.learned.terms, o.learned.gains, strict=True)
                 ],
             }
         )
@@ -249,9 +253,7 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
     model = o.model if model is None else model
     joints = model.samples.joints
     mse = _mse(model.samples.tau - (o.after if model is o.model else model.predict()), o.judge.fit)
-    pair = DelayPair(
-        round(float(np.median(model.input_delay)), 7), round(float(np.median(model.output_delay)), 7), mse
-    )
+    pair = DelayPair(_stepped_delay(o, model), round(float(np.median(model.output_delay)), 7), mse)
     effects = []
     for one, half in zip(model.applied, o.widths.effects, strict=False):
         values: dict[str, Any] = {}
@@ -263,6 +265,9 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         units = {parameter.name: parameter.unit for parameter in one.law.parameters}
         acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
         effects.append(Effect(one.law.name, acts, values, units, ranges))
+    if model is o.model and o.learned is not None:
+        acts = tuple(name for name, on in zip(joints, o.learned.joints, strict=True) if on)
+        effects.append(Effect(TERMS, acts, {"terms": [one.saved(joints) for one in o.learned.terms]}))
     deviations: dict[str, Any] = {
         "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
         "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
@@ -282,6 +287,24 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         effects=tuple(effects),
         **deviations,
     )
+
+
+def _stepped_delay(o: Outcome, model: Model) -> float:
+    """The input delay (s) with which a model that runs in steps repeats this one.
+
+    Such a model gives means over its steps. One fitted to the instant itself needs half a step more, or whatever the
+    grid of the commands asks for.
+    """
+    delay = float(np.median(model.input_delay))
+    if model.window > 0.0:
+        return round(delay, 7)
+    beside = o.learned.beside if o.learned is not None and model is o.model else model
+    best = 0.5 * STEP
+    for reach in (0.25 * STEP, 0.125 * STEP, 0.0625 * STEP):
+        around = [best + k * reach for k in (-2, -1, 0, 1, 2) if best + k * reach >= 0.0]
+        meant = [attrs.evolve(beside, window=STEP, input_delay=beside.input_delay + by) for by in around]
+        best = around[int(np.argmin([one.error(o.judge.fit) for one in meant]))]
+    return round(delay + best, 7)
 
 
 def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
@@ -316,7 +339,7 @@ def _shapes(o: Outcome) -> tuple[Shape, ...]:
     found = []
     entries = [(one.law.name, one.law.signal, one.active) for one in o.model.applied]
     if o.learned is not None:
-        entries += [("learned_residual", term.basis.inputs[0], term.joints) for term in o.learned.terms]
+        entries += [(TERMS, term.inputs[0], term.active) for term in o.learned.terms]
     for name, signal, active in entries:
         for j in np.flatnonzero(active)[:3]:
             x, unit = _signal(o, signal, int(j))

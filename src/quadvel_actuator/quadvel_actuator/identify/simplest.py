@@ -1,0 +1,64 @@
+"""The simplest account of a log: named effects, terms of named signals, or both.
+
+An effect that the registry does not hold is often caught in part by several laws of it, and what they leave then names
+the wrong signals. So terms are also tried without any law, and held-out rows decide; of equals the shorter account stays.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+
+from .diagnosis import Diagnosis, Rejected
+from .judging import Judge
+from .learned import LEVEL, WORTH, Learned, learn
+from .model import Model
+from .signals import Array
+
+_AT_FLOOR = 1.05
+"""Of the noise: laws that leave no more than this need no other account."""
+
+_AS_WELL = 0.02
+"""Of the noise: what a shorter account may lose."""
+
+_TERM = 2
+"""A term of signals says as much as so many laws."""
+
+
+def account(
+    before: Model, diagnosis: Diagnosis, judge: Judge, noise: Array
+) -> tuple[Diagnosis, Learned | None]:
+    """The diagnosis with the terms that it needs beside it, or terms instead of it.
+
+    `before` is the model without effects; the diagnosis that comes back holds the model fitted beside the terms.
+    """
+    beside = learn(diagnosis.model, judge, noise)
+    floor = float(np.average(noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
+    named = _with(diagnosis, beside)
+    if not diagnosis.findings or (beside is None and diagnosis.model.mse(judge.judge) < _AT_FLOOR * floor):
+        return named, beside
+    alone = learn(before, judge, noise)
+    if alone is None or not _shorter_or_better(named, beside, alone, judge, floor):
+        return named, beside
+    reason = "terms of named signals say it better than the named laws together"
+    given_up = tuple(Rejected(one.name, one.gain, reason) for one in diagnosis.findings)
+    return Diagnosis(alone.model, (), (*given_up, *diagnosis.rejected)), alone
+
+
+def _with(diagnosis: Diagnosis, learned: Learned | None) -> Diagnosis:
+    return diagnosis if learned is None else attrs.evolve(diagnosis, model=learned.model)
+
+
+def _left(model: Model, learned: Learned | None) -> Array:
+    left: Array = model.samples.tau - model.predict()
+    return left if learned is None else left - learned.torque
+
+
+def _shorter_or_better(
+    named: Diagnosis, beside: Learned | None, alone: Learned, judge: Judge, floor: float
+) -> bool:
+    found = judge.compare(_left(named.model, beside), _left(alone.model, alone))
+    if found.gain > WORTH * floor and found.p_any < LEVEL:
+        return True
+    length = len(named.findings) + _TERM * (len(beside.terms) if beside is not None else 0)
+    return found.gain > -_AS_WELL * floor and _TERM * len(alone.terms) < length
