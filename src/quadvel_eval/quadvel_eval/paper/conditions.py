@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from ..grid import DURATION, Cell, CellResult, judge, mass
 from ..walk import Setup, make_loop, record
 from .cells import Command
-from .section import Record, column, distinct, mean, select
+from .section import Record, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
 """ahead, sideways, along an arc; m/s, rad/s"""
@@ -64,4 +64,5 @@ def draw(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
         stood.bar(left, [survival(group) for group in groups], width, align="edge")
     for panel in (error, stood):
         panel.set_xticks(places + 0.4, [str(level) for level in levels])
+        panel.set_xlim(-0.2, len(levels))
     stood.set_ylim(0.0, 105.0)

@@ -15,7 +15,7 @@ from ..walk import Setup, Walk, make_loop, record_to_the_fall
 from .cells import limits
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, mean, select
 
-BANDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)  # m/s, where a band of true speed begins; the last one ends at TOP
+BANDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)  # m/s, where a band of true speed begins; each is 0.5 wide
 TOP = 2.5  # m/s: commands go no further
 HOLD = 2.5  # s of each command
 BESIDE = ("learned", "kalman")
@@ -88,9 +88,10 @@ class Estimator(Section):
                     panel.plot(np.array(BANDS) + 0.25, values, style, label=f"{name}, walks of {policy}")
             panel.set_title(f"{ground} ground")
             panel.set_xlabel("true speed, m/s")
-            panel.set_ylim(0.0, None)
+            panel.set_xlim(0.0, BANDS[-1] + 0.5)
+        panels[0].set_ylim(0.0, None)
         panels[0].set_ylabel("RMSE of the worst axis, m/s")
-        panels[0].legend(fontsize="small")
+        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2)
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:

@@ -127,7 +127,7 @@ class Symmetry(Section):
             panel.set_xlabel("velocity, rad/s")
         panels[-1, 3].set_xlabel("share of the gait cycle")
         panels[0, 0].legend()
-        panels[0, 3].legend(fontsize="small", ncols=3)
+        figure.legend(*panels[0, 3].get_legend_handles_labels(), loc="outside lower right", ncols=6)
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
