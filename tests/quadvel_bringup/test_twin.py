@@ -18,7 +18,7 @@ from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, Sl
 from quadvel_bringup.twin import PLANTS, SHIPPED, plant_nodes
 from quadvel_bringup.twin_page import decision, twin_page
 from quadvel_description import robot
-from quadvel_description.state import JointCommand
+from quadvel_description.state import JointCommand, RobotState
 from quadvel_sim import SimulatorConfig
 
 DT = 0.001
@@ -78,6 +78,17 @@ def test_reading_a_plants_state_does_not_alter_its_run(name: str) -> None:
     np.testing.assert_allclose(ends[0], ends[1], rtol=0, atol=1e-12)
 
 
+def test_a_plant_logs_its_state_every_ms_however_seldom_it_is_read() -> None:
+    logged: list[RobotState] = []
+    plant = Plant(SimulatorConfig(seed=1), read_plant(PLANTS / "slow_current.yaml"), logged.append)
+    plant.reset("stand")
+    for _ in range(3):
+        state = plant.state()
+        assert logged[-1] is state
+        plant.step(5)
+    assert [one.tick for one in logged] == [*range(15)]
+
+
 def test_what_a_plant_reports_is_the_torque_that_its_joints_get() -> None:
     plant = Plant(SimulatorConfig(seed=1), read_plant(PLANTS / "slow_current.yaml"))
     plant.reset("stand")
@@ -102,6 +113,13 @@ def test_only_the_plants_process_is_told_of_its_file() -> None:
     assert told == ["sim_node"]
     assert set(nodes) == {"sim_node", "estimator", "controller", "command_mux"}
     assert "seed:=4" in nodes["sim_node"]
+
+
+def test_the_nodes_follow_the_board_and_the_recording_holds_the_plants_log() -> None:
+    nodes = plant_nodes(PLANTS / "dry_gears.yaml", seed=0)
+    followers = {name for name, line in nodes.items() if "low_state:=board/low_state" in line}
+    assert followers == {"sim_node", "estimator", "controller"}
+    assert "joint_log:=low_state" in nodes["sim_node"]
 
 
 def test_the_plants_physics_knows_nothing_of_what_identification_fits() -> None:

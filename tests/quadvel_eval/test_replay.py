@@ -124,6 +124,9 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
     assert true.q < 0.003
     assert true.dq < 0.7 * ideal.dq  # the noise of the torque alone makes half of it
     assert true.q < 0.2 * ideal.q
+    assert len(ideal.growth) == 20
+    assert ideal.growth[0] < 0.3 * ideal.q < 0.3 * ideal.growth[-1]
+    assert np.sqrt(np.mean(np.square(ideal.growth))) == pytest.approx(ideal.q)
 
 
 def test_a_stretch_without_a_past_is_not_replayed(run: tuple[Joints, Callable[[float], Truth]]) -> None:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
+from quadvel_description.state import RobotState
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator
 
@@ -119,11 +120,33 @@ class HiddenDrives(ActuatorModel):
 
 
 class Plant(Simulator):
-    """A simulated robot with hidden drives, made from a plant's file."""
+    """A simulated robot with hidden drives, made from a plant's file.
 
-    def __init__(self, config: SimulatorConfig, physics: Callable[[], Physics]) -> None:
+    `log` is given its state every ms, as the board of a robot logs its joints faster than it reports them.
+    """
+
+    def __init__(
+        self,
+        config: SimulatorConfig,
+        physics: Callable[[], Physics],
+        log: Callable[[RobotState], None] = lambda state: None,
+    ) -> None:
         self._make_physics = physics
+        self._log = log
         super().__init__(config)
+
+    def step(self, n: int = 1) -> None:
+        """As `Simulator.step`."""
+        super().step()
+        for _ in range(n - 1):
+            self.state()
+            super().step()
+
+    def state(self) -> RobotState:
+        """As `Simulator.state`; logged, as every reading is."""
+        state = super().state()
+        self._log(state)
+        return state
 
     def _make_actuator(self, seed: int) -> ActuatorModel:
         return HiddenDrives(self.config.actuator, self._make_physics(), DT, seed)
@@ -161,19 +184,35 @@ def _value(path: Path, name: str, value: Any) -> Any:
 
 
 def main() -> None:
-    """FILE, and then what ROS 2 wants."""
+    """FILE, and then what ROS 2 wants. The log of the joints goes to the topic joint_log."""
     import quadvel_dds
 
     quadvel_dds.install()
+    from quadvel_msgs.msg import LowState
+    from quadvel_nodes.messages import write_low_state
     from quadvel_nodes.node import run
     from quadvel_sim.sim_node import SimNode
+
+    class PlantNode(SimNode):
+        def __init__(self, physics: Callable[[], Physics]) -> None:
+            super().__init__(lambda config: Plant(config, physics, self._log_joints()))
+
+        def _log_joints(self) -> Callable[[RobotState], None]:
+            publisher = self.create_publisher(LowState, "joint_log", 10)
+
+            def log(state: RobotState) -> None:
+                message = LowState(stamp=self._stamp(state.time))
+                write_low_state(state, message)
+                publisher.publish(message)
+
+            return log
 
     path, *arguments = sys.argv[1:]
     try:
         physics = read_plant(Path(path))
     except ValueError as error:
         sys.exit(f"plant: {error}")
-    run(lambda: SimNode(lambda config: Plant(config, physics)), ["plant", *arguments])
+    run(lambda: PlantNode(physics), ["plant", *arguments])
 
 
 if __name__ == "__main__":

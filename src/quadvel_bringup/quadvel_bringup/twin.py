@@ -86,12 +86,17 @@ def _plant_file(plant: str) -> Path:
 
 
 def plant_nodes(file: Path, seed: int) -> dict[str, list[str]]:
-    """Command lines of the stack in lockstep, its simulator replaced by the plant, which reports at 1 kHz."""
-    stack = Stack(use_sim_time=True)
-    words = ["state_rate:=1000", f"seed:={seed}"]
-    arguments = stack.arguments()["sim_node"] + [word for each in words for word in ("-p", each)]
-    plant = [sys.executable, "-m", "quadvel_bringup.plant", str(file.resolve()), *arguments]
-    return {**stack.commands(), "sim_node": plant}
+    """Command lines of the stack in lockstep, its simulator replaced by the plant.
+
+    The nodes follow the states on `board/low_state`, 200 a second; `low_state` is the plant's log of each ms.
+    """
+    commands = Stack(use_sim_time=True).commands()
+    arguments = Stack(use_sim_time=True).arguments()["sim_node"]
+    commands["sim_node"] = [sys.executable, "-m", "quadvel_bringup.plant", str(file.resolve()), *arguments]
+    for name in ("sim_node", "estimator", "controller"):
+        commands[name] += ["-r", "low_state:=board/low_state"]
+    commands["sim_node"] += ["-r", "joint_log:=low_state", "-p", f"seed:={seed}"]
+    return commands
 
 
 def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
