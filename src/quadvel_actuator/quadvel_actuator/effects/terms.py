@@ -8,6 +8,7 @@ it was fitted. Signals are named as in the report: `q`, `dq`, `ddq`, `q_des`, `t
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any, ClassVar
@@ -34,7 +35,7 @@ def _array(values: Any) -> Array:
 
 
 @attrs.frozen(eq=False)
-class Shape:
+class Shape(ABC):
     """What is made of a signal: `columns` of a series, whose weighted sum is the term, or the sum itself, by steps."""
 
     kind: ClassVar[str]
@@ -43,26 +44,26 @@ class Shape:
     """the numbers that every column of the signal has its own of, (C,)"""
 
     @property
+    @abstractmethod
     def count(self) -> int:
         """Columns."""
-        raise NotImplementedError
 
     @property
     def penalty(self) -> Array:
         """What a fit adds to the columns' second moments, (K, K), in shares of the mean one."""
         return 1e-5 * np.eye(self.count)
 
+    @abstractmethod
     def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
         """Of a series (N, C) whose stretches begin at `start` (N,), rows `dt` s apart: (N, K, C)."""
-        raise NotImplementedError
 
     def rest(self, u: Array, dt: float) -> Memory:
         """The memory where `u` has not changed since ever."""
         return ()
 
+    @abstractmethod
     def advance(self, u: Array, dt: float, weights: Array, memory: Memory) -> tuple[Array, Memory]:
         """One step: the sum of columns times `weights` (K, J), and the new memory."""
-        raise NotImplementedError
 
     def at(self, columns: NDArray[np.intp]) -> Shape:
         """The shape for these columns of the signal."""
