@@ -83,6 +83,25 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     np.testing.assert_allclose(steps[:, 3], plain[:, 3], atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["coulomb_friction", "hysteresis", "load_dependent_friction"])
+def test_a_torque_added_at_the_joint_does_not_wait_for_the_output_delay(name):
+    t, q, dq, q_des = (x[..., :3] if np.ndim(x) > 1 else x for x in _motion())
+    effect = Effect(name, JOINTS, TRUTH[name] | {"at": "joint"})
+    gains = {"delta_kp": 0.0, "delta_kd": 0.0, "input_delay": 0.0}
+    truth = attrs.evolve(parameters([effect], **gains, output_delay=0.004, noise=0.0), joints=JOINTS)
+    model = ActuatorModel(truth, (3,))
+    steps = np.array([model.step(q[k], dq[k], q_des[k], 30.0, 0.5) for k in range(len(t))])
+
+    plain = 30.0 * (q_des - q) - 0.5 * dq
+    late = np.concatenate([np.repeat(plain[:1], 4, axis=0), plain[:-4]])
+    law = registry()[name](at="joint")
+    samples = Samples([Log("steps", JOINTS, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=steps)])
+    p = {parameter: np.full(3, TRUTH[name][parameter]) for parameter in law.names}
+    now = samples.at(0.0, 0.0, 0.0)
+    added = law.series(late, now, p) if name == "hysteresis" else law.torque(late, now, p)
+    np.testing.assert_allclose(steps[5:], (late + added)[5:], atol=1e-9)
+
+
 def test_every_law_has_a_truth_to_be_tested_with():
     assert set(TRUTH) == set(registry())
 

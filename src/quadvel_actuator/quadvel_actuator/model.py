@@ -2,7 +2,7 @@
 
     command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff
     asked torque --effects, if the parameters hold any--> clipped
-    asked torque --output delay--> + noise, clipped = torque on the joint
+    asked torque --output delay--> + effects at the joint + noise, clipped = torque on the joint
 
 The law is evaluated every step on the present joint state, with the command held between its updates. One
 model serves the simulator, the batch training and the identification.
@@ -207,11 +207,15 @@ class ActuatorModel:
         self._take_command(q_des, kp, kd, dq_des, tau_ff)
         asked = self._torques.push()
         self._asked_torque(q, dq, out=asked)
-        if self._any_new:
-            self._torques.hold(self._new)
-            self._new[...] = False
-            self._any_new = False
+        new = self._new if self._any_new else None
+        if new is not None:
+            self._torques.hold(new)
         torque = self._torques.read()
+        if self._effects is not None:
+            torque = self._effects.at_joint(torque, new)
+        if new is not None:
+            new[...] = False
+            self._any_new = False
         if self._noisy:
             torque += np.multiply(self._noise_std, self._next_noise(), out=self._scratch)
             self._clip(torque, out=torque)

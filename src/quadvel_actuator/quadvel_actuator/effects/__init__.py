@@ -9,12 +9,12 @@ from functools import cache
 from importlib.metadata import entry_points
 
 from . import commands, dynamics, elastic, friction, gains, limits
-from .base import AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Parameter, Stage, TorqueLaw
+from .base import DRIVE, JOINT, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Parameter, Stage, TorqueLaw
 
 GROUP = "quadvel.effects"
 
 __all__ = [
-    "AddedLaw", "EffectLaw", "ErrorLaw", "MemoryLaw", "Parameter", "Stage", "TorqueLaw", "registry",
+    "DRIVE", "JOINT", "AddedLaw", "EffectLaw", "ErrorLaw", "MemoryLaw", "Parameter", "Stage", "TorqueLaw", "registry",
 ]  # fmt: skip
 
 

@@ -37,6 +37,9 @@ class Stage(enum.IntEnum):
     """a torque beside it: friction, springs, coupling"""
 
 
+DRIVE, JOINT = "drive", "joint"
+
+
 class View(Protocol):
     """What a law may look at: `quadvel_actuator.identify.signals.Signals`, or one step of a running model."""
 
@@ -99,11 +102,13 @@ class EffectLaw(ABC):
     """on all joints together it is a deviation of a gain: at least one joint is free of it"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
+    at: str = attrs.field(default=DRIVE, kw_only=True, validator=attrs.validators.in_((DRIVE, JOINT)))
+    """where a torque is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[EffectLaw]:
-        """The forms of the law to try on the data `about` (`identify.model.Model`); none where they cannot act."""
-        return (cls(),)
+        """The forms of the law to try on the data `about` (`identify.candidates.About`); none where they cannot act."""
+        return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
 
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
@@ -112,8 +117,9 @@ class EffectLaw(ABC):
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What `configured` needs to make this form again."""
-        return attrs.asdict(self)
+        """What `configured` needs to make this form again: all that is not as usual."""
+        own = {field.name: (getattr(self, field.name), field.default) for field in attrs.fields(type(self))}
+        return {name: value for name, (value, usual) in own.items() if value != usual}
 
     @abstractmethod
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
@@ -126,6 +132,10 @@ class EffectLaw(ABC):
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""
         return p
+
+    def chance(self, p: Params, s: View) -> dict[str, Array]:
+        """Half widths (J,) of the 95 % intervals of parameters that count what happened at random."""
+        return {}
 
     def running(self, rng: np.random.Generator) -> EffectLaw:
         """The law as a running model has it; what happens at random is drawn from `rng`."""

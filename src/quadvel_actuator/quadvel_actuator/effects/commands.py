@@ -54,6 +54,11 @@ class CommandHold(ErrorLaw):
         old: Array = s.sent[np.maximum(s.packet - behind, 0), np.arange(s.q.shape[-1])]
         return np.where(behind > 0, e[0] + old - s.q_des, e[0]), e[1]
 
+    def chance(self, p: Params, s: View) -> dict[str, Array]:
+        """As of as many tosses as there were commands."""
+        share, count = p["share"], len(np.unique(s.packet))
+        return {"share": 2.0 * np.sqrt(share * (1.0 - share) / count) + 1.0 / count}
+
     def running(self, rng: np.random.Generator) -> _Losing:
         return _Losing(rng)
 

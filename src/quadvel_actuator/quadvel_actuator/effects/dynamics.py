@@ -8,7 +8,21 @@ from typing import Any
 import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
+from .base import (
+    DRIVE,
+    JOINT,
+    AddedLaw,
+    Array,
+    ErrorLaw,
+    Errors,
+    Memory,
+    MemoryLaw,
+    Parameter,
+    Params,
+    Stage,
+    Start,
+    View,
+)
 
 _FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
 _TIME = Parameter("T", "s", 0.0002, 0.1, 0.004)
@@ -115,7 +129,7 @@ class Armature(AddedLaw):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[Armature]:
-        return cls("ddq"), cls("ddq_smooth")
+        return tuple(cls(of=of, at=at) for of in ("ddq", "ddq_smooth") for at in (DRIVE, JOINT))
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

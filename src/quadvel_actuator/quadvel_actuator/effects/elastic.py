@@ -37,6 +37,10 @@ class TorqueOffset(AddedLaw):
         "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
     )
 
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[TorqueOffset]:
+        return (cls(),)
+
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]
 

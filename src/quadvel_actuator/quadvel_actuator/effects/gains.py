@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Stage, Start, TorqueLaw, View
+from .base import DRIVE, JOINT, AddedLaw, Array, EffectLaw, Parameter, Params, Stage, Start, TorqueLaw, View
 
 
 class GainAsymmetry(TorqueLaw):
@@ -135,12 +135,13 @@ class CrossCoupling(AddedLaw):
 
     @property
     def settings(self) -> dict[str, Any]:
-        return {"source": list(self.source)}
+        return {"source": list(self.source)} | ({} if self.at == DRIVE else {"at": self.at})
 
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
         source = tuple(settings["source"])
-        return cls(source, tuple(cls._column(one, joints) for one in source))
+        columns = tuple(cls._column(one, joints) for one in source)
+        return cls(source, columns, at=settings.get("at", DRIVE))
 
     @staticmethod
     def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:
@@ -155,7 +156,8 @@ class CrossCoupling(AddedLaw):
             return ()
         names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
         found = [names[k] for k in about.strongest_neighbour(("q", "dq", "measured"))]
-        return (cls(tuple(found), tuple(cls._column(one, joints) for one in found)),)
+        columns = tuple(cls._column(one, joints) for one in found)
+        return tuple(cls(tuple(found), columns, at=at) for at in (DRIVE, JOINT))
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

@@ -16,8 +16,28 @@ LOST, STILL_LOST, LATE = 6.0, 3.0, 4.0
 """nats: the first command lost, one more in a row, one that takes effect between two sendings"""
 
 
+def suspicious(model: Model, noise: Array, least: float) -> bool:
+    """Do more than `least` of the commands look lost or late, each on its own? If not, the search finds nothing."""
+    s = model.signals
+    gain = np.where(model.samples.judged, -np.diff(_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
+    gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all together
+    first = np.flatnonzero(np.diff(s.packet[:, 0], prepend=-1))
+    total = np.cumsum(gain, axis=0)
+    most = np.maximum.reduceat(total, first) - total[first] + gain[first]
+    return bool(((most > LOST).mean(axis=0) > least).any())
+
+
 def backlog(model: Model, noise: Array, most: int, together: bool) -> NDArray[np.intp]:
     """By how many commands, 0 to `most`, the drive is behind at each row: (N, 1), or (N, J) unless `together`."""
+    emission = _costs(model, noise, most)
+    if together:
+        emission = emission.sum(axis=1, keepdims=True)
+    packet = model.signals.packet[:, 0]
+    return _likeliest(emission, np.diff(packet, prepend=packet[0]).tolist())
+
+
+def _costs(model: Model, noise: Array, most: int) -> Array:
+    """How little each row agrees with a drive that is 0 to `most` commands behind, nats, (N, J, most + 1)."""
     s = model.signals
     left = np.where(model.samples.judged, model.samples.tau - model.predict(), 0.0)
     stiffness = model.gains[0] * s.kp
@@ -27,11 +47,7 @@ def backlog(model: Model, noise: Array, most: int, together: bool) -> NDArray[np
         old = s.sent[np.maximum(s.packet - behind, 0), joint]
         change = stiffness * (old - s.q_des) if behind else 0.0
         cost.append(np.where(model.samples.judged, (left - change) ** 2 / (2.0 * noise), 0.0))
-    emission = np.stack(cost, axis=-1)  # (N, J, M)
-    if together:
-        emission = emission.sum(axis=1, keepdims=True)
-    new = np.diff(s.packet[:, 0], prepend=s.packet[0, 0])
-    return _likeliest(emission, new.tolist())
+    return np.stack(cost, axis=-1)
 
 
 def _likeliest(emission: Array, new: list[int]) -> NDArray[np.intp]:

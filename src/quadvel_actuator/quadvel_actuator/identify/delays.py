@@ -9,9 +9,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from ..effects import MemoryLaw
 from .eam import LONGEST_INPUT, LONGEST_OUTPUT
-from .model import Model, Slots, fit, gather, jacobian, pack, step, with_slots
+from .model import Model, Slots, gather, jacobian, pack, step, with_slots
 from .signals import Array, Bools
 
 SLOPE = 0.0003
@@ -19,7 +18,8 @@ SLOPE = 0.0003
 
 _DAMPING = (1e-6, 1e-2, 1.0)
 _SETTLED = 2e-5
-_BOUNDS = (2 * LONGEST_INPUT, 2 * LONGEST_OUTPUT)
+LONGEST = (LONGEST_INPUT, LONGEST_OUTPUT)
+"""s, input and output delay at most"""
 
 
 def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
@@ -35,7 +35,7 @@ def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
     both = np.stack(extra).transpose(2, 0, 1)
     groups = model.delay_groups
     index = np.stack([slots.count + groups, slots.count + int(groups.max()) + 1 + groups])
-    bound = np.broadcast_to(np.array(_BOUNDS)[:, None], index.shape)
+    bound = np.broadcast_to(np.array(LONGEST)[:, None], index.shape)
     wider = attrs.evolve(
         slots,
         index=np.concatenate([slots.index, index]),
@@ -49,7 +49,7 @@ def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
 
 def _at(model: Model, which: int, by: float) -> Model:
     delays = [model.input_delay, model.output_delay]
-    delays[which] = np.maximum(delays[which] + by, 0.0)
+    delays[which] = np.clip(delays[which] + by, 0.0, LONGEST[which])
     return model.with_delays(*delays)
 
 
@@ -64,39 +64,17 @@ def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
         hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
         gradient = gather(slots, np.einsum("jan,nj->ja", slopes, left))
         theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
-        tries = []
+        better = None
         for damping in _DAMPING:
             after = step(slots, theta, hessian, gradient, damping)
-            tries.append(
-                with_slots(model, after[:-2]).with_delays(np.round(after[-2], 7), np.round(after[-1], 7))
-            )
-        errors = [one.error(rows) for one in tries]
-        best = int(np.argmin(errors))
-        if not errors[best] < error:
+            tried = with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
+            found = tried.error(rows)
+            if found < error:
+                better = tried
+                break
+        if better is None:
             break
-        model = tries[best]
-        if errors[best] > error * (1.0 - _SETTLED):
+        model = better
+        if found > error * (1.0 - _SETTLED):
             break
     return attrs.evolve(model, samples=whole, applied=tuple(one.tidied() for one in model.applied))
-
-
-_TOTALS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006)  # s, about the present sum of both delays
-_OUTPUTS = (0.0, 0.0015, 0.003, 0.0045)  # s
-
-
-def fit_anew(model: Model, rows: Bools) -> Model:
-    """Like `fit_with_delays`, but from the best pair of a coarse grid: an effect just found may have moved them far.
-
-    With laws that have a memory, which are slow, it starts from the present pair alone.
-    """
-    whole, model, rows = model.samples, *model.reaching(rows)
-    tries = [model]
-    if not any(isinstance(one.law, MemoryLaw) for one in model.applied):
-        total = model.input_delay + model.output_delay
-        for change in _TOTALS:
-            for output in _OUTPUTS:
-                if (total + change >= output).all():
-                    at = model.with_delays(np.round(total + change - output, 7), np.full(len(total), output))
-                    tries.append(fit(at, rows, 1))
-    best = fit_with_delays(min(tries, key=lambda one: one.error(rows)), rows)
-    return attrs.evolve(best, samples=whole)

@@ -12,10 +12,11 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, Started, propose, start
-from .delays import fit_anew, fit_with_delays
+from .candidates import About, Candidate, propose, started
+from .delays import fit_with_delays
 from .judging import Judge
-from .model import Model, fit
+from .model import Model
+from .screening import Started
 from .sharing import pooled, regroupings
 from .signals import Array
 
@@ -29,10 +30,12 @@ MOST = 5
 """Effects of one log at most."""
 
 _FITTED = 5
-_PROMISING = 0.5  # of the most promising law: so much, or among the first few, and a law is fitted further
+_PROMISING = (
+    0.5  # of the most promising law: so much, or among the first few and quick, and a law is fitted further
+)
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
-_TIES = 3
+_TIES = 3  # names beside the first one's
 
 Tick = Callable[[str], None]
 
@@ -81,7 +84,6 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         best, tied = _choice(candidates, judge, noise)
         model = best.model
         ties.append(tied)
-        model = fit_anew(model, judge.fit)
     model, ties = _pruned(model, ties, judge, noise)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
@@ -96,18 +98,19 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
     """
     idle: dict[str, Rejected] = {}
     best: dict[str, Candidate] = {}
-    started: list[Started] = []
+    looked: list[Started] = []
     taken = {one.law.name for one in about.model.applied}
     for name, law in registry().items():
         tick(f"{what}: {name}")
         if name in taken:
             continue
         idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
-        started += [one for one in (start(about, form) for form in law.variants(about)) if one is not None]
-    started.sort(key=lambda one: -one.promise)
-    for k, first in enumerate(started):
+        looked += [one for one in (started(about, form) for form in law.variants(about)) if one is not None]
+    looked.sort(key=lambda one: -one.promise)
+    for k, first in enumerate(looked):
         name = first.law.name
-        if k >= _FITTED and first.promise < _PROMISING * started[0].promise:
+        costly = k >= _FITTED or first.law.remembers
+        if costly and first.promise < _PROMISING * looked[0].promise:
             idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
             continue
         tick(f"{what}: {name}, fitted")
@@ -160,7 +163,7 @@ def _choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tupl
     for one in equal[1:]:
         if size[one.name] < size[chosen.name] and best.gain - one.gain < 0.01 * float(noise.mean()):
             chosen = one
-    return chosen, tuple(one.name for one in equal if one is not chosen)[: _TIES - 1]
+    return chosen, tuple(one.name for one in equal if one is not chosen)[:_TIES]
 
 
 def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool:
@@ -191,8 +194,7 @@ def _pruned(
 
 def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
     """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
-    shifts = model.applied[index].law.shifts
-    less = (fit_with_delays if shifts else fit)(model.without(index), judge.fit, 4)
+    less = fit_with_delays(model.without(index), judge.fit, 4)
     found = judge.compare(less.samples.tau - less.predict(), model.samples.tau - model.predict())
     return found.gain, found.p_any, less
 

@@ -55,7 +55,11 @@ def intervals(model: Model, judge: Judge) -> Intervals:
     wide = np.where(slots.index >= 0, half[slots.index], 0.0)
     effects, first = [], 2
     for one in model.applied:
-        effects.append(wide[first : first + len(one.law.parameters)])
+        mine = wide[first : first + len(one.law.parameters)]
+        random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
+        effects.append(
+            np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
+        )
         first += len(one.law.parameters)
     return Intervals(wide[:2], tuple(effects), wide[-2:], _on_bound(model))
 

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import EffectLaw, MemoryLaw, Stage
+from ..effects import DRIVE, EffectLaw, MemoryLaw, Stage
 from .signals import Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
@@ -108,7 +108,8 @@ class Model:
         for one, value in todo:
             if one.law.stage == Stage.ADDED:
                 law, p = one.law, one.part(value)
-                extra = law.series(x, s, p) if isinstance(law, MemoryLaw) else law.torque(x, s, p)  # type: ignore[attr-defined]
+                seen = s if law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
+                extra = law.series(x, seen, p) if isinstance(law, MemoryLaw) else law.torque(x, seen, p)  # type: ignore[attr-defined]
                 total = total + (extra if one.active.all() else extra * one.active)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *s.q.shape))

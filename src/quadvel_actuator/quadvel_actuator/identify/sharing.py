@@ -31,6 +31,8 @@ def regroupings(model: Model, judge: Judge) -> Iterator[tuple[str, Model]]:
     joints = model.samples.joints
     each = np.arange(len(joints))
     for word, groups in (("kind", kinds(joints)), ("joint", each)):
+        if word == "kind" and len(np.unique(groups)) == len(joints):
+            continue
         if len(np.unique(groups)) > len(np.unique(model.gain_groups[0])):
             yield (
                 f"gains per {word}",

@@ -187,6 +187,7 @@ class Samples:
         self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
+        self._every = 1
         self._cache: dict[tuple[float, float, float], Signals] = {}
         self._parts: dict[int, Samples] = {}
         self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
@@ -217,6 +218,18 @@ class Samples:
             self._parts[count] = part
         return self._parts[count]
 
+    def thinned(self, every: int) -> tuple[Samples, NDArray[np.intp]]:
+        """One row of `every` of each log, and which these are; `dt` and `start` of the rows are those they had."""
+        lengths = np.diff(np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1)))
+        firsts = np.cumsum([0, *lengths[:-1]])
+        rows = np.concatenate([np.arange(a, a + n, every) for a, n in zip(firsts, lengths, strict=True)])
+        part = copy(self)
+        for name in ("log_of_row", "t", "tau", "start", "dt", "judged"):
+            setattr(part, name, getattr(self, name)[rows])
+        part._every = every
+        part._cache, part.kept, part._parts = {}, {}, {}
+        return part, rows
+
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
         delays = np.broadcast_arrays(np.atleast_1d(input_delay), np.atleast_1d(output_delay))
@@ -242,7 +255,7 @@ class Samples:
         parts: dict[str, list[Array]] = {}
         packets = []
         for one, first in zip(self.logs, self._first_packet, strict=False):
-            at = _double(one.log.t) - output_delay
+            at = _double(one.log.t)[:: self._every] - output_delay
             for name in one.states:
                 parts.setdefault(name, []).append(
                     one.state(name, at - SMOOTH_LATE if name == "ddq_smooth" else at)

@@ -1,0 +1,277 @@
+"""Where to fit a law from: many guesses of its parameters at several pairs of delays, looked at cheaply.
+
+An effect that the model lacks bends the delays and gains that were fitted without it. Each law is therefore looked at
+over a grid of delays; between its points, and for the gains, slopes stand in, shared by the joints as the model has it.
+Every joint takes the guess that suits it best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import attrs
+import numpy as np
+
+from ..effects import EffectLaw, Parameter
+from .delays import LONGEST
+from .eam import pd_torque
+from .judging import Judge
+from .model import Applied, Model
+from .signals import Array, Bools
+
+_BATCH = 8  # guesses evaluated at once
+_ENOUGH = 1200  # rows that laws without memory are looked at on
+_GAIN_STEP = 0.01
+_DELAY_STEP = 0.0003  # s
+_OUTPUTS = (0.0005, 0.002, 0.0035, 0.005)  # s, output delays, the sum of both delays being kept
+_EXCHANGED = ((0.0, 0.0), (0.003, -0.003), (-0.003, 0.003))
+"""s, of input and output delay, for laws that have to be run row by row"""
+_SHORTENED = ((0.0, -0.003), (-0.004, 0.0), (-0.007, 0.0))
+"""besides, for those that look like a delay"""
+
+_PROMISE = 0.015
+"""Of the noise: a law that takes less off the fitted error of every joint is not tried further."""
+
+_ROUNDS = 3
+_FARTHEST = 0.002  # s, that slopes along the delays are followed
+
+
+@attrs.frozen(eq=False)
+class Started:
+    """A law on a model at the best of its guesses, the rest of the model as the slopes have it."""
+
+    law: EffectLaw
+    model: Model
+    promise: float
+    """what it takes off the squared error of the fitted rows, each joint's in units of its noise"""
+
+
+class Ground:
+    """The model that laws are looked at on, and its rows: all of them, or few where no memory needs the others."""
+
+    def __init__(self, model: Model, judge: Judge, noise: Array) -> None:
+        self.model, self.noise = model, noise
+        self._whole = model.reaching(judge.fit)
+        every = max(1, int(judge.fit.any(axis=1).sum()) // _ENOUGH)
+        few, rows = self._whole[0].samples.thinned(every)
+        self.few = attrs.evolve(self._whole[0], samples=few), self._whole[1][rows]
+        self._bare: dict[bool, tuple[Array, int]] = {}
+
+    def at(self, law: EffectLaw) -> tuple[Model, Bools]:
+        """The model and the rows that `law` is looked at on."""
+        return self._whole if self.thorough(law) else self.few
+
+    def thorough(self, law: EffectLaw) -> bool:
+        """Are all rows needed?"""
+        return law.remembers or any(one.law.remembers for one in self.model.applied)
+
+    def bare(self, law: EffectLaw) -> tuple[Array, int]:
+        """Error (J,) of the model without the law on these rows, at its best delays, and how many rows one stands for."""
+        key = self.thorough(law)
+        if key not in self._bare:
+            model, rows = self.at(law)
+            every = pairs(model, _EXCHANGED if key else None)
+            tried = [_Screen(at, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for at in every]
+            self._bare[key] = (
+                min(tried, key=lambda error: float(error.sum())),
+                round(self._whole[1].sum() / max(rows.sum(), 1)),
+            )
+        return self._bare[key]
+
+
+def pairs(model: Model, moves: Sequence[tuple[float, float]] | None) -> Iterator[Model]:
+    """The model at every pair of delays that is tried: so much from the present ones, or a grid of output delays."""
+    i, o = model.input_delay, model.output_delay
+    if moves is not None:
+        tried = [(i + a, o + b) for a, b in moves]
+    else:
+        tried = [(i, o), *((i + o - at, np.full_like(o, at)) for at in _OUTPUTS)]
+    for a, b in tried:
+        if (a > -1e-9).all() and (b > -1e-9).all() and (a <= LONGEST[0]).all() and (b <= LONGEST[1]).all():
+            yield model.with_delays(np.round(np.maximum(a, 0.0), 7), np.round(np.maximum(b, 0.0), 7))
+
+
+def start(ground: Ground, law: EffectLaw, starts: Sequence[dict[str, Array | float]]) -> Started | None:
+    """The law at the best of `starts`, chosen for each joint; None where that takes nothing off the error."""
+    if not starts:
+        return None
+    model, rows = ground.at(law)
+    joints = rows.shape[1]
+    table = np.array(
+        [[_within(one.get(p.name, p.scale), p, joints) for p in law.parameters] for one in starts]
+    )
+    empty = Applied(law, np.ones(joints, dtype=bool), table[0], np.arange(joints))
+    best: Model | None = None
+    lowest = np.full(joints, np.inf)
+    moves = (*_EXCHANGED, *(_SHORTENED if law.shifts else ())) if ground.thorough(law) else None
+    for at in pairs(model, moves):
+        found, error = _Screen(at.plus(empty), law, rows).best(table)
+        if error.sum() < lowest.sum():
+            lowest, best = error, found
+    bare, weight = ground.bare(law)
+    promise = (bare - lowest) / ground.noise
+    count = np.maximum(rows.sum(axis=0), 1)
+    if best is None or not (promise / count).max() > _PROMISE:
+        return None
+    return Started(law, attrs.evolve(best, samples=ground.model.samples), weight * float(promise.sum()))
+
+
+def _within(value: Array | float, parameter: Parameter, joints: int) -> Array:
+    return np.broadcast_to(value, joints).clip(parameter.low, parameter.high)
+
+
+class _Screen:
+    """Least squares of one model, its last effect being `law` if there is one, for many guesses of its parameters.
+
+    Unknown are the law's linear parameters, of each joint, and gains and delays, shared as the model shares them.
+    """
+
+    def __init__(self, model: Model, law: EffectLaw | None, rows: Bools) -> None:
+        self.model, self.rows = model, rows
+        self.others = model.applied[:-1] if law else model.applied
+        self.linear = [law.names.index(name) for name in getattr(law, "linear", ())] if law else []
+        self.bounds = (
+            np.array([(law.parameters[k].low, law.parameters[k].high) for k in self.linear]) if law else None
+        )
+        groups = np.concatenate([model.gain_groups, np.tile(model.delay_groups, (2, 1))])
+        offsets = np.cumsum([0, *(int(one.max()) + 1 for one in groups)])
+        self.index, self.count = groups + offsets[:4, None], int(offsets[4])
+        moved = np.repeat(model.gains[None], 3, axis=0)
+        moved[1, 0] += _GAIN_STEP
+        moved[2, 1] += _GAIN_STEP
+        self.moved = moved
+        delays = np.stack([model.input_delay, model.output_delay])
+        at, *later = (
+            pd_torque(model.samples, model.gains, *(delays + by), model.window)
+            for by in ([[0.0], [0.0]], [[_DELAY_STEP], [0.0]], [[0.0], [_DELAY_STEP]])
+        )
+        self.slopes = [(one - at) / _DELAY_STEP for one in later]
+
+    def best(self, table: Array) -> tuple[Model, Array]:
+        """The model at the best of `table` (guesses, P, J) for each joint, and its squared error (J,)."""
+        parts = [self._products(one) for one in np.split(table, range(_BATCH, len(table), _BATCH))]
+        free = _Quadratic.of(*(np.concatenate(one) for one in zip(*parts, strict=True)), len(self.linear))
+        joint = np.arange(table.shape[2])
+        chosen = np.argmin(free.alone(), axis=0)
+        outside = np.zeros(free.error.shape, dtype=bool)
+        for _ in range(_ROUNDS):
+            off = outside[chosen, joint]
+            hessian = np.where(off[:, None, None], free.plain[2][chosen, joint], free.hessian[chosen, joint])
+            gradient = np.where(off[:, None], free.plain[1][chosen, joint], free.gradient[chosen, joint])
+            change = self._shared(hessian, gradient)
+            error, values, outside = free.at(change, self.bounds)
+            chosen = np.argmin(error, axis=0)
+        best = table[chosen, :, joint].T.copy()
+        best[self.linear] = values[chosen, joint].T
+        return self._moved_by(change, best), error[chosen, joint]
+
+    def _shared(self, hessian: Array, gradient: Array) -> Array:
+        """The change (4, J) of gains and delays that lessens the error of all joints most."""
+        total, right = np.zeros((self.count, self.count)), np.zeros(self.count)
+        for at, one, g in zip(self.index.T, hessian, gradient, strict=True):
+            total[np.ix_(at, at)] += one
+            right[at] += g
+        size = np.diagonal(total)
+        change = np.linalg.solve(total + np.diag(1e-6 * size + 1e-12), right)[self.index]
+        change[2:] = np.clip(change[2:], -_FARTHEST, _FARTHEST)
+        return change
+
+    def _moved_by(self, change: Array, values: Array) -> Model:
+        """The model with gains and delays changed by (4, J) and these values of the last effect."""
+        model = self.model
+        delays = np.round(
+            np.clip(
+                [model.input_delay + change[2], model.output_delay + change[3]],
+                0.0,
+                np.array(LONGEST)[:, None],
+            ),
+            7,
+        )
+        applied = (
+            *self.others,
+            *(attrs.evolve(one, values=values) for one in model.applied[len(self.others) :]),
+        )
+        return attrs.evolve(model, gains=model.gains + change[:2], applied=applied).with_delays(*delays)
+
+    def _products(self, values: Array) -> tuple[Array, Array, Array]:
+        """Of each guess (B, P, J) and joint: products of the columns (B, J, M, M), with the target, and of the target."""
+        zero = values.copy()
+        zero[:, self.linear] = 0.0
+        bases = zero[:1] if self.linear else zero
+        torque = self._run(np.repeat(bases, 3, axis=0), np.tile(self.moved, (len(bases), 1, 1)))
+        base = torque[::3]
+        gains = [(torque[k::3] - base) / _GAIN_STEP for k in (1, 2)]
+        columns = []
+        for one in self.linear:
+            unit = zero.copy()
+            unit[:, one] = 1.0
+            columns.append(self._run(unit, self.model.gains[None]) - base)
+        found = []
+        for b in range(len(values)):
+            every = [one[min(b, len(one) - 1)] for one in (*columns, *gains)] + self.slopes
+            every.append(self.model.samples.tau - base[min(b, len(base) - 1)])
+            wide = np.ascontiguousarray((np.stack(every) * self.rows).transpose(2, 0, 1))  # (J, M + 1, N)
+            found.append(wide @ wide.transpose(0, 2, 1))
+        gram = np.stack(found)
+        return gram[..., :-1, :-1], gram[..., :-1, -1], gram[..., -1, -1]
+
+    def _run(self, values: Array, gains: Array) -> Array:
+        """Torque (B, N, J) of a batch of values (B, P, J) of the last effect and of gains, as many or one."""
+        batch = [np.repeat(one.values[None], max(len(values), len(gains)), axis=0) for one in self.others]
+        mine = [values] if len(self.others) < len(self.model.applied) else []
+        return self.model.evaluate(np.broadcast_to(gains, (len(values), *gains.shape[1:])), [*batch, *mine])
+
+
+@attrs.frozen(eq=False)
+class _Quadratic:
+    """The squared error of each guess and joint over a change d (4,) of gains and delays: e - 2 g d + d H d.
+
+    The linear parameters are at their best, la - LX d, or 0 where that is outside of their bounds (then `plain`).
+    """
+
+    error: Array  # (S, J)
+    gradient: Array  # (S, J, 4)
+    hessian: Array  # (S, J, 4, 4)
+    local: Array  # (S, J, K)
+    follows: Array  # (S, J, K, 4)
+    plain: tuple[Array, Array, Array]
+
+    @classmethod
+    def of(cls, gram: Array, right: Array, square: Array, count: int) -> _Quadratic:
+        """`count` linear parameters come first among the columns."""
+        mine, cross, rest = gram[..., :count, :count], gram[..., :count, count:], gram[..., count:, count:]
+        size = np.einsum("sjkk->sjk", mine)
+        mine = mine + np.eye(count) * (1e-8 * size[..., None] + 1e-12)
+        local = np.linalg.solve(mine, right[..., :count, None])[..., 0]
+        follows = np.linalg.solve(mine, cross)
+        back = cross.swapaxes(-1, -2)
+        plain = square, right[..., count:], rest
+        return cls(
+            square - np.einsum("sjk,sjk->sj", right[..., :count], local),
+            right[..., count:] - (back @ local[..., None])[..., 0],
+            rest - back @ follows,
+            local,
+            follows,
+            plain,
+        )
+
+    def alone(self) -> Array:
+        """Error (S, J) with a change for each joint."""
+        size = np.einsum("sjkk->sjk", self.hessian)
+        ridged = self.hessian + np.eye(4) * (1e-6 * size[..., None] + 1e-12)
+        best = np.linalg.solve(ridged, self.gradient[..., None])[..., 0]
+        error: Array = self.error - np.einsum("sjk,sjk->sj", self.gradient, best)
+        return error
+
+    def at(self, change: Array, bounds: Array | None) -> tuple[Array, Array, Bools]:
+        """With the change (4, J): error (S, J), linear parameters (S, J, K), and where these would be out of bounds."""
+        d = change.T
+        values = self.local - np.einsum("sjka,ja->sjk", self.follows, d)
+        outside = np.zeros(self.error.shape, dtype=bool)
+        if bounds is not None and len(bounds):
+            outside = ((values < bounds[:, 0]) | (values > bounds[:, 1])).any(axis=-1)
+        error, plain = (
+            e - 2.0 * np.einsum("sja,ja->sj", g, d) + np.einsum("ja,sjab,jb->sj", d, h, d)
+            for e, g, h in ((self.error, self.gradient, self.hessian), self.plain)
+        )
+        return np.where(outside, plain, error), np.where(outside[..., None], 0.0, values), outside
