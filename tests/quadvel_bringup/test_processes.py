@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
@@ -133,30 +132,6 @@ with ProcessGroup(lambda name, line: None) as group:
     assert parent.returncode == -signal.SIGKILL
     child = Path("/proc") / parent.stdout.strip()
     wait_until(lambda: not (child / "cmdline").exists() or not (child / "cmdline").read_bytes())
-
-
-@pytest.mark.parametrize(("seconds", "code"), [(60, 130), (0, 3)])
-def test_an_attended_command_hears_ctrl_c_once(seconds: int, code: int) -> None:
-    talking = COUNTING.replace("sys.exit(7)", "print('once', flush=True); sys.exit(7)")
-    talking = talking.replace(
-        'print("up")\ntime.sleep(60)', f'print("up", flush=True)\ntime.sleep({seconds})'
-    )
-    program = f"""
-import sys
-from quadvel_bringup.processes import run_attended
-sys.exit(run_attended([sys.executable, "-c", {talking + "sys.exit(3)"!r}]))
-"""
-    ours = subprocess.Popen(
-        [sys.executable, "-c", program], stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
-    assert ours.stdout is not None
-    with ours.stdout as lines:
-        assert lines.readline() == "up\n"
-        if seconds:
-            os.killpg(ours.pid, signal.SIGINT)  # as a terminal does
-        rest = lines.read()
-    assert ours.wait(20.0) == code
-    assert rest == ("once\n" if seconds else "")
 
 
 def _alone(program: str) -> None:

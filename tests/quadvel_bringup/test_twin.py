@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
+from rich.console import Console
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup import plant as plant_module
 from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
-from quadvel_bringup.twin import PLANTS, SHIPPED, plant_nodes
+from quadvel_bringup.twin import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
 from quadvel_bringup.twin_page import decision, twin_page
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
@@ -206,3 +208,14 @@ def test_a_file_that_is_no_plant_ends_its_process_in_one_sentence(tmp_path: Path
     assert ended.returncode == 1
     assert ended.stderr.startswith(f"plant: {file}: kind: found 'rust'")
     assert ended.stderr.count("\n") == 1
+
+
+def test_a_plant_that_cannot_be_identified_is_named_with_the_reason(tmp_path: Path) -> None:
+    for walk in WALKS:
+        (tmp_path / f"{walk}.mcap").write_text("no recording")
+    said = Console(record=True, soft_wrap=True)
+    with pytest.raises(typer.Exit) as ended:
+        _identify({"rusty": tmp_path}, said)
+    assert ended.value.exit_code == 2
+    assert re.search(r"rusty was not identified: quadvel: .*walk_1\.mcap", said.export_text())
+    assert {path.name for path in tmp_path.iterdir()} == {f"{walk}.mcap" for walk in WALKS}

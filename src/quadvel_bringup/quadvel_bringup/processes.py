@@ -120,21 +120,6 @@ class StopSignals:
             signal.signal(number, handler)
 
 
-def run_attended(command: Sequence[str]) -> int:
-    """Run a command on our terminal to its end and return its exit code.
-
-    Ctrl-C reaches it through us alone and once; then the exit code says that a signal ended it, whatever it says.
-    """
-    with StopSignals() as signals:
-        process = subprocess.Popen(command, start_new_session=True, preexec_fn=_before_exec)
-        while process.poll() is None and not signals.wait(0.2):
-            pass
-        if signals.received:
-            process.send_signal(signal.SIGINT)
-        code = process.wait()
-    return 128 + signals.received if signals.received else code
-
-
 def _before_exec() -> None:
     """Runs in the child: hold SIGINT back, and have the kernel send SIGTERM when the parent is gone."""
     signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)

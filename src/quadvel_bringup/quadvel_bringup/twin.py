@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -17,6 +17,7 @@ import attrs
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
@@ -27,16 +28,17 @@ from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import output_folder, replacing, write_json
 from quadvel_eval.segments import Segment, rounded
 
-from .processes import run_attended
-from .scripted_walk import ScriptedWalk
+from .processes import ProcessGroup, StopSignals
+from .scripted_walk import LOOK, ScriptedWalk
 from .stack import Stack
-from .twin_page import ROWS, twin_page
+from .twin_page import ROWS, decision, twin_page
 
 PLANTS = Path(__file__).parent / "config" / "plants"
 SHIPPED = ("dry_gears", "slow_current", "chafing_cable")
 SCRIPT = "circuit"
 WALKS = ("walk_1", "walk_2")
 """The first is fitted, the second is held out; they differ in the seed of the noise."""
+CORRECTED = Path("identify") / "actuator.yaml"
 SEEDS = (0, 1)  # of the model's walks
 SCHEMA = 1
 
@@ -59,23 +61,23 @@ def twin_command(
       quadvel twin dry_gears --out out/twin
       quadvel twin my_plant.yaml
     """
-    files = [_plant_file(plant) for plant in plants or SHIPPED]
+    files = {file.stem: file for file in map(_plant_file, plants or SHIPPED)}
     folder, console = output_folder(out), Console(soft_wrap=True)
-    results = []
-    for file in files:
-        console.rule(file.stem)
-        here = output_folder(folder / file.stem)
+    folders = {name: output_folder(folder / name) for name in files}
+    for name, file in files.items():
         for seed, walk in enumerate(WALKS):
-            if not (reuse and (here / f"{walk}.mcap").exists()):
-                console.print(f"walk {seed + 1} of {len(WALKS)}")
-                _walk(file, here / f"{walk}.mcap", seed, console)
-        _identify(here)
-        results.append({"name": file.stem, **judge(here, console)})
-        console.print(_table(results[-1]))
+            recording = folders[name] / f"{walk}.mcap"
+            if not (reuse and recording.exists()):
+                console.rule(f"{name}: walk {seed + 1} of {len(WALKS)}")
+                _walk(file, recording, seed, console)
+    _identify(folders, console)
+    results = judge(folders, console)
+    for result in results:
+        console.print(_table(result))
     write_json(folder / "twin.json", {"schema": SCHEMA, "plants": results})
     with replacing(folder / "twin.html") as draft:
         draft.write_text(twin_page(results), encoding="utf-8")
-    console.print(f"written to {folder}: twin.html, twin.json")
+    console.print(f"{decision(results)}\nwritten to {folder}: twin.html, twin.json", highlight=False)
 
 
 def _plant_file(plant: str) -> Path:
@@ -108,12 +110,32 @@ def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
             raise typer.Exit(1)
 
 
-def _identify(folder: Path) -> None:
-    """`quadvel identify` on the recordings, as a process that sees nothing else."""
-    fitted, held_out = (str(folder / f"{walk}.mcap") for walk in WALKS)
-    line = ["identify", fitted, "--holdout", held_out, "--out", str(folder / "identify")]
-    if code := run_attended([sys.executable, "-m", "quadvel_bringup", *line]):
-        raise typer.Exit(code)
+def _identify(folders: Mapping[str, Path], console: Console) -> None:
+    """`quadvel identify` on the recordings of every plant, as processes that see nothing else.
+
+    Ends with an exit code where one of them fails or a signal comes; reports that are there stay as they were.
+    """
+    lines: dict[str, list[str]] = {name: [] for name in folders}
+    columns = (TextColumn("identifying"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    bar = Progress(*columns, console=console)
+    with StopSignals() as signals, bar, ProcessGroup(lambda name, line: lines[name].append(line)) as group:
+        task = bar.add_task("", total=len(folders))
+        for name, folder in folders.items():
+            fitted, held_out = (str(folder / f"{walk}.mcap") for walk in WALKS)
+            line = ["identify", fitted, "--holdout", held_out, "--out", str(folder / "identify")]
+            one_thread = {"OMP_NUM_THREADS": "1"}  # they share the cores among them
+            group.start(name, [sys.executable, "-m", "quadvel_bringup", *line], one_thread)
+        ended: dict[str, int] = {}
+        while len(ended) < len(folders) and not any(ended.values()) and not signals.wait(LOOK):
+            ended = group.ended()
+            bar.update(task, completed=len(ended))
+    if signals.received:
+        raise typer.Exit(128 + signals.received)
+    for name, code in ended.items():
+        if code:
+            reason = lines[name][-1] if lines[name] else f"exit code {code}"
+            console.print(f"[bold red]{name} was not identified: {escape(reason)}")
+            raise typer.Exit(code)
 
 
 @attrs.frozen(eq=False)
@@ -138,16 +160,25 @@ def read_walk(path: Path) -> Walked:
     return Walked(recording, replay.read_joints(path), moving, segments)
 
 
-def judge(folder: Path, console: Console) -> dict[str, Any]:
-    """What the stack's model and the corrected one make of the plant's walks: an entry of `twin.json`."""
+def judge(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]:
+    """What the stack's model and the corrected one make of the plants' walks: the entries of `twin.json`."""
+    walks = {name: [read_walk(folder / f"{walk}.mcap") for walk in WALKS] for name, folder in folders.items()}
+    calls: list[Call] = []
+    for name, folder in folders.items():
+        commands = [(velocity, stop - start) for start, stop, velocity in walks[name][1].stretches]
+        for model in (ActuatorParameters.default(), ActuatorParameters.load(folder / CORRECTED)):
+            calls += [(replay.predicted_tracking, model, commands, seed) for seed in SEEDS]
+            calls.append((_replayed, model, folder / f"{WALKS[1]}.mcap"))
+    answers = iter(_answers(calls, console))
+    return [_entry(name, folder, walks[name], answers) for name, folder in folders.items()]
+
+
+def _entry(name: str, folder: Path, walks: Sequence[Walked], answers: Iterator[Any]) -> dict[str, Any]:
+    """A plant's entry. answers: of the calls that `judge` made for it, in their order."""
     report = json.loads((folder / "identify" / "report.json").read_text())
-    models = {
-        "before": ActuatorParameters.default(),
-        "after": ActuatorParameters.load(folder / "identify" / "actuator.yaml"),
-    }
-    walks = [read_walk(folder / f"{walk}.mcap") for walk in WALKS]
     plant = _average([walk.segments for walk in walks])
     entry: dict[str, Any] = {
+        "name": name,
         "decision": report["decision"],
         "effects": [effect["name"] for effect in report["effects"]],
         "unexplained": report["unexplained"],
@@ -156,23 +187,17 @@ def judge(folder: Path, console: Console) -> dict[str, Any]:
         "segments": [{"command": rounded(s.command), "plant": rounded(s.mean)} for s in plant],
         "repeat": _gap(walks[0].segments, walks[1].segments),
     }
-    commands = [(velocity, stop - start) for start, stop, velocity in walks[1].stretches]
-    calls: list[Call] = []
-    for model in models.values():
-        calls += [(replay.predicted_tracking, model, commands, seed) for seed in SEEDS]
-        calls.append((_replayed, model, folder / f"{WALKS[1]}.mcap"))
-    answers = _answers(calls, console)
-    for name in models:
-        *runs, (torque, error) = (answers.pop(0) for _ in range(len(SEEDS) + 1))
-        predicted = _average(runs)
-        entry[name] = {
+    for when in ("before", "after"):
+        predicted = _average([next(answers) for _ in SEEDS])
+        torque, error = next(answers)
+        entry[when] = {
             "torque_mse": rounded(torque),
             **attrs.asdict(error, filter=attrs.filters.exclude("growth")),
             "growth": rounded(error.growth),
             "tracking": _gap(plant, predicted),
         }
         for segment, model_segment in zip(entry["segments"], predicted, strict=True):
-            segment[name] = rounded(model_segment.mean)
+            segment[when] = rounded(model_segment.mean)
     return entry
 
 
@@ -188,7 +213,7 @@ def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
     """What the calls return, in their order; they run on all cores, under a bar."""
     answers: list[Any] = [None] * len(calls)
     columns = (TextColumn("before and after"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
+    with Progress(*columns, console=console) as bar:
         task = bar.add_task("", total=len(calls))
         for i, answer in in_parallel(calls):
             answers[i] = answer
@@ -209,7 +234,12 @@ def _gap(plant: Sequence[Segment], model: Sequence[Segment]) -> dict[str, float]
 
 
 def _table(result: dict[str, Any]) -> Table:
-    table = Table("error of the model against the plant", "before", "after", title=result["decision"])
+    table = Table(
+        "error of the model against the plant",
+        "before",
+        "after",
+        title=f"{result['name']}: {result['decision']}",
+    )
     for row in ROWS:
         table.add_row(row.title, *(f"{row.error(result[when]):.4g}" for when in ("before", "after")))
     return table
