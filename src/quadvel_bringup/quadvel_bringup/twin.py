@@ -26,6 +26,7 @@ from quadvel_eval import demo_summary, replay
 from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import output_folder, replacing, write_json
+from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 
 from .processes import ProcessGroup, StopSignals
@@ -38,7 +39,6 @@ SHIPPED = ("dry_gears", "slow_current", "chafing_cable")
 SCRIPT = "circuit"
 WALKS = ("walk_1", "walk_2")
 """The first is fitted, the second is held out; they differ in the seed of the noise."""
-CORRECTED = Path("identify") / "actuator.yaml"
 SEEDS = (0, 1)  # of the model's walks
 SCHEMA = 1
 
@@ -49,7 +49,9 @@ def twin_command(
         typer.Argument(help=f"Shipped plants ({', '.join(SHIPPED)}) or YAML files.", show_default="all"),
     ] = None,
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/twin"),
-    reuse: Annotated[bool, typer.Option("--reuse", help="Take up the recordings that are there.")] = False,
+    reuse: Annotated[
+        bool, typer.Option("--reuse", help="Take up the recordings and reports that are there.")
+    ] = False,
 ) -> None:
     """Walk plants that the model does not know, identify what it lacks, and hold the corrected model against them.
 
@@ -70,7 +72,7 @@ def twin_command(
             if not (reuse and recording.exists()):
                 console.rule(f"{name}: walk {seed + 1} of {len(WALKS)}")
                 _walk(file, recording, seed, console)
-    _identify(folders, console)
+    _identify({name: here for name, here in folders.items() if not (reuse and _identified(here))}, console)
     results = judge(folders, console)
     for result in results:
         console.print(_table(result))
@@ -108,6 +110,13 @@ def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
         if problem:
             console.print(f"[bold red]{file.stem} did not walk to the end: {problem}")
             raise typer.Exit(1)
+
+
+def _identified(folder: Path) -> bool:
+    """Whether there is a report that is newer than the recordings."""
+    report = folder / "identify" / "report.json"
+    written = [(folder / f"{walk}.mcap").stat().st_mtime for walk in WALKS]
+    return report.exists() and report.stat().st_mtime >= max(written)
 
 
 def _identify(folders: Mapping[str, Path], console: Console) -> None:
@@ -162,21 +171,24 @@ def read_walk(path: Path) -> Walked:
 
 def judge(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]:
     """What the stack's model and the corrected one make of the plants' walks: the entries of `twin.json`."""
-    walks = {name: [read_walk(folder / f"{walk}.mcap") for walk in WALKS] for name, folder in folders.items()}
-    calls: list[Call] = []
-    for name, folder in folders.items():
-        commands = [(velocity, stop - start) for start, stop, velocity in walks[name][1].stretches]
-        for model in (ActuatorParameters.default(), ActuatorParameters.load(folder / CORRECTED)):
-            calls += [(replay.predicted_tracking, model, commands, seed) for seed in SEEDS]
-            calls.append((_replayed, model, folder / f"{WALKS[1]}.mcap"))
+    own = ActuatorParameters.default()
+    drives = [step for step in SCRIPTS[SCRIPT] if isinstance(step, Drive) and any(step.velocity)]
+    commands = [(np.array(step.velocity), step.seconds) for step in drives]
+    calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in SEEDS]
+    for folder in folders.values():
+        corrected = ActuatorParameters.load(folder / "identify" / "actuator.yaml")
+        calls += [(replay.predicted_tracking, corrected, commands, seed) for seed in SEEDS]
+        calls += [(_replayed, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
     answers = iter(_answers(calls, console))
-    return [_entry(name, folder, walks[name], answers) for name, folder in folders.items()]
+    before = _average([next(answers) for _ in SEEDS])
+    return [_entry(name, folder, before, answers) for name, folder in folders.items()]
 
 
-def _entry(name: str, folder: Path, walks: Sequence[Walked], answers: Iterator[Any]) -> dict[str, Any]:
+def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator[Any]) -> dict[str, Any]:
     """A plant's entry. answers: of the calls that `judge` made for it, in their order."""
     report = json.loads((folder / "identify" / "report.json").read_text())
-    plant = _average([walk.segments for walk in walks])
+    walks = [read_walk(folder / f"{walk}.mcap").segments for walk in WALKS]
+    plant = _average(walks)
     entry: dict[str, Any] = {
         "name": name,
         "decision": report["decision"],
@@ -185,19 +197,19 @@ def _entry(name: str, folder: Path, walks: Sequence[Walked], answers: Iterator[A
         "fit": {"eam": report["before"]["heldout_mse"], "corrected": report["after"]["heldout_mse"]},
         "noise_floor": report["noise_floor"],
         "segments": [{"command": rounded(s.command), "plant": rounded(s.mean)} for s in plant],
-        "repeat": _gap(walks[0].segments, walks[1].segments),
+        "repeat": _gap(*walks),
     }
+    for when, predicted in (("before", before), ("after", _average([next(answers) for _ in SEEDS]))):
+        entry[when] = {"tracking": _gap(plant, predicted)}
+        for segment, model_segment in zip(entry["segments"], predicted, strict=True):
+            segment[when] = rounded(model_segment.mean)
     for when in ("before", "after"):
-        predicted = _average([next(answers) for _ in SEEDS])
         torque, error = next(answers)
-        entry[when] = {
+        entry[when] |= {
             "torque_mse": rounded(torque),
             **attrs.asdict(error, filter=attrs.filters.exclude("growth")),
             "growth": rounded(error.growth),
-            "tracking": _gap(plant, predicted),
         }
-        for segment, model_segment in zip(entry["segments"], predicted, strict=True):
-            segment[when] = rounded(model_segment.mean)
     return entry
 
 
