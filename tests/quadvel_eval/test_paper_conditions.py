@@ -54,8 +54,8 @@ def test_survival_counts_the_robots_that_did_not_fall() -> None:
         [answer(labels, command, 0.1), answer(labels, command, 0.3), answer(labels, command, None)]
     )
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
-    assert ours["slope, survival"] == pytest.approx(100.0 * 2 / 3)
-    assert ours["slope, mean error"] == pytest.approx(0.2)
+    assert ours["slope: survival"] == pytest.approx(100.0 * 2 / 3)
+    assert ours["slope: mean error"] == pytest.approx(0.2)
     section.figure(records)
 
 
@@ -73,8 +73,8 @@ def test_the_gap_is_told_plant_by_plant() -> None:
         ]
     )
     rows = {row.what: row.ours for row in section.rows(records)}
-    assert rows["friction, falls"] == {"a": 0.0, "b": 1.0}
-    assert rows["friction, largest error"] == {"a": pytest.approx(0.2), "b": None}
+    assert rows["friction: falls"] == {"a": 0.0, "b": 1.0}
+    assert rows["friction: largest error"] == {"a": pytest.approx(0.2), "b": None}
     section.figure(records)
 
 

@@ -41,11 +41,11 @@ def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() ->
     answers = [answer(1.0, 0.0, 0.02), answer(1.0, 0.4, None), answer(2.5, 0.0, 0.5, inside=0)]
     records = section.judge(answers)
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
-    assert ours["paper grid, runs"] == 3
-    assert ours["paper grid, falls"] == 1
-    assert ours["paper grid, largest error"] == pytest.approx(0.5)
-    assert ours["paper grid, largest error of these"] == pytest.approx(0.02)
-    assert ours["paper grid, left-right difference of these"] is None
+    assert ours["paper grid, all: runs"] == 3
+    assert ours["paper grid, all: falls"] == 1
+    assert ours["paper grid, all: largest error"] == pytest.approx(0.5)
+    assert ours["paper grid, within the policy's limits: largest error"] == pytest.approx(0.02)
+    assert ours["paper grid, within the policy's limits: largest left-right difference"] is None
     assert len(section.figure(records).axes) == 2  # the grid and its scale
 
 
@@ -60,7 +60,7 @@ def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     labels = {"policy": "mine", "direction": "forward", "limit": 4.0}
     records = section.judge([({**labels, "command": 3.0}, 2.9), ({**labels, "command": 4.0}, None)])
     rows = {row.what: row for row in section.rows(records)}
-    assert rows["forward, reached"].ours == {"mine": 2.9}
-    assert rows["forward, reached"].paper == 4.2
+    assert rows["forward: reached"].ours == {"mine": 2.9}
+    assert rows["forward: reached"].paper == 4.2
     assert rows["falls"].ours == {"mine": 1.0}
     section.figure(records)

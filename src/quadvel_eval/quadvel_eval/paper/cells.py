@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 from quadvel_policy.observation import COMMAND_AXES
@@ -10,7 +11,7 @@ from quadvel_policy.policy_file import PolicyFile
 
 from ..grid import Cell, CellResult, run_cell
 from ..walk import Setup
-from .section import Job, Record, Study
+from .section import Job, Record, Study, column, largest, mean
 
 Command = tuple[float, float, float]
 
@@ -35,6 +36,21 @@ def cell_record(labels: Record, result: CellResult) -> Record:
         "cot": result.cot,
         "fell": int(segment is None),
     }
+
+
+def falls(records: Sequence[Record]) -> float:
+    """How many robots fell."""
+    return float(column(records, "fell").sum())
+
+
+def mean_error(records: Sequence[Record]) -> float:
+    """Of the mean velocities of the robots that did not fall, m/s."""
+    return mean(records, "error_xy")
+
+
+def largest_error(records: Sequence[Record]) -> float:
+    """Of the mean velocities of the robots that did not fall, m/s."""
+    return largest(records, "error_xy")
 
 
 def limits(study: Study, policy: str) -> dict[str, tuple[float, float]]:

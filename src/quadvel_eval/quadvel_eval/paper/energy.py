@@ -69,8 +69,8 @@ class Energy(Section):
             return by_policy(select(records, **command), lambda r: mean(r, "cot"))
 
         return [
-            Row("cost of transport at 1 m/s", "", None, at(vx=1.0)),
+            Row("cost of transport at 1 m/s", "", None, at(vx=1.0), key=True),
             Row("cost of transport, the least", "", None, least("vx")),
-            Row("cost of turning at 1 rad/s", "", None, at(wz=1.0)),
+            Row("cost of turning at 1 rad/s", "", None, at(wz=1.0), key=True),
             Row("cost of turning, the least", "", None, least("wz")),
         ]

@@ -101,8 +101,8 @@ class Estimator(Section):
                 mine = select(records, ground=ground, estimator=name)
                 what = f"{ground} ground, {name}"
                 rows += [
-                    Row(f"{what}: RMSE of the worst axis", "m/s", None, by_policy(mine, rmse)),
-                    Row(f"{what}: drift", "% of the way", None, by_policy(mine, drift), 1),
+                    Row(f"{what}: RMSE of the worst axis", "m/s", None, by_policy(mine, rmse), key=True),
+                    Row(f"{what}: drift", "% of the way", None, by_policy(mine, drift), 1, key=True),
                 ]
         return rows
 
@@ -110,11 +110,9 @@ class Estimator(Section):
 def rmse(records: Sequence[Record]) -> float:
     """Of the worst axis over all samples of the records, m/s; nan without any."""
     samples = column(records, "samples").sum()
-    return (
-        float(np.sqrt(max(column(records, axis).sum() for axis in "xyz") / samples))
-        if samples
-        else float("nan")
-    )
+    if not samples:
+        return float("nan")
+    return float(np.sqrt(max(column(records, axis).sum() for axis in "xyz") / samples))
 
 
 def drift(records: Sequence[Record]) -> float:

@@ -12,7 +12,7 @@ from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
 
 from ..grid import Cell
-from .cells import Command, cell_record
+from .cells import Command, cell_record, falls, largest_error, mean_error
 from .conditions import Condition, draw, walk_under
 from .section import (
     Answers,
@@ -22,10 +22,7 @@ from .section import (
     Section,
     Study,
     by_policy,
-    column,
     distinct,
-    largest,
-    mean,
     select,
 )
 
@@ -104,10 +101,8 @@ class Gap(Section):
         for level in distinct(records, "level"):
             mine = select(records, level=level)
             rows += [
-                Row(f"{level}, falls", "", 0.0, by_policy(mine, lambda r: column(r, "fell").sum()), 0),
-                Row(f"{level}, mean error", "m/s", None, by_policy(mine, lambda r: mean(r, "error_xy"))),
-                Row(
-                    f"{level}, largest error", "m/s", 0.084, by_policy(mine, lambda r: largest(r, "error_xy"))
-                ),
+                Row(f"{level}: falls", "", 0.0, by_policy(mine, falls), 0),
+                Row(f"{level}: mean error", "m/s", None, by_policy(mine, mean_error)),
+                Row(f"{level}: largest error", "m/s", 0.084, by_policy(mine, largest_error), key=True),
             ]
         return rows

@@ -19,7 +19,7 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 from ..robot_loop import PERIOD, STEPS, RobotLoop, make_estimator
-from ..walk import Setup, record
+from ..walk import Setup, record_to_the_fall
 from .cells import limits
 from .section import Answers, Job, Record, Row, Section, Study, column, select
 
@@ -65,9 +65,9 @@ class RecordedSimulator(Simulator):
             self._rows.append((self.state(), self._held))
             super().step()
 
-    def log(self, name: str, start: float) -> Log:
-        """What there was from `start` (s) on, at 1 kHz."""
-        rows = [(state, command) for state, command in self._rows if state.time >= start]
+    def log(self, name: str, start: float, end: float = np.inf) -> Log:
+        """What there was from `start` to `end` (s), at 1 kHz."""
+        rows = [(state, command) for state, command in self._rows if start <= state.time <= end]
         states, commands = zip(*rows, strict=True)
         t = np.array([state.time for state in states]) - start
         q, dq, tau = (np.array([getattr(s, field) for s in states]) for field in ("q", "dq", "tau"))
@@ -91,7 +91,7 @@ def lifting(seed: int, seconds: float) -> Log:
 
 
 def mixed(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]]) -> Log:
-    """A walk of all kinds: stand, walk, run, turn, sideways, and stops in between. ValueError where the robot fell."""
+    """A walk of all kinds: stand, walk, run, turn, sideways, and stops in between; as far as the robot got."""
     simulator = RecordedSimulator(SimulatorConfig(seed=seed))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
@@ -103,9 +103,8 @@ def mixed(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]]) -> Lo
         (0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (fast, 0.0, 0.0), (0.0, 0.0, 0.0),
         (0.0, 0.0, turn), (0.0, -aside, 0.0), (bounds["vx"][0], 0.0, 0.0), (0.5 * fast, 0.0, -0.7 * turn),
     ]  # fmt: skip
-    if record(loop, [(velocity, 1.5) for velocity in program]) is None:
-        raise ValueError(f"{setup.policy}: the robot fell on the walk that was to be identified")
-    return simulator.log("mixed motion", start)
+    walk, _ = record_to_the_fall(loop, [(velocity, 1.5) for velocity in program])
+    return simulator.log("mixed motion", start, start + (walk.time[-1] if walk else 0.0))
 
 
 def identified(

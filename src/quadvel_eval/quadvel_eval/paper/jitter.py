@@ -57,7 +57,7 @@ class Jitter(Section):
             Row(f"jitter at {s:g} m/s", "mrad", None, by_policy(select(records, vx=s), _jitter), 2)
             for s in speeds
         ]
-        return [*rows, Row("mean", "mrad", None, by_policy(records, _jitter), 2)]
+        return [*rows, Row("mean", "mrad", None, by_policy(records, _jitter), 2, key=True)]
 
 
 def _jitter(records: Sequence[Record]) -> float:

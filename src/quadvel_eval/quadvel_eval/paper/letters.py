@@ -144,7 +144,7 @@ class Letters(Section):
             return float(np.abs(column(mine, "heading") - column(mine, "asked_heading")).max())
 
         return [
-            Row("mean deviation", "m", None, by_policy(records, lambda r: mean(r, "deviation"))),
+            Row("mean deviation", "m", None, by_policy(records, lambda r: mean(r, "deviation")), key=True),
             Row("largest deviation", "m", None, by_policy(records, lambda r: largest(r, "deviation"))),
             Row("deviation at the end, mean", "m", None, by_policy(records, lambda r: end(r, "deviation"))),
             Row("largest error of the heading", "rad", None, by_policy(records, turned)),

@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 from quadvel_sim.terrain import Terrain
 
 from ..grid import Cell
-from .cells import Command, cell_record
+from .cells import Command, cell_record, largest_error, mean_error
 from .conditions import COMMANDS, Condition, draw, survival, walk_under
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, largest, mean, select
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
 
 FORCE = 60.0  # N
 XLABELS = {
@@ -94,10 +94,8 @@ class Robustness(Section):
         for group in distinct(records, "group"):
             mine = select(records, group=group)
             rows += [
-                Row(f"{group}, survival", "%", None, by_policy(mine, survival), 1),
-                Row(f"{group}, mean error", "m/s", None, by_policy(mine, lambda r: mean(r, "error_xy"))),
-                Row(
-                    f"{group}, largest error", "m/s", None, by_policy(mine, lambda r: largest(r, "error_xy"))
-                ),
+                Row(f"{group}: survival", "%", None, by_policy(mine, survival), 1, key=True),
+                Row(f"{group}: mean error", "m/s", None, by_policy(mine, mean_error)),
+                Row(f"{group}: largest error", "m/s", None, by_policy(mine, largest_error)),
             ]
         return rows

@@ -64,6 +64,8 @@ class Row:
     paper: float | None
     ours: Mapping[str, float | None]
     digits: int = 3
+    key: bool = False
+    """whether the page begins with it"""
 
 
 @attrs.frozen

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import ClassVar
 
 import attrs
@@ -125,19 +126,19 @@ class Stance(Section):
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
+        def centimetres(mine: Sequence[Record]) -> float:
+            return 100.0 * largest(mine, "drift")
+
         def over_constant(mine: Sequence[Record]) -> float:
             return mean(mine, "joint_speed") / mean(mine, "constant_speed")
 
+        steps, speed, fell = (
+            by_policy(records, partial(largest, name=name)) for name in ("steps", "joint_speed", "fell")
+        )
         return [
-            Row(
-                "drift in 30 s, largest",
-                "cm",
-                None,
-                by_policy(records, lambda r: 100.0 * largest(r, "drift")),
-                2,
-            ),
-            Row("steps, most", "", None, by_policy(records, lambda r: largest(r, "steps")), 0),
-            Row("joint speed", "rad/s", None, by_policy(records, lambda r: mean(r, "joint_speed"))),
+            Row("largest drift in 30 s", "cm", None, by_policy(records, centimetres), 2, key=True),
+            Row("steps, most", "", None, steps, 0),
+            Row("joint speed, largest", "rad/s", None, speed),
             Row("joint speed over that of constant targets", "", None, by_policy(records, over_constant), 2),
-            Row("falls", "", 0.0, by_policy(records, lambda r: largest(r, "fell")), 0),
+            Row("whether one fell", "", 0.0, fell, 0),
         ]

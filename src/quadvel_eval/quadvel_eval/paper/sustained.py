@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import partial
 from typing import ClassVar
 
 import attrs
@@ -11,8 +12,8 @@ from matplotlib.figure import Figure
 
 from ..robot_loop import PERIOD
 from ..walk import Setup, make_loop, record
-from .cells import Command, limits, reach
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
+from .cells import Command, falls, limits, reach
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, largest, select
 
 ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
 KEPT = 5.0  # s at the full command, of which the last 4 count
@@ -87,17 +88,10 @@ class Sustained(Section):
         rows = []
         for name in distinct(records, "direction"):
             mine = select(records, direction=name)
-            unit = "rad/s" if name.startswith("spin") else "m/s"
-            limit = by_policy(mine, lambda r: column(r, "limit").max())
+            unit, paper = "rad/s" if name.startswith("spin") else "m/s", DIRECTIONS[name][1]
+            reached, tried = (by_policy(mine, partial(largest, name=what)) for what in ("reached", "command"))
             rows += [
-                Row(
-                    f"{name}, reached",
-                    unit,
-                    DIRECTIONS[name][1],
-                    by_policy(mine, lambda r: largest(r, "reached")),
-                    2,
-                ),
-                Row(f"{name}, largest command that was tried", unit, None, limit, 2),
+                Row(f"{name}: reached", unit, paper, reached, 2, key=True),
+                Row(f"{name}: largest command that was tried", unit, None, tried, 2),
             ]
-        rows.append(Row("falls", "", 0.0, by_policy(records, lambda r: column(r, "fell").sum()), 0))
-        return rows
+        return [*rows, Row("falls", "", 0.0, by_policy(records, falls), 0)]

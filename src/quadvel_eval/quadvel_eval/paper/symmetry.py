@@ -131,10 +131,8 @@ class Symmetry(Section):
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
-        return [
-            Row(f"asymmetry at {speed:g} m/s", "", None, by_policy(select(records, speed=speed), asymmetry))
-            for speed in distinct(records, "speed")
-        ]
+        indices = {v: by_policy(select(records, speed=v), asymmetry) for v in distinct(records, "speed")}
+        return [Row(f"asymmetry at {v:g} m/s", "", None, index, key=True) for v, index in indices.items()]
 
 
 def _line(curves: dict[str, Array], k: int) -> Record:

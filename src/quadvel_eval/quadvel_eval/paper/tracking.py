@@ -6,28 +6,14 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 import attrs
-import numpy as np
 from matplotlib.figure import Figure
 
 from ..grid import cells
 from ..report import heatmaps
-from .cells import cell_job, cell_record, limits, within
-from .section import (
-    Answers,
-    Job,
-    Record,
-    Row,
-    Section,
-    Study,
-    by_policy,
-    column,
-    distinct,
-    largest,
-    mean,
-    select,
-)
+from .cells import cell_job, cell_record, falls, largest_error, limits, mean_error, within
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
 
-MIRRORED = {"vx": 1.0, "vy": -1.0, "wz": -1.0}
+LARGEST = 0.084  # m/s, the paper's largest error
 
 
 def left_right(records: Sequence[Record]) -> float:
@@ -72,40 +58,27 @@ class Tracking(Section):
         panels = {}
         for policy in distinct(records, "policy"):
             mine = select(records, policy=policy, grid=self.grids[0])
-            title = f"{policy}: mean {mean(mine, 'error_xy'):.3f}, max {largest(mine, 'error_xy'):.3f} m/s"
+            title = f"{policy}: mean {mean_error(mine):.3f}, max {largest_error(mine):.3f} m/s"
             panels[title] = [{**r, "command": [r["vx"], r["vy"], r["wz"]]} for r in mine]
         return heatmaps(panels)
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
-        paper = {"paper": (None, 0.084), "quick": (None, None)}
-        rows = []
-        for grid in distinct(records, "grid"):
-            mine = select(records, grid=grid)
-            inside = select(mine, within=1)
-            known_mean, known_max = paper[grid]
-            rows += [
-                Row(f"{grid} grid, runs", "", None, by_policy(mine, len), 0),
-                Row(f"{grid} grid, falls", "", 0.0, by_policy(mine, lambda r: column(r, "fell").sum()), 0),
-                Row(f"{grid} grid, mean error", "m/s", known_mean, by_policy(mine, _mean_error)),
-                Row(f"{grid} grid, largest error", "m/s", known_max, by_policy(mine, _largest_error)),
-                Row(f"{grid} grid, commands within the policy's limits", "", None, by_policy(inside, len), 0),
-                Row(f"{grid} grid, mean error of these", "m/s", known_mean, by_policy(inside, _mean_error)),
-                Row(
-                    f"{grid} grid, largest error of these",
-                    "m/s",
-                    known_max,
-                    by_policy(inside, _largest_error),
-                ),
-                Row(
-                    f"{grid} grid, left-right difference of these", "m/s", None, by_policy(inside, left_right)
-                ),
-            ]
-        return rows
+        return [row for grid in distinct(records, "grid") for row in _rows(grid, select(records, grid=grid))]
 
 
-def _mean_error(records: Sequence[Record]) -> float:
-    return mean(records, "error_xy")
-
-
-def _largest_error(records: Sequence[Record]) -> float:
-    return float(np.float64(largest(records, "error_xy")))
+def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
+    """Of one grid; the paper's figure is that of its own."""
+    paper = LARGEST if grid == "paper" else None
+    every, inside = f"{grid} grid, all", f"{grid} grid, within the policy's limits"
+    taken = select(records, within=1)
+    return [
+        Row(f"{every}: runs", "", None, by_policy(records, len), 0),
+        Row(f"{every}: falls", "", 0.0, by_policy(records, falls), 0, key=True),
+        Row(f"{every}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
+        Row(f"{every}: largest error", "m/s", paper, by_policy(records, largest_error), key=True),
+        Row(f"{inside}: runs", "", None, by_policy(taken, len), 0),
+        Row(f"{inside}: falls", "", 0.0, by_policy(taken, falls), 0),
+        Row(f"{inside}: mean error", "m/s", None, by_policy(taken, mean_error), key=True),
+        Row(f"{inside}: largest error", "m/s", paper, by_policy(taken, largest_error), key=True),
+        Row(f"{inside}: largest left-right difference", "m/s", None, by_policy(taken, left_right), key=True),
+    ]
