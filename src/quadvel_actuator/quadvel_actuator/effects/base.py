@@ -110,6 +110,11 @@ class EffectLaw(ABC):
         """The forms of the law to try on the data `about` (`identify.candidates.About`); none where they cannot act."""
         return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
 
+    @property
+    def alternatives(self) -> tuple[EffectLaw, ...]:
+        """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""
+        return ()
+
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
         """The form that a parameter file names: of its parameters those that are no numbers; the robot's `joints`."""

@@ -1,19 +1,41 @@
-"""Friction: torques against the velocity. s is a smooth sign, v_0 the velocity at which it turns."""
+"""Friction: torques against the velocity. s is a smooth sign, v_0 the velocity at which it turns.
+
+How a sign turns hardly shows in a log, but what it says about the amplitude of friction hangs on it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
+import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, Parameter, Params, Start, View, smooth_sign
+from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, smooth_sign
 
 _WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
 _WIDTHS = (0.02, 0.06, 0.2)
 _SLOW = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/s"
 
 
-class CoulombFriction(AddedLaw):
+@attrs.frozen(eq=False)
+class _Rubbing(AddedLaw):
+    """Friction with a sign that turns as the hyperbolic tangent does, or slower, as the arctangent."""
+
+    turn: str = attrs.field(default="tanh", kw_only=True, validator=attrs.validators.in_(("tanh", "arctan")))
+
+    @property
+    def alternatives(self) -> tuple[EffectLaw, ...]:
+        return (attrs.evolve(self, turn="arctan"),)
+
+    def sign(self, v: Array, width: Array) -> Array:
+        """-1 to 1, through zero at rest."""
+        if self.turn == "tanh":
+            return smooth_sign(v, width)
+        slow: Array = np.arctan(v / width) * (2.0 / np.pi)
+        return slow
+
+
+class CoulombFriction(_Rubbing):
     """-c s(dq)"""
 
     name = "coulomb_friction"
@@ -26,7 +48,7 @@ class CoulombFriction(AddedLaw):
         return [{"v_0": width} for width in _WIDTHS]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return -p["c"] * smooth_sign(s.dq, p["v_0"])
+        return -p["c"] * self.sign(s.dq, p["v_0"])
 
 
 class ViscousFriction(AddedLaw):
@@ -46,7 +68,7 @@ class ViscousFriction(AddedLaw):
         return -p["b"] * s.dq
 
 
-class StribeckFriction(AddedLaw):
+class StribeckFriction(_Rubbing):
     """-(c + (c_s - c) exp(-(dq / v_s)^2)) s(dq), where c_s > c"""
 
     name = "stribeck_friction"
@@ -68,7 +90,7 @@ class StribeckFriction(AddedLaw):
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         sticking = np.exp(-np.square(s.dq / p["v_s"]))
-        return -(p["c"] + (p["c_s"] - p["c"]) * sticking) * smooth_sign(s.dq, p["v_0"])
+        return -(p["c"] + (p["c_s"] - p["c"]) * sticking) * self.sign(s.dq, p["v_0"])
 
 
 class QuadraticDrag(AddedLaw):
@@ -87,7 +109,7 @@ class QuadraticDrag(AddedLaw):
         return -p["c"] * s.dq * np.abs(s.dq)
 
 
-class LoadDependentFriction(AddedLaw):
+class LoadDependentFriction(_Rubbing):
     """-mu |tau*| s(dq)"""
 
     name = "load_dependent_friction"
@@ -100,7 +122,7 @@ class LoadDependentFriction(AddedLaw):
         return [{"v_0": width} for width in _WIDTHS]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return -p["mu"] * np.abs(x) * smooth_sign(s.dq, p["v_0"])
+        return -p["mu"] * np.abs(x) * self.sign(s.dq, p["v_0"])
 
 
 LAWS = (CoulombFriction, ViscousFriction, StribeckFriction, QuadraticDrag, LoadDependentFriction)

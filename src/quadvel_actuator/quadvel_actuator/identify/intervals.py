@@ -1,7 +1,8 @@
 """How sure the parameters are: 95 % intervals from the Jacobian, with residuals that may be correlated.
 
 Two covariances are compared and the wider one counts: that of white residuals, and the sandwich of sums over blocks of
-consecutive rows, which holds whatever the correlation within a block. The delays are unknowns of it, too.
+consecutive rows, which holds whatever the correlation within a block. The delays are unknowns of it, too. Where a law may
+have other shapes that no log tells apart, what these say of its parameters lies within the interval.
 """
 
 from __future__ import annotations
@@ -10,12 +11,14 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from .delays import jacobian_with_delays
+from .delays import fit_with_delays, jacobian_with_delays
 from .judging import Judge
 from .model import Model, gather
 from .signals import Array
 
 LEVEL = 0.95
+_AS_WELL = 1.003
+"""of the error: a shape of a law that leaves no more explains the log as well"""
 
 
 @attrs.frozen(eq=False)
@@ -57,11 +60,23 @@ def intervals(model: Model, judge: Judge) -> Intervals:
     for one in model.applied:
         mine = wide[first : first + len(one.law.parameters)]
         random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
-        effects.append(
-            np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
-        )
+        chance = np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
+        effects.append(chance + _shape_error(model, len(effects), judge))
         first += len(one.law.parameters)
     return Intervals(wide[:2], tuple(effects), wide[-2:], _on_bound(model))
+
+
+def _shape_error(model: Model, index: int, judge: Judge) -> Array:
+    """How far an effect's values (P, J) move where it has another shape that explains the log as well."""
+    one = model.applied[index]
+    moved = np.zeros(one.values.shape)
+    for law in one.law.alternatives:
+        others = attrs.evolve(one, law=law)
+        applied = (*model.applied[:index], others, *model.applied[index + 1 :])
+        tried = fit_with_delays(attrs.evolve(model, applied=applied), judge.fit)
+        if tried.error(judge.fit) < _AS_WELL * model.error(judge.fit):
+            moved = np.maximum(moved, np.abs(tried.applied[index].values - one.values))
+    return moved
 
 
 def _on_bound(model: Model) -> tuple[str, ...]:

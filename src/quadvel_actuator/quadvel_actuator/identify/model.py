@@ -21,7 +21,7 @@ Groups = NDArray[np.intp]
 _DAMPING = (1e-7, 1e-2, 1.0)
 _SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
 _GAIN_SLOPE = 0.01
-_KEPT = 12  # results of laws with memory
+_KEPT = 4  # results of laws with memory
 _SETTLED = 1e-5  # relative fall of the error below which a fit has converged
 
 

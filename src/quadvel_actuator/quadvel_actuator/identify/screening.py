@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 
 from ..effects import EffectLaw, Parameter
+from ..effects.base import Start
 from .delays import LONGEST
 from .eam import pd_torque
 from .judging import Judge
@@ -24,7 +25,7 @@ _ENOUGH = 1200  # rows that laws without memory are looked at on
 _GAIN_STEP = 0.01
 _DELAY_STEP = 0.0003  # s
 _OUTPUTS = (0.0005, 0.002, 0.0035, 0.005)  # s, output delays, the sum of both delays being kept
-_EXCHANGED = ((0.0, 0.0), (0.003, -0.003), (-0.003, 0.003))
+_EXCHANGED = ((0.0, 0.0), (0.003, -0.003))
 """s, of input and output delay, for laws that have to be run row by row"""
 _SHORTENED = ((0.0, -0.003), (-0.004, 0.0), (-0.007, 0.0))
 """besides, for those that look like a delay"""
@@ -88,10 +89,10 @@ def pairs(model: Model, moves: Sequence[tuple[float, float]] | None) -> Iterator
         tried = [(i, o), *((i + o - at, np.full_like(o, at)) for at in _OUTPUTS)]
     for a, b in tried:
         if (a > -1e-9).all() and (b > -1e-9).all() and (a <= LONGEST[0]).all() and (b <= LONGEST[1]).all():
-            yield model.with_delays(np.round(np.maximum(a, 0.0), 7), np.round(np.maximum(b, 0.0), 7))
+            yield model.with_delays(*(np.round(np.clip(one, 0.0, None), 7) for one in (a, b)))
 
 
-def start(ground: Ground, law: EffectLaw, starts: Sequence[dict[str, Array | float]]) -> Started | None:
+def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | None:
     """The law at the best of `starts`, chosen for each joint; None where that takes nothing off the error."""
     if not starts:
         return None
@@ -141,16 +142,15 @@ class _Screen:
         moved[2, 1] += _GAIN_STEP
         self.moved = moved
         delays = np.stack([model.input_delay, model.output_delay])
-        at, *later = (
-            pd_torque(model.samples, model.gains, *(delays + by), model.window)
-            for by in ([[0.0], [0.0]], [[_DELAY_STEP], [0.0]], [[0.0], [_DELAY_STEP]])
-        )
+        moves = np.array([[0.0, 0.0], [_DELAY_STEP, 0.0], [0.0, _DELAY_STEP]])[..., None]
+        at, *later = (pd_torque(model.samples, model.gains, a, b, model.window) for a, b in delays + moves)
         self.slopes = [(one - at) / _DELAY_STEP for one in later]
 
     def best(self, table: Array) -> tuple[Model, Array]:
         """The model at the best of `table` (guesses, P, J) for each joint, and its squared error (J,)."""
         parts = [self._products(one) for one in np.split(table, range(_BATCH, len(table), _BATCH))]
-        free = _Quadratic.of(*(np.concatenate(one) for one in zip(*parts, strict=True)), len(self.linear))
+        gram, right, square = (np.concatenate(one) for one in zip(*parts, strict=True))
+        free = _Quadratic.of(gram, right, square, len(self.linear))
         joint = np.arange(table.shape[2])
         chosen = np.argmin(free.alone(), axis=0)
         outside = np.zeros(free.error.shape, dtype=bool)
@@ -195,10 +195,12 @@ class _Screen:
 
     def _products(self, values: Array) -> tuple[Array, Array, Array]:
         """Of each guess (B, P, J) and joint: products of the columns (B, J, M, M), with the target, and of the target."""
-        zero = values.copy()
-        zero[:, self.linear] = 0.0
-        bases = zero[:1] if self.linear else zero
-        torque = self._run(np.repeat(bases, 3, axis=0), np.tile(self.moved, (len(bases), 1, 1)))
+        if self.linear:  # without them the law does nothing
+            zero = values.copy()
+            zero[:, self.linear] = 0.0
+            torque = self._bare(self.moved)
+        else:
+            torque = self._run(np.repeat(values, 3, axis=0), np.tile(self.moved, (len(values), 1, 1)))
         base = torque[::3]
         gains = [(torque[k::3] - base) / _GAIN_STEP for k in (1, 2)]
         columns = []
@@ -214,6 +216,11 @@ class _Screen:
             found.append(wide @ wide.transpose(0, 2, 1))
         gram = np.stack(found)
         return gram[..., :-1, :-1], gram[..., :-1, -1], gram[..., -1, -1]
+
+    def _bare(self, gains: Array) -> Array:
+        """Torque (B, N, J) without the last effect, of a batch of gains."""
+        bare = attrs.evolve(self.model, applied=self.others)
+        return bare.evaluate(gains, [np.repeat(one.values[None], len(gains), axis=0) for one in self.others])
 
     def _run(self, values: Array, gains: Array) -> Array:
         """Torque (B, N, J) of a batch of values (B, P, J) of the last effect and of gains, as many or one."""

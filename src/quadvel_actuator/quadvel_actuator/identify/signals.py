@@ -30,7 +30,17 @@ SETTLING = 0.03
 SMOOTH, SMOOTH_LATE = 0.006, 0.001
 """The smooth acceleration is taken over so long to either side, and so much later, s."""
 
-_CACHED = 64
+_CACHED = 6, 64
+"""sets of signals that are kept, at least and at most;"""
+_CACHED_VALUES = 2_500_000
+"""as many as have about so many values in each of their signals together"""
+
+_OF_JOINTS = (
+    "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "measured", "temperature",
+)  # fmt: skip
+
+Joints = slice | list[int]
+ALL = slice(None)
 
 
 @attrs.frozen(eq=False)
@@ -129,25 +139,29 @@ class _LogSignals:
             if values.any()
         }
 
-    def state(self, name: str, at: Array) -> Array:
+    def state(self, name: str, at: Array, joints: Joints = ALL) -> Array:
         """A state signal, linear between rows."""
         t = self.log.t
         row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
         share = np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)[:, None]
         values = self.states[name]
+        values = values if values.shape[1] == 1 else values[:, joints]
         return values[row] + share * (values[row + 1] - values[row])
 
-    def command(self, name: str, at: Array, window: float) -> Array:
+    def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
         """A command signal: the mean over `at` to `at + window`."""
+        values = self.commands[name][:, joints]
         if name not in self.sums:
-            return np.zeros((len(at), self.log.q_des.shape[1]))
+            return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
-            return self.commands[name][self.log.command_rows(at + 1e-9)]
-        return (self._integral(name, at + window) - self._integral(name, at)) / window
+            return values[self.log.command_rows(at + 1e-9)]
+        sums = self.sums[name][:, joints]
+        late, early = (self._integral(values, sums, end) for end in (at + window, at))
+        return (late - early) / window
 
-    def _integral(self, name: str, at: Array) -> Array:
+    def _integral(self, values: Array, sums: Array, at: Array) -> Array:
         row = self.log.command_rows(at)
-        return self.sums[name][row] + self.commands[name][row] * (at - self.log.t_cmd[row])[:, None]
+        return sums[row] + values[row] * (at - self.log.t_cmd[row])[:, None]
 
 
 def _double(values: NDArray[np.floating]) -> Array:
@@ -188,7 +202,7 @@ class Samples:
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._every = 1
-        self._cache: dict[tuple[float, float, float], Signals] = {}
+        self._cache: dict[tuple[Any, ...], Signals] = {}
         self._parts: dict[int, Samples] = {}
         self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
 
@@ -233,38 +247,45 @@ class Samples:
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
         delays = np.broadcast_arrays(np.atleast_1d(input_delay), np.atleast_1d(output_delay))
-        keys = [(round(float(a), 7), round(float(b), 7), window) for a, b in zip(*delays, strict=True)]
-        if len(set(keys)) == 1:
-            return self._at(keys[0])
-        every = [self._at(key) for key in keys]
-        columns = {
-            field.name: np.column_stack([getattr(one, field.name)[:, j] for j, one in enumerate(every)])
-            for field in attrs.fields(Signals)
-            if np.ndim(getattr(every[0], field.name)) == 2 and getattr(every[0], field.name).shape[1] > 1
-        }
-        return attrs.evolve(every[0], **columns)
-
-    def _at(self, key: tuple[float, float, float]) -> Signals:
+        pairs = [(round(float(a), 7), round(float(b), 7)) for a, b in zip(*delays, strict=True)]
+        shared = len(set(pairs)) == 1
+        key = (window, pairs[0]) if shared else (window, *pairs)
         if key not in self._cache:
-            if len(self._cache) >= _CACHED:
+            if len(self._cache) >= max(_CACHED[0], min(_CACHED[1], _CACHED_VALUES // self.tau.size)):
                 self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = self._make(*key)
+            self._cache[key] = self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
         return self._cache[key]
 
-    def _make(self, input_delay: float, output_delay: float, window: float) -> Signals:
+    def _mixed(self, pairs: Sequence[tuple[float, float]], window: float) -> Signals:
+        """Each joint's columns at its own delays; times and packets are those of the first one."""
+        every = {pair: [j for j, one in enumerate(pairs) if one == pair] for pair in dict.fromkeys(pairs)}
+        made = {pair: self._make(*pair, window, joints) for pair, joints in every.items()}
+        first = made[pairs[0]]
+        columns = {}
+        for name in _OF_JOINTS:
+            if getattr(first, name) is not None:
+                columns[name] = np.empty(self.tau.shape)
+                for pair, joints in every.items():
+                    columns[name][:, joints] = getattr(made[pair], name)
+        return attrs.evolve(first, **columns)
+
+    def _make(
+        self, input_delay: float, output_delay: float, window: float, joints: list[int] | None = None
+    ) -> Signals:
+        """The signals of `joints`, or of all, at one pair of delays."""
         parts: dict[str, list[Array]] = {}
         packets = []
+        chosen = ALL if joints is None else joints
         for one, first in zip(self.logs, self._first_packet, strict=False):
             at = _double(one.log.t)[:: self._every] - output_delay
             for name in one.states:
-                parts.setdefault(name, []).append(
-                    one.state(name, at - SMOOTH_LATE if name == "ddq_smooth" else at)
-                )
+                moment = at - SMOOTH_LATE if name == "ddq_smooth" else at
+                parts.setdefault(name, []).append(one.state(name, moment, chosen))
             for name in one.commands:
-                parts.setdefault(name, []).append(one.command(name, at - input_delay, window))
+                parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
             row = one.log.command_rows(at - input_delay + 1e-9)
             for name, values in one.gains.items():
-                parts.setdefault(name, []).append(values[row])
+                parts.setdefault(name, []).append(values[:, chosen][row])
             packets.append((row + first)[:, None])
             parts.setdefault("t", []).append((at - one.origin)[:, None])
         signals = {name: np.concatenate(part) for name, part in parts.items()}

@@ -1,0 +1,89 @@
+"""What laws are looked at with: few rows, other delays, and intervals that say what a log cannot tell."""
+
+import attrs
+import numpy as np
+import pytest
+from simulated_joints import NAMES, parameters, record
+
+from quadvel_actuator import Effect
+from quadvel_actuator.effects import JOINT, registry
+from quadvel_actuator.effects.commands import CommandHold
+from quadvel_actuator.identify.candidates import About, propose, started
+from quadvel_actuator.identify.intervals import intervals
+from quadvel_actuator.identify.judging import Judge
+from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.signals import Samples
+
+JOINTS = NAMES[:2]
+ONE = np.zeros(2, dtype=np.intp)
+FRICTION = Effect("coulomb_friction", JOINTS, {"c": 0.5, "v_0": 0.05})
+
+
+def _log(*effects, seconds=3.0, seed=2):
+    truth = parameters(effects, input_delay=0.009, output_delay=0.003)
+    return record(attrs.evolve(truth, joints=JOINTS), 2, seconds, 500, seed=seed)
+
+
+def _about(log, input_delay, output_delay):
+    samples = Samples([log])
+    even = np.floor(samples.t / 0.2).astype(int) % 2 == 0
+    judge = Judge.of(samples, samples.judged & even[:, None], samples.judged & ~even[:, None])
+    gains = np.ones((2, 2))
+    model = Model(
+        samples, 0.001, gains, np.array([ONE, ONE]), *np.full((2, 2), [[input_delay], [output_delay]]), ONE
+    )
+    return About(model, judge, np.full(2, 0.066))
+
+
+def test_signals_of_few_rows_are_those_of_all():
+    samples = Samples([_log(), _log(seed=3)])
+    few, rows = samples.thinned(7)
+    assert len(few.t) == len(rows) < len(samples.t) / 6
+    for name in ("t", "q", "q_des", "ddq", "packet"):
+        whole = getattr(samples.at(0.004, 0.001, 0.001), name)
+        np.testing.assert_array_equal(getattr(few.at(0.004, 0.001, 0.001), name), whole[rows])
+
+
+def test_each_joint_reads_the_signals_at_its_own_delays():
+    samples = Samples([_log()])
+    mixed = samples.at(np.array([0.004, 0.009]), np.array([0.001, 0.003]), 0.001)
+    for joint, pair in enumerate(((0.004, 0.001), (0.009, 0.003))):
+        for name in ("q", "dq", "q_des", "kp"):
+            own = getattr(samples.at(*pair, 0.001), name)[:, joint]
+            np.testing.assert_array_equal(getattr(mixed, name)[:, joint], own)
+
+
+def test_friction_is_found_from_delays_that_it_has_bent():
+    about = _about(_log(FRICTION), input_delay=0.007, output_delay=0.0055)
+    found = propose(about, started(about, registry()["coulomb_friction"]()))
+    last = found.model.applied[-1]
+    np.testing.assert_allclose(last.values[0], 0.5, atol=0.04)
+    np.testing.assert_allclose(found.model.input_delay, 0.009, atol=0.0006)
+    np.testing.assert_allclose(found.model.output_delay, 0.003, atol=0.0006)
+
+
+def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
+    about = _about(_log(), input_delay=0.009, output_delay=0.003)
+    assert started(about, registry()["coulomb_friction"]()) is None
+
+
+@pytest.mark.parametrize("turn", ["tanh", "arctan"])
+def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
+    """Two hundredths of a radian a second are too few to show how the sign turns."""
+    about = _about(_log(Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.02})), 0.009, 0.003)
+    law = registry()["coulomb_friction"](at=JOINT, turn=turn)
+    found = propose(about, started(about, law))
+    other = propose(about, started(about, attrs.evolve(law, turn="arctan")))
+    half = intervals(found.model, about.judge).effects[0]
+    apart = np.abs(found.model.applied[0].values - other.model.applied[0].values)
+    assert (half[0] > apart[0]).all()
+
+
+def test_the_share_of_lost_commands_has_the_width_of_as_many_tosses():
+    about = _about(_log(), 0.009, 0.003)
+    law = CommandHold(np.zeros((len(about.samples.t), 1), dtype=np.intp))
+    share = np.full((1, 2), 0.1)
+    model = about.model.plus(Applied(law, np.ones(2, dtype=bool), share, ONE))
+    half = intervals(model, about.judge).effects[0]
+    commands = len(np.unique(about.signals.packet))
+    np.testing.assert_allclose(half[0], 2 * np.sqrt(0.09 / commands), rtol=0.15)
