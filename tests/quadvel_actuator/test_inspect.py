@@ -75,6 +75,15 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
             {"q": exchanged(fields()["q"]), "dq": exchanged(fields()["dq"])},
             "q_des: a joint's q follows another",
         ),
+        (
+            {"tau": exchanged(fields()["tau"])},
+            "tau: a joint's tau follows another joint's command and motion (FR_",
+        ),
+        ({"tau": 1e3 * fields()["tau"]}, "tau: 1e+03 times what kp asks for; expected N m"),
+        (
+            {"tau": np.random.default_rng(0).normal(size=(2000, 12))},
+            "tau: does not answer the position error",
+        ),
         ({"q": np.zeros((2000, 12)), "dq": np.zeros((2000, 12))}, "q: no joint ever moves"),
         ({"tau": np.zeros((2000, 12))}, "tau: never changes on any joint"),
         ({"kp": np.zeros((2000, 12))}, "valid: 0.00 s under PD control are left"),

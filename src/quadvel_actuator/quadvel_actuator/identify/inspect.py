@@ -183,7 +183,12 @@ CHECKS: tuple[Callable[[Log], Iterator[Finding]], ...] = (
     gains,
     torque,
 )
-CHECKS_UNDER_CONTROL = (plausible.sign_of_torque, plausible.exchanged, excited.collinear)
+CHECKS_UNDER_CONTROL = (
+    plausible.sign_of_torque,
+    plausible.exchanged,
+    plausible.answer_of_torque,
+    excited.collinear,
+)
 """These ask how the joints answer their commands."""
 
 

@@ -20,6 +20,9 @@ MOVING = 0.05  # rad/s
 LAGS = (0.0, 0.006, 0.012)  # s, from a command to its torque
 TURNS = 10.0  # rad; a joint of a leg does not reach so far
 REACH = 0.4  # rad beyond the model's range
+UNANSWERED = 0.1  # of the torque that the speed leaves, explained by the position error
+FAR_OFF = 8.0  # times the commanded gain
+ROWS_FOR_A_LAW = 50
 
 # What the slope of q divided by dq may be, when it is not 1: the mistake behind it.
 SLOPES = (
@@ -136,22 +139,64 @@ def sign_of_torque(log: Log) -> Iterator[Finding]:
         )
 
 
+def answer_of_torque(log: Log) -> Iterator[Finding]:
+    """Torque that has nothing to do with the position error, or only by a law with quite other gains than commanded."""
+    if log.tau is None:
+        return
+    row = _some_valid(log)
+    if len(row) < ROWS_FOR_A_LAW:
+        return
+    lags = [log.command_rows(log.t[row] - lag) for lag in LAGS]
+    left, gain, answer = (np.zeros(len(log.joints)) for _ in range(3))
+    for j in range(len(log.joints)):
+        tau, q, dq = (x[row, j].astype(float) for x in (log.tau, log.q, log.dq))
+        fits = (_law(log.q_des[at, j].astype(float) - q, dq, tau) for at in lags)
+        least, gain[j] = min(fits, key=lambda one: one[0])
+        left[j] = least / max(float(np.var(tau)), 1e-12)
+        answer[j] = 1.0 - least / max(_law(np.zeros(len(row)), dq, tau)[0], 1e-12)
+    if (answer < UNANSWERED).all():
+        text = (
+            f"tau: does not answer the position error on any joint (which explains {100 * answer.max():.0f} % of it at "
+            "most); expected q_des, q and tau of the same joints, with the same signs"
+        )
+        yield Finding("refusal", "tau", log.joints, text)
+    clear = left < 0.3
+    if log.kp is not None and clear.any():
+        asked = np.median(log.kp[lags[0]], axis=0)
+        ratio = float(np.median(gain[clear] / np.maximum(asked[clear], 1e-12)))
+        if ratio > FAR_OFF or ratio < 1.0 / FAR_OFF:
+            text = f"tau: {ratio:.3g} times what kp asks for; expected N m, and kp in N m/rad"
+            yield Finding("refusal", "tau", _names(log, clear), text)
+
+
 def exchanged(log: Log) -> Iterator[Finding]:
     """Joints that answer another joint's command, or whose torque answers another joint's angle."""
     if len(log.joints) < 2:
         return
-    found = _by_torque(log) if log.tau is not None else _by_motion(log)
-    joints = tuple(log.joints[j] for j in found)
-    if joints:
-        pairs = some([f"{log.joints[j]} follows {log.joints[k]}" for j, k in found.items()])
-        text = f"q_des: a joint's q follows another joint's command ({pairs}): the columns stand in different orders"
-        yield Finding("refusal", "q_des", joints, text)
+    found = _by_torque(log) if log.tau is not None else {j: ("q_des", k) for j, k in _by_motion(log).items()}
+    said = {
+        "q_des": "q follows another joint's command",
+        "tau": "tau follows another joint's command and motion",
+    }
+    for field, what in said.items():
+        mine = {j: k for j, (other, k) in found.items() if other == field}
+        if mine:
+            pairs = some([f"{log.joints[j]} follows {log.joints[k]}" for j, k in mine.items()])
+            text = f"{field}: a joint's {what} ({pairs}): the columns stand in different orders"
+            yield Finding("refusal", field, tuple(log.joints[j] for j in mine), text)
 
 
-def _by_torque(log: Log) -> dict[int, int]:
-    """Joint and the one whose command or angle explains its torque far better than its own do."""
+def _some_valid(log: Log) -> NDArray[np.intp]:
     row = rows_of(log)
-    row = row[log.valid[row].any(axis=1)][:: max(1, len(row) // 4000)]
+    return row[log.valid[row].any(axis=1)][:: max(1, len(row) // 4000)]
+
+
+def _by_torque(log: Log) -> dict[int, tuple[str, int]]:
+    """Joint, and the one whose command or angle, or both, explain its torque far better than its own do.
+
+    With the column that stands in another order than the others.
+    """
+    row = _some_valid(log)
     commands = [log.q_des[log.command_rows(log.t[row] - lag)].astype(float) for lag in LAGS]
     q, dq = log.q[row].astype(float), log.dq[row].astype(float)
     assert log.tau is not None
@@ -164,23 +209,30 @@ def _by_torque(log: Log) -> dict[int, int]:
 
         def left(k: int, m: int, j: int = j, total: float = total) -> float:
             """Share of the torque that the command of k and the motion of m leave."""
-            return min(_left(c[:, k] - q[:, m], dq[:, m], tau[:, j]) for c in commands) / total
+            return min(_law(c[:, k] - q[:, m], dq[:, m], tau[:, j])[0] for c in commands) / total
 
         own = left(j, j)
         if own < 0.3:
             continue
         others = [k for k in range(len(log.joints)) if k != j]
-        least, k = min((min(left(k, j), left(j, k)), k) for k in others)
+        tries = [
+            (share, field, k)
+            for k in others
+            for share, field in ((left(k, j), "q_des"), (left(j, k), "q_des"), (left(k, k), "tau"))
+        ]
+        least, field, k = min(tries)
         if least < 0.3 * own and least < 0.3:
-            found[j] = k
+            found[j] = (field, k)
     return found
 
 
-def _left(error: Array, speed: Array, tau: Array) -> float:
-    """Variance of the torque that a PD law with a positive gain leaves."""
+def _law(error: Array, speed: Array, tau: Array) -> tuple[float, float]:
+    """Variance of the torque that a PD law with a positive gain leaves, and that gain."""
     regressors = np.stack([error, -speed, np.ones(len(error))], axis=1)
     solution = np.linalg.lstsq(regressors, tau, rcond=None)[0]
-    return float(np.var(tau - regressors @ solution)) if solution[0] > 0.0 else float(np.var(tau))
+    if solution[0] < 0.0:
+        return float(np.var(tau)), 0.0
+    return float(np.var(tau - regressors @ solution)), float(solution[0])
 
 
 def _by_motion(log: Log) -> dict[int, int]:
