@@ -151,14 +151,17 @@ def _gains(o: Outcome) -> dict[str, Any]:
         "output_delay_ms": (1e3 * model.output_delay, 1e3 * widths.delays[1]),
     }
     for name, (values, half) in rows.items():
-        value, ci = _with_interval(values, half)
+        least = -np.inf if name.startswith("delta") else 0.0
+        value, ci = _with_interval(values, half, least)
         found[name], found[f"{name}_ci95"] = value, ci
     return found
 
 
-def _with_interval(values: Array, half: Array) -> tuple[Any, Any]:
-    """Value and interval: numbers if all joints share them, else lists."""
-    low, high = values - half, values + half
+def _with_interval(
+    values: Array, half: Array, least: float = -np.inf, most: float = np.inf
+) -> tuple[Any, Any]:
+    """Value and interval, within what is possible: numbers if all joints share them, else lists."""
+    low, high = np.maximum(values - half, least), np.minimum(values + half, most)
     if np.all(values == values[0]):
         return float(values[0]), [float(low[0]), float(high[0])]
     return values.tolist(), np.stack([low, high], axis=1).tolist()
@@ -196,7 +199,7 @@ def _effects(o: Outcome) -> list[dict[str, Any]]:
 def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
     params = {}
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
-        value, ci = _with_interval(values[one.active], width[one.active])
+        value, ci = _with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
         params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
     settings = _settings(one)
     entry: dict[str, Any] = {
@@ -259,7 +262,7 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         values: dict[str, Any] = {}
         ranges = {}
         for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
-            value, ci = _with_interval(row[one.active], width[one.active])
+            value, ci = _with_interval(row[one.active], width[one.active], parameter.low, parameter.high)
             values[parameter.name], ranges[parameter.name] = value, ci
         values |= _settings(one)
         units = {parameter.name: parameter.unit for parameter in one.law.parameters}

@@ -83,13 +83,14 @@ class Ground:
 def pairs(model: Model, moves: Sequence[tuple[float, float]] | None) -> Iterator[Model]:
     """The model at every pair of delays that is tried: so much from the present ones, or a grid of output delays."""
     i, o = model.input_delay, model.output_delay
+    tried: list[tuple[Array, Array]]
     if moves is not None:
         tried = [(i + a, o + b) for a, b in moves]
     else:
         tried = [(i, o), *((i + o - at, np.full_like(o, at)) for at in _OUTPUTS)]
     for a, b in tried:
         if (a > -1e-9).all() and (b > -1e-9).all() and (a <= LONGEST[0]).all() and (b <= LONGEST[1]).all():
-            yield model.with_delays(*(np.round(np.clip(one, 0.0, None), 7) for one in (a, b)))
+            yield model.with_delays(np.maximum(a, 0.0), np.maximum(b, 0.0))
 
 
 def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | None:

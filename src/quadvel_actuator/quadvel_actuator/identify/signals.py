@@ -261,7 +261,7 @@ class Samples:
         every = {pair: [j for j, one in enumerate(pairs) if one == pair] for pair in dict.fromkeys(pairs)}
         made = {pair: self._make(*pair, window, joints) for pair, joints in every.items()}
         first = made[pairs[0]]
-        columns = {}
+        columns: dict[str, Any] = {}
         for name in _OF_JOINTS:
             if getattr(first, name) is not None:
                 columns[name] = np.empty(self.tau.shape)
