@@ -31,7 +31,8 @@ def wander(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]], seco
         direction = rng.standard_normal(3)
         direction *= rng.uniform() ** (1.0 / 3.0) / np.linalg.norm(direction)
         command = np.where(direction > 0, direction * high, -direction * low)
-        commands.append((np.clip(command, -TOP, TOP), HOLD))
+        command[:2] = np.clip(command[:2], -TOP, TOP)
+        commands.append((command, HOLD))
     walk, _ = record_to_the_fall(make_loop(setup, seed, BESIDE), commands)
     return walk
 
@@ -62,9 +63,10 @@ class Estimator(Section):
         return jobs
 
     def judge(self, answers: Answers) -> list[Record]:
-        found = [({**labels}, walk) for labels, walk in answers if walk is not None]
         records: list[Record] = []
-        for labels, walk in found:
+        for labels, walk in answers:
+            if walk is None:
+                continue
             way = float(np.linalg.norm(np.diff(walk.position[:, :2], axis=0), axis=1).sum())
             speed = np.hypot(*walk.velocity[:, :2].T)
             for name, error in walk.estimate_errors.items():

@@ -6,7 +6,7 @@ Here stands the interface alone; each section has a module of its own, `study` r
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, TypeAlias
 
@@ -110,11 +110,13 @@ def column(records: Iterable[Record], name: str) -> np.ndarray:
     return np.array([np.nan if r[name] is None else r[name] for r in records], float)
 
 
-def by_policy(records: Sequence[Record], figure: Any) -> dict[str, float | None]:
-    """`figure(records of a policy)` for each policy; what is not finite becomes None."""
+def by_policy(
+    records: Sequence[Record], measure: Callable[[Sequence[Record]], float | None]
+) -> dict[str, float | None]:
+    """`measure(records of a policy)` for each policy; what is not finite becomes None."""
     found: dict[str, float | None] = {}
     for policy in distinct(records, "policy"):
-        value = figure(select(records, policy=policy))
+        value = measure(select(records, policy=policy))
         found[policy] = float(value) if value is not None and np.isfinite(value) else None
     return found
 
