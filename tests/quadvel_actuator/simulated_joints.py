@@ -44,9 +44,18 @@ def targets(t, joints, rng, motion="lift"):
 
 
 def record(
-    truth, joints=12, seconds=5.0, rate=1000, motion="lift", seed=0, inertia=0.06, distort=None, extra=None
+    truth,
+    joints=12,
+    seconds=5.0,
+    rate=1000,
+    motion="lift",
+    seed=0,
+    inertia=0.06,
+    distort=None,
+    extra=None,
+    load=4.0,
 ):
-    """A log (N, J) of joints with inertia and a load from the ground, at `rate`; the actuators run at 1 kHz.
+    """A log (N, J) of joints with inertia and a load from the ground (N m at most), at `rate`; the actuators run at 1 kHz.
 
     `distort(k, q, dq, tau_mean) -> tau` adds what the model does not hold, before the noise of `truth`.
     """
@@ -64,8 +73,8 @@ def record(
         if distort is not None:
             tau = distort(k, q, dq, tau)
         rows[:, k] = q, dq, tau
-        load = 4.0 * np.maximum(np.sin(2 * np.pi * 2.0 * t[k] + load_phase), 0.0) ** 2
-        dq = dq + dt * (tau - load - 0.3 * dq) / inertia
+        ground = load * np.maximum(np.sin(2 * np.pi * 2.0 * t[k] + load_phase), 0.0) ** 2
+        dq = dq + dt * (tau - ground - 0.3 * dq) / inertia
         q = q + dt * dq
     q, dq, tau = rows
     tau = tau + noise * rng.normal(size=tau.shape)

@@ -7,7 +7,7 @@ summed once for each delay, not once for each pair, which is what makes the grid
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import attrs
@@ -18,6 +18,9 @@ from ..parameters import PROBABLE, DelayPair
 from .signals import Array, Bools, Samples
 
 LONGEST_INPUT, LONGEST_OUTPUT = 0.020, 0.006  # s
+WINDOWS = (0.0, 0.001)
+"""s, steps that a drive may have"""
+
 _REFINEMENTS = ((0.00075, 0.00025), (0.0002, 0.00005))  # s: reach about the best pair so far, step
 _ENOUGH = 1500  # rows for the first, coarse look
 _CHUNK = 20000  # rows summed at once
@@ -128,15 +131,20 @@ class _Sums:
         return np.maximum(mse, 0.0), g0, g1
 
 
-def fit_eam(samples: Samples, rows: Bools, groups: NDArray[np.intp] | None = None) -> Eam:
+def fit_eam(
+    samples: Samples,
+    rows: Bools,
+    groups: NDArray[np.intp] | None = None,
+    windows: Sequence[float] = WINDOWS,
+) -> Eam:
     """Fit the EAM to `rows` (N, J); joints with the same number in `groups` (J,) share gains and delays.
 
-    All joints share them by default, as the paper has it. The drive's step is the shorter of 0 and 1 ms unless the
-    longer one fits better.
+    All joints share them by default, as the paper has it. The drive's step is the first of `windows` (s) unless a
+    later one fits better.
     """
     groups = np.zeros(len(samples.joints), dtype=int) if groups is None else groups
     found = []
-    for window in (0.0, 0.001):
+    for window in windows:
         thinned = rows & (np.arange(len(rows)) % max(1, len(rows) // _ENOUGH) == 0)[:, None]
         totals = np.arange(0.0, LONGEST_INPUT + LONGEST_OUTPUT + 1e-9, 0.001)
         eam = _search(
@@ -148,8 +156,10 @@ def fit_eam(samples: Samples, rows: Bools, groups: NDArray[np.intp] | None = Non
             outputs = _around(output, reach, step, LONGEST_OUTPUT)
             eam = _search(samples, rows, groups, window, totals, outputs, float(np.median(total)), eam.pairs)
         found.append(eam)
-    instant, mean = found
-    return instant if instant.mse <= 1.002 * mean.mse else mean
+    best = found[0]
+    for eam in found[1:]:
+        best = best if best.mse <= 1.002 * eam.mse else eam
+    return best
 
 
 def _around(values: Array, reach: float, step: float, longest: float) -> Array:

@@ -13,8 +13,8 @@ import numpy as np
 
 from ..parameters import ActuatorParameters
 from .delays import fit_with_delays
-from .diagnosis import diagnose
-from .eam import Eam, fit_eam, pd_torque
+from .diagnosis import Diagnosis, Rejected, diagnose
+from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
 from .findings import Finding
 from .floor import noise_floor
@@ -25,7 +25,7 @@ from .judging import Judge
 from .learned import Learned
 from .log import Log, LogError
 from .model import Model
-from .motion import STRETCH, Rigid, implied, replayed
+from .motion import STRETCH, Body, Replay, implied, replayed
 from .outcome import Outcome, identification, parameters
 from .residual import remainder
 from .signals import Array, Samples
@@ -66,38 +66,73 @@ def identify(
     tell = progress or (lambda share, text: None)
     logs, findings = _checked([*train, *heldout])
     kp, kd = (np.array([gain]) for gain in options.gains) if options.gains else (None, None)
-    carried = None
+    body = None
+    windows: Sequence[float] = WINDOWS
     if logs[0].tau is None:
         tell(0.01, "the torque that the motion implies")
-        logs, carried = _moving(logs, kp, kd)
+        logs, body = _moving(logs, kp, kd)
+        windows = (logs[0].period,)
     parts = [
         [Piece(one.log, one.origin) for one in pieces(log, options.seconds / len(train))] for log in logs
     ]
     chosen = [piece for part in parts for piece in part]
     fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
     tell(0.02, "gains and delays")
-    samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd)
+    samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd, windows)
     findings += remark
     before = _plain(samples, eam, judge)
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
     diagnosis = diagnose(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
     tell(0.88, "what no effect explains")
-    named = diagnosis.model
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
-    diagnosis, learned = account(before, diagnosis, judge, noise)
-    rest = remainder(diagnosis.model, learned, judge)
-    tell(0.95, "intervals")
-    outcome = Outcome(
-        eam, before, diagnosis, learned, _worth(named, learned, judge), rest,
-        intervals(diagnosis.model if learned is None else learned.beside, judge), ideal, noise, judge,
-        chosen, *_reference(samples), options.base or ActuatorParameters.default(),
-    )  # fmt: skip
-    found = identification(outcome, findings)
-    if carried is not None:
-        found = attrs.evolve(found, report=_with_motion(found.report, outcome, carried))
+
+    def told(chosen_one: Diagnosis, learned: Learned | None) -> Outcome:
+        model = chosen_one.model
+        return Outcome(
+            eam, before, chosen_one, learned, _worth(diagnosis.model, learned, judge), remainder(model, learned, judge),
+            intervals(model if learned is None else learned.beside, judge), ideal, noise, judge,
+            chosen, *_reference(samples), options.base or ActuatorParameters.default(),
+        )  # fmt: skip
+
+    outcome = told(*account(before, diagnosis, judge, noise))
+    if body is None:
+        found = identification(outcome, findings)
+    else:
+        tell(0.95, "replays")
+        tries = [outcome, told(diagnosis, None), told(_nothing(before, diagnosis), None)]
+        outcome, motion = _steadiest(tries, body)
+        found = identification(outcome, findings)
+        found = attrs.evolve(found, report=_with_motion(found.report, motion, body))
     tell(1.0, "done")
     return found
+
+
+def _nothing(before: Model, diagnosis: Diagnosis) -> Diagnosis:
+    """No effects at all."""
+    reason = "with it the commands replay the motion no better"
+    given_up = tuple(Rejected(one.name, one.gain, reason) for one in diagnosis.findings)
+    return Diagnosis(before, (), (*given_up, *diagnosis.rejected))
+
+
+def _steadiest(tries: Sequence[Outcome], body: Body) -> tuple[Outcome, tuple[Replay, Replay]]:
+    """The account with which the commands replay the motion best, and the replays before and after.
+
+    The torque that a motion implies holds the encoders' errors, which terms can mistake for an effect; a replay does not.
+    """
+    logs = [piece.log for piece in tries[0].pieces]
+
+    def replay(o: Outcome, model: Model) -> Replay:
+        return replayed(logs, parameters(o, model), body, o.judge.judge)
+
+    before = replay(tries[0], tries[0].before)
+    best, after = tries[-1], before
+    for one in tries[:-1]:
+        if one.model is not one.before:
+            found = replay(one, one.model)
+            if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
+                best, after = one, found
+    return best, (before, after)
 
 
 def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]:
@@ -115,20 +150,17 @@ def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]
     return [one.log for one in inspected], [(one.log.name, f) for one in inspected for f in one.findings]
 
 
-def _moving(logs: Sequence[Log], kp: Array | None, kd: Array | None) -> tuple[list[Log], Rigid]:
-    """The logs with the torque that their motion implies, and what the joints carry, from the first one."""
-    first, carried = implied(logs[0], kp, kd)
-    return [first, *(implied(log, kp, kd)[0] for log in logs[1:])], carried
+def _moving(logs: Sequence[Log], kp: Array | None, kd: Array | None) -> tuple[list[Log], Body]:
+    """The logs with the torque that their motion implies, and the body that they carry, from the first one."""
+    first, body = implied(logs[0], kp, kd)
+    return [first, *(implied(log, kp, kd, body)[0] for log in logs[1:])], body
 
 
-def _with_motion(report: Mapping[str, Any], o: Outcome, carried: Rigid) -> dict[str, Any]:
+def _with_motion(report: Mapping[str, Any], replays: tuple[Replay, Replay], body: Body) -> dict[str, Any]:
     """The report with before and after in rad and rad/s, too."""
-    logs = [piece.log for piece in o.pieces]
-    before, after = (
-        replayed(logs, parameters(o, model), carried, o.judge.judge) for model in (o.before, o.model)
-    )
+    before, after = replays
     motion = {
-        "inertia": {"value": carried.inertia.tolist(), "unit": "kg m^2"},
+        "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
         "replayed_s": STRETCH,
         "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
         "the inertia and an encoder bias part of the torque offset.",
@@ -147,14 +179,14 @@ def _with_motion(report: Mapping[str, Any], o: Outcome, carried: Rigid) -> dict[
 
 
 def _clocked(
-    chosen: Sequence[Piece], fitted: int, kp: Array | None, kd: Array | None
+    chosen: Sequence[Piece], fitted: int, kp: Array | None, kd: Array | None, windows: Sequence[float]
 ) -> tuple[Samples, Judge, Eam, list[tuple[str, Finding]]]:
     """Samples and the EAM, with the stamps as logged or as an even sender's, whichever explains the torque better."""
 
     def tried(logs: Sequence[Log]) -> tuple[Samples, Judge, Eam]:
         samples = Samples(logs, kp, kd, [piece.origin for piece in chosen])
         judge = _rows(samples, fitted)
-        return samples, judge, fit_eam(samples, judge.fit)
+        return samples, judge, fit_eam(samples, judge.fit, windows=windows)
 
     logs = [piece.log for piece in chosen]
     as_logged = tried(logs)

@@ -322,8 +322,7 @@ def _inverse(x: Array, penalties: Sequence[Array]) -> Array:
         size = float(np.trace(gram[first:last, first:last])) / len(penalty)
         gram[first:last, first:last] += size * penalty + 1e-12 * np.eye(len(penalty))
         first = last
-    inverse: Array = np.linalg.inv(gram)
-    return inverse
+    return np.asarray(np.linalg.inv(gram), dtype=np.float64)
 
 
 class _Joint:

@@ -1,0 +1,76 @@
+"""Effects that the registry does not hold: the right signal is named, most of the error goes, and the model runs so."""
+
+from functools import cache
+
+import attrs
+import numpy as np
+import odd_joints
+import pytest
+from simulated_joints import parameters, record
+
+from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_actuator.identify.delays import fit_with_delays
+from quadvel_actuator.identify.eam import fit_eam
+from quadvel_actuator.identify.floor import noise_floor
+from quadvel_actuator.identify.identify import identify
+from quadvel_actuator.identify.judging import Judge
+from quadvel_actuator.identify.learned import learn
+from quadvel_actuator.identify.model import Model
+from quadvel_actuator.identify.signals import Samples
+
+VARIANCE = 0.066  # of the torque noise of these logs
+
+
+def _looked_at(log):
+    """The plain EAM on a log, who judges, and the noise floor."""
+    samples = Samples([log])
+    first = (np.floor(samples.t / 0.2).astype(int) % 3 != 2)[:, None]
+    judge = Judge.of(samples, samples.judged & first, samples.judged & ~first)
+    eam = fit_eam(samples, judge.fit)
+    one = np.zeros(len(log.joints), dtype=np.intp)
+    plain = Model(samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one)
+    model = fit_with_delays(plain, judge.fit, 2)
+    return model, judge, noise_floor(samples, judge.fit | judge.judge, samples.tau - model.predict())
+
+
+@cache
+def _learned(name):
+    model, judge, noise = _looked_at(odd_joints.log(name, "mixed", 0, 4.0))
+    learned = learn(model, judge, noise)
+    assert learned is not None
+    left = model.samples.tau - learned.model.predict() - learned.torque
+    error = float(np.sum(np.where(judge.judge, left, 0.0) ** 2) / judge.judge.sum())
+    return learned, model.mse(judge.judge), error
+
+
+@pytest.mark.parametrize("name", odd_joints.ODD)
+def test_the_signal_behind_an_odd_effect_is_named_and_most_of_its_error_goes(name):
+    learned, before, after = _learned(name)
+    odd = odd_joints.ODD[name]
+    heaviest = learned.terms[int(np.argmax(learned.gains))]
+    assert set(odd.signals) & set(heaviest.inputs)
+    assert before - after > 0.6 * (before - VARIANCE)
+    assert np.flatnonzero(heaviest.active).tolist() == list(odd.joints)
+    assert len(learned.terms) <= 3
+
+
+def test_nothing_is_learned_where_nothing_is():
+    truth = attrs.evolve(parameters(), joints=odd_joints.NAMES[: odd_joints.JOINTS])
+    model, judge, noise = _looked_at(record(truth, odd_joints.JOINTS, 3.0, 500, "mixed", 5))
+    assert learn(model, judge, noise) is None
+
+
+def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):
+    fitted, kept = (odd_joints.log("rubbing", "mixed", seed, 2.0, 1000) for seed in (0, 1))
+    found = identify([fitted], [kept])
+    report = found.report
+    assert [one["name"] for one in report["effects"]] == ["learned_residual"]
+    assert report["effects"][0]["inputs"] == report["unexplained"]["depends_on"] == ["q", "dq"]
+    found.parameters.save(tmp_path / "actuator.yaml")
+    loaded = ActuatorParameters.load(tmp_path / "actuator.yaml")
+    model = ActuatorModel(attrs.evolve(loaded, torque_noise=0.0), (len(kept.joints),))
+    rows = zip(kept.q, kept.dq, kept.q_des, strict=True)
+    torque = np.array([model.step(q, dq, q_des, 30.0, 0.5) for q, dq, q_des in rows])
+    error = np.mean((kept.tau - torque)[40:] ** 2)
+    assert error == pytest.approx(report["after"]["heldout_mse"], rel=0.05)
+    assert error < 0.5 * report["before"]["heldout_mse"]
