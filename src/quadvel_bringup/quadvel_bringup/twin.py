@@ -72,7 +72,9 @@ def twin_command(
             if not (reuse and recording.exists()):
                 console.rule(f"{name}: walk {seed + 1} of {len(WALKS)}")
                 _walk(file, recording, seed, console)
-    _identify({name: here for name, here in folders.items() if not (reuse and _identified(here))}, console)
+    new = {name: here for name, here in folders.items() if not (reuse and _identified(here))}
+    if new:
+        _identify(new, console)
     results = judge(folders, console)
     for result in results:
         console.print(_table(result))
