@@ -8,7 +8,7 @@ import pytest
 from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_actuator.effects.terms import Curve, Filter, Resonance, Term, Wave, loaded
+from quadvel_actuator.effects.terms import Curve, Filter, Lag, Resonance, Term, Wave, loaded
 
 JOINTS = NAMES[:3]
 DT = 0.001
@@ -16,6 +16,7 @@ SHAPES = {
     "curve": Curve([-0.4, -0.3, -0.5], [0.4, 0.5, 0.3], 6),
     "wave": Wave([9.0, 12.0, 15.0], 2),
     "filter": Filter((0.001, 0.002, 0.004, 0.009, 0.02)),
+    "lag": Lag(0.03),
     "resonance": Resonance(18.0, 0.05),
 }
 
@@ -65,6 +66,13 @@ def test_a_resonance_rings_as_its_equation_says():
     columns = shape.columns(u, np.arange(400) == 0, DT)
     expected = abs(pole) / -pole * (1.0 - np.exp(pole * (t[1:] - 0.5 * DT)))
     np.testing.assert_allclose(columns[1:, 1, 0] + 1j * columns[1:, 2, 0], expected, atol=0.01)
+
+
+def test_a_lag_follows_a_step_as_an_exponential():
+    u = np.where(np.arange(200) < 1, 0.0, 1.0)[:, None]
+    columns = Lag(0.03).columns(u, np.arange(200) == 0, DT)
+    expected = 1.0 - np.exp(-(np.arange(1, 200) - 0.5) * DT / 0.03)
+    np.testing.assert_allclose(columns[1:, 1, 0], expected, atol=0.001)
 
 
 @pytest.mark.parametrize("kind", SHAPES)
@@ -133,7 +141,7 @@ def test_no_term_gives_more_than_its_bound():
     assert 0.19 < np.max(np.abs(torques[0] - torques[1])) <= 0.2 + 1e-9
 
 
-@pytest.mark.parametrize("kind", ["filter", "resonance"])
+@pytest.mark.parametrize("kind", ["filter", "lag", "resonance"])
 def test_environments_of_a_batch_have_memories_of_their_own_and_peeks_leave_none(kind):
     single, batch = _model(kind=kind), _model((2, 3), kind=kind)
     views = _views()

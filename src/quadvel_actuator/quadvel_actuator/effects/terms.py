@@ -1,9 +1,9 @@
 """Terms of named signals: what stands for an effect that has no law, over whole series and step by step.
 
-A term is a shape of one signal (a smooth curve, a wave along it, a filter of its recent past, a resonance that it
-excites), alone or times the direction of motion, the speed, or the torque. Its torque stays within what it was where
-it was fitted. Signals are named as in the report: `q`, `dq`, `ddq`, `q_des`, `tau` (what the model gives without terms),
-`t`, besides `error` for q_des - q, and `FR_thigh_joint/q` for another joint's.
+A term is a shape of one signal (a smooth curve, a wave along it, a filter of its recent past, a lag behind it, a resonance
+that it excites), alone or times the direction of motion, the speed, or the torque. Its torque stays within what it was
+where it was fitted. Signals are named as in the report: `q`, `dq`, `ddq`, `q_des`, `tau` (what the model gives without
+terms), `t`, besides `error` for q_des - q, and `FR_thigh_joint/q` for another joint's.
 """
 
 from __future__ import annotations
@@ -181,6 +181,37 @@ class Filter(Shape):
 
 
 @attrs.frozen(eq=False)
+class Lag(Shape):
+    """The signal, and what follows it with a time constant `time` (s)."""
+
+    kind: ClassVar[str] = "lag"
+    history: ClassVar[bool] = True
+    time: float
+
+    @property
+    def count(self) -> int:
+        return 2
+
+    def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
+        kept = float(np.exp(-dt / self.time))
+        half = 0.5 * (1.0 - kept)
+        z = np.empty_like(u)
+        for first, last in pairwise([*np.flatnonzero(start), len(u)]):
+            begin = (kept + half) * u[first : first + 1]
+            z[first:last] = lfilter([half, half], [1.0, -kept], u[first:last], axis=0, zi=begin)[0]
+        return np.stack([u, z], axis=1)
+
+    def rest(self, u: Array, dt: float) -> Memory:
+        return u, u
+
+    def advance(self, u: Array, dt: float, weights: Array, memory: Memory) -> tuple[Array, Memory]:
+        kept = float(np.exp(-dt / self.time))
+        last, z = memory
+        z = kept * z + 0.5 * (1.0 - kept) * (last + u)
+        return weights[0] * u + weights[1] * z, (u, z)
+
+
+@attrs.frozen(eq=False)
 class Resonance(Shape):
     """The signal, and place and speed of a mass on a damped spring that it pushes, scaled to its units."""
 
@@ -223,7 +254,7 @@ class Resonance(Shape):
         return weights[0] * u + weights[1] * z.real + weights[2] * z.imag, (u, z)
 
 
-SHAPES: dict[str, type[Shape]] = {one.kind: one for one in (Curve, Wave, Filter, Resonance)}
+SHAPES: dict[str, type[Shape]] = {one.kind: one for one in (Curve, Wave, Filter, Lag, Resonance)}
 
 
 def read(name: str, view: View, tau: Array, joints: Sequence[str]) -> Array:

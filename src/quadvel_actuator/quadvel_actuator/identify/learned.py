@@ -13,7 +13,7 @@ from copy import copy
 import attrs
 import numpy as np
 
-from ..effects.terms import Curve, Filter, Resonance, Shape, Term, Wave, factor, inputs, read
+from ..effects.terms import Curve, Filter, Lag, Resonance, Shape, Term, Wave, factor, inputs, read
 from ..running import SLOPE
 from .delays import jacobian_with_delays
 from .judging import Comparison, Judge
@@ -37,9 +37,15 @@ _STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model 
 _HISTORY = 0.02  # s
 _FREQUENCIES = np.geomspace(3.0, 110.0, 26)  # Hz
 _DAMPING, _MOST_DAMPED = (0.02, 0.07, 0.2), 0.7
-_TUNING = (1.06, 1.03, 1.015, 1.007)  # steps of a resonance's frequency
+_TUNING = (
+    1.06,
+    1.03,
+    1.015,
+    1.007,
+)  # steps of a frequency; of dampings and time constants to the fourth power
+_LAGS = np.geomspace(0.01, 1.0, 8)  # s
 _RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
-_COARSE, _MIDDLE, _FINE = 3, 6, 25  # pieces of a curve
+_COARSE, _MIDDLE, _FINE, _FINEST = 3, 6, 25, 70  # pieces of a curve
 
 
 @attrs.frozen(eq=False)
@@ -159,10 +165,13 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
             yield curve(name, times, _MIDDLE)
     for times in ("", "direction", "dq"):
         yield curve("q", times, _FINE)
+    yield from (curve("q", times, _FINEST) for times in ("", "direction"))
     rows = max(round(_HISTORY / scene.dt), 4)
     edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
     for name in ("tau", "q_des", "q", "dq"):
         yield Feature(name, "", Filter(edges))
+    for name in ("tau", "q"):  # a lag of dq is what q has more than a lag of its own
+        yield from (Feature(name, "", Lag(float(time))) for time in _LAGS)
     for name in ("tau", "q"):
         for frequency in _FREQUENCIES[0.35 / scene.dt > _FREQUENCIES]:
             yield from (Feature(name, "", Resonance(float(frequency), damping)) for damping in _DAMPING)
@@ -250,22 +259,32 @@ def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
 
 
 def _tuned(pick: _Pick, trial: _Trial, noise: Array) -> _Pick:
-    """A resonance with the frequency and damping with which it says most of the fitted rows; another pick as it is."""
+    """The pick with the time constant, frequency or damping with which it says most of the fitted rows."""
     shape = pick.feature.shape
-    if not isinstance(shape, Resonance):
+    if not _near(shape, _TUNING[0]):
         return pick
     least = trial.error(pick.feature, pick.columns, pick.joints)
     for size in _TUNING:
-        for by_frequency, by_damping in ((1, 0), (-1, 0), (0, 1), (0, -1)):
-            damping = min(shape.damping * size ** (4 * by_damping), _MOST_DAMPED)
-            moved = Resonance(shape.frequency * size**by_frequency, damping)
+        for moved in _near(shape, size):
             tried = attrs.evolve(pick.feature, shape=moved)
             error = trial.error(tried, trial.scene.columns(tried), pick.joints)
             if error < least:
                 least, shape = error, moved
-    best = attrs.evolve(pick.feature, shape=shape)
-    found = _pick(best, trial, noise)
+    found = _pick(attrs.evolve(pick.feature, shape=shape), trial, noise)
     return pick if found is None or found.gain < pick.gain else found
+
+
+def _near(shape: Shape, size: float) -> list[Shape]:
+    """The same with its times changed by a factor near `size`; none of shapes that have none."""
+    if isinstance(shape, Lag):
+        return [Lag(shape.time * size**by) for by in (4, -4)]
+    if isinstance(shape, Resonance):
+        sharp = [min(shape.damping * size**by, _MOST_DAMPED) for by in (4, -4)]
+        return [
+            *(Resonance(shape.frequency * size**by, shape.damping) for by in (1, -1)),
+            *(Resonance(shape.frequency, damping) for damping in sharp),
+        ]
+    return []
 
 
 class _Trial:
