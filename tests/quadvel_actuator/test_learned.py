@@ -21,21 +21,23 @@ from quadvel_actuator.identify.signals import Samples
 VARIANCE = 0.066  # of the torque noise of these logs
 
 
-def _looked_at(log):
+def looked_at(log):
     """The plain EAM on a log, who judges, and the noise floor."""
     samples = Samples([log])
     first = (np.floor(samples.t / 0.2).astype(int) % 3 != 2)[:, None]
     judge = Judge.of(samples, samples.judged & first, samples.judged & ~first)
     eam = fit_eam(samples, judge.fit)
     one = np.zeros(len(log.joints), dtype=np.intp)
-    plain = Model(samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one)
+    plain = Model(
+        samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one
+    )
     model = fit_with_delays(plain, judge.fit, 2)
     return model, judge, noise_floor(samples, judge.fit | judge.judge, samples.tau - model.predict())
 
 
 @cache
 def _learned(name):
-    model, judge, noise = _looked_at(odd_joints.log(name, "mixed", 0, 4.0))
+    model, judge, noise = looked_at(odd_joints.log(name, "mixed", 0, 4.0))
     learned = learn(model, judge, noise)
     assert learned is not None
     left = model.samples.tau - learned.model.predict() - learned.torque
@@ -56,7 +58,7 @@ def test_the_signal_behind_an_odd_effect_is_named_and_most_of_its_error_goes(nam
 
 def test_nothing_is_learned_where_nothing_is():
     truth = attrs.evolve(parameters(), joints=odd_joints.NAMES[: odd_joints.JOINTS])
-    model, judge, noise = _looked_at(record(truth, odd_joints.JOINTS, 3.0, 500, "mixed", 5))
+    model, judge, noise = looked_at(record(truth, odd_joints.JOINTS, 3.0, 500, "mixed", 5))
     assert learn(model, judge, noise) is None
 
 

@@ -13,12 +13,11 @@ from copy import copy
 import attrs
 import numpy as np
 
-from ..effects.terms import Curve, Filter, Lag, Resonance, Shape, Term, Wave, factor, inputs, read
-from ..running import SLOPE
-from .delays import jacobian_with_delays
+from ..effects.terms import Lag, Resonance, Shape, Term
+from .features import Feature, Scene, library, lines
 from .judging import Comparison, Judge
 from .model import Model, gather, pack, step, with_slots
-from .signals import Array, Bools, Signals
+from .signals import Array, Bools
 
 LEVEL = 0.01
 """A term is taken if chance would bring its gain with less than this probability, all that were tried counted."""
@@ -34,67 +33,14 @@ _KEPT = 12  # features that come into question after a look at all of them
 _AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
 _RIDGE = 1e-6
 _STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model and terms together
-_HISTORY = 0.02  # s
-_FREQUENCIES = np.geomspace(3.0, 110.0, 26)  # Hz
-_DAMPING, _MOST_DAMPED = (0.02, 0.07, 0.2), 0.7
+_MOST_DAMPED = 0.7
+_ENOUGH = 1500  # rows for a first look
 _TUNING = (
     1.06,
     1.03,
     1.015,
     1.007,
 )  # steps of a frequency; of dampings and time constants to the fourth power
-_LAGS = np.geomspace(0.01, 1.0, 8)  # s
-_RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
-_COARSE, _MIDDLE, _FINE, _FINEST = 3, 6, 25, 70  # pieces of a curve
-
-
-@attrs.frozen(eq=False)
-class Feature:
-    """A shape of a signal, times something."""
-
-    signal: str
-    times: str
-    shape: Shape
-
-    @property
-    def key(self) -> tuple[str, ...]:
-        """Features with the same one stand for each other: the best of them comes into question."""
-        return inputs(self.signal, self.times, self.shape)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """How much it says: signals, then numbers."""
-        return len(self.key), self.shape.count
-
-
-class Scene:
-    """A model's rows as terms see them: the signals, what is left, and how that moves with the model's parameters."""
-
-    def __init__(self, model: Model, judge: Judge) -> None:
-        self.model, self.judge = model, judge
-        self.joints: Sequence[str] = model.samples.joints
-        self.rows = judge.fit | judge.judge
-        self.asked, self.slopes, self.slots = jacobian_with_delays(model)  # (N, J), (J, A, N)
-        self.residual = np.where(self.rows, model.samples.tau - self.asked, 0.0)
-        self.dt = model.samples.period
-        self.start = model.samples.start
-        self.view = _past_only(model.signals, self.dt)
-
-    def columns(self, feature: Feature) -> Array:
-        """What the feature is a sum of, (N, K, J)."""
-        u = read(feature.signal, self.view, self.asked, self.joints)
-        columns = feature.shape.columns(u, self.start, self.dt)
-        by = factor(feature.times, self.view, self.asked)
-        return columns if isinstance(by, float) else columns * by[:, None]
-
-
-def _past_only(s: Signals, dt: float) -> Signals:
-    """The signals with an acceleration that a running model can have, too."""
-    back = max(1, round(SLOPE / dt))
-    n = np.arange(len(s.dq))
-    began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
-    slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
-    return attrs.evolve(s, ddq=slope)
 
 
 @attrs.frozen(eq=False)
@@ -155,82 +101,22 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     return _fitted_beside(picks, scene) if picks else None
 
 
-def library(scene: Scene, left: Array) -> Iterator[Feature]:
-    """Everything that is tried on what is left (N, J)."""
-    curve = _Curves(scene)
-    for name in ("q", "dq", "ddq", "q_des", "tau", "error", "t"):
-        yield curve(name, "", _MIDDLE)
-    for times, names in (("direction", ("q", "tau", "t")), ("tau", ("q", "dq", "t")), ("dq", ("q", "t"))):
-        for name in names:
-            yield curve(name, times, _MIDDLE)
-    for times in ("", "direction", "dq"):
-        yield curve("q", times, _FINE)
-    yield from (curve("q", times, _FINEST) for times in ("", "direction"))
-    rows = max(round(_HISTORY / scene.dt), 4)
-    edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
-    for name in ("tau", "q_des", "q", "dq"):
-        yield Feature(name, "", Filter(edges))
-    for name in ("tau", "q"):  # a lag of dq is what q has more than a lag of its own
-        yield from (Feature(name, "", Lag(float(time))) for time in _LAGS)
-    for name in ("tau", "q"):
-        for frequency in _FREQUENCIES[0.35 / scene.dt > _FREQUENCIES]:
-            yield from (Feature(name, "", Resonance(float(frequency), damping)) for damping in _DAMPING)
-    for joint in scene.joints if len(scene.joints) > 1 else ():
-        for name in ("q", "dq", "tau"):
-            yield curve(f"{joint}/{name}", "", _MIDDLE)
-            yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau"))
-        yield curve(f"{joint}/q", "", _FINE)
-        yield from _ripples(scene, left, f"{joint}/q")
-    yield from _lines(scene, left)
-
-
-class _Curves:
-    """Makes curves over the range that a signal had."""
-
-    def __init__(self, scene: Scene) -> None:
-        self._scene = scene
-        self._ranges: dict[str, tuple[Array, Array]] = {}
-
-    def __call__(self, signal: str, times: str, pieces: int) -> Feature:
-        if signal not in self._ranges:
-            u = read(signal, self._scene.view, self._scene.asked, self._scene.joints)
-            low, high = np.quantile(u, (0.005, 0.995), axis=0)
-            self._ranges[signal] = low, np.maximum(high, low + 1e-9)
-        return Feature(signal, times, Curve(*self._ranges[signal], pieces))
-
-
-def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
-    """A wave along the angle of another joint: the rate with which most of what is left goes."""
-    u = read(signal, scene.view, scene.asked, scene.joints)
-    least = 2.0 * np.pi / max(float(np.ptp(u)), 1e-3)
-    rates = _RATES[1.5 * least < _RATES]
-    if rates.size:
-        power = np.abs(np.exp(-1j * rates[:, None] * u[:, 0]) @ np.where(scene.judge.fit, left, 0.0)) ** 2
-        yield Feature(signal, "", Wave(rates[np.argmax(power.max(axis=1))], 2))
-
-
-def _lines(scene: Scene, left: Array) -> Iterator[Feature]:
-    """The strongest lines of the spectrum in time of what is left, each with two overtones."""
-    t = scene.view.t[:, 0]
-    span, period = float(np.ptp(t)), scene.dt
-    grid = np.arange(max(2.0, 3.0 / span), 0.45 / period, 0.5 / span)
-    even = np.arange(t.min(), t.max(), period)
-    order = np.argsort(t, kind="stable")
-    fitted = np.where(scene.judge.fit, left, 0.0)
-    power = np.zeros(len(grid))
-    for one in fitted.T:
-        spectrum = np.fft.rfft(np.interp(even, t[order], one[order]), 2 * len(even))
-        power = np.maximum(power, np.interp(grid, np.fft.rfftfreq(2 * len(even), period), np.abs(spectrum)))
-    for best in np.argsort(-power)[:3]:
-        near = grid[best] + np.linspace(-0.5 / span, 0.5 / span, 21)
-        waves = np.exp(-2j * np.pi * np.outer(near, t)) @ fitted
-        frequency = near[int(np.argmax((np.abs(waves) ** 2).sum(axis=1)))]
-        yield Feature("t", "", Wave(2.0 * np.pi * frequency, 3))
+def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
+    """The signals that what `model` leaves goes with most clearly, whether or not a term of them would pay."""
+    scene = Scene(model, judge)
+    trial, every = _Trial([], scene), np.ones(len(scene.joints), dtype=bool)
+    best: tuple[str, ...] = ()
+    least = 1.0
+    for feature in library(scene, scene.residual):
+        p = trial.compare(feature, scene.columns(feature), every).p_any
+        if p < least:
+            best, least = feature.key, p
+    return best
 
 
 def _again(kept: Sequence[_Pick], scene: Scene, left: Array) -> Iterator[Feature]:
     yield from (one.feature for one in kept)
-    yield from _lines(scene, left)
+    yield from lines(scene, left)
 
 
 def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
@@ -249,8 +135,11 @@ def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, n
 
 def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
     """The feature on the joints where it pays; None where there are none."""
+    promising = trial.promising(feature, noise)
+    if not promising.any():
+        return None
     columns = trial.scene.columns(feature)
-    found = trial.compare(feature, columns)
+    found = trial.compare(feature, columns, promising)
     taken = (found.p_joints * _TRIED * len(noise) < LEVEL) & (found.joint_gain > WORTH * noise)
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
@@ -312,23 +201,39 @@ class _Trial:
         left: Array = values - x @ (self.inverse[j] @ (x[keep].T @ values[keep]))
         return left
 
-    def compare(self, feature: Feature, columns: Array) -> Comparison:
-        """Held-out residuals without and with the feature."""
-        return self.scene.judge.compare(self.bare, self._after(feature, columns))
+    def promising(self, feature: Feature, noise: Array) -> Bools:
+        """The joints where the feature fitted to some of the rows gains more than chance would."""
+        few = slice(None, None, max(1, len(self.bare) // _ENOUGH))
+        columns, fit = self.scene.columns(feature, few), self.scene.judge.fit[few]
+        found = np.zeros(len(noise), dtype=bool)
+        for j, x in enumerate(self.others):
+            keep = fit[:, j]
+            left = self.bare[few, j][keep]
+            b, x = columns[keep, :, min(j, columns.shape[2] - 1)], x[few][keep]
+            b = b - x @ np.linalg.lstsq(x.T @ x + 1e-9 * len(x) * np.eye(x.shape[1]), x.T @ b, rcond=None)[0]
+            onto = b.T @ left
+            gain = (onto @ _inverse(b, [feature.shape.penalty]) @ onto) / len(left)
+            chance = float(np.mean(left * left)) * feature.shape.count / len(left)
+            found[j] = gain - chance > 0.5 * WORTH * noise[j]
+        return found
+
+    def compare(self, feature: Feature, columns: Array, joints: Bools) -> Comparison:
+        """Held-out residuals without the feature, and with it on these joints."""
+        return self.scene.judge.compare(self.bare, self._after(feature, columns, joints))
 
     def error(self, feature: Feature, columns: Array, joints: Bools) -> float:
         """Sum of squares that the feature leaves of the fitted rows of these joints."""
-        left = (self._after(feature, columns) * self.scene.judge.fit)[:, joints]
+        left = (self._after(feature, columns, joints) * self.scene.judge.fit)[:, joints]
         return float(np.sum(left * left))
 
-    def _after(self, feature: Feature, columns: Array) -> Array:
-        """Residual (N, J) with the feature fitted to each joint."""
-        after = np.empty_like(self.bare)
-        for j in range(self.bare.shape[1]):
+    def _after(self, feature: Feature, columns: Array, joints: Bools) -> Array:
+        """Residual (N, J) with the feature fitted to each of these joints."""
+        after = self.bare.copy()
+        for j in np.flatnonzero(joints).tolist():
             own = self._without(j, columns[:, :, min(j, columns.shape[2] - 1)])
             keep = self.scene.judge.fit[:, j]
             inverse = _inverse(own[keep], [feature.shape.penalty])
-            after[:, j] = self.bare[:, j] - own @ (inverse @ (own[keep].T @ self.bare[keep, j]))
+            after[:, j] -= own @ (inverse @ (own[keep].T @ self.bare[keep, j]))
         return after
 
 

@@ -6,7 +6,7 @@ import attrs
 import numpy as np
 
 from .judging import Judge
-from .learned import Learned
+from .learned import Learned, leanings
 from .model import Model
 from .signals import Array, Bools
 
@@ -38,7 +38,7 @@ def remainder(model: Model, learned: Learned | None, judge: Judge) -> Remainder:
     correlation = _correlation(left, model)
     coloured = correlation > _CORRELATED
     if coloured.any() and not names:
-        names = ("tau@history",)
+        names = leanings(model, judge)
     return Remainder(learned is not None or bool(coloured.any()), names, joints | coloured, correlation, left)
 
 

@@ -1,0 +1,150 @@
+"""What is tried for what no law explains: shapes of named signals, and a model's rows as they see them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import attrs
+import numpy as np
+
+from ..effects.terms import Curve, Filter, Lag, Resonance, Shape, Wave, factor, inputs, read
+from ..running import SLOPE
+from .delays import jacobian_with_delays
+from .judging import Judge
+from .model import Model
+from .signals import Array, Signals
+
+EVERY = slice(None)
+
+_HISTORY = 0.02  # s
+_FREQUENCIES = np.geomspace(3.0, 110.0, 26)  # Hz
+_DAMPING = (0.02, 0.07, 0.2)
+_LAGS = np.geomspace(0.01, 1.0, 8)  # s
+_RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
+_COARSE, _MIDDLE, _FINE, _FINEST = 3, 6, 25, 70  # pieces of a curve
+
+
+@attrs.frozen(eq=False)
+class Feature:
+    """A shape of a signal, times something."""
+
+    signal: str
+    times: str
+    shape: Shape
+
+    @property
+    def key(self) -> tuple[str, ...]:
+        """Features with the same one stand for each other: the best of them comes into question."""
+        return inputs(self.signal, self.times, self.shape)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """How much it says: signals, then numbers."""
+        return len(self.key), self.shape.count
+
+
+class Scene:
+    """A model's rows as terms see them: the signals, what is left, and how that moves with the model's parameters."""
+
+    def __init__(self, model: Model, judge: Judge) -> None:
+        self.model, self.judge = model, judge
+        self.joints: Sequence[str] = model.samples.joints
+        self.rows = judge.fit | judge.judge
+        self.asked, self.slopes, self.slots = jacobian_with_delays(model)  # (N, J), (J, A, N)
+        self.residual = np.where(self.rows, model.samples.tau - self.asked, 0.0)
+        self.dt = model.samples.period
+        self.start = model.samples.start
+        self.view = _past_only(model.signals, self.dt)
+
+    def columns(self, feature: Feature, rows: slice = EVERY) -> Array:
+        """What the feature is a sum of, (N, K, J), at some rows."""
+        u = read(feature.signal, self.view, self.asked, self.joints)
+        if feature.shape.history:
+            columns = feature.shape.columns(u, self.start, self.dt)[rows]
+        else:
+            columns = feature.shape.columns(u[rows], self.start[rows], self.dt)
+        by = factor(feature.times, self.view, self.asked)
+        return columns if isinstance(by, float) else columns * by[rows, None]
+
+
+def _past_only(s: Signals, dt: float) -> Signals:
+    """The signals with an acceleration that a running model can have, too."""
+    back = max(1, round(SLOPE / dt))
+    n = np.arange(len(s.dq))
+    began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
+    slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
+    return attrs.evolve(s, ddq=slope)
+
+
+def library(scene: Scene, left: Array) -> Iterator[Feature]:
+    """Everything that is tried on what is left (N, J)."""
+    curve = _Curves(scene)
+    for name in ("q", "dq", "ddq", "q_des", "tau", "error", "t"):
+        yield curve(name, "", _MIDDLE)
+    for times, names in (("direction", ("q", "tau", "t")), ("tau", ("q", "dq", "t")), ("dq", ("q", "t"))):
+        for name in names:
+            yield curve(name, times, _MIDDLE)
+    for times in ("", "direction", "dq"):
+        yield curve("q", times, _FINE)
+    yield from (curve("q", times, _FINEST) for times in ("", "direction"))
+    rows = max(round(_HISTORY / scene.dt), 4)
+    edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
+    for name in ("tau", "q_des", "q", "dq"):
+        yield Feature(name, "", Filter(edges))
+    for name in ("tau", "q"):  # a lag of dq is what q has more than a lag of its own
+        yield from (Feature(name, "", Lag(float(time))) for time in _LAGS)
+    for name in ("tau", "q"):
+        for frequency in _FREQUENCIES[0.35 / scene.dt > _FREQUENCIES]:
+            yield from (Feature(name, "", Resonance(float(frequency), damping)) for damping in _DAMPING)
+    for joint in scene.joints if len(scene.joints) > 1 else ():
+        for name in ("q", "dq", "tau"):
+            yield curve(f"{joint}/{name}", "", _MIDDLE)
+            yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau"))
+        yield curve(f"{joint}/q", "", _FINE)
+        yield from (Feature(f"{joint}/{name}", "", Filter(edges)) for name in ("q", "tau"))
+        yield from _ripples(scene, left, f"{joint}/q")
+    yield from lines(scene, left)
+
+
+class _Curves:
+    """Makes curves over the range that a signal had."""
+
+    def __init__(self, scene: Scene) -> None:
+        self._scene = scene
+        self._ranges: dict[str, tuple[Array, Array]] = {}
+
+    def __call__(self, signal: str, times: str, pieces: int) -> Feature:
+        if signal not in self._ranges:
+            u = read(signal, self._scene.view, self._scene.asked, self._scene.joints)
+            low, high = np.quantile(u, (0.005, 0.995), axis=0)
+            self._ranges[signal] = low, np.maximum(high, low + 1e-9)
+        return Feature(signal, times, Curve(*self._ranges[signal], pieces))
+
+
+def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
+    """A wave along the angle of another joint: the rate with which most of what is left goes."""
+    u = read(signal, scene.view, scene.asked, scene.joints)
+    least = 2.0 * np.pi / max(float(np.ptp(u)), 1e-3)
+    rates = _RATES[1.5 * least < _RATES]
+    if rates.size:
+        power = np.abs(np.exp(-1j * rates[:, None] * u[:, 0]) @ np.where(scene.judge.fit, left, 0.0)) ** 2
+        yield Feature(signal, "", Wave(rates[np.argmax(power.max(axis=1))], 2))
+
+
+def lines(scene: Scene, left: Array) -> Iterator[Feature]:
+    """The strongest lines of the spectrum in time of what is left, each with two overtones."""
+    t = scene.view.t[:, 0]
+    span, period = float(np.ptp(t)), scene.dt
+    grid = np.arange(max(2.0, 3.0 / span), 0.45 / period, 0.5 / span)
+    even = np.arange(t.min(), t.max(), period)
+    order = np.argsort(t, kind="stable")
+    fitted = np.where(scene.judge.fit, left, 0.0)
+    power = np.zeros(len(grid))
+    for one in fitted.T:
+        spectrum = np.fft.rfft(np.interp(even, t[order], one[order]), 2 * len(even))
+        power = np.maximum(power, np.interp(grid, np.fft.rfftfreq(2 * len(even), period), np.abs(spectrum)))
+    for best in np.argsort(-power)[:3]:
+        near = grid[best] + np.linspace(-0.5 / span, 0.5 / span, 21)
+        waves = np.exp(-2j * np.pi * np.outer(near, t)) @ fitted
+        frequency = near[int(np.argmax((np.abs(waves) ** 2).sum(axis=1)))]
+        yield Feature("t", "", Wave(2.0 * np.pi * frequency, 3))
