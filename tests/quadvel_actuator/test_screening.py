@@ -62,6 +62,14 @@ def test_friction_is_found_from_delays_that_it_has_bent():
     np.testing.assert_allclose(found.model.output_delay, 0.003, atol=0.0006)
 
 
+def test_a_spring_is_found_from_delays_that_are_far_off():
+    about = _about(_log(Effect("parallel_spring", JOINTS, {"k": 3.0, "q0": -0.4})), 0.001, 0.0055)
+    found = propose(about, started(about, registry()["parallel_spring"]()))
+    model = about.fit_anew(found.model)
+    np.testing.assert_allclose(model.applied[-1].values[0], 3.0, atol=0.3)
+    np.testing.assert_allclose(model.input_delay + model.output_delay, 0.012, atol=0.0004)
+
+
 def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
     about = _about(_log(), input_delay=0.009, output_delay=0.003)
     assert started(about, registry()["coulomb_friction"]()) is None

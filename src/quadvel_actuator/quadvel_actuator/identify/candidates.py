@@ -14,7 +14,7 @@ from .backlog import backlog, suspicious
 from .delays import fit_with_delays
 from .judging import Judge
 from .model import Applied, Model
-from .screening import Ground, Started, start
+from .screening import Ground, Started, divided, start
 from .signals import Array, Bools
 
 _STEPS, _LAST_STEPS = 6, 2
@@ -47,10 +47,11 @@ class About:
     def __init__(self, model: Model, judge: Judge, noise: Array) -> None:
         self.model, self.judge, self.noise = model, judge, noise
         self.samples, self.signals = model.samples, model.signals
-        self.torque = model.predict()
-        self.residual = np.where(judge.fit | judge.judge, self.samples.tau - self.torque, 0.0)
-        self.fitted = np.where(judge.fit, self.residual, 0.0)
+        self.residual = np.where(judge.fit | judge.judge, self.samples.tau - model.predict(), 0.0)
         self.ground = Ground(model, judge, noise)
+        start = self.ground.bases[-1]
+        self.seen, self.torque = start.signals, start.predict()
+        self.fitted = np.where(judge.fit, self.samples.tau - self.torque, 0.0)
 
     def fit(self, model: Model) -> Model:
         """The model fitted with its delays; first on few rows where that is enough to come near."""
@@ -59,6 +60,21 @@ class About:
         few, rows = self.ground.few
         near = fit_with_delays(attrs.evolve(model, samples=few.samples), rows, _STEPS)
         return fit_with_delays(attrs.evolve(near, samples=model.samples), self.judge.fit, _LAST_STEPS)
+
+    def fit_anew(self, model: Model) -> Model:
+        """The model fitted from other splits of the delays, too: an effect just found may have moved them far."""
+        if any(one.law.remembers for one in model.applied):
+            return fit_with_delays(model, self.judge.fit, _STEPS)
+        few, rows = self.ground.few
+        near = [
+            fit_with_delays(attrs.evolve(at, samples=few.samples), rows, 2 * _STEPS) for at in divided(model)
+        ]
+        near.sort(key=lambda one: one.error(rows))
+        close = [
+            fit_with_delays(attrs.evolve(one, samples=model.samples), self.judge.fit, _STEPS)
+            for one in near[:2]
+        ]
+        return min(close, key=lambda one: one.error(self.judge.fit))
 
     def strongest_neighbour(self, names: Sequence[str]) -> NDArray[np.intp]:
         """For each joint the index (over names, then joints) of another joint's signal that its residual goes with.
@@ -110,7 +126,7 @@ def _share(behind: NDArray[np.intp], model: Model) -> float:
 
 def started(about: About, law: EffectLaw) -> Started | None:
     """Where to fit the law from; None where it takes nothing off the error."""
-    return start(about.ground, law, law.starts(about.signals, about.torque, about.fitted))
+    return start(about.ground, law, law.starts(about.seen, about.torque, about.fitted))
 
 
 def propose(about: About, started: Started) -> Candidate | None:

@@ -73,7 +73,8 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
-        candidates, idle = ranked(About(model, judge, noise), tick, f"effect {number + 1}")
+        about = About(model, judge, noise)
+        candidates, idle = ranked(about, tick, f"effect {number + 1}")
         rejected = [*(_reason(one, noise, len(registry())) for one in candidates), *idle]
         finer = _finer(model, candidates, judge, noise)
         if finer is not None:
@@ -82,7 +83,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
-        model = best.model
+        model = about.fit_anew(best.model)
         ties.append(tied)
     model, ties = _pruned(model, ties, judge, noise)
     model = pooled(model, judge, noise)

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 import attrs
 import numpy as np
 
-from ..effects import EffectLaw, Parameter
-from ..effects.base import Start
+from ..effects import AddedLaw, EffectLaw, Parameter
+from ..effects.base import Params, Start, View, smooth_sign
 from .delays import LONGEST
 from .eam import pd_torque
 from .judging import Judge
@@ -25,10 +25,13 @@ _ENOUGH = 1200  # rows that laws without memory are looked at on
 _GAIN_STEP = 0.01
 _DELAY_STEP = 0.0003  # s
 _OUTPUTS = (0.0005, 0.002, 0.0035, 0.005)  # s, output delays, the sum of both delays being kept
+_PERIODS = (-0.005, 0.005)  # s, commands come in steps about so far apart: a delay may be off by one
 _EXCHANGED = ((0.0, 0.0), (0.003, -0.003))
 """s, of input and output delay, for laws that have to be run row by row"""
 _SHORTENED = ((0.0, -0.003), (-0.004, 0.0), (-0.007, 0.0))
 """besides, for those that look like a delay"""
+_TOTALS = tuple(np.arange(0.0015, 0.026, 0.003))  # s, sums of both delays where nothing is known of them
+_APART = 0.0015  # s, between sums of delays that are both to be looked at
 
 _PROMISE = 0.015
 """Of the noise: a law that takes less off the fitted error of every joint is not tried further."""
@@ -57,6 +60,28 @@ class Ground:
         few, rows = self._whole[0].samples.thinned(every)
         self.few = attrs.evolve(self._whole[0], samples=few), self._whole[1][rows]
         self._bare: dict[bool, tuple[Array, int]] = {}
+        unbent = self._unbent()
+        self.bases = (model,) if unbent is None else (model, unbent)
+        """models with the gains and delays to start from: as fitted, and as a stand-in for any effect has them"""
+
+    def _unbent(self) -> Model | None:
+        """The model with gains and delays as they are beside `_Anything`; None where that is next to the same."""
+        model, rows = self.few
+        if any(one.law.remembers for one in model.applied):
+            return None
+        joints = rows.shape[1]
+        law = _Anything()
+        nothing = np.zeros((1, len(law.parameters), joints))
+        at = model.plus(Applied(law, np.ones(joints, dtype=bool), nothing[0], np.arange(joints)))
+        grid = [
+            (np.full(joints, total - out), np.full(joints, out)) for total in _TOTALS for out in _OUTPUTS[::2]
+        ]
+        tried = [_Screen(one, law, rows).best(nothing) for one in _possible(at, grid)]
+        best = min(tried, key=lambda one: float(one[1].sum()))[0]
+        apart = best.input_delay + best.output_delay - model.input_delay - model.output_delay
+        if np.abs(apart).max() < _APART:
+            return None
+        return attrs.evolve(best, samples=self.model.samples, applied=best.applied[:-1])
 
     def at(self, law: EffectLaw) -> tuple[Model, Bools]:
         """The model and the rows that `law` is looked at on."""
@@ -70,8 +95,8 @@ class Ground:
         """Error (J,) of the model without the law on these rows, at its best delays, and how many rows one stands for."""
         key = self.thorough(law)
         if key not in self._bare:
-            model, rows = self.at(law)
-            every = pairs(model, _EXCHANGED if key else None)
+            rows = self.at(law)[1]
+            every = self.pairs(law, _EXCHANGED)
             tried = [_Screen(at, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for at in every]
             self._bare[key] = (
                 min(tried, key=lambda error: float(error.sum())),
@@ -79,25 +104,56 @@ class Ground:
             )
         return self._bare[key]
 
+    def pairs(self, law: EffectLaw, moves: Sequence[tuple[float, float]]) -> Iterator[Model]:
+        """The model at the pairs of delays at which `law` is tried: `moves` away, or a grid of output delays."""
+        samples = self.at(law)[0].samples
+        for base in self.bases:
+            at = attrs.evolve(base, samples=samples)
+            if self.thorough(law):
+                moved = [(base.input_delay + a, base.output_delay + b) for a, b in moves]
+                yield from _possible(at, moved)
+            else:
+                yield from divided(at)
 
-def pairs(model: Model, moves: Sequence[tuple[float, float]] | None) -> Iterator[Model]:
-    """The model at every pair of delays that is tried: so much from the present ones, or a grid of output delays."""
+
+def divided(model: Model) -> Iterator[Model]:
+    """The model, and with its delays divided in other ways between input and output, and some commands off."""
+    yield model
     i, o = model.input_delay, model.output_delay
-    tried: list[tuple[Array, Array]]
-    if moves is not None:
-        tried = [(i + a, o + b) for a, b in moves]
-    else:
-        tried = [(i, o), *((i + o - at, np.full_like(o, at)) for at in _OUTPUTS)]
-    for a, b in tried:
+    yield from _possible(model, [(i + o - at, np.full_like(o, at)) for at in _OUTPUTS])
+    yield from _possible(model, [(i + by, o) for by in _PERIODS])
+
+
+def _possible(model: Model, delays: Sequence[tuple[Array, Array]]) -> Iterator[Model]:
+    """The model at those of these delays, each (J,), that are within bounds."""
+    for a, b in delays:
         if (a > -1e-9).all() and (b > -1e-9).all() and (a <= LONGEST[0]).all() and (b <= LONGEST[1]).all():
             yield model.with_delays(np.maximum(a, 0.0), np.maximum(b, 0.0))
+
+
+class _Anything(AddedLaw):
+    """A stand-in for what the model may lack: a constant, a spring, dry friction, drag, of any sign.
+
+    No inertia: with it the motion alone would explain the torque, whatever the delays.
+    """
+
+    name = "anything"
+    linear = ("constant", "spring", "dry", "drag")
+    parameters = tuple(Parameter(name, "", -1e9, 1e9, 1.0) for name in linear)
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        return [{}]
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        dry = smooth_sign(s.dq, np.array(0.05))
+        return p["constant"] + p["spring"] * s.q + p["dry"] * dry + p["drag"] * s.dq * np.abs(s.dq)
 
 
 def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | None:
     """The law at the best of `starts`, chosen for each joint; None where that takes nothing off the error."""
     if not starts:
         return None
-    model, rows = ground.at(law)
+    rows = ground.at(law)[1]
     joints = rows.shape[1]
     table = np.array(
         [[_within(one.get(p.name, p.scale), p, joints) for p in law.parameters] for one in starts]
@@ -105,8 +161,7 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     empty = Applied(law, np.ones(joints, dtype=bool), table[0], np.arange(joints))
     best: Model | None = None
     lowest = np.full(joints, np.inf)
-    moves = (*_EXCHANGED, *(_SHORTENED if law.shifts else ())) if ground.thorough(law) else None
-    for at in pairs(model, moves):
+    for at in ground.pairs(law, (*_EXCHANGED, *(_SHORTENED if law.shifts else ()))):
         found, error = _Screen(at.plus(empty), law, rows).best(table)
         if error.sum() < lowest.sum():
             lowest, best = error, found
