@@ -1,5 +1,8 @@
 """Logs without torque: joints that swing freely, alone and as the legs of the robot hung in the air."""
 
+import os
+from pathlib import Path
+
 import attrs
 import numpy as np
 import pytest
@@ -7,7 +10,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_actuator.identify.identify import Options, identify
-from quadvel_actuator.identify.log import Log, LogError
+from quadvel_actuator.identify.log import Log, LogError, read_log
 from quadvel_actuator.identify.motion import implied
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
@@ -105,3 +108,15 @@ def test_a_leg_that_swings_is_carried_as_one_body():
     assert np.all(body.inertia > 0.0)
     given = np.array([np.interp(coarse.t, log.t, tau) for tau in log.tau.T]).T
     assert np.all(np.std(coarse.tau - given, axis=0) < 0.2 * np.std(given, axis=0))
+
+
+@pytest.mark.skipif("QUADVEL_MEASURED" not in os.environ, reason="QUADVEL_MEASURED names no measured logs")
+def test_a_measured_leg_in_the_air_is_never_replayed_worse_than_before():
+    log = read_log(Path(os.environ["QUADVEL_MEASURED"]) / "go2_inair.npz")
+    leg = [name.startswith("FL") for name in log.joints]
+    states = {name: getattr(log, name)[:, leg] for name in ("q", "dq", "valid", "q_des", "kp", "kd")}
+    one = attrs.evolve(log, joints=tuple(np.array(log.joints)[leg].tolist()), **states)
+    report = identify([one], options=Options(seconds=8.0)).report
+    assert 0.01 < min(report["motion"]["inertia"]["value"]) < max(report["motion"]["inertia"]["value"]) < 0.1
+    for name in ("heldout_q_rms_rad", "heldout_dq_rms_rad_s"):
+        assert report["after"][name] <= report["before"][name]

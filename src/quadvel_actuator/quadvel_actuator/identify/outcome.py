@@ -29,6 +29,8 @@ UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "
 _REMOVABLE = 0.05
 """Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
 
+_ALIKE = 0.05  # ms
+
 STEP = 0.001
 """s, of the models that run with the parameters"""
 
@@ -128,11 +130,23 @@ def _report(o: Outcome) -> dict[str, Any]:
         "warnings": [
             f"{name} sits on its bound: its value and interval are not to be trusted"
             for name in o.widths.on_bound
-        ],
+        ]
+        + _unlike_delays(o.model),
         "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
     }
     report["decision"] = _decision(report)
     return report
+
+
+def _unlike_delays(model: Model) -> list[str]:
+    """A model that runs has one pair of delays."""
+    spread = 1e3 * float(max(np.ptp(model.input_delay), np.ptp(model.output_delay)))
+    if spread < _ALIKE:
+        return []
+    return [
+        f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml holds their median, so a model that runs "
+        "with it does worse than the error after says"
+    ]
 
 
 def _mse(error: Array, rows: Any) -> float:

@@ -18,6 +18,9 @@ from .signals import Array
 _AT_FLOOR = 1.05
 """Of the noise: laws that leave no more than this need no other account."""
 
+_FEW, _MOST = 2, 0.8
+"""So few laws that take so much of what is above the noise are the account, whatever is left beside them."""
+
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
 
@@ -35,7 +38,7 @@ def account(
     beside = learn(diagnosis.model, judge, noise)
     floor = float(np.average(noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
     named = _with(diagnosis, beside)
-    if not diagnosis.findings or (beside is None and diagnosis.model.mse(judge.judge) < _AT_FLOOR * floor):
+    if not diagnosis.findings or _enough(before, diagnosis, beside, judge, floor):
         return named, beside
     alone = learn(before, judge, noise)
     if alone is None or not _shorter_or_better(named, beside, alone, judge, floor):
@@ -43,6 +46,14 @@ def account(
     reason = "terms of named signals say it better than the named laws together"
     given_up = tuple(Rejected(one.name, one.gain, reason) for one in diagnosis.findings)
     return Diagnosis(alone.model, (), (*given_up, *diagnosis.rejected)), alone
+
+
+def _enough(before: Model, diagnosis: Diagnosis, beside: Learned | None, judge: Judge, floor: float) -> bool:
+    """Do the laws say nearly everything?"""
+    left = diagnosis.model.mse(judge.judge)
+    if len(diagnosis.findings) <= _FEW and left - floor < (1.0 - _MOST) * (before.mse(judge.judge) - floor):
+        return True
+    return beside is None and left < _AT_FLOOR * floor
 
 
 def _with(diagnosis: Diagnosis, learned: Learned | None) -> Diagnosis:
