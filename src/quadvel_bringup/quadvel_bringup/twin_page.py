@@ -25,8 +25,8 @@ class Row:
     unit: str
     error: Callable[[Entry], float]
     """of an entry's "before" or "after\""""
-    floor: Callable[[Entry], float | None] = lambda entry: None
-    """of an entry: what no model can undercut, where that is known"""
+    noise: Callable[[Entry], float | None] = lambda entry: None
+    """of an entry: an error that says nothing, where that is known"""
 
     @property
     def title(self) -> str:
@@ -47,10 +47,10 @@ ROWS = (TORQUE, Q, DQ, VELOCITY, YAW)
 
 NOTE = (
     "Before: the stack's own model. After: the model that `quadvel identify` made of one recorded walk. All errors are "
-    "on a second walk that was not fitted. Torque: mean square, on the recorded motion; its floor is the noise of the "
+    "on a second walk that was not fitted. Torque: mean square, on the recorded motion; its noise is that of the "
     "drives. Open loop: the recorded commands are replayed over stretches of 0.2 s, each from the recorded state; root "
     "mean square over all joints. Velocity: the shipped policy walks the same commands in the model; mean distance to "
-    "the plant's mean velocities; its floor is the plant against itself, one walk and the other."
+    "the plant's mean velocities, of two walks each; its noise is what the two walks of the plant differ by."
 )
 
 
@@ -92,7 +92,7 @@ def _before_after(entry: Entry, row: Row) -> str:
 
 
 def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
-    """A panel for each quantity: error before beside after, plant by plant, and the floor."""
+    """A panel for each quantity: error before beside after, plant by plant, and the noise."""
     places = np.arange(len(results))
     for panel, row in zip(figure.subplots(1, len(ROWS)), ROWS, strict=True):
         for shift, colour, when in ((-0.19, BEFORE, "before"), (0.19, AFTER, "after")):
@@ -100,8 +100,8 @@ def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
                 places + shift, [row.error(one[when]) for one in results], 0.36, color=colour, label=when
             )
         for place, one in zip(places, results, strict=True):
-            if (floor := row.floor(one)) is not None:
-                panel.hlines(floor, place - 0.42, place + 0.42, MEASURED, lw=2.0, label="floor")
+            if (noise := row.noise(one)) is not None:
+                panel.hlines(noise, place - 0.42, place + 0.42, MEASURED, lw=2.0, label="noise")
         panel.set_title(f"{row.name}\n{row.unit}", fontsize="small", loc="left")
         panel.set_xticks(places, [one["name"] for one in results], rotation=30, ha="right")
         panel.grid(axis="y", alpha=0.2)
@@ -120,7 +120,9 @@ def draw_plant(figure: Figure, entry: Entry) -> None:
         growth.plot(GROWTH * (np.arange(len(error)) + 0.5), error, color=colour, lw=1.8, label=when)
         off = [np.hypot(*np.subtract(s[when], s["plant"])[:2]) for s in entry["segments"]]
         velocity.bar(places + shift, off, 0.36, color=colour, label=when)
-    velocity.axhline(entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="plant against itself, mean")
+    velocity.axhline(
+        entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="one walk of the plant to the other, mean"
+    )
     growth.set(xlabel="time in open loop, ms", ylabel="error of q, rad", ylim=(0.0, None), xlim=(0.0, None))
     velocity.set(xlabel="command vx, vy, wz", ylabel="error of the mean velocity, m/s")
     velocity.set_xticks(places, commands, fontsize="small")
@@ -133,8 +135,8 @@ def _plant(entry: Entry) -> str:
     rows = []
     for row in ROWS:
         before, after = row.error(entry["before"]), row.error(entry["after"])
-        floor = number(row.floor(entry))
-        rows.append((escape(row.title), number(before), number(after), _cut(before, after), floor))
+        noise = number(row.noise(entry))
+        rows.append((escape(row.title), number(before), number(after), _cut(before, after), noise))
     name = escape(entry["name"])
     text = (
         f'<section id="{name}"><h2>{name}</h2><p><b>{escape(entry["decision"])}</b> '
@@ -147,7 +149,7 @@ def _plant(entry: Entry) -> str:
             (number(entry["noise_floor"]), "noise floor, N² m²"),
         ]
     )
-    text += table(("error of the model against the plant", "#before", "#after", "#less", "#floor"), rows)
+    text += table(("error of the model against the plant", "#before", "#after", "#less", "#noise"), rows)
     text += svg(9.5, 2.9, lambda figure: draw_plant(figure, entry))
     columns = ("command vx, vy, wz", "#plant", "#model before", "#model after")
     keys = ("command", "plant", "before", "after")
