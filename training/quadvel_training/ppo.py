@@ -28,13 +28,15 @@ class PpoConfig:
     mini_batches: int = 4
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
-    target_kl: float = 0.01
+    target_kl: float = 0.01  # of an update, as if exploration were white: correlated, lasting shifts would count too little
     entropy: float = 0.0
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8
     symmetric_share: float = 1.0  # of the environments, the first ones, that the symmetry term sees
     correlation: float = 0.0  # of the exploration from sample to sample
+    advantage_bound: float = 10.0  # standard deviations: a fall must not drown what all others show
     max_grad_norm: float = 1.0
+    momentum: float = 0.0  # above 0: plain gradient steps. Adam steps in all weights alike, most of which see but noise
 
 
 @attrs.define
@@ -73,7 +75,12 @@ class Ppo:
     ) -> None:
         self.actor, self.critic, self.config = actor, critic, config
         self.mirror_obs, self.mirror_action = mirror_obs, mirror_action
-        self.actor_optimiser = torch.optim.Adam(actor.parameters(), lr=config.learning_rate)
+        rate, momentum = config.learning_rate, config.momentum
+        self.actor_optimiser: torch.optim.Optimizer = (
+            torch.optim.SGD(actor.parameters(), lr=rate, momentum=momentum)
+            if momentum
+            else torch.optim.Adam(actor.parameters(), lr=rate)
+        )
         self.critic_optimiser = torch.optim.Adam(critic.parameters(), lr=1e-3)
         self.learning_rate = config.learning_rate
 
@@ -113,11 +120,12 @@ class Ppo:
 
     def update(self, r: Rollout, learn_actor: bool = True) -> dict[str, float]:
         """Several epochs over one rollout; returns means of the loss terms."""
+        c = self.config
         advantage, target = self.advantages(r)
         alive = r.mask.sum().clamp(min=1)
         mean = (advantage * r.mask).sum() / alive
         spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
-        advantage = (advantage - mean) / (spread + 1e-6)
+        advantage = ((advantage - mean) / (spread + 1e-6)).clamp(-c.advantage_bound, c.advantage_bound)
         with torch.no_grad():
             old_log_prob = self._log_prob(r.action - r.mean, r.noise)
         total: dict[str, float] = {}
@@ -170,8 +178,7 @@ class Ppo:
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
         surrogate = -(torch.minimum(ratio * advantage, clipped * advantage) * mask).sum() / alive
         variance = (2 * actor.log_std).exp().detach()
-        shift = self._draws(mean.detach() - r.mean[:, ids], torch.zeros_like(r.noise[ids]))
-        kl = ((shift**2 / (2 * variance)).sum(-1) * mask).sum() / alive
+        kl = (((mean - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1) * mask).sum().detach() / alive
 
         seen = ids < self.mirrored(r.reward.shape[1])
         mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), select(r.mirrored_state, ids[seen]))
