@@ -35,7 +35,7 @@ class CrlConfig:
     n: int = 512
     threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
-    std: float = 0.06  # of what exploration draws anew in every tick, in the network's unit
+    std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit
     critic_first: int = 40  # updates of the critic alone
     timestep: float = 0.0025
     seed: int = 3
@@ -45,14 +45,15 @@ class CrlConfig:
     rewards: RewardWeights = RewardWeights()
     ppo: PpoConfig = PpoConfig(
         discount=0.995,
-        gae=0.98,
-        epochs=2,
-        mini_batches=2,
-        learning_rate=4e-6,
-        max_learning_rate=2e-4,
-        target_kl=0.004,
-        symmetry=0.02,
-        smoothness=0.001,
+        gae=0.97,
+        epochs=1,
+        mini_batches=1,
+        learning_rate=1.5e-4,
+        max_learning_rate=1.5e-4,
+        momentum=0.95,
+        max_grad_norm=4.0,
+        symmetry=0.01,
+        smoothness=0.05,
         symmetric_share=0.25,
         correlation=0.9,
     )

@@ -28,7 +28,9 @@ class PpoConfig:
     mini_batches: int = 4
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
-    target_kl: float = 0.01  # of an update, as if exploration were white: correlated, lasting shifts would count too little
+    target_kl: float = (
+        0.01  # of an update, as if exploration were white: correlated, lasting shifts would count too little
+    )
     entropy: float = 0.0
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8
@@ -36,7 +38,9 @@ class PpoConfig:
     correlation: float = 0.0  # of the exploration from sample to sample
     advantage_bound: float = 10.0  # standard deviations: a fall must not drown what all others show
     max_grad_norm: float = 1.0
-    momentum: float = 0.0  # above 0: plain gradient steps. Adam steps in all weights alike, most of which see but noise
+    momentum: float = (
+        0.0  # above 0: plain gradient steps. Adam steps in all weights alike, most of which see but noise
+    )
 
 
 @attrs.define
