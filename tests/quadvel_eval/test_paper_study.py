@@ -11,8 +11,8 @@ import attrs
 import pytest
 from matplotlib.figure import Figure
 
-from quadvel_eval.cli import paper_command
 from quadvel_eval.paper import files, study
+from quadvel_eval.paper.cli import paper_command
 from quadvel_eval.paper.section import Answers, Job, Record, Row, Section, Study, by_policy, largest
 from quadvel_eval.pool import Call
 from quadvel_policy.policy_file import SHIPPED_POLICY

@@ -183,7 +183,7 @@ def compare(context: typer.Context) -> None:
 @app.command(context_settings=HANDED_ON, add_help_option=False)
 def paper(context: typer.Context) -> None:
     """Measure what the paper's figures show: a page, pictures, tables."""
-    _hand_on(context, "quadvel_eval.cli:paper_command")
+    _hand_on(context, "quadvel_eval.paper.cli:paper_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

@@ -17,7 +17,7 @@ import attrs
 from ..pool import in_parallel
 from .energy import Energy
 from .estimator import Estimator
-from .files import PAGE, is_done, write_page, write_section
+from .files import is_done, write_page, write_section
 from .gait import Gait
 from .gap import Gap
 from .identification import Identification
@@ -45,8 +45,6 @@ SECTIONS: tuple[Section, ...] = (
     Estimator(),
 )
 """in the order of the page"""
-
-__all__ = ["PAGE", "SECTIONS", "Progress", "run"]
 
 
 @attrs.frozen

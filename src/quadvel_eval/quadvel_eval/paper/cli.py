@@ -1,0 +1,104 @@
+"""The command `quadvel paper`, as a function for a typer application."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_policy.policy_file import PolicyFile
+
+from ..cli import Cluster, walks_bar
+from ..report import output_folder
+from .files import PAGE
+from .section import Section, Study
+from .study import SECTIONS, Progress, run
+
+
+def paper_command(
+    out: Annotated[Path, typer.Option(help="Folder for the page, pictures and tables.")],
+    policy: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=FILE",
+            help="A policy and its name; may be given several times.",
+            show_default="the shipped one",
+        ),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SECTION",
+            help=f"One of {', '.join(s.name for s in SECTIONS)}; may be given several times.",
+            show_default="all",
+        ),
+    ] = None,
+    estimator: Annotated[
+        Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
+    ] = "learned",
+    estimator_file: Annotated[Path, typer.Option(help="ONNX file of the learned one.")] = SHIPPED_MODEL,
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
+    again: Annotated[bool, typer.Option("--again", help="Run sections that are done already, too.")] = False,
+    cluster: Cluster = None,
+) -> None:
+    """Measure what Section 4 of the paper shows: a page with its values beside ours, pictures and CSV files.
+
+    Sections whose files were made with the same networks, seeds and settings are kept; what was stopped goes on.
+
+    \b
+    For example:
+      quadvel paper --out docs/results/paper
+      quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap
+    """
+    policies = _policies(policy or [])
+    study = Study(
+        **({"policies": policies} if policies else {}),
+        estimator=estimator,
+        estimator_file=estimator_file,
+        seeds=seeds,
+    )
+    for path in study.policies.values():
+        PolicyFile(path)  # what is wrong with the files shows here, once, before any run
+    LearnedEstimator(estimator_file)
+    sections = _sections(only or [])
+    folder = output_folder(out)
+    with walks_bar() as bar:
+        task = bar.add_task("walks", total=None)
+
+        def tell(progress: Progress) -> None:
+            bar.update(task, completed=progress.done, total=progress.total)
+            if progress.completed:
+                bar.console.print(
+                    f"{progress.completed}: done, {progress.seconds / 60.0:.1f} min of a core",
+                    highlight=False,
+                )
+
+        done = run(study, sections, folder, again, cluster, tell)
+    kept = [section.name for section in sections if section.name not in done]
+    console = Console()
+    if kept:
+        console.print(f"kept as they were: {', '.join(kept)}")
+    console.print(f"written: {folder}/{PAGE}")
+
+
+def _policies(given: list[str]) -> dict[str, Path]:
+    """NAME=FILE, each name once."""
+    policies: dict[str, Path] = {}
+    for text in given:
+        name, equals, file = text.partition("=")
+        if not (name and equals and file) or name in policies:
+            raise ValueError(f"--policy: found {text!r}, expected NAME=FILE with a name of its own")
+        policies[name] = Path(file)
+    return policies
+
+
+def _sections(only: list[str]) -> list[Section]:
+    """The sections of these names, all where there are none."""
+    known = {section.name: section for section in SECTIONS}
+    for name in only:
+        if name not in known:
+            raise ValueError(f"--only: found {name!r}, expected one of {', '.join(known)}")
+    return [section for name, section in known.items() if not only or name in only]
