@@ -12,13 +12,22 @@ from ..effects import EffectLaw
 from ..effects.commands import CommandHold
 from .backlog import backlog, suspicious
 from .delays import fit_with_delays
+from .eam import WINDOWS
 from .judging import Judge
-from .model import Applied, Model
-from .screening import Ground, Started, divided, start
+from .model import Applied, Model, fit
+from .screening import Ground, Started, divided, later, start
 from .signals import Array, Bools
 
 _STEPS, _LAST_STEPS = 6, 2
+_LATER = tuple(np.arange(-0.003, 0.0031, 0.0005))
+"""s: commands that step make an error of many small valleys along the delays"""
+
 _JOINT_LEVEL = 0.01  # p-value below which a joint counts as acted on
+
+
+def _best(models: Sequence[Model], rows: Bools, count: int) -> list[Model]:
+    """The `count` models with the least errors."""
+    return sorted(models, key=lambda one: one.error(rows))[:count]
 
 
 @attrs.frozen(eq=False)
@@ -62,19 +71,15 @@ class About:
         return fit_with_delays(attrs.evolve(near, samples=model.samples), self.judge.fit, _LAST_STEPS)
 
     def fit_anew(self, model: Model) -> Model:
-        """The model fitted from other splits of the delays, too: an effect just found may have moved them far."""
+        """The model fitted from other delays and with other steps of the drive: an effect may have hidden the right ones."""
         if any(one.law.remembers for one in model.applied):
             return fit_with_delays(model, self.judge.fit, _STEPS)
         few, rows = self.ground.few
-        near = [
-            fit_with_delays(attrs.evolve(at, samples=few.samples), rows, 2 * _STEPS) for at in divided(model)
-        ]
-        near.sort(key=lambda one: one.error(rows))
-        close = [
-            fit_with_delays(attrs.evolve(one, samples=model.samples), self.judge.fit, _STEPS)
-            for one in near[:2]
-        ]
-        return min(close, key=lambda one: one.error(self.judge.fit))
+        windows = [attrs.evolve(model, samples=few.samples, window=one) for one in {model.window, *WINDOWS}]
+        tried = [fit(at, rows, 2) for one in windows for at in (*divided(one), *later(one, _LATER))]
+        near = [fit_with_delays(one, rows, 2 * _STEPS) for one in _best(tried, rows, 3)]
+        whole = [attrs.evolve(one, samples=model.samples) for one in _best(near, rows, 2)]
+        return _best([fit_with_delays(one, self.judge.fit, _STEPS) for one in whole], self.judge.fit, 1)[0]
 
     def strongest_neighbour(self, names: Sequence[str]) -> NDArray[np.intp]:
         """For each joint the index (over names, then joints) of another joint's signal that its residual goes with.

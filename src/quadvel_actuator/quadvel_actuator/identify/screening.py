@@ -121,7 +121,12 @@ def divided(model: Model) -> Iterator[Model]:
     yield model
     i, o = model.input_delay, model.output_delay
     yield from _possible(model, [(i + o - at, np.full_like(o, at)) for at in _OUTPUTS])
-    yield from _possible(model, [(i + by, o) for by in _PERIODS])
+    yield from later(model, _PERIODS)
+
+
+def later(model: Model, by: Sequence[float]) -> Iterator[Model]:
+    """The model with other input delays, `by` s more."""
+    yield from _possible(model, [(model.input_delay + one, model.output_delay) for one in by])
 
 
 def _possible(model: Model, delays: Sequence[tuple[Array, Array]]) -> Iterator[Model]:
