@@ -63,11 +63,13 @@ class About:
         self.fitted = np.where(judge.fit, self.samples.tau - self.torque, 0.0)
 
     def fit(self, model: Model) -> Model:
-        """The model fitted with its delays; first on few rows where that is enough to come near."""
+        """The model fitted with its delays, from these or those without its last effect; first on few rows."""
         if any(one.law.remembers for one in model.applied):
             return fit_with_delays(model, self.judge.fit, _STEPS)
         few, rows = self.ground.few
-        near = fit_with_delays(attrs.evolve(model, samples=few.samples), rows, _STEPS)
+        there = attrs.evolve(model, samples=few.samples)
+        here = there.with_delays(self.model.input_delay, self.model.output_delay)
+        near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in (there, here)], rows, 1)[0]
         return fit_with_delays(attrs.evolve(near, samples=model.samples), self.judge.fit, _LAST_STEPS)
 
     def fit_anew(self, model: Model) -> Model:
