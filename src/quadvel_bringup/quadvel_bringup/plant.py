@@ -185,6 +185,11 @@ def _value(path: Path, name: str, value: Any) -> Any:
 
 def main() -> None:
     """FILE, and then what ROS 2 wants. The log of the joints goes to the topic joint_log."""
+    path, *arguments = sys.argv[1:]
+    try:
+        physics = read_plant(Path(path))
+    except ValueError as error:
+        sys.exit(f"plant: {error}")
     import quadvel_dds
 
     quadvel_dds.install()
@@ -207,11 +212,6 @@ def main() -> None:
 
             return log
 
-    path, *arguments = sys.argv[1:]
-    try:
-        physics = read_plant(Path(path))
-    except ValueError as error:
-        sys.exit(f"plant: {error}")
     run(lambda: PlantNode(physics), ["plant", *arguments])
 
 

@@ -120,9 +120,7 @@ def draw_plant(figure: Figure, entry: Entry) -> None:
         growth.plot(GROWTH * (np.arange(len(error)) + 0.5), error, color=colour, lw=1.8, label=when)
         off = [np.hypot(*np.subtract(s[when], s["plant"])[:2]) for s in entry["segments"]]
         velocity.bar(places + shift, off, 0.36, color=colour, label=when)
-    velocity.axhline(
-        entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="one walk of the plant to the other, mean"
-    )
+    velocity.axhline(entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="noise")
     growth.set(xlabel="time in open loop, ms", ylabel="error of q, rad", ylim=(0.0, None), xlim=(0.0, None))
     velocity.set(xlabel="command vx, vy, wz", ylabel="error of the mean velocity, m/s")
     velocity.set_xticks(places, commands, fontsize="small")
