@@ -15,8 +15,6 @@ from rich.progress import Progress, TextColumn
 from quadvel_estimator.kalman import KalmanConfig
 
 from . import crl, distill, env, estimator, kalman_tuning, loop, student, teacher
-from .command_map import fit_command_map, held_commands
-from .randomisation import Randomisation
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -100,7 +98,8 @@ def train_crl(
     config = _configured(crl.CrlConfig, recipe, minutes)
     run = crl.CrlRun(config, _actor(start) if start else None)
     loop.train(run, config.budget, out / "crl.pt")
-    student.export_policy(run.actor.network, run.env, out / "policy.onnx", _recipe(config, run, "crl"))
+    recipe_of = _recipe(config, run, "crl")
+    student.export_policy(run.actor.network, run.env, out / "policy.onnx", recipe_of, run.command_map)
 
 
 @app.command("export")
@@ -108,20 +107,17 @@ def export_policy(
     checkpoint: Annotated[Path, typer.Argument(help="Of `distill` or `crl`.")],
     out: Annotated[Path, typer.Option(help="The policy file to write.")] = Path("out/training/crl_eam.onnx"),
     recipe: Recipe = None,
-    seconds: Annotated[float, typer.Option(help="How long the command map's walks take.")] = 16.0,
 ) -> None:
     """A policy file of a checkpoint, behind a command map that takes out its steady-state error."""
     config = _configured(crl.CrlConfig, recipe, None)
     actor = _actor(checkpoint)
-    walks = env.EnvConfig(n=512, commands=config.commands, randomisation=Randomisation.calm())
-    walker = distill.Student(actor, env.VelocityEnv(held_commands(walks)), gain=0.6)
-    command_map = fit_command_map(walker, seconds)
+    command_map, walks = distill.student_map(actor, config.commands)
     made_of = {
         "stage": "crl",
         "samples": loop.load(checkpoint)["samples"],
         "configuration": attrs.asdict(config),
     }
-    student.export_policy(actor, walker.env, out, made_of, command_map)
+    student.export_policy(actor, walks, out, made_of, command_map)
     print(f"written: {out}")
 
 

@@ -16,6 +16,8 @@ from quadvel_description import symmetry
 from quadvel_sim.terrain import Terrain
 
 from . import student
+from .command_map import CommandMap
+from .distill import student_map
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget
 from .networks import Gaussian, Mlp, Recurrent
@@ -37,6 +39,7 @@ class CrlConfig:
     length: int = 64  # ticks a sequence, 0.32 s
     std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit
     critic_first: int = 40  # updates of the critic alone
+    mapped: bool = False  # train behind a command map that takes out the steady-state error at the start
     timestep: float = 0.0025
     seed: int = 3
     commands: CommandRange = CommandRange()
@@ -76,6 +79,7 @@ class CrlRun:
         )
         self.env = VelocityEnv(env_config)
         self.rewards = Table2(self.env, c.rewards)
+        self.command_map = student_map(start, c.commands)[0] if start and c.mapped else CommandMap()
         self.actor = Gaussian(start or student.new_actor(), 12, c.std)
         self.actor.log_std.requires_grad_(False)
         self.critic = Mlp(48 + PRIVILEGED, 1)
@@ -100,6 +104,7 @@ class CrlRun:
             "learner": self.ppo.state(),
             "samples": self.samples,
             "updates": self.updates,
+            "command_map": torch.from_numpy(self.command_map.weights),
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -108,12 +113,16 @@ class CrlRun:
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.samples, self.updates = state["samples"], state["updates"]
+        self.command_map = CommandMap(state["command_map"].numpy())
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
         rollout, seen = self.collect()
         self.updates += 1
         return seen | self.ppo.update(rollout, learn_actor=self.updates > self.config.critic_first)
+
+    def _observe(self) -> np.ndarray:
+        return student.observe(self.env, self._action, self.command_map(self.env.command))
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
         env = self.env
@@ -137,7 +146,7 @@ class CrlRun:
         state, start, mirrored_start = self._state, self._state, self._mirrored
         before = torch.from_numpy(self._noise)
         for _ in range(c.length):
-            obs = student.observe(env, self._action)
+            obs = self._observe()
             critic_obs = self._critic_obs(obs)
             with torch.no_grad():
                 mean, state = self.actor(torch.from_numpy(obs[None]), state)
@@ -156,7 +165,7 @@ class CrlRun:
             alive &= ~(fell | late)
         self.samples += c.length * c.n
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
-        last = torch.from_numpy(self._critic_obs(student.observe(env, self._action)))
+        last = torch.from_numpy(self._critic_obs(self._observe()))
         rollout = Rollout(**t, noise=before, last_critic_obs=last, state=start, mirrored_state=mirrored_start)
         self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
         error = env.command[:, :2] - env.velocity[:, :2]

@@ -24,6 +24,7 @@ from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State
 from .ppo import select
+from .randomisation import Randomisation
 from .teacher import GaitState, torch_mirror
 
 
@@ -94,6 +95,14 @@ class Student:
     def advance(self) -> None:
         """After the environment's tick."""
         self.tracking.advance(self.env, self.env.command[:, :3])
+
+
+def student_map(
+    actor: Recurrent, commands: CommandRange, seconds: float = 12.0
+) -> tuple[CommandMap, VelocityEnv]:
+    """The command map of a student on the nominal plant, and the environment that it was measured in."""
+    env = VelocityEnv(held_commands(EnvConfig(commands=commands, randomisation=Randomisation.calm())))
+    return fit_command_map(Student(actor, env, gain=0.6), seconds), env
 
 
 @attrs.frozen
