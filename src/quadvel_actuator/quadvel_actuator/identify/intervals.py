@@ -56,7 +56,8 @@ def intervals(model: Model, judge: Judge) -> Intervals:
     variance = np.maximum(*(np.diagonal(one) for one in covariance)) * (1.0 + slots.count / freedom)
     half = np.sqrt(np.maximum(variance, 0.0)) * stats.t.ppf(0.5 + LEVEL / 2, max(units - slots.count, 5))
     wide = np.where(slots.index >= 0, half[slots.index], 0.0)
-    effects, first = [], 2
+    effects: list[Array] = []
+    first = 2
     for one in model.applied:
         mine = wide[first : first + len(one.law.parameters)]
         random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
