@@ -86,7 +86,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
             yield curve(name, times, _MIDDLE)
     for times in ("", "direction", "dq"):
         yield curve("q", times, _FINE)
-    yield curve("dq", "", _FINE)
+    yield from (curve(name, times, _FINE) for name, times in (("dq", ""), ("q", "tau")))
     yield from (curve("q", times, _FINEST) for times in ("", "direction"))
     rows = max(round(_HISTORY / scene.dt), 4)
     edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
