@@ -144,5 +144,9 @@ def write_csv(rows: list[Row], path: Path) -> None:
         writer.writeheader()
         for row in rows:
             writer.writerow(
-                {key: " ".join(value) if isinstance(value, list) else value for key, value in row.items()}
+                {
+                    key: " ".join(row[key]) if isinstance(row[key], list) else row[key]
+                    for key in COLUMNS
+                    if key in row
+                }
             )
