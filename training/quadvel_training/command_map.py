@@ -6,7 +6,7 @@ it some speed; and for the finished policy, whose file carries its map along.
 
 from __future__ import annotations
 
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import attrs
 import numpy as np
@@ -14,8 +14,33 @@ import torch
 
 from .env import TICK, EnvConfig, VelocityEnv
 
-T = TypeVar("T", np.ndarray, torch.Tensor)
-TERMS = 20
+EVEN = [
+    (0, 0, 0),
+    (1, 0, 0),
+    (2, 0, 0),
+    (0, 2, 0),
+    (0, 0, 2),
+    (0, 1, 1),
+    (3, 0, 0),
+    (1, 2, 0),
+    (1, 0, 2),
+    (1, 1, 1),
+]
+ODD = [
+    (0, 1, 0),
+    (0, 0, 1),
+    (1, 1, 0),
+    (1, 0, 1),
+    (0, 3, 0),
+    (0, 0, 3),
+    (0, 1, 2),
+    (0, 2, 1),
+    (2, 1, 0),
+    (2, 0, 1),
+]
+EXPONENTS = np.array(EVEN + ODD)
+"""Of vx, vy, wz in each term: first those that mirroring leaves as they are, then as many that it turns round."""
+TERMS = len(EXPONENTS)
 BOUND = 0.6  # m/s, rad/s, of what the map adds
 STRIDE = 0.35  # s, time constant of velocities averaged over a stride
 
@@ -52,11 +77,9 @@ class Tracking:
         return np.concatenate([command[:, :3] + self.correction * moving, command[:, 3:]], axis=1)
 
 
-def terms(x: T, y: T, r: T) -> list[T]:
-    """The polynomial's, of vx, vy, wz: first those that mirroring leaves as they are, then as many that it turns round."""
-    even = [x * 0 + 1, x, x * x, y * y, r * r, y * r, x**3, x * y * y, x * r * r, x * y * r]
-    odd = [y, r, x * y, x * r, y**3, r**3, y * r * r, y * y * r, x * x * y, x * x * r]
-    return even + odd
+def features(command: np.ndarray) -> np.ndarray:
+    """The polynomial's terms (n, TERMS) of vx, vy, wz (n, 3)."""
+    return np.prod(command[:, None, :] ** EXPONENTS, axis=-1)
 
 
 class CommandMap:
@@ -67,7 +90,7 @@ class CommandMap:
 
     def fit(self, wanted: np.ndarray, given: np.ndarray) -> float:
         """Ridge regression of given - wanted, (n, 3) each; returns the residual's RMS."""
-        a = np.stack(terms(*wanted[:, :3].T), -1)
+        a = features(wanted[:, :3])
         b = given - wanted
         half = a.shape[1] // 2
         self.weights = np.zeros((a.shape[1], 3))
@@ -81,24 +104,38 @@ class CommandMap:
         """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
         given = command.copy()
         moving = command[:, 3] < 0.5
-        added = np.stack(terms(*command[:, :3].T), -1) @ self.weights
+        added = features(command[:, :3]) @ self.weights
         given[:, :3] += added.clip(-BOUND, BOUND) * moving[:, None]
         return given
 
 
 class CommandMapped(torch.nn.Module):
-    """The map in front of a policy: observations (n, 48) whose first four numbers are the command, to the same."""
+    """The map in front of a policy: observations (n, 48) whose first four numbers are the command, to the same.
+
+    Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz, the last
+    of the four is 0 in stance.
+    """
 
     weights: torch.Tensor
 
     def __init__(self, command_map: CommandMap) -> None:
         super().__init__()
-        self.register_buffer("weights", torch.as_tensor(command_map.weights, dtype=torch.float32))
+        self.factors = torch.nn.Linear(4, 4 * TERMS).requires_grad_(False)
+        pick, one = np.zeros((4, TERMS, 4)), np.ones((4, TERMS))
+        for term, exponents in enumerate(EXPONENTS):
+            for place, axis in enumerate(np.repeat([0, 1, 2], exponents)):
+                pick[place, term, axis], one[place, term] = 1.0, 0.0
+        pick[3, :, 3] = -1.0
+        self.factors.weight.copy_(torch.as_tensor(pick.reshape(-1, 4)))
+        self.factors.bias.copy_(torch.as_tensor(one.reshape(-1)))
+        weights = np.pad(command_map.weights, ((0, 0), (0, 1)))  # stance stays as it is
+        self.register_buffer("weights", torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        command, stance, rest = obs.split((3, 1, obs.shape[-1] - 4), dim=-1)
-        added = torch.stack(terms(*command.unbind(-1)), -1) @ self.weights
-        return torch.cat([command + added.clamp(-BOUND, BOUND) * (stance < 0.5), stance, rest], dim=-1)
+        command, rest = obs.split((4, obs.shape[-1] - 4), dim=-1)
+        a, b, c, moving = self.factors(command).chunk(4, dim=-1)
+        added = (a * b * c * moving) @ self.weights
+        return torch.cat([command + added.clamp(-BOUND, BOUND), rest], dim=-1)
 
 
 class Walker(Protocol):
