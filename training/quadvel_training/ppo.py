@@ -127,6 +127,7 @@ class Ppo:
         c = self.config
         advantage, target = self.advantages(r)
         alive = r.mask.sum().clamp(min=1)
+        explained = 1 - (advantage**2 * r.mask).sum() / alive / target[r.mask > 0].var().clamp(min=1e-8)
         mean = (advantage * r.mask).sum() / alive
         spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
         advantage = ((advantage - mean) / (spread + 1e-6)).clamp(-c.advantage_bound, c.advantage_bound)
@@ -145,9 +146,6 @@ class Ppo:
         means = {name: value / batches for name, value in total.items()}
         if learn_actor:
             self._adapt_rate(means["kl"])
-        explained = 1 - (((advantage * spread + mean) ** 2) * r.mask).sum() / alive / target[
-            r.mask > 0
-        ].var().clamp(min=1e-8)
         return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
 
     def _draws(self, noise: Tensor, before: Tensor) -> Tensor:

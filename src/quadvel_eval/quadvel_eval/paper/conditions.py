@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from ..grid import DURATION, Cell, CellResult, judge, mass
 from ..walk import Setup, make_loop, record
 from .cells import Command
-from .section import Record, distinct, mean, select
+from .section import Job, Record, Study, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
 """ahead, sideways, along an arc; m/s, rad/s"""
@@ -45,6 +45,12 @@ def walk_under(setup: Setup, cell: Cell, push: tuple[float, float, float] | None
         loop.simulator.push("trunk", push, duration=PUSH_SECONDS)
     walk = record(loop, [(cell.command, DURATION)])
     return judge(walk, cell, mass(loop)) if walk else CellResult(cell)
+
+
+def condition_job(study: Study, policy: str, one: Condition, command: Command, seed: int) -> Job:
+    """A policy's walk under a condition."""
+    setup = study.setup(policy, **one.plant)
+    return Job({"policy": policy, **one.labels}, (walk_under, setup, Cell(command, seed), one.push))
 
 
 def survival(records: Sequence[Record]) -> float:

@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
 
-from ..grid import Cell
 from .cells import Command, cell_record, falls, largest_error, mean_error
-from .conditions import Condition, draw, walk_under
+from .conditions import Condition, condition_job, draw
 from .section import (
     Answers,
     Job,
@@ -74,10 +73,7 @@ class Gap(Section):
 
     def jobs(self, study: Study) -> list[Job]:
         return [
-            Job(
-                {"policy": policy, **one.labels},
-                (walk_under, study.setup(policy, **one.plant), Cell(command, seed), None),
-            )
+            condition_job(study, policy, one, command, seed)
             for policy in study.policies
             for one in plants()
             for command in self.commands

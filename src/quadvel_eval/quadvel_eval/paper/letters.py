@@ -26,6 +26,7 @@ from .section import (
     largest,
     mean,
     select,
+    walks,
 )
 
 Array = NDArray[np.float64]
@@ -103,11 +104,7 @@ class Letters(Section):
     strokes: tuple[Stroke, ...] = LETTERS
 
     def jobs(self, study: Study) -> list[Job]:
-        return [
-            Job({"policy": policy, "seed": seed}, (write_letters, study.setup(policy), seed, self.strokes))
-            for policy in study.policies
-            for seed in range(study.seeds)
-        ]
+        return walks(study, write_letters, self.strokes)
 
     def judge(self, answers: Answers) -> list[Record]:
         asked = reference(self.strokes)

@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 
 from quadvel_sim.terrain import Terrain
 
-from ..grid import Cell
 from .cells import Command, cell_record, largest_error, mean_error
-from .conditions import COMMANDS, Condition, draw, survival, walk_under
+from .conditions import COMMANDS, Condition, condition_job, draw, survival
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
 
 FORCE = 60.0  # N
@@ -63,10 +62,7 @@ class Robustness(Section):
 
     def jobs(self, study: Study) -> list[Job]:
         return [
-            Job(
-                {"policy": policy, **one.labels},
-                (walk_under, study.setup(policy, **one.plant), Cell(command, seed), one.push),
-            )
+            condition_job(study, policy, one, command, seed)
             for policy in study.policies
             for seed in range(study.seeds)
             for one in conditions(seed)

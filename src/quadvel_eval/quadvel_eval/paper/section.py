@@ -51,6 +51,15 @@ class Job:
     call: Call
 
 
+def walks(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[Job]:
+    """`walk(setup, seed, *arguments)` for each policy and seed."""
+    return [
+        Job({"policy": policy, "seed": seed}, (walk, study.setup(policy), seed, *arguments))
+        for policy in study.policies
+        for seed in range(study.seeds)
+    ]
+
+
 Answers: TypeAlias = Sequence[tuple[Record, Any]]
 """labels of each job and what it returned, in the order of the jobs"""
 

@@ -30,6 +30,7 @@ from .section import (
     largest,
     mean,
     select,
+    walks,
 )
 
 Array = NDArray[np.float64]
@@ -91,11 +92,7 @@ class Stance(Section):
     seconds: float = 29.0
 
     def jobs(self, study: Study) -> list[Job]:
-        return [
-            Job({"policy": policy, "seed": seed}, (stand, study.setup(policy), seed, self.seconds))
-            for policy in study.policies
-            for seed in range(study.seeds)
-        ]
+        return walks(study, stand, self.seconds)
 
     def judge(self, answers: Answers) -> list[Record]:
         records: list[Record] = []
