@@ -13,6 +13,7 @@ TERRAINS = {
     "downhill": Terrain("slope", slope=-0.2),
     "rough": Terrain("rough", size=8.0, seed=3),
     "rough slope": Terrain("rough", slope=0.15, size=8.0, seed=4),
+    "hills": Terrain("rough", hills=1.0, size=8.0, seed=5),
 }
 
 
@@ -54,6 +55,15 @@ def test_rough_ground_is_bounded_and_fills_its_bound() -> None:
     heights = terrain.height(*np.meshgrid(axis, axis))
     assert 0.9 * 0.08 < np.abs(heights).max() <= 0.08
     assert abs(heights.mean()) < 0.005
+
+
+def test_hills_are_far_apart_under_the_noise() -> None:
+    x = np.linspace(-19.0, 19.0, 3801)
+    hills, alone = (Terrain("rough", roughness=0.04, hills=h).height(x, 2.0) for h in (1.5, 0.0))
+    np.testing.assert_array_less(np.abs(hills), 1.54)
+    assert np.ptp(hills) > 0.75
+    steepness = np.degrees(np.arctan(np.gradient(hills - alone, x)))
+    assert 8.0 < np.abs(steepness).max() < 35.0
 
 
 def test_equal_seeds_give_equal_ground_and_others_another() -> None:

@@ -109,33 +109,31 @@ class CommandMap:
         return given
 
 
-class CommandMapped(torch.nn.Module):
-    """The map in front of a policy: observations (n, 48) whose first four numbers are the command, to the same.
+class CommandCorrection(torch.nn.Module):
+    """What the map adds to the command: observations (n, 48), which start with the command, to (n, 4).
 
-    Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz, the last
-    of the four is 0 in stance.
+    Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz; the last
+    of the four factors is 0 in stance.
     """
 
     weights: torch.Tensor
 
-    def __init__(self, command_map: CommandMap) -> None:
+    def __init__(self, command_map: CommandMap, inputs: int) -> None:
         super().__init__()
-        self.factors = torch.nn.Linear(4, 4 * TERMS).requires_grad_(False)
-        pick, one = np.zeros((4, TERMS, 4)), np.ones((4, TERMS))
+        self.factors = torch.nn.Linear(inputs, 4 * TERMS).requires_grad_(False)
+        pick, one = np.zeros((4, TERMS, inputs)), np.ones((4, TERMS))
         for term, exponents in enumerate(EXPONENTS):
             for place, axis in enumerate(np.repeat([0, 1, 2], exponents)):
                 pick[place, term, axis], one[place, term] = 1.0, 0.0
         pick[3, :, 3] = -1.0
-        self.factors.weight.copy_(torch.as_tensor(pick.reshape(-1, 4)))
+        self.factors.weight.copy_(torch.as_tensor(pick.reshape(-1, inputs)))
         self.factors.bias.copy_(torch.as_tensor(one.reshape(-1)))
         weights = np.pad(command_map.weights, ((0, 0), (0, 1)))  # stance stays as it is
         self.register_buffer("weights", torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        command, rest = obs.split((4, obs.shape[-1] - 4), dim=-1)
-        a, b, c, moving = self.factors(command).chunk(4, dim=-1)
-        added = (a * b * c * moving) @ self.weights
-        return torch.cat([command + added.clamp(-BOUND, BOUND), rest], dim=-1)
+        terms = self.factors(obs).reshape(-1, 4, TERMS).prod(dim=1)
+        return (terms @ self.weights).clamp(-BOUND, BOUND)
 
 
 class Walker(Protocol):

@@ -18,7 +18,7 @@ from quadvel_description import robot
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
 
-from .command_map import CommandMap, CommandMapped
+from .command_map import CommandCorrection, CommandMap
 from .env import VelocityEnv
 from .networks import Recurrent, State
 
@@ -50,12 +50,14 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
 class _Cell(nn.Module):
     """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
 
-    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
+    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM. `added`: x goes on
+    with as many numbers that are to be added to its first ones, and the product does that as well.
     """
 
-    def __init__(self, lstm: nn.LSTM) -> None:
+    def __init__(self, lstm: nn.LSTM, added: int) -> None:
         super().__init__()
-        weight = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
+        inputs = lstm.weight_ih_l0
+        weight = torch.cat([inputs, inputs[:, :added], lstm.weight_hh_l0], dim=1)
         self.weight = nn.Parameter(weight.detach().T.contiguous())
         self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
 
@@ -71,30 +73,36 @@ class _Cell(nn.Module):
 class _Step(nn.Module):
     """One time step with the signature of the policy file."""
 
-    def __init__(self, network: Recurrent, outputs: int, before: nn.Module) -> None:
+    def __init__(self, network: Recurrent, outputs: int, correction: CommandCorrection | None) -> None:
         super().__init__()
-        self.network, self.outputs, self.before = copy.deepcopy(network), outputs, before
-        self.network.lstm = _Cell(network.lstm)
+        self.network, self.outputs, self.correction = copy.deepcopy(network), outputs, correction
+        self.network.lstm = _Cell(network.lstm, 4 if correction else 0)
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
-        y, (hidden, memory) = self.network(self.before(obs), (h.flatten(0, 1), c.flatten(0, 1)))
+        x = torch.cat([obs, self.correction(obs)], dim=1) if self.correction else obs
+        y, (hidden, memory) = self.network(x, (h.flatten(0, 1), c.flatten(0, 1)))
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
 
 
 def export(
-    network: Recurrent, path: Path, outputs: Sequence[str], metadata: str, before: nn.Module | None = None
+    network: Recurrent,
+    path: Path,
+    outputs: Sequence[str],
+    metadata: str,
+    command_map: CommandMap | None = None,
 ) -> None:
     """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
 
-    `before`: what the observation goes through first.
+    `command_map`: what corrects the command, the observation's first four numbers.
     """
     size = network.lstm.input_size
     state = network.initial_state(1)
+    correction = CommandCorrection(command_map, size) if command_map else None
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.onnx.export(
-        _Step(network, len(outputs), before or nn.Identity()).eval(),
+        _Step(network, len(outputs), correction).eval(),
         (torch.zeros(1, size), *state),
         str(part),
         input_names=["obs", "h_in", "c_in"],
@@ -137,5 +145,4 @@ def export_policy(
         recipe=recipe,
         commit=commit(),
     )
-    before = CommandMapped(command_map) if command_map else None
-    export(actor, path, ["actions"], metadata.to_json(), before)
+    export(actor, path, ["actions"], metadata.to_json(), command_map)

@@ -18,6 +18,7 @@ KINDS = ("flat", "slope", "rough")
 GEOM_NAME = "ground"
 _RESOLUTION = 0.05  # m between the points of the height grid
 _LEVEL_RADIUS = 0.5  # m around the origin where rough ground stays level, so that a robot can be put down
+_HILL_LENGTH = 8.0  # m, spacing of the lattice of hills
 _BASE = 0.5  # m of solid ground below the lowest point
 
 
@@ -56,6 +57,8 @@ class Terrain:
     """Bound of the noise of rough ground above and below the slope, m."""
     wavelength: float = attrs.field(default=0.6, **number(0.1, 10.0))
     """Spacing of the noise's lattice, m: about the distance from a hump to the next hollow."""
+    hills: float = attrs.field(default=0.0, **number(0.0, 10.0))
+    """Bound of the hills under the noise of rough ground, m: about 8 m from a hill to the next valley."""
     blend: float = attrs.field(default=0.5, **number(0.1, 100.0))
     """Distance over which rough ground grows from level to fully rough, m. Long: a field from easy to hard."""
     size: float = attrs.field(default=40.0, **number(4.0, 200.0))
@@ -75,10 +78,11 @@ class Terrain:
         points = round(self.size / _RESOLUTION) + 1
         axis = np.linspace(0.0, self.size, points)
         x, y = np.meshgrid(axis, axis)
-        noise = perlin(x, y, self.wavelength, self.seed)
+        bumps = self.roughness * perlin(x, y, self.wavelength, self.seed)
+        hills = self.hills * perlin(x, y, _HILL_LENGTH, self.seed + 1)
         x, y = x - 0.5 * self.size, y - 0.5 * self.size
         grown = np.clip((np.hypot(x, y) - _LEVEL_RADIUS) / self.blend, 0.0, 1.0)
-        return np.asarray(x * np.tan(self.slope) + self.roughness * grown * noise)
+        return np.asarray(x * np.tan(self.slope) + grown * (bumps + hills))
 
     @property
     def tilt(self) -> NDArray[np.float64]:
