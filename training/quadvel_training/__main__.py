@@ -1,4 +1,4 @@
-"""`python -m quadvel_training`: the stages of training, each resumable, and what makes policy files of them."""
+"""`python -m quadvel_training`: the stages of training, each resumable, and what makes policy files and their cards of them."""
 
 from __future__ import annotations
 
@@ -6,67 +6,51 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import attrs
-import cattrs
 import torch
 import typer
-import yaml
 from rich.progress import Progress, TextColumn
 
+from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_estimator.kalman import KalmanConfig
 
-from . import crl, distill, env, estimator, kalman_tuning, loop, student, teacher
+from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, student, teacher
+from .card import card
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Train quadvel's policy and estimator. The order: teacher, distill, crl, export, estimator. Every run resumes where "
-    "its directory stands; Ctrl-C saves.",
+    help="Train quadvel's policy and estimator. The order: teacher, distill, crl, export, estimator, card; `ablation` and `tune` "
+    "run stage 3 with recipes of their own. Every run resumes where its directory stands; Ctrl-C saves.",
 )
 
-Out = Annotated[Path, typer.Option(help="Run directory: checkpoint, TensorBoard curves, ONNX.")]
+Out = Annotated[
+    Path, typer.Option(help="Run directory: configuration, checkpoint, TensorBoard curves, ONNX.")
+]
 Recipe = Annotated[
-    Path | None, typer.Option(help="YAML file whose fields replace the defaults; see training/recipes.")
+    Path | None,
+    typer.Option(
+        "--recipe", help="YAML file whose fields replace the defaults; see training/recipes.", dir_okay=False
+    ),
 ]
 Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
+Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
+SHIPPED = Path("training/checkpoints/student.pt")
 
 
-def _configured(kind: type[Any], recipe: Path | None, minutes: float | None) -> Any:
+def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> Any:
     """A configuration of `kind` from its defaults, the recipe's fields and the command line's budget."""
-    fields = yaml.safe_load(recipe.read_text()) if recipe else {}
-    fields = {key: value for key, value in (fields or {}).items() if key != "stage"}
-    converter = cattrs.Converter(forbid_extra_keys=True)
-    try:
-        config = converter.structure(fields, kind)
-    except cattrs.BaseValidationError as error:
-        raise typer.BadParameter(f"{recipe}: " + "; ".join(cattrs.transform_error(error))) from None
+    config = recipe.read(kind, source)
     if minutes is not None:
         config = attrs.evolve(config, budget=attrs.evolve(config.budget, minutes=minutes))
     return config
 
 
-def _actor(path: Path) -> Any:
-    """A recurrent policy from a checkpoint of `distill` or `crl`."""
-    content = loop.load(path)
-    actor = student.new_actor()
-    if "student" in content:
-        actor.load_state_dict(content["student"])
-    else:
-        weights = {
-            k.removeprefix("network."): v for k, v in content["actor"].items() if k.startswith("network.")
-        }
-        actor.load_state_dict(weights)
-    return actor
-
-
-def _recipe(config: Any, run: Any, stage: str) -> dict[str, Any]:
-    return {"stage": stage, "samples": run.samples, "configuration": attrs.asdict(config)}
-
-
 @app.command("teacher")
 def train_teacher(
-    out: Out = Path("out/training/teacher"), recipe: Recipe = None, minutes: Minutes = None
+    out: Out = Path("out/training/teacher"), source: Recipe = None, minutes: Minutes = None
 ) -> None:
     """Stage 1: the teacher with a clock and the true state."""
-    config = _configured(teacher.TeacherConfig, recipe, minutes)
+    config = _configured(teacher.TeacherConfig, source, minutes)
+    run_folder.describe(out, "teacher", source, config)
     loop.train(teacher.TeacherRun(config), config.budget, out / "teacher.pt")
 
 
@@ -75,14 +59,17 @@ def train_student(
     teacher_file: Annotated[Path, typer.Option("--teacher")] = Path("out/training/teacher/teacher.pt"),
     start: Annotated[Path | None, typer.Option(help="Checkpoint of a student to refine.")] = None,
     out: Out = Path("out/training/student"),
-    recipe: Recipe = None,
+    source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
     """Stage 2: the recurrent student learns from the teacher."""
-    config = _configured(distill.DistillConfig, recipe, minutes)
-    run = distill.DistillRun(config, teacher_file, _actor(start) if start else None)
-    loop.train(run, config.budget, out / "student.pt")
-    student.export_policy(run.student, run.env, out / "policy.onnx", _recipe(config, run, "distill"))
+    config = _configured(distill.DistillConfig, source, minutes)
+    run_folder.describe(out, "distill", source, config)
+    run = distill.DistillRun(config, teacher_file, stage3.policy_of(start) if start else None)
+    checkpoint = out / "student.pt"
+    loop.train(run, config.budget, checkpoint)
+    made_of = run_folder.made_of("distill", source, config, checkpoint)
+    student.export_policy(run.student, run.env, out / "policy.onnx", made_of)
 
 
 @app.command("crl")
@@ -91,34 +78,75 @@ def train_crl(
         Path | None, typer.Option(help="Checkpoint of a student; without it, random weights.")
     ] = None,
     out: Out = Path("out/training/crl"),
-    recipe: Recipe = None,
+    source: Recipe = None,
     minutes: Minutes = None,
+    device: Device = "cpu",
 ) -> None:
-    """Stage 3: constrained reinforcement learning with the rewards of Table 2."""
-    config = _configured(crl.CrlConfig, recipe, minutes)
-    run = crl.CrlRun(config, _actor(start) if start else None)
-    loop.train(run, config.budget, out / "crl.pt")
-    recipe_of = _recipe(config, run, "crl")
-    student.export_policy(run.actor.network, run.env, out / "policy.onnx", recipe_of, run.command_map)
+    """Stage 3: constrained reinforcement learning with the rewards of Table 2.
+
+    With torchrun, several processes or machines learn together: torchrun --nproc-per-node 2 -m quadvel_training crl ...
+    """
+    stage3.learn(_configured(crl.CrlConfig, source, minutes), source, start, out, device)
 
 
 @app.command("export")
 def export_policy(
     checkpoint: Annotated[Path, typer.Argument(help="Of `distill` or `crl`.")],
     out: Annotated[Path, typer.Option(help="The policy file to write.")] = Path("out/training/crl_eam.onnx"),
-    recipe: Recipe = None,
+    source: Recipe = None,
 ) -> None:
     """A policy file of a checkpoint, behind a command map that takes out its steady-state error."""
-    config = _configured(crl.CrlConfig, recipe, None)
-    actor = _actor(checkpoint)
-    command_map, walks = distill.student_map(actor, config.commands)
-    made_of = {
-        "stage": "crl",
-        "samples": loop.load(checkpoint)["samples"],
-        "configuration": attrs.asdict(config),
-    }
-    student.export_policy(actor, walks, out, made_of, command_map)
+    stage3.export(recipe.read(crl.CrlConfig, source), source, checkpoint, out)
     print(f"written: {out}")
+
+
+@app.command("ablation")
+def train_ablation(
+    start: Annotated[Path, typer.Option(help="Checkpoint that all three start from.")] = SHIPPED,
+    samples: Annotated[float, typer.Option(help="Of each recipe, the budget that is equal for all.")] = 6e7,
+    out: Annotated[Path, typer.Option(help="Folder for the runs and their policy files.")] = Path(
+        "out/ablation"
+    ),
+    device: Device = "cpu",
+) -> None:
+    """Train rl_pd, rl_eam and crl_eam from one start, one after the other; goes on where it was stopped.
+
+    \b
+    Then:
+      quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd.onnx \\
+        --policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx
+    """
+    if not stage3.ablation(start, samples, out, device):
+        raise typer.Exit(1)
+    print(f"written: {', '.join(f'{out}/{name}.onnx' for name in stage3.ABLATION)}")
+
+
+def _actuator_file(path: Path) -> Path:
+    try:
+        ActuatorParameters.load(path)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    return path
+
+
+@app.command("tune")
+def tune_policy(
+    actuator: Annotated[
+        Path,
+        typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
+    ],
+    policy: Annotated[Path, typer.Option(help="Checkpoint to start from.", exists=True)] = SHIPPED,
+    minutes: Annotated[float, typer.Option(help="How long; counts anew where it is resumed.")] = 20.0,
+    out: Out = Path("out/tuned"),
+    device: Device = "cpu",
+) -> None:
+    """Tune a policy on a corrected actuator model for a short while: DIR/tuned.onnx, with a command map of its own.
+
+    \b
+    Before and after, on the plants of the gap:
+      quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/tuned.onnx
+    """
+    print(f"written: {stage3.tune(actuator, policy, minutes, out, device)}")
 
 
 @app.command("estimator")
@@ -127,14 +155,16 @@ def train_estimator(
         "out/training/student/student.pt"
     ),
     out: Out = Path("out/training/estimator"),
-    recipe: Recipe = None,
+    source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
     """The linear-velocity estimator, on the policy's own walks."""
-    config = _configured(estimator.EstimatorConfig, recipe, minutes)
-    run = estimator.EstimatorRun(config, _actor(policy))
-    loop.train(run, config.budget, out / "estimator.pt")
-    run.export(out / "estimator.onnx", _recipe(config, run, "estimator"))
+    config = _configured(estimator.EstimatorConfig, source, minutes)
+    run_folder.describe(out, "estimator", source, config)
+    run = estimator.EstimatorRun(config, stage3.policy_of(policy))
+    checkpoint = out / "estimator.pt"
+    loop.train(run, config.budget, checkpoint)
+    run.export(out / "estimator.onnx", run_folder.made_of("estimator", source, config, checkpoint))
 
 
 @app.command("kalman")
@@ -142,11 +172,11 @@ def tune_kalman(
     policy: Annotated[Path, typer.Option(help="Checkpoint of the policy whose walks it is tuned on.")] = Path(
         "out/training/student/student.pt"
     ),
-    recipe: Recipe = None,
+    source: Recipe = None,
 ) -> None:
     """Tune the Kalman filter's noise on the same kind of walks; prints what belongs into `KalmanConfig`."""
-    config = _configured(kalman_tuning.TuningConfig, recipe, None)
-    recording = kalman_tuning.record(config, _actor(policy))
+    config = recipe.read(kalman_tuning.TuningConfig, source)
+    recording = kalman_tuning.record(config, stage3.policy_of(policy))
     before = kalman_tuning.rmse(KalmanConfig(), recording)
     with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[error]}")) as progress:
         task = progress.add_task("kalman", total=config.evaluations, error="")
@@ -161,6 +191,25 @@ def tune_kalman(
         print(f"{name}: {getattr(tuned, name):.3g}")
 
 
-if __name__ == "__main__":
+@app.command("card")
+def write_card(
+    network: Annotated[Path, typer.Argument(help="Policy or estimator file.")],
+    evaluation: Annotated[Path, typer.Argument(help="eval.json of `quadvel eval`, or the folder it is in.")],
+) -> None:
+    """The model card of a network, written beside it: FILE.md of FILE.onnx."""
+    path = network.with_suffix(".md")
+    path.write_text(card(network, evaluation))
+    print(f"written: {path}")
+
+
+def main() -> None:
+    """The program; what is wrong with a file is told in one sentence."""
     torch.set_num_threads(env.cores())
-    app()
+    try:
+        app()
+    except (recipe.RecipeError, FileNotFoundError) as error:
+        raise SystemExit(f"quadvel_training: {error}") from None
+
+
+if __name__ == "__main__":
+    main()

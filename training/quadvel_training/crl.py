@@ -6,6 +6,8 @@ the soft gains. The symmetry term runs the mirrored sequence from the memory of 
 
 from __future__ import annotations
 
+import copy
+from functools import cached_property
 from typing import Any
 
 import attrs
@@ -15,14 +17,14 @@ import torch
 from quadvel_description import symmetry
 from quadvel_sim.terrain import Terrain
 
-from . import student
+from . import parallel, student
 from .command_map import CommandMap
 from .distill import student_map
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
-from .loop import Budget
-from .networks import Gaussian, Mlp, Recurrent
+from .loop import Budget, Shares
+from .networks import Gaussian, Mlp, Recurrent, State
 from .ppo import Ppo, PpoConfig, Rollout
-from .randomisation import Randomisation
+from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
 from .teacher import torch_mirror
 
@@ -40,6 +42,8 @@ class CrlConfig:
     std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit
     critic_first: int = 40  # updates of the critic alone
     mapped: bool = False  # train behind a command map that takes out the steady-state error at the start
+    keep: float = 5e6  # samples between policies that are kept and evaluated
+    actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025
     seed: int = 3
     commands: CommandRange = CommandRange()
@@ -52,7 +56,7 @@ class CrlConfig:
         epochs=1,
         mini_batches=1,
         learning_rate=1.5e-4,
-        max_learning_rate=1.5e-4,
+        target_kl=None,
         momentum=0.95,
         max_grad_norm=4.0,
         symmetry=0.01,
@@ -63,38 +67,56 @@ class CrlConfig:
 
 
 class CrlRun:
-    """Environment, policy, critic and learner."""
+    """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
 
-    def __init__(self, config: CrlConfig, start: Recurrent | None = None) -> None:
+    def __init__(self, config: CrlConfig, start: Recurrent | None = None, device: str = "cpu") -> None:
         self.config = c = config
+        self.device = parallel.join(device)
         torch.manual_seed(c.seed)
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed,
+            seed=c.seed + 1000 * parallel.rank(),
             timestep=c.timestep,
+            actuator=actuator(c.actuator),
             commands=c.commands,
             terrain=c.terrain,
             randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config)
         self.rewards = Table2(self.env, c.rewards)
-        self.command_map = student_map(start, c.commands)[0] if start and c.mapped else CommandMap()
-        self.actor = Gaussian(start or student.new_actor(), 12, c.std)
+        self._mapped = c.mapped and start is not None
+        self.actor = Gaussian(start or student.new_actor(), 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
-        self.critic = Mlp(48 + PRIVILEGED, 1)
+        self.critic = Mlp(48 + PRIVILEGED, 1).to(self.device)
         self.mirror_obs, self.mirror_action = (
-            torch_mirror(symmetry.OBSERVATION),
-            torch_mirror(symmetry.JOINTS),
+            torch_mirror(mirror, self.device) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS)
         )
         self.ppo = Ppo(self.actor, self.critic, c.ppo, self.mirror_obs, self.mirror_action)
         self.map = student.action_map(self.env)
+        self.shares = Shares()
         self.samples = self.updates = 0
         self._action = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
-        network = self.actor.network
-        self._state = network.initial_state(c.n)
-        self._mirrored = network.initial_state(self.ppo.mirrored(c.n))
+        self._state = self._initial_state(c.n)
+        self._mirrored = self._initial_state(self.ppo.mirrored(c.n))
+
+    def _initial_state(self, n: int) -> State:
+        h, c = self.actor.network.initial_state(n)
+        return h.to(self.device), c.to(self.device)
+
+    @cached_property
+    def command_map(self) -> CommandMap:
+        """What stands in front of the policy, measured on the start before the first update or taken from a checkpoint."""
+        c = self.config
+        return (
+            student_map(self.policy(), c.commands, actuator(c.actuator))[0] if self._mapped else CommandMap()
+        )
+
+    def policy(self) -> Recurrent:
+        """A copy of the policy as it is now, on the CPU."""
+        network: Recurrent = copy.deepcopy(self.actor.network).cpu()
+        return network
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -119,7 +141,9 @@ class CrlRun:
         """One rollout, one update."""
         rollout, seen = self.collect()
         self.updates += 1
-        return seen | self.ppo.update(rollout, learn_actor=self.updates > self.config.critic_first)
+        with self.shares.of("learning"):
+            seen |= self.ppo.update(rollout, learn_actor=self.updates > self.config.critic_first)
+        return seen | self.shares.taken()
 
     def _observe(self) -> np.ndarray:
         return student.observe(self.env, self._action, self.command_map(self.env.command))
@@ -136,26 +160,33 @@ class CrlRun:
         ]
         return np.concatenate([obs, *true], axis=1).astype(np.float32)
 
+    def _act(self, obs: np.ndarray, state: State) -> tuple[np.ndarray, State]:
+        with torch.no_grad():
+            mean, state = self.actor(torch.from_numpy(obs[None]).to(self.device), state)
+        return mean[0].cpu().numpy(), state
+
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment."""
         c, env = self.config, self.env
         names = ("obs", "critic_obs", "action", "mean", "reward", "ended", "cut", "mask")
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
-        std = self.actor.log_std.exp().numpy()
+        std = self.actor.log_std.exp().cpu().numpy()
         alive = np.ones(c.n, bool)
         state, start, mirrored_start = self._state, self._state, self._mirrored
-        before = torch.from_numpy(self._noise)
+        before = self._noise
         for _ in range(c.length):
-            obs = self._observe()
-            critic_obs = self._critic_obs(obs)
-            with torch.no_grad():
-                mean, state = self.actor(torch.from_numpy(obs[None]), state)
-            mean = mean[0].numpy()
-            drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
-            self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
-            action = mean + self._noise
-            env.tick(self.map.targets(action))
-            reward = self.rewards(action)
+            with self.shares.of("sensing"):
+                obs = self._observe()
+                critic_obs = self._critic_obs(obs)
+            with self.shares.of("inference"):
+                mean, state = self._act(obs, state)
+            with self.shares.of("physics"):
+                drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
+                self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
+                action = mean + self._noise
+                env.tick(self.map.targets(action))
+            with self.shares.of("sensing"):
+                reward = self.rewards(action)
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
             for name, value in zip(
@@ -163,11 +194,13 @@ class CrlRun:
             ):
                 keep[name].append(value)
             alive &= ~(fell | late)
-        self.samples += c.length * c.n
-        t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
-        last = torch.from_numpy(self._critic_obs(self._observe()))
-        rollout = Rollout(**t, noise=before, last_critic_obs=last, state=start, mirrored_state=mirrored_start)
-        self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
+        self.samples += c.length * c.n * parallel.size()
+        rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
+        rows |= {"noise": before, "last_critic_obs": self._critic_obs(self._observe())}
+        t = {name: torch.from_numpy(value).to(self.device) for name, value in rows.items()}
+        rollout = Rollout(**t, state=start, mirrored_state=mirrored_start)
+        with self.shares.of("inference"):
+            self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
         error = env.command[:, :2] - env.velocity[:, :2]
         seconds = c.length * c.n * 0.005
         return rollout, {

@@ -15,6 +15,7 @@ import attrs
 import numpy as np
 import torch
 
+from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import robot, symmetry
 from quadvel_sim.terrain import Terrain
 
@@ -98,10 +99,11 @@ class Student:
 
 
 def student_map(
-    actor: Recurrent, commands: CommandRange, seconds: float = 12.0
+    actor: Recurrent, commands: CommandRange, drives: ActuatorParameters, seconds: float = 12.0
 ) -> tuple[CommandMap, VelocityEnv]:
-    """The command map of a student on the nominal plant, and the environment that it was measured in."""
-    env = VelocityEnv(held_commands(EnvConfig(commands=commands, randomisation=Randomisation.calm())))
+    """The command map of a student on the nominal plant with these actuators, and the environment it was measured in."""
+    plain = EnvConfig(commands=commands, actuator=drives, randomisation=Randomisation.calm())
+    env = VelocityEnv(held_commands(plain))
     return fit_command_map(Student(actor, env, gain=0.6), seconds), env
 
 

@@ -1,9 +1,12 @@
-"""What every training run shares: a budget, progress, curves, and checkpoints that are whole or absent."""
+"""What every training run shares: a budget, progress, curves, where the time goes, and checkpoints, whole or absent."""
 
 from __future__ import annotations
 
 import math
 import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -11,6 +14,8 @@ import attrs
 import torch
 from rich.progress import Progress, TextColumn
 from torch.utils.tensorboard import SummaryWriter
+
+from . import parallel
 
 SAVE_EVERY = 60.0  # s
 
@@ -41,6 +46,39 @@ class Run(Protocol):
         ...
 
 
+class Keeper(Protocol):
+    """Keeps and judges what a run has become on its way."""
+
+    def due(self, samples: int) -> bool:
+        """Whether it is time."""
+        ...
+
+    def keep(self) -> dict[str, float]:
+        """Keep the run as it is now; returns what is worth plotting."""
+        ...
+
+
+class Shares:
+    """Where the time of an update goes."""
+
+    def __init__(self) -> None:
+        self._seconds: defaultdict[str, float] = defaultdict(float)
+
+    @contextmanager
+    def of(self, part: str) -> Iterator[None]:
+        """Time in the block counts as this part's."""
+        start = time.perf_counter()
+        yield
+        self._seconds[part] += time.perf_counter() - start
+
+    def taken(self) -> dict[str, float]:
+        """The share of each part in all that was counted since the last call."""
+        total = sum(self._seconds.values())
+        shares = {part: seconds / total for part, seconds in self._seconds.items()}
+        self._seconds.clear()
+        return shares
+
+
 def save(content: dict[str, Any], path: Path) -> None:
     """Write a checkpoint so that a reader finds the old one or the new one, never a part."""
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -50,10 +88,10 @@ def save(content: dict[str, Any], path: Path) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint. Raises FileNotFoundError with a sentence."""
+    """Read a checkpoint, whatever device wrote it. Raises FileNotFoundError with a sentence."""
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
-    content: dict[str, Any] = torch.load(path, weights_only=True)
+    content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
     return content
 
 
@@ -68,37 +106,70 @@ def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
         group["lr"] = float(rate)
 
 
-def train(run: Run, budget: Budget, checkpoint: Path) -> None:
+def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = None) -> bool:
     """Resume from `checkpoint` if it is there, run until the budget is spent, save on the way and at the end.
 
-    Ctrl-C ends it early with everything saved.
+    Ctrl-C ends it early with everything saved; returns whether the budget is spent. Of several processes the first one
+    writes, and says when it is over.
     """
-    if checkpoint.exists():
-        run.restore(load(checkpoint))
-    started = saved = time.monotonic()
-    first = run.samples
-    name = checkpoint.stem
-    columns = [*Progress.get_default_columns(), TextColumn("{task.fields[note]}")]
-    with SummaryWriter(str(checkpoint.parent)) as writer, Progress(*columns) as progress:
-        task = progress.add_task(name, total=1.0, note="")
-        try:
-            while True:
-                now = time.monotonic()
-                done = max(run.samples / budget.samples, (now - started) / (60 * budget.minutes))
-                if done >= 1.0:
-                    break
-                seen = run.step(done)
-                for key, value in seen.items():
-                    writer.add_scalar(f"{name}/{key}", value, run.samples)
-                rate = (run.samples - first) / (time.monotonic() - started)
-                note = "  ".join(f"{key} {value:.3g}" for key, value in seen.items())
-                progress.update(task, completed=done, note=note)
-                if now - saved > SAVE_EVERY:
-                    save(run.state(), checkpoint)
-                    saved = now
-                    progress.console.print(
-                        f"{run.samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True
-                    )
-        except KeyboardInterrupt:
-            progress.console.print("stopped; the checkpoint holds everything so far")
-    save(run.state(), checkpoint)
+    known = load(checkpoint) if checkpoint.exists() else {}
+    if known or parallel.size() > 1:
+        run.restore(parallel.from_first(known or run.state()))
+    journal = _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if parallel.rank() == 0 else None
+    started = time.monotonic()
+    try:
+        while True:
+            minutes = (time.monotonic() - started) / 60
+            done = parallel.from_first(max(run.samples / budget.samples, minutes / budget.minutes))
+            if done >= 1.0:
+                return True
+            seen = run.step(done)
+            if journal:
+                journal.note(done, seen)
+    except KeyboardInterrupt:
+        print("stopped; the checkpoint holds everything so far")
+        return False
+    finally:
+        if journal:
+            journal.close()
+
+
+class _Journal:
+    """What the first process writes: progress, curves, the checkpoint."""
+
+    def __init__(self, run: Run, checkpoint: Path, keeper: Keeper | None, seconds: float) -> None:
+        self._run, self._checkpoint, self._keeper = run, checkpoint, keeper
+        self._before, self._first = seconds, run.samples
+        self._started = self._saved = time.monotonic()
+        self._curves = SummaryWriter(str(checkpoint.parent))
+        self._progress = Progress(*Progress.get_default_columns(), TextColumn("{task.fields[note]}"))
+        self._task = self._progress.add_task(checkpoint.stem, total=1.0, note="")
+        self._progress.start()
+
+    def note(self, done: float, seen: dict[str, float]) -> None:
+        """Tell what the last update showed; save now and then."""
+        samples = self._run.samples
+        if self._keeper and self._keeper.due(samples):
+            seen = seen | self._keeper.keep()
+        for key, value in seen.items():
+            self._curves.add_scalar(f"{self._checkpoint.stem}/{key}", value, samples)
+        note = "  ".join(f"{key} {value:.3g}" for key, value in seen.items())
+        self._progress.update(self._task, completed=done, note=note)
+        now = time.monotonic()
+        if now - self._saved > SAVE_EVERY:
+            self._save()
+            self._saved = now
+            rate = (samples - self._first) / (now - self._started)
+            self._progress.console.print(
+                f"{samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True
+            )
+
+    def _save(self) -> None:
+        seconds = self._before + time.monotonic() - self._started
+        save(self._run.state() | {"seconds": seconds}, self._checkpoint)
+
+    def close(self) -> None:
+        """Save, and end what is shown."""
+        self._save()
+        self._progress.stop()
+        self._curves.close()

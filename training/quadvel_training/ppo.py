@@ -13,8 +13,11 @@ import attrs
 import torch
 from torch import Tensor
 
+from . import parallel
 from .loop import set_rate
 from .networks import Gaussian, State
+
+ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
 
 
 @attrs.frozen
@@ -28,15 +31,14 @@ class PpoConfig:
     mini_batches: int = 4
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
-    target_kl: float = (
-        0.01  # of an update, as if exploration were white: correlated, lasting shifts would count too little
-    )
+    target_kl: float | None = 0.01
+    """of an update, as if exploration were white: correlated, lasting shifts would count too little; None keeps the rate, as
+    it must where an update is a single step, before which nothing has shifted yet"""
     entropy: float = 0.0
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8
     symmetric_share: float = 1.0  # of the environments, the first ones, that the symmetry term sees
     correlation: float = 0.0  # of the exploration from sample to sample
-    advantage_bound: float = 10.0  # standard deviations: a fall must not drown what all others show
     max_grad_norm: float = 1.0
     momentum: float = (
         0.0  # above 0: plain gradient steps. Adam steps in all weights alike, most of which see but noise
@@ -64,6 +66,11 @@ class Rollout:
 def select(state: State | None, ids: Tensor) -> State | None:
     """The state of some environments."""
     return None if state is None else (state[0][:, ids].contiguous(), state[1][:, ids].contiguous())
+
+
+def _mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Over the living samples of all processes: the mean of what each process returns here, and so of its gradients."""
+    return (values * mask).sum() / parallel.mean(mask.sum()).clamp(min=1)
 
 
 class Ppo:
@@ -124,18 +131,16 @@ class Ppo:
 
     def update(self, r: Rollout, learn_actor: bool = True) -> dict[str, float]:
         """Several epochs over one rollout; returns means of the loss terms."""
-        c = self.config
         advantage, target = self.advantages(r)
-        alive = r.mask.sum().clamp(min=1)
-        explained = 1 - (advantage**2 * r.mask).sum() / alive / target[r.mask > 0].var().clamp(min=1e-8)
-        mean = (advantage * r.mask).sum() / alive
-        spread = (((advantage - mean) ** 2 * r.mask).sum() / alive).sqrt()
-        advantage = ((advantage - mean) / (spread + 1e-6)).clamp(-c.advantage_bound, c.advantage_bound)
+        explained = 1 - _mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
+        centre = parallel.mean(_mean(advantage, r.mask))
+        spread = parallel.mean(_mean((advantage - centre) ** 2, r.mask)).sqrt()
+        advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
             old_log_prob = self._log_prob(r.action - r.mean, r.noise)
         total: dict[str, float] = {}
         batches = 0
-        for ids in self._mini_batches(r.reward.shape[1]):
+        for ids in self._mini_batches(r.reward.shape[1], r.reward.device):
             mask = r.mask[:, ids]
             terms = self._critic_step(r.critic_obs[:, ids], target[:, ids], mask)
             if learn_actor:
@@ -144,8 +149,8 @@ class Ppo:
                 total[name] = total.get(name, 0.0) + value
             batches += 1
         means = {name: value / batches for name, value in total.items()}
-        if learn_actor:
-            self._adapt_rate(means["kl"])
+        if learn_actor and self.config.target_kl is not None:
+            self._adapt_rate(means["kl"], self.config.target_kl)
         return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
 
     def _draws(self, noise: Tensor, before: Tensor) -> Tensor:
@@ -161,12 +166,12 @@ class Ppo:
         draws = self._draws(noise, before)
         return self.actor.log_prob(torch.zeros_like(draws), draws)
 
-    def _mini_batches(self, n: int) -> Iterator[Tensor]:
+    def _mini_batches(self, n: int, device: torch.device) -> Iterator[Tensor]:
         for _ in range(self.config.epochs):
-            yield from torch.randperm(n).chunk(self.config.mini_batches)
+            yield from torch.randperm(n).to(device).chunk(self.config.mini_batches)
 
     def _critic_step(self, obs: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
-        loss = ((self.critic(obs)[0][..., 0] - target) ** 2 * mask).sum() / mask.sum().clamp(min=1)
+        loss = _mean((self.critic(obs)[0][..., 0] - target) ** 2, mask)
         self._step(self.critic_optimiser, self.critic, loss)
         return {"value_loss": float(loss.detach())}
 
@@ -174,41 +179,39 @@ class Ppo:
         self, r: Rollout, ids: Tensor, advantage: Tensor, old_log_prob: Tensor, mask: Tensor
     ) -> dict[str, float]:
         c, actor = self.config, self.actor
-        alive = mask.sum().clamp(min=1)
         mean, _ = actor(r.obs[:, ids], select(r.state, ids))
         ratio = (self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob).exp()
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
-        surrogate = -(torch.minimum(ratio * advantage, clipped * advantage) * mask).sum() / alive
+        surrogate = -_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
         variance = (2 * actor.log_std).exp().detach()
-        kl = (((mean - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1) * mask).sum().detach() / alive
 
         seen = ids < self.mirrored(r.reward.shape[1])
         mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), select(r.mirrored_state, ids[seen]))
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
-        symmetry = (gap.sum(-1) * mask[:, seen]).sum() / mask[:, seen].sum().clamp(min=1)
+        symmetry = _mean(gap.sum(-1), mask[:, seen])
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
-        smoothness = (bend.norm(dim=-1) * mask[2:]).sum() / mask[2:].sum().clamp(min=1)
+        smoothness = _mean(bend.norm(dim=-1), mask[2:])
 
         loss = surrogate + c.symmetry * symmetry + c.smoothness * smoothness - c.entropy * actor.entropy()
         self._step(self.actor_optimiser, actor, loss)
-        return {
-            "surrogate": float(surrogate.detach()),
-            "kl": float(kl),
-            "symmetry": float(symmetry.detach()),
-            "smoothness": float(smoothness.detach()),
-        }
+        terms = {"surrogate": surrogate, "symmetry": symmetry, "smoothness": smoothness}
+        if c.target_kl is not None:
+            shift = ((mean.detach() - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1)
+            terms["kl"] = parallel.mean(_mean(shift, mask))
+        return {name: float(term.detach()) for name, term in terms.items()}
 
     def _step(self, optimiser: torch.optim.Optimizer, module: torch.nn.Module, loss: Tensor) -> None:
         optimiser.zero_grad()
         loss.backward()
+        parallel.share_gradients(module)
         torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
         optimiser.step()
 
-    def _adapt_rate(self, kl: float) -> None:
+    def _adapt_rate(self, kl: float, target: float) -> None:
         """Keep the KL divergence of an update near its target."""
-        if kl > 2 * self.config.target_kl:
+        if kl > 2 * target:
             self.learning_rate /= 1.5
-        elif kl < 0.5 * self.config.target_kl:
+        elif kl < 0.5 * target:
             self.learning_rate *= 1.2
         self.learning_rate = min(max(self.learning_rate, 1e-6), self.config.max_learning_rate)
         set_rate(self.actor_optimiser, self.learning_rate)

@@ -7,6 +7,9 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadvel_actuator.model import ActuatorModel
+from quadvel_actuator.parameters import ActuatorParameters
+
+ACTUATORS = {"eam": ActuatorParameters.default, "ideal": ActuatorParameters.ideal}
 
 
 @attrs.frozen
@@ -30,6 +33,10 @@ class Randomisation:
     push_interval: float = 8.0  # s, mean
     push_velocity: float = 0.4  # m/s, sudden change of the trunk's velocity
     push_turn: float = 0.5  # rad/s
+    gain_scale: tuple[float, float] = (
+        1.0,
+        1.0,
+    )  # of kp and of kd, each on its own, where no identified model says more
 
     @classmethod
     def none(cls) -> Randomisation:
@@ -94,12 +101,22 @@ class PlantSampler:
         self.drawn[ids] = np.concatenate([friction, payload[:, None], shift / max(r.com_shift, 1e-3)], axis=1)
 
 
+def actuator(name: str) -> ActuatorParameters:
+    """The joints of a recipe: `eam` is Table 4, `ideal` plain PD, anything else an actuator file."""
+    return ACTUATORS[name]() if name in ACTUATORS else ActuatorParameters.load(name)
+
+
 def sample_actuators(
     actuators: ActuatorModel, ids: np.ndarray, ranges: Randomisation, rng: np.random.Generator
 ) -> None:
-    """Draw delays and gains as Section 3.1 says, add the transmission delay, and forget the past of `ids`."""
+    """Draw what the model itself varies (Section 3.1, and effects within their intervals), and what `ranges` adds.
+
+    The past of `ids` is forgotten.
+    """
     actuators.sample(ids, rng)
-    delay = actuators.input_delay
+    delay, kp_scale, kd_scale = actuators.input_delay, actuators.kp_scale, actuators.kd_scale
     delay[ids] += rng.uniform(*ranges.transmission_delay, (len(ids), 1))
-    actuators.input_delay = delay
+    kp_scale[ids] *= rng.uniform(*ranges.gain_scale, (len(ids), 1))
+    kd_scale[ids] *= rng.uniform(*ranges.gain_scale, (len(ids), 1))
+    actuators.input_delay, actuators.kp_scale, actuators.kd_scale = delay, kp_scale, kd_scale
     actuators.reset(ids)

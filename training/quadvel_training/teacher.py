@@ -37,9 +37,12 @@ OBSERVATION_MIRROR = symmetry.stack(
 CRITIC_MIRROR_FREE = 8 + 6  # plant draws, low-passed errors: seen by the critic alone
 
 
-def torch_mirror(mirror: Mirror) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The same mirror on tensors."""
-    index, sign = torch.as_tensor(mirror.index), torch.as_tensor(mirror.sign, dtype=torch.float32)
+def torch_mirror(
+    mirror: Mirror, device: torch.device | None = None
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The same mirror on tensors of `device`."""
+    index = torch.as_tensor(mirror.index, device=device)
+    sign = torch.as_tensor(mirror.sign, dtype=torch.float32, device=device)
     return lambda x: x[..., index] * sign
 
 

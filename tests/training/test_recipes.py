@@ -1,0 +1,91 @@
+"""Recipe files, and the three of the ablation."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+
+pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_actuator import ActuatorModel
+from quadvel_training import loop, recipe, stage3
+from quadvel_training.crl import CrlConfig
+from quadvel_training.randomisation import actuator, sample_actuators
+
+
+@pytest.fixture
+def ablation():
+    return {name: recipe.read(CrlConfig, stage3.RECIPES / f"{name}.yaml") for name in stage3.ABLATION}
+
+
+def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
+    shipped = ablation["crl_eam"]
+    free = attrs.evolve(
+        shipped,
+        ppo=attrs.evolve(shipped.ppo, symmetry=0.0, smoothness=0.0),
+        rewards=attrs.evolve(shipped.rewards, action_smoothness=0.01),
+    )
+    assert ablation["rl_eam"] == free
+    pd = ablation["rl_pd"]
+    assert pd == attrs.evolve(free, actuator="ideal", randomisation=pd.randomisation)
+    assert (
+        attrs.evolve(
+            pd.randomisation,
+            gain_scale=(1.0, 1.0),
+            transmission_delay=free.randomisation.transmission_delay,
+        )
+        == free.randomisation
+    )
+
+
+def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):
+    config, ids = ablation["rl_pd"], np.arange(400)
+    joints = ActuatorModel(actuator(config.actuator), (400, 12))
+    for _ in range(2):  # drawing again starts from the nominal joints, not from those drawn before
+        sample_actuators(joints, ids, config.randomisation, np.random.default_rng(0))
+    for drawn, (low, high) in (
+        (joints.input_delay, config.randomisation.transmission_delay),
+        (joints.kp_scale, config.randomisation.gain_scale),
+        (joints.kd_scale, config.randomisation.gain_scale),
+    ):
+        assert low <= drawn.min() < low + 0.05 * (high - low)
+        assert high - 0.05 * (high - low) < drawn.max() <= high
+    assert np.ptp(joints.kp_scale, axis=1).max() == 0.0
+    assert abs(np.corrcoef(joints.kp_scale[:, 0], joints.kd_scale[:, 0])[0, 1]) < 0.2
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("ppo: {symetry: 1.0}", "symetry"),
+        ("n: many", r"expected int @ \$[.]n"),
+        ("- 1", r"found \[1\]"),
+        ("n: 3\nfoo: 1", "foo"),
+    ],
+)
+def test_a_recipe_with_a_mistake_is_refused_by_file_and_field(tmp_path, text, complaint):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    with pytest.raises(recipe.RecipeError, match=rf"mine[.]yaml: .*{complaint}"):
+        recipe.read(CrlConfig, path)
+
+
+def test_the_ablation_gives_every_recipe_the_same_and_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
+    runs, stop_after = [], 2
+
+    def learn(config, source, start, folder, device):
+        runs.append((source.stem, start.name, config.budget.samples))
+        loop.save({"samples": config.budget.samples}, folder / stage3.CHECKPOINT)
+        return len(runs) != stop_after
+
+    monkeypatch.setattr(stage3, "learn", learn)
+    monkeypatch.setattr(stage3, "export", lambda config, source, checkpoint, out: out.touch())
+    start = tmp_path / "start.pt"
+    assert not stage3.ablation(start, 100.0, tmp_path, "cpu")
+    assert stage3.ablation(start, 100.0, tmp_path, "cpu")
+    order = ["rl_pd", "rl_eam", "rl_eam", "crl_eam"]
+    assert runs == [(name, "start.pt", 100.0) for name in order]
+    assert all((tmp_path / f"{name}.onnx").exists() for name in order)
+    assert stage3.ablation(start, 100.0, tmp_path, "cpu")
+    assert len(runs) == len(order)

@@ -1,0 +1,150 @@
+"""The model card of a policy or estimator file: what its metadata and an evaluation say, as Markdown.
+
+Nothing is measured here, and nothing is said that does not follow from the two files, but that no robot was there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import onnx
+
+from quadvel_description.recurrent_network import METADATA_KEY
+from quadvel_estimator.features import KIND
+from quadvel_eval.compare import figures, read_evaluation
+
+Json = Mapping[str, Any]
+UNITS = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}
+
+
+def card(network: Path, evaluation: Path) -> str:
+    """The text for a network file with what an evaluation says of it. Raises ValueError or FileNotFoundError."""
+    metadata, found = _metadata(network), read_evaluation(evaluation)
+    estimator = metadata.get("kind") == KIND
+    _check_belongs(network, found["setup"]["estimator_file" if estimator else "policy"], evaluation)
+    what, limits = (ESTIMATOR, _estimator_limits) if estimator else (POLICY, _policy_limits)
+    digest = hashlib.sha256(network.read_bytes()).hexdigest()[:12]
+    measured = figures(found).items()
+    return "\n".join(
+        [
+            f"# {network.name}",
+            "",
+            what,
+            f"Written by `python -m quadvel_training card` from the file (SHA-256 {digest}...) and an evaluation; do not edit.",
+            "",
+            *_table("how it was made", "", _origin(metadata)),
+            "",
+            *_table(
+                f"evaluation: {_conditions(found['setup'])}",
+                "measured",
+                ((n, _number(v)) for n, v in measured),
+            ),
+            "",
+            "Known limits:",
+            "",
+            *(f"- {limit}" for limit in limits(metadata, found)),
+            "- Trained and evaluated in simulation alone.",
+            "",
+        ]
+    )
+
+
+POLICY = "A recurrent policy for velocity tracking of the AlienGo, one step at 200 Hz; metadata in the file say how to run it."
+ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, encoders and torques, one step at 200 Hz."
+
+
+def _metadata(network: Path) -> dict[str, Any]:
+    if not network.is_file():
+        raise FileNotFoundError(f"{network}: no such file, expected a policy or an estimator")
+    texts = {entry.key: entry.value for entry in onnx.load(network).metadata_props}
+    if METADATA_KEY not in texts:
+        raise ValueError(f"{network}: no metadata {METADATA_KEY}, expected a policy or an estimator")
+    found: dict[str, Any] = json.loads(texts[METADATA_KEY])
+    return found
+
+
+def _check_belongs(network: Path, evaluated: str, evaluation: Path) -> None:
+    """Refuse an evaluation of another network."""
+    other = Path(evaluated)
+    same = other.read_bytes() == network.read_bytes() if other.exists() else other.name == network.name
+    if not same:
+        raise ValueError(f"{evaluation}: is an evaluation of {evaluated}, expected one of {network}")
+
+
+def _origin(metadata: Json) -> Iterable[tuple[str, str]]:
+    recipe = metadata.get("recipe") or {}
+    for name, value in recipe.items():
+        if name == "configuration":
+            for field, setting in value.items():
+                yield f"`{field}`", f"`{json.dumps(setting)}`"
+        else:
+            yield name, f"{value:,}" if isinstance(value, int) else str(value)
+    yield "hours", "not kept" if recipe.get("hours") is None else str(recipe["hours"])
+    yield "commit", metadata["commit"]
+    if "actuator" in metadata:
+        yield "actuator model", _drives(metadata["actuator"])
+
+
+def _drives(actuator: Json | None) -> str:
+    if not actuator:
+        return "not kept"
+    delays = [1e3 * (pair["input_delay_s"] + pair["output_delay_s"]) for pair in actuator["pairs"]]
+    effects = ", ".join(effect["name"] for effect in actuator["effects"]) or "none"
+    return (
+        f"{actuator['name']}: ΔKp {actuator['delta_kp']} N m/rad, ΔKd {actuator['delta_kd']} N m s/rad, "
+        f"delays together {min(delays):.1f} to {max(delays):.1f} ms, effects beyond the EAM: {effects}"
+    )
+
+
+def _conditions(setup: Json) -> str:
+    drawn = "drawn at random" if setup["randomised"] else "nominal"
+    return f"{setup['grid']} grid, {setup['seeds']} seeds, {setup['terrain']} ground, {drawn} robot, {setup['estimator']} estimator"
+
+
+def _policy_limits(metadata: Json, found: Json) -> Iterable[str]:
+    limits = metadata["command_limits"]
+    spans = ", ".join(
+        f"{axis} {limits[axis][0]:g} to {limits[axis][1]:g} {unit}" for axis, unit in UNITS.items()
+    )
+    yield f"Commands beyond {spans} are cut to that."
+    yield f"Its gains are part of it: kp {_one(metadata['kp'])} N m/rad, kd {_one(metadata['kd'])} N m s/rad."
+    yield from _failures(found)
+
+
+def _estimator_limits(metadata: Json, found: Json) -> Iterable[str]:
+    yield f"Measured on walks under {Path(found['setup']['policy']).name}; other gaits were not tried."
+    yield from _failures(found)
+
+
+def _failures(found: Json) -> Iterable[str]:
+    """Where the evaluated robot fell or was furthest off."""
+    fell = [cell for cell in found["cells"] if cell["fell"]]
+    if fell:
+        where = "; ".join(sorted({_command(cell) for cell in fell}))
+        yield f"The robot fell in {len(fell)} of {len(found['cells'])} runs, at commands (vx, vy, wz) {where}."
+    stood = [cell for cell in found["cells"] if not cell["fell"]]
+    if stood:
+        worst = max(stood, key=lambda cell: cell["error_xy"])
+        yield f"Furthest off at the command {_command(worst)}: {worst['error_xy']:.3f} m/s."
+
+
+def _command(cell: Json) -> str:
+    return "({:g}, {:g}, {:g})".format(*cell["command"])
+
+
+def _one(values: Any) -> str:
+    """One number where all are alike."""
+    numbers = sorted(set(values))
+    return f"{numbers[0]:g}" if len(numbers) == 1 else f"{numbers[0]:g} to {numbers[-1]:g}"
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
+
+
+def _table(head: str, second: str, rows: Iterable[tuple[str, str]]) -> list[str]:
+    return [f"| {head} | {second} |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]

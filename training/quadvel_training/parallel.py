@@ -1,0 +1,60 @@
+"""Several processes as one learner, started by torchrun: mean gradients, one start, one end, one writer.
+
+Each process has environments of its own. A single process, started without torchrun, passes through here for free.
+"""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import torch
+import torch.distributed as dist
+
+
+def join(device: str) -> torch.device:
+    """Become one of torchrun's processes where it started this one; the device that this process computes on."""
+    if "LOCAL_RANK" not in os.environ:
+        return torch.device(device)
+    if not dist.is_initialized():
+        dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+    local = int(os.environ["LOCAL_RANK"])
+    return torch.device(device, local) if device == "cuda" else torch.device(device)
+
+
+def rank() -> int:
+    """The number of this process; 0 writes."""
+    return int(dist.get_rank()) if dist.is_initialized() else 0
+
+
+def size() -> int:
+    """How many processes learn together."""
+    return int(dist.get_world_size()) if dist.is_initialized() else 1
+
+
+def mean(value: torch.Tensor) -> torch.Tensor:
+    """Of all processes' values."""
+    if size() > 1:
+        value = value.detach().clone()
+        dist.all_reduce(value)
+        value /= size()
+    return value
+
+
+def share_gradients(module: torch.nn.Module) -> None:
+    """Give every process the mean of all gradients."""
+    if size() == 1:
+        return
+    gradients = [p.grad for p in module.parameters() if p.grad is not None]
+    shared = mean(torch.cat([g.flatten() for g in gradients]))
+    for own, part in zip(gradients, shared.split([g.numel() for g in gradients]), strict=True):
+        own.copy_(part.view_as(own))
+
+
+def from_first(value: Any) -> Any:
+    """What process 0 has."""
+    if size() == 1:
+        return value
+    kept = [value]
+    dist.broadcast_object_list(kept, src=0, device=torch.device("cpu"))
+    return kept[0]

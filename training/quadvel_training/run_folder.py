@@ -1,0 +1,78 @@
+"""What a run directory holds beside curves and checkpoint: what was run, and the policies kept on the way with their figures.
+
+run.json: stage, recipe, configuration, commit. kept/: a checkpoint, its policy file and its evaluation every some samples.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import attrs
+import cattrs
+
+from quadvel_eval.grid import evaluate
+from quadvel_eval.report import write_json
+from quadvel_eval.walk import Setup
+
+from . import loop, student
+from .crl import CrlRun
+from .randomisation import ACTUATORS, actuator
+
+GRID = "quick"
+
+
+def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
+    """Write run.json: what this directory's run is; where it is resumed, what it is from now on."""
+    folder.mkdir(parents=True, exist_ok=True)
+    about = {"stage": stage, "recipe": recipe.stem if recipe else None, "commit": student.commit()}
+    write_json(folder / "run.json", about | {"configuration": cattrs.unstructure(config)})
+
+
+def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> dict[str, Any]:
+    """How a network came to be, for the metadata of its file; hours of training where the checkpoint knows them."""
+    content = loop.load(checkpoint)
+    hours = round(content["seconds"] / 3600, 2) if "seconds" in content else None
+    about = {
+        "stage": stage,
+        "recipe": recipe.stem if recipe else None,
+        "samples": content["samples"],
+        "hours": hours,
+    }
+    return about | {"configuration": cattrs.unstructure(config)}
+
+
+@attrs.define
+class Evaluated:
+    """Keeps the run's policy every so many samples and evaluates it on the quick grid, one seed.
+
+    On the drives as they are known best: those of an actuator file where the run has one, else Table 4.
+    """
+
+    run: CrlRun
+    folder: Path
+    last: int = attrs.field(init=False)
+
+    def __attrs_post_init__(self) -> None:
+        self.last = self.run.samples
+
+    def due(self, samples: int) -> bool:
+        """Whether a multiple of `every` was passed since the last time."""
+        every = self.run.config.keep
+        passed = samples // every > self.last // every
+        self.last = samples
+        return passed
+
+    def keep(self) -> dict[str, float]:
+        """Checkpoint, policy file and evaluation; falls and errors (m/s) for the curves."""
+        run = self.run
+        kept = self.folder / "kept" / f"{run.samples / 1e6:07.2f}M"
+        loop.save(run.state(), kept.with_suffix(".pt"))
+        policy = kept.with_suffix(".onnx")
+        student.export_policy(run.policy(), run.env, policy, {"samples": run.samples}, run.command_map)
+        name = run.config.actuator
+        plant = {} if name in ACTUATORS else {"actuator": actuator(name)}
+        found = evaluate(Setup(policy=policy, plant=plant), GRID, seeds=1)
+        write_json(kept.with_suffix(".json"), found)
+        figures = ("falls", "mean_error_xy", "max_error_xy")
+        return {f"eval_{name}": float(found[name]) for name in figures}

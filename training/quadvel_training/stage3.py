@@ -1,0 +1,82 @@
+"""Stage 3 as it is run: a recipe from a start, the ablation's three recipes, and tuning on a corrected actuator model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import attrs
+
+from . import distill, loop, parallel, recipe, student
+from .crl import CrlConfig, CrlRun
+from .loop import Budget
+from .networks import Recurrent
+from .randomisation import actuator
+from .run_folder import Evaluated, describe, made_of
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+ABLATION = ("rl_pd", "rl_eam", "crl_eam")
+TUNE = RECIPES / "tune.yaml"
+CHECKPOINT = "crl.pt"
+NO_LIMIT = 1e6  # minutes
+
+
+def policy_of(checkpoint: Path) -> Recurrent:
+    """The recurrent policy in a checkpoint of stage 2 or 3."""
+    content = loop.load(checkpoint)
+    actor = student.new_actor()
+    if "student" in content:
+        actor.load_state_dict(content["student"])
+    else:
+        prefix = "network."
+        weights = {k.removeprefix(prefix): v for k, v in content["actor"].items() if k.startswith(prefix)}
+        actor.load_state_dict(weights)
+    return actor
+
+
+def learn(config: CrlConfig, source: Path | None, start: Path | None, folder: Path, device: str) -> bool:
+    """Train in `folder` from the checkpoint `start`, its critic included; whether the budget is spent.
+
+    `source`: the recipe file, for the record.
+    """
+    run = CrlRun(config, policy_of(start) if start else None, device)
+    if start and (critic := loop.load(start).get("critic")):
+        run.critic.load_state_dict(critic)
+    if parallel.rank() == 0:
+        describe(folder, "crl", source, config)
+    return loop.train(run, config.budget, folder / CHECKPOINT, Evaluated(run, folder))
+
+
+def export(config: CrlConfig, source: Path | None, checkpoint: Path, out: Path) -> None:
+    """The policy file of a checkpoint, behind a command map that is measured anew on the recipe's actuators."""
+    actor = policy_of(checkpoint)
+    command_map, walks = distill.student_map(actor, config.commands, actuator(config.actuator))
+    student.export_policy(actor, walks, out, made_of("crl", source, config, checkpoint), command_map)
+
+
+def ablation(start: Path, samples: float, out: Path, device: str) -> bool:
+    """Train the three recipes from one start, `samples` each, one after the other; `out` gets NAME.onnx of each.
+
+    Goes on where it was stopped; whether all are done.
+    """
+    for name in ABLATION:
+        source = RECIPES / f"{name}.yaml"
+        config = attrs.evolve(recipe.read(CrlConfig, source), budget=Budget(samples, NO_LIMIT))
+        checkpoint, policy = out / name / CHECKPOINT, out / f"{name}.onnx"
+        if policy.exists() and loop.load(checkpoint)["samples"] >= samples:
+            continue
+        if not learn(config, source, start, out / name, device):
+            return False
+        if parallel.rank() == 0:
+            export(config, source, checkpoint, policy)
+    return True
+
+
+def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
+    """Tune the policy of a checkpoint on the actuators of a file; the policy file, exported also where it was stopped."""
+    config = recipe.read(CrlConfig, TUNE)
+    budget = attrs.evolve(config.budget, minutes=minutes)
+    config = attrs.evolve(config, actuator=str(drives), budget=budget)
+    learn(config, TUNE, start, out, device)
+    if parallel.rank() == 0:
+        export(config, TUNE, out / CHECKPOINT, out / "tuned.onnx")
+    return out / "tuned.onnx"
