@@ -164,3 +164,45 @@ def test_effects_survive_the_file(tmp_path):
 def test_an_effect_that_cannot_run_is_refused_by_name(effect, message):
     with pytest.raises(ValueError, match=message):
         ActuatorModel(attrs.evolve(parameters([effect]), joints=JOINTS), (3,))
+
+
+@pytest.mark.parametrize("name", sorted(set(registry()) - {"command_hold"}))
+def test_a_sampled_environment_runs_as_a_model_of_the_parameters_that_were_drawn(name):
+    """Environments of a batch, one of them not sampled; each parameter within its interval, alike for all joints."""
+    _, q, dq, q_des = _motion(60, 0.0025)
+    numbers = {k: v for k, v in TRUTH[name].items() if isinstance(v, float)}
+    intervals = {k: sorted((0.5 * v, 1.5 * v)) for k, v in numbers.items() if k != "full"}
+    plain = parameters(delta_kp=0.0, delta_kd=0.0, noise=0.0)
+    effect = Effect(name, JOINTS, TRUTH[name], {}, intervals)
+    batch = ActuatorModel(attrs.evolve(plain, effects=(effect,)), (3, 12), dt=0.0025)
+    batch.sample(np.array([0, 2]), np.random.default_rng(1))
+    batch.reset(np.array([0, 2]))
+    drawn = batch._effects._all[0].values
+    single = []
+    for env in range(3):
+        values = {k: float(drawn[k][env, 0]) for k in intervals}
+        assert all(low <= values[k] <= high for k, (low, high) in intervals.items())
+        assert (values == {k: numbers[k] for k in intervals}) == (env == 1)
+        mine = attrs.evolve(effect, parameters=effect.parameters | values)
+        single.append(ActuatorModel(attrs.evolve(plain, effects=(mine,)), (12,), dt=0.0025))
+    for k in range(60):
+        step = [np.tile(x[k, :4], 3) for x in (q, dq, q_des)]
+        torque = batch.step(*(np.tile(x, (3, 1)) for x in step), 30.0, 0.5)
+        expected = [one.step(*step, 30.0, 0.5) for one in single]
+        np.testing.assert_allclose(torque, expected, atol=1e-9)
+
+
+def test_intervals_of_single_joints_are_drawn_joint_by_joint():
+    effect = Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.1}, {}, {"c": [[0.2, 0.4]] * 3})
+    batch = ActuatorModel(parameters([effect]), (50, 12))
+    batch.sample()
+    c = batch._effects._all[0].values["c"][:, [NAMES.index(name) for name in JOINTS]]
+    assert np.abs(np.corrcoef(c.T) - np.eye(3)).max() < 0.4
+    assert 0.2 <= c.min() < 0.21
+    assert 0.39 < c.max() <= 0.4
+
+
+def test_an_interval_the_wrong_way_round_is_refused_by_name():
+    effect = Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.1}, {}, {"c": [0.4, 0.2]})
+    with pytest.raises(ValueError, match=r"coulomb_friction/intervals/c: found \[0.4, 0.2\]"):
+        ActuatorModel(parameters([effect]))

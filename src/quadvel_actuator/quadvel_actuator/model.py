@@ -160,8 +160,8 @@ class ActuatorModel:
         """Draw delays and gains of the environments `ids` (all by default) as Section 3.1 randomises them.
 
         A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform,
-        independent between environments, the same share of the deviation for all joints of one. Follow it
-        with `reset(ids)`.
+        independent between environments, the same share of the deviation for all joints of one; the parameters
+        of effects within their intervals. Follow it with `reset(ids)`.
         """
         where = ... if ids is None else ids
         rng = self._rng if rng is None else rng
@@ -176,6 +176,8 @@ class ActuatorModel:
         kd_scale[where] = 1.0 + 2.0 * rng.random(count) * self._kd_deviation
         self.input_delay, self.output_delay = input_delay, output_delay
         self.kp_scale, self.kd_scale = kp_scale, kd_scale
+        if self._effects is not None:
+            self._effects.sample(where, rng, self.shape)
 
     def reset(self, ids: Any = None) -> None:
         """Forget the past of the environments `ids` (all by default).

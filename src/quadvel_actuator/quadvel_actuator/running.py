@@ -53,16 +53,17 @@ class Instant:
         return power
 
     def shifted(self, name: str, late: Array) -> Array:
-        """The velocity `late` s ago, (J,); one of the future is not known and stays the present one."""
+        """The velocity `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
         if name != "dq":
             raise ValueError(f"shifted: found {name}, expected dq")
-        steps = np.clip(np.broadcast_to(late, self.dq.shape[-1:]) / self.dt, 0.0, len(self.past) - 1.0)
-        found = np.empty_like(self.dq)
-        for joint, back in enumerate(steps):
-            first = int(back)
-            share = back - first
-            older = self.past[min(first + 1, len(self.past) - 1)][..., joint]
-            found[..., joint] = (1.0 - share) * self.past[first][..., joint] + share * older
+        last = len(self.past) - 1
+        back = np.clip(np.broadcast_to(late, self.dq.shape) / self.dt, 0.0, last)
+        first = back.astype(np.intp)
+        past = np.stack(self.past)
+        newer, older = (
+            np.take_along_axis(past, at[None], 0)[0] for at in (first, np.minimum(first + 1, last))
+        )
+        found: Array = newer + (back - first) * (older - newer)
         return found
 
 
@@ -90,7 +91,25 @@ class _Running:
             parameter.name: _column(effect, parameter.name, numbers, where, len(joints), parameter.scale)
             for parameter in form.parameters
         }
+        self.ranges = {
+            name: _range(effect, name, interval, where, self.values[name])
+            for name, interval in effect.intervals.items()
+            if name in self.values
+        }
         self.memory: tuple[Array, ...] = ()
+
+    def sample(self, ids: Any, rng: np.random.Generator, shape: tuple[int, ...]) -> None:
+        """Draw the parameters of the environments `ids` within their intervals, uniform; then they are of `shape`.
+
+        One number for all joints where the interval is one for all, and one for each joint where it is not.
+        """
+        for name, (low, high) in self.ranges.items():
+            values = np.broadcast_to(self.values[name], shape).copy()
+            drawn = values[ids].shape
+            share = rng.random((*drawn[:-1], drawn[-1] if low.ndim else 1))
+            values[ids] = np.where(self.active, low + share * (high - low), values[ids])
+            self.values[name] = values
+        self.values = self.law.tidy(self.values)
 
     def act(self, x: Any, now: Instant, new: NDArray[np.bool_] | None) -> Any:
         """The value instead of `x`; environments that are `new` start from rest."""
@@ -159,6 +178,22 @@ def _column(
     return column
 
 
+def _range(
+    effect: Effect, name: str, interval: Any, where: Sequence[int], values: Array
+) -> tuple[Array, Array]:
+    """Lowest and highest value of a parameter: one of each, (), or one for each joint, (J,)."""
+    given = np.asarray(interval, dtype=float)
+    if given.shape not in ((2,), (len(where), 2)) or (given[..., 0] > given[..., 1]).any():
+        raise ValueError(
+            f"effects/{effect.name}/intervals/{name}: found {interval!r}, expected [low, high], or one for each joint"
+        )
+    if given.ndim == 1:
+        return given[0], given[1]
+    low, high = values.copy(), values.copy()
+    low[list(where)], high[list(where)] = given.T
+    return low, high
+
+
 def _terms(effect: Effect, joints: Sequence[str], dt: float) -> RunningTerms:
     """The terms that an effect of the name `learned_residual` holds."""
     try:
@@ -184,6 +219,11 @@ class RunningEffects:
         self._terms = [_terms(one, joints, dt) for one in effects if one.name == TERMS]
         self._now = Instant(shape, dt)
         self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
+
+    def sample(self, ids: Any, rng: np.random.Generator, shape: tuple[int, ...]) -> None:
+        """Draw what the intervals leave open for the environments `ids`, whose past is of no use then."""
+        for one in self._all:
+            one.sample(ids, rng, shape)
 
     def send(self, q_des: Any, dq_des: Any, new: NDArray[np.bool_] | None) -> None:
         """The targets of this step go their way."""
