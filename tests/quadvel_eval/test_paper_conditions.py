@@ -78,6 +78,23 @@ def test_the_gap_is_told_plant_by_plant() -> None:
     section.figure(records)
 
 
+def test_before_and_after_are_compared_on_the_walks_that_neither_fell_on() -> None:
+    section, ahead, aside = Gap(), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0)
+    records = section.judge(
+        [
+            answer({"policy": name, "group": "drives", "level": "friction"}, command, error)
+            for name, command, error in (
+                ("before", ahead, 0.2),
+                ("before", aside, 0.9),
+                ("after", ahead, 0.05),
+                ("after", aside, None),
+            )
+        ]
+    )
+    ours = {row.what: row.ours for row in section.rows(records)}
+    assert ours["friction: mean error below that of before"] == {"after": pytest.approx(75.0)}
+
+
 def test_the_least_cost_is_that_of_the_best_speed() -> None:
     section = Energy()
     labels = {"policy": "mine"}

@@ -12,6 +12,8 @@ from rich.progress import Progress, TextColumn
 
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_estimator.kalman import KalmanConfig
+from quadvel_eval.paper import gap
+from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, student, teacher
 from .card import card
@@ -33,7 +35,7 @@ Recipe = Annotated[
 ]
 Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
 Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
-SHIPPED = Path("training/checkpoints/student.pt")
+START = Path("training/checkpoints/student.pt")
 
 
 def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> Any:
@@ -102,7 +104,7 @@ def export_policy(
 
 @app.command("ablation")
 def train_ablation(
-    start: Annotated[Path, typer.Option(help="Checkpoint that all three start from.")] = SHIPPED,
+    start: Annotated[Path, typer.Option(help="Checkpoint that all three start from.")] = START,
     samples: Annotated[float, typer.Option(help="Of each recipe, the budget that is equal for all.")] = 6e7,
     out: Annotated[Path, typer.Option(help="Folder for the runs and their policy files.")] = Path(
         "out/ablation"
@@ -135,7 +137,7 @@ def tune_policy(
         Path,
         typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
     ],
-    policy: Annotated[Path, typer.Option(help="Checkpoint to start from.", exists=True)] = SHIPPED,
+    policy: Annotated[Path, typer.Option(help="Checkpoint to start from.", exists=True)] = START,
     minutes: Annotated[float, typer.Option(help="How long; counts anew where it is resumed.")] = 20.0,
     out: Out = Path("out/tuned"),
     device: Device = "cpu",
@@ -147,6 +149,22 @@ def tune_policy(
       quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/tuned.onnx
     """
     print(f"written: {stage3.tune(actuator, policy, minutes, out, device)}")
+
+
+@app.command("record")
+def record_log(
+    plant: Annotated[
+        str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.plants())}.")
+    ],
+    out: Annotated[Path, typer.Option(help="NPZ file for `quadvel identify`.")],
+    policy: Annotated[Path, typer.Option(help="Policy file that walks.", exists=True)] = SHIPPED_POLICY,
+) -> None:
+    """Record a walk on a plant whose drives hold what training never saw, as a log for `quadvel identify`."""
+    try:
+        gap.record_walk(policy, plant, out)
+    except ValueError as error:
+        raise typer.BadParameter(str(error)) from None
+    print(f"written: {out}")
 
 
 @app.command("estimator")

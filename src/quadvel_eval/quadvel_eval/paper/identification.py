@@ -92,7 +92,7 @@ def lifting(seed: int, seconds: float) -> Log:
 
 def mixed(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]]) -> Log:
     """A walk of all kinds: stand, walk, run, turn, sideways, and stops in between; as far as the robot got."""
-    simulator = RecordedSimulator(SimulatorConfig(seed=seed))
+    simulator = RecordedSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
     loop = RobotLoop(simulator, Supervisor(PolicyFile(setup.policy)), estimator)
