@@ -86,7 +86,7 @@ def train_crl(
 ) -> None:
     """Stage 3: constrained reinforcement learning with the rewards of Table 2.
 
-    With torchrun, several processes or machines learn together: torchrun --nproc-per-node 2 -m quadvel_training crl ...
+    With torchrun, several processes or machines learn together: torchrun --nproc-per-node 2 -m -- quadvel_training crl ...
     """
     stage3.learn(_configured(crl.CrlConfig, source, minutes), source, start, out, device)
 

@@ -2,7 +2,7 @@
 
 `environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps of the same model. `training`:
 a whole update (rollout and learning, symmetry and smoothness on) against the bare steps and bare passes of the same
-networks over the same sizes.
+networks over the same sizes, and the shares that its parts have in it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from quadvel_description import robot
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import student
-from .crl import PRIVILEGED, CrlConfig, CrlRun
+from .crl import PARTS, PRIVILEGED, CrlConfig, CrlRun
 from .env import EnvConfig, VelocityEnv, training_model
 from .networks import Mlp
 from .rewards import RewardWeights, Table2
@@ -85,7 +85,8 @@ def _passes(config: CrlConfig) -> float:
 
     def learn(network: torch.nn.Module, inputs: int, envs: int) -> Callable[[], None]:
         x = torch.randn(length, envs, inputs)
-        return lambda: network(x)[0].square().mean().backward()
+        state = network.initial_state(envs)
+        return lambda: network(x, state)[0].square().mean().backward()
 
     size = n // p.mini_batches
     batch = _seconds(learn(actor, DEFAULT_OBSERVATION.size, size), 3)
@@ -95,10 +96,11 @@ def _passes(config: CrlConfig) -> float:
 
 
 def training(config: CrlConfig | None = None, updates: int = 3) -> dict[str, float]:
-    """Policy samples a second of the whole loop, of its bare parts, and their ratio."""
+    """Policy samples a second of the whole loop, of its bare parts, their ratio, and the shares of the loop's parts."""
     config = config or CrlConfig(critic_first=0)
     run = CrlRun(config)
-    whole = _seconds(lambda: run.step(0.0), updates)
+    seen: list[dict[str, float]] = []
+    whole = _seconds(lambda: seen.append(run.step(0.0)), updates)
     physics = config.length * _bare_steps(run.env.config, run.env.substeps)
     passes = _passes(config)
     samples = config.n * config.length
@@ -106,6 +108,5 @@ def training(config: CrlConfig | None = None, updates: int = 3) -> dict[str, flo
         "samples_per_s": samples / whole,
         "bare_samples_per_s": samples / (physics + passes),
         "ratio": (physics + passes) / whole,
-        "physics_share": physics / whole,
-        "network_share": passes / whole,
+        **{f"{part}_share": float(np.mean([one[part] for one in seen])) for part in PARTS},
     }

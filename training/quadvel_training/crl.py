@@ -28,6 +28,7 @@ from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
 from .teacher import torch_mirror
 
+PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
 PRIVILEGED = 8 + 3 + 4 + 1 + 12 + 12  # plant, true velocity, contacts, height, torque, exploration under way
 
 

@@ -156,7 +156,11 @@ ROWS = (  # part, figure, what it is, what is wanted
     ("environment", "steps_per_s", "training environment, steps/s", ""),
     ("environment", "ratio", "of the bare batch's", "0.7 or more"),
     ("training", "samples_per_s", "training, policy samples/s", ""),
-    ("training", "ratio", "of what bare steps and passes allow", "0.6 or more"),
+    ("training", "ratio", "of what bare steps and passes allow", "0.7 or more"),
+    ("training", "physics_share", "of its time: physics and actuators", ""),
+    ("training", "sensing_share", "observations and rewards", ""),
+    ("training", "inference_share", "inference", ""),
+    ("training", "learning_share", "learning", ""),
 )
 
 
