@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from quadvel_actuator.identify.inspect import Inspection, inspect
-from quadvel_actuator.identify.log import Log, LogError, read_log
+from quadvel_actuator.identify.log import Log, LogError
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_description.robot import JOINT_NAMES
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from quadvel_actuator.identify import tables
-from quadvel_actuator.identify.log import LogError, read_log
+from quadvel_actuator.identify.log import LogError
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_description.robot import JOINT_NAMES
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -245,7 +246,8 @@ def test_a_file_of_nothing_but_zeros_is_refused_within_little_memory(tmp_path: P
     with path.open("wb") as file:
         file.truncate(2**31)
     program = (
-        "import resource, sys; from quadvel_actuator.identify.log import LogError, read_log\n"
+        "import resource, sys; from quadvel_actuator.identify.log import LogError\n"
+        "from quadvel_actuator.identify.read_log import read_log\n"
         "resource.setrlimit(resource.RLIMIT_AS, (1 << 30, 1 << 30))\n"
         "try: read_log(sys.argv[1])\n"
         "except LogError as error: print(error)"

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from quadvel_actuator.identify.identify import Options, identify
-from quadvel_actuator.identify.log import read_log
+from quadvel_actuator.identify.read_log import read_log
 
 LEG = ("FR_hip", "FR_thigh", "FR_calf")
 GAINS = (35.0, 0.5)  # the recording lab's driver; the logs hold none

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from quadvel_actuator.identify.excitation import FootLifting
-from quadvel_actuator.identify.log import read_log
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_bringup.excite import RAMP, MotionError, Player
 from quadvel_description import robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState

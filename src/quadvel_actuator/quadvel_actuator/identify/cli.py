@@ -18,7 +18,8 @@ from typer.core import TyperCommand
 
 from ..parameters import ActuatorParameters
 from .inspect import Inspection, inspect
-from .log import Log, LogError, read_log
+from .log import Log, LogError
+from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}

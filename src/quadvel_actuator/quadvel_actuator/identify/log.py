@@ -1,4 +1,4 @@
-"""A measured log of joints, whatever file it came from: `Log`, and `read_log`, which makes one of a path.
+"""A measured log of joints, whatever file it came from; `read_log` makes one of a path.
 
 Here stands what a log has to be before anything can be computed from it: shapes that fit, finite numbers, times
 that rise. What a well-formed log says about the robot is for `inspect.py`; the formats are in `recordings.py`
@@ -8,7 +8,6 @@ that rise. What a well-formed log says about the robot is for `inspect.py`; the 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import attrs
@@ -135,27 +134,3 @@ class Log:
             f"{self.name}: {field}{joint}: {len(missing)} of {finite.size} values are not finite, "
             f"the first in row {row}, expected numbers (leave out rows without a measurement)"
         )
-
-
-def read_log(path: str | Path, joints: Sequence[str] | None = None) -> Log:
-    """The log at `path`: an .mcap file, a rosbag2 folder, an .npz or a .csv; only `joints` where they are given.
-
-    Raises LogError, one sentence that names the file and the field, and OSError where there is no such file.
-    """
-    from .recordings import read as read_recording  # these build a Log
-    from .tables import read_csv, read_npz
-
-    path = Path(path)
-    if not path.exists():
-        raise FileNotFoundError(f"{path}: there is no such file")
-    if path.is_dir() or path.suffix in (".mcap", ".db3"):
-        log = read_recording(path)
-    elif path.suffix == ".npz":
-        log = read_npz(path)
-    elif path.suffix == ".csv":
-        log = read_csv(path)
-    else:
-        raise LogError(
-            f"{path}: the suffix is '{path.suffix}', expected .mcap, .npz, .csv or a rosbag2 folder"
-        )
-    return log if joints is None else log.select(joints)
