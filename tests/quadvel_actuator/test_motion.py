@@ -11,8 +11,8 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.identify.identify import Options, identify
 from quadvel_actuator.identify.log import Log, LogError
-from quadvel_actuator.identify.read_log import read_log
 from quadvel_actuator.identify.motion import implied
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_sim.config import SensorNoise, SimulatorConfig
