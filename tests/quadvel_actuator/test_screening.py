@@ -9,6 +9,7 @@ from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
 from quadvel_actuator.identify.candidates import About, propose, started
+from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
 from quadvel_actuator.identify.model import Applied, Model
@@ -32,7 +33,7 @@ def _about(log, input_delay, output_delay):
     model = Model(
         samples, 0.001, gains, np.array([ONE, ONE]), *np.full((2, 2), [[input_delay], [output_delay]]), ONE
     )
-    return About(model, judge, np.full(2, 0.066))
+    return About(model, judge, np.full(2, 0.066), Few(model.samples, judge))
 
 
 def test_signals_of_few_rows_are_those_of_all():

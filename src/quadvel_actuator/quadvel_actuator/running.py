@@ -32,7 +32,7 @@ class Instant:
 
     temperature = 25.0
     voltage = np.inf
-    packet = sent = None
+    packet = row = sent = None
 
     def __init__(self, shape: tuple[int, ...], dt: float) -> None:
         self.dt = dt

@@ -66,6 +66,8 @@ class View(Protocol):
     @property
     def packet(self) -> Any: ...
     @property
+    def row(self) -> Any: ...
+    @property
     def power(self) -> Array: ...
     def shifted(self, name: str, late: Array) -> Array: ...
 
@@ -203,30 +205,83 @@ class MemoryLaw(EffectLaw):
         """The value instead of `x` after `dt` (s), and the new memory."""
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """All rows of a series, memory starting anew with every stretch."""
+        """All rows of a series, memory starting anew with every stretch.
+
+        Pieces of the series advance side by side, at first each from rest, then from what the piece before it ended
+        with, until that changes nothing any more: memories fade, so that few pieces have to run again.
+        """
         pair = isinstance(x, tuple)
         given = x if pair else (x,)
         lead = np.broadcast_shapes(*(np.shape(one)[:-2] for one in (*given, *p.values())))
         rows, joints = given[0].shape[-2:]
-        xs = [
-            np.ascontiguousarray(np.moveaxis(np.broadcast_to(one, (*lead, rows, joints)), -2, 0))
-            for one in given
-        ]
-        us = [np.broadcast_to(getattr(s, name), (rows, joints)) for name in self.inputs]
-        p = {name: np.squeeze(value, -2) if np.ndim(value) > 1 else value for name, value in p.items()}
-        out = [np.empty_like(one) for one in xs]
-        dts, starts = s.dt[:, 0].tolist(), s.start[:, 0].tolist()
-        memory: Memory = ()
-        for k in range(rows):
-            here = tuple(one[k] for one in xs) if pair else xs[0][k]
-            u = [one[k] for one in us]
-            if starts[k]:
-                memory = self.rest(here, u, p)
-            now, memory = self.advance(here, u, dts[k], p, memory)
-            for one, value in zip(out, now if pair else (now,), strict=True):
-                one[k] = value
-        back = tuple(np.moveaxis(one, 0, -2) for one in out)
+        xs = [_side_by_side(one) for one in given]
+        us = [_side_by_side(np.broadcast_to(getattr(s, name), (rows, joints))) for name in self.inputs]
+        dt, start = _side_by_side(s.dt), _side_by_side(s.start)
+        count = dt.shape[-2]
+        out = [np.empty((len(dt), *lead, count, joints)) for _ in given]
+
+        def run(begin: Memory, which: NDArray[np.intp]) -> Memory:
+            """These pieces, from `begin` to the end; the memory that they end with."""
+            whole = len(which) == count
+            x_in, u_in, steps, anew = (
+                [one if whole else one[..., which, :] for one in group] for group in (xs, us, [dt], [start])
+            )
+            resets: list[bool] = np.any(anew[0], axis=(1, 2)).tolist()
+            memory = begin
+            for k, reset in enumerate(resets):
+                here = tuple(one[k] for one in x_in) if pair else x_in[0][k]
+                u = [one[k] for one in u_in]
+                if reset:
+                    rest = self.rest(here, u, p)
+                    memory = tuple(np.where(anew[0][k], r, m) for r, m in zip(rest, memory, strict=True))
+                now, memory = self.advance(here, u, steps[0][k], p, memory)
+                for one, value in zip(out, now if pair else (now,), strict=True):
+                    if whole:
+                        one[k] = value
+                    else:
+                        one[k][..., which, :] = value
+            return memory
+
+        every = np.arange(count)
+        first = tuple(one[0] for one in xs) if pair else xs[0][0]
+        begin = ended = tuple(
+            np.array(np.broadcast_to(one, (*lead, count, joints)))
+            for one in self.rest(first, [one[0] for one in us], p)
+        )
+        which = every
+        while len(which):
+            last = run(tuple(one[..., which, :] for one in begin), which)
+            ended = tuple(one.copy() for one in ended)
+            for one, value in zip(ended, last, strict=True):
+                one[..., which, :] = value
+            after = tuple(
+                np.concatenate([b[..., :1, :], e[..., :-1, :]], axis=-2)
+                for b, e in zip(begin, ended, strict=True)
+            )
+            moved = [np.abs(a - b) > _SAME * (1.0 + np.abs(b)) for a, b in zip(after, begin, strict=True)]
+            changed = np.any([one.any(axis=(*range(len(lead)), -1)) for one in moved], axis=0)
+            which, begin = every[changed & ~start[0][:, 0]], after
+        back = tuple(_one_after_the_other(one, rows) for one in out)
         return back if pair else back[0]
+
+
+_PIECE = 800  # rows that advance one after the other
+_SAME = 1e-7
+
+
+def _side_by_side(values: Array) -> Array:
+    """Rows (..., N, C) as (row of the piece, ..., piece, C); the last piece is filled with its last row."""
+    pieces = -(-values.shape[-2] // _PIECE)
+    short = min(pieces * _PIECE, -(-values.shape[-2] // pieces) * pieces) - values.shape[-2]
+    wide = np.concatenate([values, np.repeat(values[..., -1:, :], short, axis=-2)], axis=-2)
+    cut = wide.reshape(*values.shape[:-2], pieces, -1, values.shape[-1])
+    return np.ascontiguousarray(np.moveaxis(cut, -2, 0))
+
+
+def _one_after_the_other(values: Array, rows: int) -> Array:
+    """The first `rows` of what was put side by side."""
+    cut = np.moveaxis(values, 0, -2)
+    return cut.reshape(*cut.shape[:-3], -1, cut.shape[-1])[..., :rows, :]
 
 
 def smooth_sign(v: Array, width: Array) -> Array:

@@ -27,7 +27,6 @@ class CommandHold(ErrorLaw):
     parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
     signal = "q_des@history"
     shifts = True
-    remembers = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
     behind: NDArray[np.intp] | None = attrs.field(default=None, repr=False)
 
@@ -43,14 +42,14 @@ class CommandHold(ErrorLaw):
         if self.behind is None:
             return [{"share": 0.05}]
         fresh = np.diff(s.packet[:, 0], prepend=s.packet[0, 0] - 1) > 0
-        lost = (self.behind[: len(fresh)] > 0) & fresh[:, None]
+        lost = (self.behind[s.row[:, 0]] > 0) & fresh[:, None]
         share = lost.sum(axis=0) / max(int(fresh.sum()), 1)
         return [{"share": np.broadcast_to(share, s.q.shape[-1:]).copy()}]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         if self.behind is None:
             return e
-        behind = self.behind[: len(s.packet)]
+        behind = self.behind[s.row[:, 0]]
         old: Array = s.sent[np.maximum(s.packet - behind, 0), np.arange(s.q.shape[-1])]
         return np.where(behind > 0, e[0] + old - s.q_des, e[0]), e[1]
 

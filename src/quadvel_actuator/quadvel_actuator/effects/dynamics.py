@@ -149,7 +149,6 @@ class TimestampSkew(ErrorLaw):
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
     signal = "dq@history"
     shifts = True
-    remembers = True
     motion = _FAST
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:

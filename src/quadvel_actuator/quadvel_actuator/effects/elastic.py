@@ -203,13 +203,23 @@ class Hysteresis(MemoryLaw):
             {"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)
         ]
 
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        """In proportion to F, and whatever the torque: computed once for all guesses with the same curve."""
+        unit = {"F": np.ones(1), "reach": p["reach"], "beta": p["beta"]}
+        if max(np.ndim(one) for one in unit.values()) == 1:
+            return p["F"] * super().series(s.q, s, unit)
+        reach, beta = np.broadcast_arrays(p["reach"], p["beta"])
+        curves, which = np.unique(np.concatenate([reach, beta], axis=-1), axis=0, return_inverse=True)
+        unit["reach"], unit["beta"] = np.split(curves, 2, axis=-1)
+        return p["F"] * super().series(s.q, s, unit)[which.ravel()]
+
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return 0.0 * (u[0] + p["reach"]), u[0]
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         z, before = memory
         way = (u[0] - before) / p["reach"]
-        bend = p["beta"] + (1.0 - p["beta"]) * np.sign(z * way)
+        bend = np.where(z * way < 0.0, 2.0 * p["beta"] - 1.0, 1.0)
         z = z + way * (1.0 - bend * np.abs(z))
         z = np.minimum(np.maximum(z, -1.0), 1.0)
         return -p["F"] * z, (z, u[0])

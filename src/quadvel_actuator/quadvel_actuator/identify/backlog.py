@@ -15,6 +15,9 @@ from .signals import Array
 LOST, STILL_LOST, LATE = 6.0, 3.0, 4.0
 """nats: the first command lost, one more in a row, one that takes effect between two sendings"""
 
+_PIECE, _AROUND = 600, 150
+"""Rows that are searched one after the other, and how many more at either end"""
+
 
 def suspicious(model: Model, noise: Array, least: float) -> bool:
     """Do more than `least` of the commands look lost or late, each on its own? If not, the search finds nothing."""
@@ -33,7 +36,7 @@ def backlog(model: Model, noise: Array, most: int, together: bool) -> NDArray[np
     if together:
         emission = emission.sum(axis=1, keepdims=True)
     packet = model.signals.packet[:, 0]
-    return _likeliest(emission, np.diff(packet, prepend=packet[0]).tolist())
+    return _likeliest(emission, np.diff(packet, prepend=packet[0]))
 
 
 def _costs(model: Model, noise: Array, most: int) -> Array:
@@ -50,35 +53,60 @@ def _costs(model: Model, noise: Array, most: int) -> Array:
     return np.stack(cost, axis=-1)
 
 
-def _likeliest(emission: Array, new: list[int]) -> NDArray[np.intp]:
-    """The cheapest path (N, G) through costs (N, G, M), `new` commands arriving before each row."""
-    rows, groups, count = emission.shape
-    came_from = np.zeros((rows, groups, count), dtype=np.int8)
-    price = np.full((groups, count), np.inf)
-    price[:, 0] = 0.0
-    stay, every = np.arange(count), np.arange(groups)
+def _likeliest(emission: Array, new: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The cheapest path (N, G) through costs (N, G, M), `new` (N,) commands arriving before each row.
+
+    Searched in pieces of the rows, side by side, each with some rows more at either end, from where paths agree.
+    """
+    rows = len(emission)
+    count = -(-rows // _PIECE)
+    first = np.arange(count) * _PIECE - _AROUND
+    at = np.clip(first + np.arange(_PIECE + 2 * _AROUND)[:, None], 0, rows - 1)  # (R, pieces)
+    inside = (first + np.arange(len(at))[:, None] == at)[..., None, None]
+    paths = _paths(np.where(inside, emission[at], 0.0), np.where(inside[..., 0, 0], new[at], 0))
+    path: NDArray[np.intp] = np.concatenate(paths[_AROUND : _AROUND + _PIECE].swapaxes(0, 1))[:rows]
+    return path
+
+
+def _paths(emission: Array, new: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The cheapest paths (R, S, G) of S pieces through costs (R, S, G, M), `new` (R, S)."""
+    rows, count = len(emission), emission.shape[-1]
+    came_from = np.zeros(emission.shape, dtype=np.int8)
+    price = np.where(np.arange(count) == 0, 0.0, LOST) + np.zeros(emission.shape[1:])
     for n in range(rows):
-        best = came_from[n]
-        best[:] = stay
-        if new[n] == 0:
-            after = price.copy()
-            late = np.minimum.accumulate(price[:, :0:-1], axis=1)[:, ::-1] + LATE
-            for group, m in np.argwhere(late < price[:, :-1]):  # a command that was held back arrives now
-                after[group, m] = late[group, m]
-                best[group, m] = m + 1 + np.argmin(price[group, m + 1 :])
-        else:
-            after = np.full_like(price, np.inf)
-            source = np.argmin(price, axis=1)
-            after[:, 0] = price[every, source]
-            best[:, 0] = source
-            d = min(new[n], count)
-            lost = price[:, : count - d] + np.where(stay[: count - d] == 0, LOST, STILL_LOST)
-            after[:, d:] = lost
-            best[:, d:] = stay[: count - d]
+        after, best = _held_back(price)
+        for d in np.unique(new[n][new[n] > 0]):
+            which = new[n] == d
+            after[which], best[which] = _sent(price[which], min(int(d), count))
+        came_from[n] = best
         price = after + emission[n]
-    path = np.zeros((rows, groups), dtype=np.intp)
-    at = np.argmin(price, axis=1)
+    path = np.zeros(emission.shape[:-1], dtype=np.intp)
+    at = np.argmin(price, axis=-1)
     for n in range(rows - 1, -1, -1):
         path[n] = at
-        at = came_from[n][every, at]
+        at = np.take_along_axis(came_from[n], at[..., None], axis=-1)[..., 0].astype(np.intp)
     return path
+
+
+def _held_back(price: Array) -> tuple[Array, NDArray[np.int8]]:
+    """Price (..., M) and origin of each state where nothing was sent: a command that was held back may arrive."""
+    after = price.copy()
+    best = np.broadcast_to(np.arange(price.shape[-1], dtype=np.int8), price.shape).copy()
+    least, origin = price[..., -1].copy(), best[..., -1].copy()
+    for m in range(price.shape[-1] - 2, -1, -1):
+        late = least + LATE < price[..., m]
+        after[..., m][late], best[..., m][late] = (least + LATE)[late], origin[late]
+        nearer = price[..., m] < least
+        least[nearer], origin[nearer] = price[..., m][nearer], m
+    return after, best
+
+
+def _sent(price: Array, d: int) -> tuple[Array, Array]:
+    """The same where `d` commands were sent: the last of them acts, or none."""
+    count = price.shape[-1]
+    stay = np.arange(count)
+    after, best = np.full_like(price, np.inf), np.zeros(price.shape)
+    after[..., 0], best[..., 0] = price.min(axis=-1), price.argmin(axis=-1)
+    after[..., d:] = price[..., : count - d] + np.where(stay[: count - d] == 0, LOST, STILL_LOST)
+    best[..., d:] = stay[: count - d]
+    return after, best

@@ -13,12 +13,13 @@ from ..effects.commands import CommandHold
 from .backlog import backlog, suspicious
 from .delays import fit_with_delays
 from .eam import WINDOWS
+from .few import Few, remembers
 from .judging import Judge
 from .model import Applied, Model, fit
 from .screening import Ground, Started, divided, later, start
 from .signals import Array, Bools
 
-_STEPS, _LAST_STEPS = 6, 2
+_STEPS, _LAST_STEPS = 6, 3
 _LATER = tuple(np.arange(-0.003, 0.0031, 0.0005))
 """s: commands that step make an error of many small valleys along the delays"""
 
@@ -53,35 +54,34 @@ class Candidate:
 class About:
     """What a law may ask of the model that it is to be added to."""
 
-    def __init__(self, model: Model, judge: Judge, noise: Array) -> None:
-        self.model, self.judge, self.noise = model, judge, noise
+    def __init__(self, model: Model, judge: Judge, noise: Array, few: Few) -> None:
+        self.model, self.judge, self.noise, self.few = model, judge, noise, few
         self.samples, self.signals = model.samples, model.signals
         self.residual = np.where(judge.fit | judge.judge, self.samples.tau - model.predict(), 0.0)
-        self.ground = Ground(model, judge, noise)
+        self.ground = Ground(model, few, noise)
         start = self.ground.bases[-1]
         self.seen, self.torque = start.signals, start.predict()
         self.fitted = np.where(judge.fit, self.samples.tau - self.torque, 0.0)
 
     def fit(self, model: Model) -> Model:
-        """The model fitted with its delays, from these or those without its last effect; first on few rows."""
-        if any(one.law.remembers for one in model.applied):
-            return fit_with_delays(model, self.judge.fit, _STEPS)
-        few, rows = self.ground.few
-        there = attrs.evolve(model, samples=few.samples)
+        """The model fitted with its delays to few rows, from these or those without its last effect."""
+        there, rows = self.few.of(model)
         here = there.with_delays(self.model.input_delay, self.model.output_delay)
-        near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in (there, here)], rows, 1)[0]
-        return fit_with_delays(attrs.evolve(near, samples=model.samples), self.judge.fit, _LAST_STEPS)
+        starts = (there,) if remembers(model) else (there, here)
+        near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in starts], rows, 1)[0]
+        return attrs.evolve(near, samples=model.samples)
 
     def fit_anew(self, model: Model) -> Model:
         """The model fitted from other delays and with other steps of the drive: an effect may have hidden the right ones."""
-        if any(one.law.remembers for one in model.applied):
-            return fit_with_delays(model, self.judge.fit, _STEPS)
-        few, rows = self.ground.few
-        windows = [attrs.evolve(model, samples=few.samples, window=one) for one in {model.window, *WINDOWS}]
-        tried = [fit(at, rows, 2) for one in windows for at in (*divided(one), *later(one, _LATER))]
-        near = [fit_with_delays(one, rows, 2 * _STEPS) for one in _best(tried, rows, 3)]
-        whole = [attrs.evolve(one, samples=model.samples) for one in _best(near, rows, 2)]
-        return _best([fit_with_delays(one, self.judge.fit, _STEPS) for one in whole], self.judge.fit, 1)[0]
+        some, rows = self.few.of(model)
+        windows = [attrs.evolve(some, window=one) for one in sorted({model.window, *WINDOWS})]
+        near = [] if remembers(model) else _LATER
+        tried = [fit(at, rows, 2) for one in windows for at in (*divided(one), *later(one, near))]
+        best = _best([fit_with_delays(one, rows, 2 * _STEPS) for one in _best(tried, rows, 3)], rows, 2)
+        whole = [attrs.evolve(one, samples=model.samples) for one in best]
+        return _best([fit_with_delays(one, self.judge.fit, _LAST_STEPS) for one in whole], self.judge.fit, 1)[
+            0
+        ]
 
     def strongest_neighbour(self, names: Sequence[str]) -> NDArray[np.intp]:
         """For each joint the index (over names, then joints) of another joint's signal that its residual goes with.

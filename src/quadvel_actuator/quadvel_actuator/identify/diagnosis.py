@@ -14,6 +14,7 @@ import numpy as np
 from ..effects import registry
 from .candidates import About, Candidate, propose, started
 from .delays import fit_with_delays
+from .few import Few
 from .judging import Judge
 from .model import Model
 from .screening import Started
@@ -70,24 +71,26 @@ class Diagnosis:
 
 def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2."""
+    few = Few(model.samples, judge)
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
-        about = About(model, judge, noise)
+        model = model.holding(True)
+        about = About(model, judge, noise, few)
         candidates, idle = ranked(about, tick, f"effect {number + 1}")
         rejected = [*(_reason(one, noise, len(registry())) for one in candidates), *idle]
-        finer = _finer(model, candidates, judge, noise)
+        finer = _finer(model, candidates, judge, noise, few)
         if finer is not None:
             model = finer
             continue
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
-        model = about.fit_anew(best.model)
+        model = about.fit_anew(best.model.holding(False))
         ties.append(tied)
-    model, ties = _pruned(model, ties, judge, noise)
+    model, ties = _pruned(model.holding(False), ties, judge, noise, few)
     model = pooled(model, judge, noise)
-    findings = tuple(_finding(model, k, judge, tied) for k, tied in enumerate(ties))
+    findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
 
@@ -126,12 +129,14 @@ def _pays(one: Candidate, noise: Array, tried: int) -> bool:
     return one.p * tried < LEVEL and bool(one.gain > 0.0) and _worth(one, noise) > WORTH
 
 
-def _finer(model: Model, candidates: Sequence[Candidate], judge: Judge, noise: Array) -> Model | None:
+def _finer(
+    model: Model, candidates: Sequence[Candidate], judge: Judge, noise: Array, few: Few
+) -> Model | None:
     """The model with gains or delays shared by fewer joints, if that pays clearly more than any effect does."""
     best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(registry())) else 0.0
     chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
     left = model.samples.tau - model.predict()
-    for _, tried in regroupings(model, judge):
+    for _, tried in regroupings(model, few):
         found = judge.compare(left, tried.samples.tau - tried.predict())
         if found.gain > most and found.p_any * len(registry()) < LEVEL:
             chosen, most = tried, found.gain + 0.5 * WORTH * float(noise.mean())
@@ -178,11 +183,11 @@ def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool
 
 
 def _pruned(
-    model: Model, ties: list[tuple[str, ...]], judge: Judge, noise: Array
+    model: Model, ties: list[tuple[str, ...]], judge: Judge, noise: Array, few: Few
 ) -> tuple[Model, list[tuple[str, ...]]]:
     """Without the effects that the later ones made needless, and fitted once more with the delays."""
     while model.applied:
-        losses = [_loss(model, k, judge) for k in range(len(model.applied))]
+        losses = [_loss(model, k, judge, few) for k in range(len(model.applied))]
         worst = int(np.argmin([loss for loss, _, _ in losses]))
         loss, p, less = losses[worst]
         active = model.applied[worst].active
@@ -193,13 +198,13 @@ def _pruned(
     return (fit_with_delays(model, judge.fit) if model.applied else model), ties
 
 
-def _loss(model: Model, index: int, judge: Judge) -> tuple[float, float, Model]:
+def _loss(model: Model, index: int, judge: Judge, few: Few) -> tuple[float, float, Model]:
     """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
-    less = fit_with_delays(model.without(index), judge.fit, 4)
+    less = few.fitted(model.without(index), fit_with_delays, 5)
     found = judge.compare(less.samples.tau - less.predict(), model.samples.tau - model.predict())
     return found.gain, found.p_any, less
 
 
-def _finding(model: Model, index: int, judge: Judge, tied: tuple[str, ...]) -> Finding:
-    gain, p, _ = _loss(model, index, judge)
+def _finding(model: Model, index: int, judge: Judge, tied: tuple[str, ...], few: Few) -> Finding:
+    gain, p, _ = _loss(model, index, judge, few)
     return Finding(model.applied[index].law.name, gain, p, tied)

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import DRIVE, EffectLaw, MemoryLaw, Stage
+from ..effects import DRIVE, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from .signals import Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
@@ -21,7 +21,7 @@ Groups = NDArray[np.intp]
 _DAMPING = (1e-7, 1e-2, 1.0)
 _SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
 _GAIN_SLOPE = 0.01
-_KEPT = 4  # results of laws with memory
+_KEPT = 8  # results of laws with memory
 _SETTLED = 1e-5  # relative fall of the error below which a fit has converged
 
 
@@ -33,6 +33,8 @@ class Applied:
     active: Bools  # (J,)
     values: Array  # (P, J)
     groups: Groups  # (J,), joints with the same number share the values
+    held: bool = False
+    """is all but what is linear left as it is while others are fitted?"""
 
     def part(self, values: Array) -> dict[str, Array]:
         """Parameters by name; `values` (B, P, J) becomes (B, 1, J) each, or (J,) where the batch has one value."""
@@ -101,15 +103,12 @@ class Model:
         )
         for one, value in todo:
             if Stage.ERRORS < one.law.stage < Stage.ADDED:
-                law, p = one.law, one.part(value)
-                after = law.series(x, s, p) if isinstance(law, MemoryLaw) else law.torque(x, s, p)  # type: ignore[attr-defined]
-                x = _where(one.active, after, x)
+                x = _where(one.active, self._series(one, x, s, value), x)
         total = x
         for one, value in todo:
             if one.law.stage == Stage.ADDED:
-                law, p = one.law, one.part(value)
-                seen = s if law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
-                extra = law.series(x, seen, p) if isinstance(law, MemoryLaw) else law.torque(x, seen, p)  # type: ignore[attr-defined]
+                seen = s if one.law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
+                extra = self._series(one, x, seen, value)
                 total = total + (extra if one.active.all() else extra * one.active)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *s.q.shape))
@@ -117,20 +116,29 @@ class Model:
     def _errors(
         self, one: Applied, error: tuple[Array, Array], s: Signals, value: Array
     ) -> tuple[Array, Array]:
-        """The errors after a law; those of one with memory are kept, as a fit of other parameters asks for them often."""
-        if not isinstance(one.law, MemoryLaw) or len(_lean(value)) > 1:
-            return _pair(one, error, s, one.part(value))
+        """The errors after a law."""
+        after = self._series(one, error, s, value)
+        new, speed = (_where(one.active, new, old) for new, old in zip(after, error, strict=True))
+        return new, speed
+
+    def _series(self, one: Applied, x: Any, s: Signals, value: Array) -> Any:
+        """What a law makes of `x`; with a memory, the latest are kept, as a fit of other parameters asks for them again."""
+        law, p = one.law, one.part(value)
+        if isinstance(law, ErrorLaw):
+            return law.errors(x, s, p)
+        if not isinstance(law, MemoryLaw):
+            return law.torque(x, s, p)  # type: ignore[attr-defined]
+        if len(_lean(value)) > 1:
+            return law.series(x, s, p)
+        given = () if law.stage == Stage.ADDED else x if isinstance(x, tuple) else (x,)
+        seen = (*given, *(getattr(s, name) for name in law.inputs))
         kept = self.samples.kept
-        key = (id(s), id(one.law), one.active.tobytes(), value[0].tobytes())
-        given = [k for k, o in enumerate(self.applied) if o.law.stage == Stage.ERRORS]
-        if len(given) > 1:  # what it is given depends on the others
-            return _pair(one, error, s, one.part(value))
+        key = (id(law), value[0].tobytes(), *(hash(part.tobytes()) for part in seen))
         if key not in kept:
             if len(kept) >= _KEPT:
                 kept.pop(next(iter(kept)))
-            kept[key] = s, one.law, _pair(one, error, s, one.part(value))
-        after: tuple[Array, Array] = kept[key][-1]
-        return after
+            kept[key] = law, law.series(x, s, p)
+        return kept[key][-1]
 
     def reaching(self, rows: Bools) -> tuple[Model, Bools]:
         """The model and `rows` (N, J) of it without the logs at the end that hold none of them."""
@@ -145,6 +153,11 @@ class Model:
         """With one more effect."""
         return attrs.evolve(self, applied=(*self.applied, applied))
 
+    def holding(self, held: bool) -> Model:
+        """With the memories of its laws held as they are, which makes fits of others cheap, or with all of it free."""
+        applied = (attrs.evolve(one, held=held and one.law.remembers) for one in self.applied)
+        return attrs.evolve(self, applied=tuple(applied))
+
     def without(self, index: int) -> Model:
         """Without the effect of this index."""
         return attrs.evolve(self, applied=tuple(one for k, one in enumerate(self.applied) if k != index))
@@ -157,12 +170,6 @@ def _lean(batch: Array) -> Array:
 
 def _where(active: Bools, new: Array, old: Array) -> Array:
     return new if active.all() else np.where(active, new, old)
-
-
-def _pair(one: Applied, error: Any, s: Signals, p: dict[str, Array]) -> Any:
-    law = one.law
-    after = law.series(error, s, p) if isinstance(law, MemoryLaw) else law.errors(error, s, p)  # type: ignore[attr-defined]
-    return tuple(_where(one.active, new, old) for new, old in zip(after, error, strict=True))
 
 
 @attrs.frozen(eq=False)
@@ -196,8 +203,10 @@ class Slots:
         for groups in model.gain_groups:
             add(groups, everywhere, (-1e6, 1e6), _GAIN_SLOPE)
         for one in model.applied:
+            linear = getattr(one.law, "linear", ())
             for parameter in one.law.parameters:
-                add(one.groups, one.active, (parameter.low, parameter.high), _SLOPE * parameter.scale)
+                free = one.active & (not one.held or parameter.name in linear)
+                add(one.groups, free, (parameter.low, parameter.high), _SLOPE * parameter.scale)
         return cls(np.array(rows), np.array(low), np.array(high), np.array(step), count)
 
 
@@ -229,12 +238,14 @@ def jacobian(model: Model, slots: Slots) -> tuple[Array, Array]:
     """Prediction (N, J) and its slopes (J, A, N) along every slot."""
     theta = pack(model)
     steps = np.where(theta + slots.step[:, None] > slots.high, -slots.step[:, None], slots.step[:, None])
-    batch = np.repeat(theta[None], len(theta) + 1, axis=0)
-    for a in range(len(theta)):
-        batch[a + 1, a] += steps[a]
+    free = np.flatnonzero((slots.index >= 0).any(axis=1))
+    batch = np.repeat(theta[None], len(free) + 1, axis=0)
+    for k, a in enumerate(free):
+        batch[k + 1, a] += steps[a]
     torque = model.evaluate(*unpack(model, batch))
-    slopes = (torque[1:] - torque[0]) / steps[:, None, :]
-    return torque[0], np.ascontiguousarray(slopes.transpose(2, 0, 1))
+    slopes = np.zeros((theta.shape[1], len(theta), len(torque[0])))
+    slopes[:, free] = ((torque[1:] - torque[0]) / steps[free, None, :]).transpose(2, 0, 1)
+    return torque[0], slopes
 
 
 def gather(slots: Slots, local: Array) -> Array:

@@ -16,12 +16,11 @@ from ..effects import AddedLaw, EffectLaw, Parameter
 from ..effects.base import Params, Start, View, smooth_sign
 from .delays import LONGEST
 from .eam import pd_torque
-from .judging import Judge
+from .few import Few, remembers
 from .model import Applied, Model
 from .signals import Array, Bools
 
 _BATCH = 8  # guesses evaluated at once
-_ENOUGH = 1200  # rows that laws without memory are looked at on
 _GAIN_STEP = 0.01
 _DELAY_STEP = 0.0003  # s
 _OUTPUTS = (0.0005, 0.002, 0.0035, 0.005)  # s, output delays, the sum of both delays being kept
@@ -51,14 +50,10 @@ class Started:
 
 
 class Ground:
-    """The model that laws are looked at on, and its rows: all of them, or few where no memory needs the others."""
+    """The model that laws are looked at on, on few of its rows."""
 
-    def __init__(self, model: Model, judge: Judge, noise: Array) -> None:
-        self.model, self.noise = model, noise
-        self._whole = model.reaching(judge.fit)
-        every = max(1, int(judge.fit.any(axis=1).sum()) // _ENOUGH)
-        few, rows = self._whole[0].samples.thinned(every)
-        self.few = attrs.evolve(self._whole[0], samples=few), self._whole[1][rows]
+    def __init__(self, model: Model, few: Few, noise: Array) -> None:
+        self.model, self.few, self.noise = model, few, noise
         self._bare: dict[bool, tuple[Array, int]] = {}
         unbent = self._unbent()
         self.bases = (model,) if unbent is None else (model, unbent)
@@ -66,9 +61,9 @@ class Ground:
 
     def _unbent(self) -> Model | None:
         """The model with gains and delays as they are beside `_Anything`; None where that is next to the same."""
-        model, rows = self.few
-        if any(one.law.remembers for one in model.applied):
+        if remembers(self.model):
             return None
+        model, rows = self.few.of(self.model)
         joints = rows.shape[1]
         law = _Anything()
         nothing = np.zeros((1, len(law.parameters), joints))
@@ -83,33 +78,24 @@ class Ground:
             return None
         return attrs.evolve(best, samples=self.model.samples, applied=best.applied[:-1])
 
-    def at(self, law: EffectLaw) -> tuple[Model, Bools]:
-        """The model and the rows that `law` is looked at on."""
-        return self._whole if self.thorough(law) else self.few
-
-    def thorough(self, law: EffectLaw) -> bool:
-        """Are all rows needed?"""
-        return law.remembers or any(one.law.remembers for one in self.model.applied)
-
     def bare(self, law: EffectLaw) -> tuple[Array, int]:
         """Error (J,) of the model without the law on these rows, at its best delays, and how many rows one stands for."""
-        key = self.thorough(law)
+        key = law.remembers
         if key not in self._bare:
-            rows = self.at(law)[1]
+            rows = self.few.of(self.model, law)[1]
             every = self.pairs(law, _EXCHANGED)
             tried = [_Screen(at, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for at in every]
             self._bare[key] = (
                 min(tried, key=lambda error: float(error.sum())),
-                round(self._whole[1].sum() / max(rows.sum(), 1)),
+                round(self.few.count / max(rows.sum(), 1)),
             )
         return self._bare[key]
 
     def pairs(self, law: EffectLaw, moves: Sequence[tuple[float, float]]) -> Iterator[Model]:
         """The model at the pairs of delays at which `law` is tried: `moves` away, or a grid of output delays."""
-        samples = self.at(law)[0].samples
         for base in self.bases:
-            at = attrs.evolve(base, samples=samples)
-            if self.thorough(law):
+            at = self.few.of(base, law)[0]
+            if law.remembers or remembers(self.model):
                 moved = [(base.input_delay + a, base.output_delay + b) for a, b in moves]
                 yield from _possible(at, moved)
             else:
@@ -158,7 +144,7 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     """The law at the best of `starts`, chosen for each joint; None where that takes nothing off the error."""
     if not starts:
         return None
-    rows = ground.at(law)[1]
+    rows = ground.few.of(ground.model, law)[1]
     joints = rows.shape[1]
     table = np.array(
         [[_within(one.get(p.name, p.scale), p, joints) for p in law.parameters] for one in starts]

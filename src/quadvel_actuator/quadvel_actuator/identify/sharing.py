@@ -11,6 +11,7 @@ import attrs
 import numpy as np
 
 from .delays import fit_with_delays
+from .few import Few
 from .judging import Judge
 from .model import Groups, Model, fit
 from .signals import Array
@@ -26,7 +27,7 @@ def kinds(joints: Sequence[str]) -> Groups:
     return found
 
 
-def regroupings(model: Model, judge: Judge) -> Iterator[tuple[str, Model]]:
+def regroupings(model: Model, few: Few) -> Iterator[tuple[str, Model]]:
     """The model with gains or delays for each kind of joint, and for each joint, fitted."""
     joints = model.samples.joints
     each = np.arange(len(joints))
@@ -36,12 +37,12 @@ def regroupings(model: Model, judge: Judge) -> Iterator[tuple[str, Model]]:
         if len(np.unique(groups)) > len(np.unique(model.gain_groups[0])):
             yield (
                 f"gains per {word}",
-                fit(attrs.evolve(model, gain_groups=np.array([groups, groups])), judge.fit, 4),
+                few.fitted(attrs.evolve(model, gain_groups=np.array([groups, groups])), fit, 4),
             )
         if len(np.unique(groups)) > len(np.unique(model.delay_groups)):
             yield (
                 f"delays per {word}",
-                fit_with_delays(attrs.evolve(model, delay_groups=groups), judge.fit, 4),
+                few.fitted(attrs.evolve(model, delay_groups=groups), fit_with_delays, 4),
             )
 
 
@@ -51,9 +52,11 @@ def pooled(model: Model, judge: Judge, noise: Array) -> Model:
         for groups in (np.zeros(len(one.active), dtype=np.intp), kinds(model.samples.joints)):
             if len(np.unique(groups[one.active])) == int(one.active.sum()):
                 continue
-            mean = np.array([[row[one.active & (groups == g)].mean() if (one.active & (groups == g)).any() else 0.0
-                              for g in groups] for row in one.values])  # fmt: skip
-            common = attrs.evolve(one, groups=groups, values=mean)
+            values = one.values.copy()
+            for g in np.unique(groups[one.active]):
+                alike = one.active & (groups == g)
+                values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
+            common = attrs.evolve(one, groups=groups, values=values)
             applied = (*model.applied[:k], common, *model.applied[k + 1 :])
             tried = fit(attrs.evolve(model, applied=applied), judge.fit, 5)
             lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())

@@ -8,8 +8,10 @@ that step, 0 for the instant itself. Rows are never resampled, so errors are tho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from copy import copy
+from functools import partial
+from itertools import pairwise
 from typing import Any
 
 import attrs
@@ -30,11 +32,15 @@ SETTLING = 0.03
 SMOOTH, SMOOTH_LATE = 0.006, 0.001
 """The smooth acceleration is taken over so long to either side, and so much later, s."""
 
+STRETCH, FILLING = 0.75, 0.25
+"""Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
+
 _CACHED = 6, 64
 """sets of signals that are kept, at least and at most;"""
 _CACHED_VALUES = 2_500_000
 """as many as have about so many values in each of their signals together"""
 
+_OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row")
 _OF_JOINTS = (
     "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "measured", "temperature",
 )  # fmt: skip
@@ -63,7 +69,9 @@ class Signals:
     temperature: Array | None
     voltage: Array | None  # (N, 1)
     packet: NDArray[np.intp]  # (N, 1), the command row in force, counted over all logs
+    row: NDArray[np.intp]  # (N, 1), which row of all logs this is
     sent: Array  # (M, J), q_des of every command row of all logs
+    elsewhere: Callable[[str, Array], Array]
 
     @property
     def power(self) -> Array:
@@ -72,15 +80,8 @@ class Signals:
         return power
 
     def shifted(self, name: str, late: Array) -> Array:
-        """The signal `late` s earlier (negative: later), linear between rows; `late` (J,) or (B, 1, J)."""
-        values = getattr(self, name)
-        rows = np.arange(len(values))[:, None] - late / float(np.median(self.dt))
-        first = np.clip(np.floor(rows), 0, len(values) - 2)
-        share = np.clip(rows - first, 0.0, 1.0)
-        index = first.astype(np.intp)
-        joint = np.arange(values.shape[1])
-        early: Array = values[index, joint]
-        return early + share * (values[index + 1, joint] - early)
+        """A signal of the joints' state `late` s earlier (negative: later); `late` (J,) or (B, 1, J)."""
+        return self.elsewhere(name, late)
 
 
 def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
@@ -148,6 +149,15 @@ class _LogSignals:
         values = values if values.shape[1] == 1 else values[:, joints]
         return values[row] + share * (values[row + 1] - values[row])
 
+    def shifted(self, name: str, at: Array) -> Array:
+        """A state signal of every joint at times of its own, (..., N, J)."""
+        t, values = self.log.t, self.states[name]
+        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+        share = np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)
+        joint = np.arange(values.shape[1])
+        early: Array = values[row, joint]
+        return early + share * (values[row + 1, joint] - early)
+
     def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
         """A command signal: the mean over `at` to `at + window`."""
         values = self.commands[name][:, joints]
@@ -200,8 +210,9 @@ class Samples:
         self.dt = np.concatenate(steps)
         self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
+        self.row = np.arange(len(self.t))
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
-        self._every = 1
+        self._first_row = np.cumsum([0, *lengths])
         self._cache: dict[tuple[Any, ...], Signals] = {}
         self._parts: dict[int, Samples] = {}
         self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
@@ -225,7 +236,7 @@ class Samples:
             part = copy(self)
             part.logs = self.logs[:count]
             stop = int(np.searchsorted(self.log_of_row, count))
-            for name in ("log_of_row", "t", "tau", "start", "dt", "judged"):
+            for name in _OF_ROWS:
                 setattr(part, name, getattr(self, name)[:stop])
             part.sent = self.sent[: self._first_packet[count]]
             part._cache, part.kept, part._parts = {}, {}, {}
@@ -234,15 +245,32 @@ class Samples:
 
     def thinned(self, every: int) -> tuple[Samples, NDArray[np.intp]]:
         """One row of `every` of each log, and which these are; `dt` and `start` of the rows are those they had."""
-        lengths = np.diff(np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1)))
-        firsts = np.cumsum([0, *lengths[:-1]])
-        rows = np.concatenate([np.arange(a, a + n, every) for a, n in zip(firsts, lengths, strict=True)])
+        edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
+        rows = np.concatenate([np.arange(a, b, every) for a, b in pairwise(edges)])
+        return self._of(rows), rows
+
+    def stretches(self, most: int) -> tuple[Samples, NDArray[np.intp], Bools]:
+        """At most some `most` rows in stretches spread evenly over the logs, which these are, and those that count.
+
+        The others fill memories: what was before a stretch is not known there.
+        """
+        long = round(STRETCH / self.period)
+        count = max(most // long, 2)
+        if len(self.t) <= (count + 1) * long:
+            return self, self.row, np.ones(len(self.t), dtype=bool)
+        first = np.linspace(0, len(self.t) - long, count).astype(np.intp)
+        place = np.tile(np.arange(long), count)
+        rows = np.repeat(first, long) + place
+        part = self._of(rows)
+        part.start = part.start | (place == 0)
+        return part, rows, place * self.period >= FILLING
+
+    def _of(self, rows: NDArray[np.intp]) -> Samples:
         part = copy(self)
-        for name in ("log_of_row", "t", "tau", "start", "dt", "judged"):
+        for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._every = every
         part._cache, part.kept, part._parts = {}, {}, {}
-        return part, rows
+        return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
@@ -267,7 +295,22 @@ class Samples:
                 columns[name] = np.empty(self.tau.shape)
                 for pair, joints in every.items():
                     columns[name][:, joints] = getattr(made[pair], name)
-        return attrs.evolve(first, **columns)
+        late = np.array([pair[1] for pair in pairs])
+        return attrs.evolve(first, **columns, elsewhere=partial(self._elsewhere, late))
+
+    def _instants(self, output_delay: float) -> Iterator[Array]:
+        """Of each log the instants at which the torque of these rows was asked for."""
+        edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
+        for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
+            yield _double(one.log.t)[self.row[a:b] - first] - output_delay
+
+    def _elsewhere(self, output_delay: Array | float, name: str, late: Array) -> Array:
+        """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
+        parts = [
+            one.shifted(name, at[:, None] - output_delay - late)
+            for one, at in zip(self.logs, self._instants(0.0), strict=True)
+        ]
+        return np.concatenate(parts, axis=-2)
 
     def _make(
         self, input_delay: float, output_delay: float, window: float, joints: list[int] | None = None
@@ -276,8 +319,7 @@ class Samples:
         parts: dict[str, list[Array]] = {}
         packets = []
         chosen = ALL if joints is None else joints
-        for one, first in zip(self.logs, self._first_packet, strict=False):
-            at = _double(one.log.t)[:: self._every] - output_delay
+        for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
             for name in one.states:
                 moment = at - SMOOTH_LATE if name == "ddq_smooth" else at
                 parts.setdefault(name, []).append(one.state(name, moment, chosen))
@@ -296,6 +338,8 @@ class Samples:
             dt=self.dt[:, None],
             start=self.start[:, None],
             packet=np.concatenate(packets),
+            row=self.row[:, None],
             sent=self.sent,
+            elsewhere=partial(self._elsewhere, output_delay),
             **signals,
         )

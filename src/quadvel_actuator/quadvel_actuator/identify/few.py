@@ -1,0 +1,48 @@
+"""Some of the fitted rows, enough to fit a model to, whatever the length of the logs.
+
+Every so many-th row; stretches of rows where a law of the model needs those before. What is found on them is judged on
+all held-out rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import attrs
+
+from ..effects import EffectLaw
+from .judging import Judge
+from .model import Model
+from .signals import Bools, Samples
+
+APART, TOGETHER = 1800, 4000
+"""Rows, some more or less: one by one, and in stretches"""
+
+
+def remembers(model: Model) -> bool:
+    """Does a law of the model need the rows before each?"""
+    return any(one.law.remembers for one in model.applied)
+
+
+class Few:
+    """The rows of `samples` that are fitted, or few of them."""
+
+    def __init__(self, samples: Samples, judge: Judge) -> None:
+        whole = samples.reaching(judge.fit)
+        fitted = judge.fit[: len(whole.t)]
+        self.count = int(fitted.sum())
+        """of all rows that are fitted, joints counted"""
+        apart, rows = whole.thinned(max(1, int(fitted.any(axis=1).sum()) // APART))
+        self._apart = apart, fitted[rows]
+        together, rows, known = whole.stretches(TOGETHER)
+        self._together = together, fitted[rows] & known[:, None]
+
+    def of(self, model: Model, law: EffectLaw | None = None) -> tuple[Model, Bools]:
+        """`model` on the rows that suit it, and `law` besides, and those of them that are fitted."""
+        long = remembers(model) or (law is not None and law.remembers)
+        samples, rows = self._together if long else self._apart
+        return attrs.evolve(model, samples=samples), rows
+
+    def fitted(self, model: Model, fit: Callable[[Model, Bools, int], Model], steps: int) -> Model:
+        """The model as `fit` fits it to the rows that suit it."""
+        return attrs.evolve(fit(*self.of(model), steps), samples=model.samples)
