@@ -1,0 +1,64 @@
+"""Model cards say what the file and its evaluation say."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+onnx = pytest.importorskip("onnx", reason="model cards need onnx: pip install 'quadvel[train]'")
+
+from quadvel_estimator.learned import SHIPPED_MODEL
+from quadvel_eval.grid import Cell, CellResult, summarise
+from quadvel_eval.segments import Segment
+from quadvel_eval.walk import Setup
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_training.card import card
+
+
+@pytest.fixture
+def evaluation(tmp_path):
+    """Of the shipped networks: one walk 0.02, one 0.11 m/s off, and one fall."""
+    commands = [(0.5, 0.0, 0.0), (1.5, 0.0, -1.0), (-1.0, 0.4, 0.0)]
+    cells = [Cell(command, 0) for command in commands]
+    mse = {"learned": np.full(3, 0.01**2)}
+    results = [
+        CellResult(cell, Segment(np.array(cell.command), np.array(cell.command) - [off, 0, 0]), 0.01, 0.9, mse,
+                   {"learned": 0.1}, 10.0)
+        for cell, off in zip(cells[:2], (0.02, 0.11), strict=True)
+    ]  # fmt: skip
+    found = summarise([*results, CellResult(cells[2])], [0.01])
+    setup = Setup().to_json() | {"grid": "quick", "seeds": 1}
+    path = tmp_path / "eval.json"
+    path.write_text(json.dumps({**found, "setup": setup}))
+    return path
+
+
+def test_a_policys_card_names_its_figures_and_where_it_fails(evaluation):
+    text, metadata = card(SHIPPED_POLICY, evaluation), PolicyFile().metadata
+    low, high = metadata.command_limits["vx"]
+    for said in (
+        f"| samples | {metadata.recipe['samples']:,} |",
+        "| largest error, m/s | 0.11 |",
+        "aliengo: ΔKp -0.706 N m/rad",
+        f"Commands beyond vx {low:g} to {high:g} m/s",
+        "fell in 1 of 3 runs, at commands (vx, vy, wz) (-1, 0.4, 0)",
+        "Furthest off at the command (1.5, 0, -1): 0.110 m/s",
+    ):
+        assert said in text
+
+
+def test_an_estimators_card_says_under_which_policy_it_was_measured(evaluation):
+    text = card(SHIPPED_MODEL, evaluation)
+    assert "| learned estimator, largest RMSE, m/s | 0.01 |" in text
+    assert "Measured on walks under crl_eam.onnx" in text
+
+
+def test_an_evaluation_of_another_network_is_refused(evaluation, tmp_path):
+    other = tmp_path / "other.onnx"
+    model = onnx.load(SHIPPED_POLICY)
+    model.doc_string = "another one"
+    onnx.save(model, other)
+    with pytest.raises(ValueError, match=r"is an evaluation of .*crl_eam[.]onnx, expected one of .*other"):
+        card(other, evaluation)
