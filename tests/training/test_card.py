@@ -9,12 +9,12 @@ import pytest
 
 onnx = pytest.importorskip("onnx", reason="model cards need onnx: pip install 'quadvel[train]'")
 
-from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_eval.grid import Cell, CellResult, summarise
-from quadvel_eval.segments import Segment
-from quadvel_eval.walk import Setup
-from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
-from quadvel_training.card import card
+from quadvel_estimator.learned import SHIPPED_MODEL  # noqa: E402
+from quadvel_eval.grid import Cell, CellResult, summarise  # noqa: E402
+from quadvel_eval.segments import Segment  # noqa: E402
+from quadvel_eval.walk import Setup  # noqa: E402
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile  # noqa: E402
+from quadvel_training.card import card  # noqa: E402
 
 
 @pytest.fixture
