@@ -12,6 +12,7 @@ from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_training import gait, loop  # noqa: E402
 from quadvel_training.command_map import CommandMap  # noqa: E402
+from quadvel_training.crl import PARTS, CrlConfig, CrlRun  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
@@ -164,6 +165,19 @@ def test_a_run_resumes_where_its_checkpoint_stands(tmp_path):
     kept = loop.load(path)
     assert kept["samples"] == 80
     assert kept["seconds"] > 0.0
+
+
+def test_a_resumed_run_of_stage_3_draws_on_where_it_was_saved(tmp_path):
+    config = CrlConfig(n=3, length=3, threads=1, critic_first=0)
+    first = CrlRun(config)
+    seen = first.step(0.0)
+    assert sum(seen[part] for part in PARTS) == pytest.approx(1.0)
+    loop.save(first.state(), tmp_path / "crl.pt")
+    expected = first.env.rng.random(), torch.rand(1)
+    second = CrlRun(config)
+    second.restore(loop.load(tmp_path / "crl.pt"))
+    assert (second.env.rng.random(), torch.rand(1)) == expected
+    assert second.samples == 9
 
 
 def test_a_missing_checkpoint_is_named(tmp_path):

@@ -128,15 +128,19 @@ class CrlRun:
             "samples": self.samples,
             "updates": self.updates,
             "command_map": torch.from_numpy(self.command_map.weights),
+            "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.samples, self.updates = state["samples"], state["updates"]
         self.command_map = CommandMap(state["command_map"].numpy())
+        if "random" in state and parallel.size() == 1:
+            torch.set_rng_state(state["random"]["learner"])
+            self.env.rng.bit_generator.state = state["random"]["environments"]
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
