@@ -12,7 +12,7 @@ from ..running import SLOPE
 from .delays import jacobian_with_delays
 from .judging import Judge
 from .model import Model
-from .signals import Array, Signals
+from .signals import Array, Bools, Signals
 
 EVERY = slice(None)
 
@@ -55,6 +55,17 @@ class Scene:
         self.dt = model.samples.period
         self.start = model.samples.start
         self.view = _past_only(model.signals, self.dt)
+        self._taken: dict[Feature, dict[int, Array]] = {}
+
+    def taken(self, feature: Feature, joints: Bools) -> dict[int, Array]:
+        """The same of each of these joints, (N, K); kept, as few features are taken and these are asked for often."""
+        if feature not in self._taken:
+            columns = self.columns(feature)
+            last = columns.shape[2] - 1
+            self._taken[feature] = {
+                int(j): columns[:, :, min(int(j), last)].copy() for j in np.flatnonzero(joints)
+            }
+        return self._taken[feature]
 
     def columns(self, feature: Feature, rows: slice = EVERY) -> Array:
         """What the feature is a sum of, (N, K, J), at some rows."""

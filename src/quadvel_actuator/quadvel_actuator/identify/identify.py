@@ -48,7 +48,7 @@ class Options:
     """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
     base: ActuatorParameters | None = None
     """its torque limits go into the corrected model"""
-    seconds: float = 10.0
+    seconds: float = 6.0
     """of log that is fitted at most, in blocks spread over all of it"""
 
 

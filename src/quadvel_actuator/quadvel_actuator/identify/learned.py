@@ -79,7 +79,6 @@ class _Pick:
     feature: Feature
     joints: Bools
     gain: float
-    columns: Array
 
 
 def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
@@ -144,7 +143,7 @@ def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
     gain = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
-    return _Pick(feature, taken, gain, columns) if taken.any() else None
+    return _Pick(feature, taken, gain) if taken.any() else None
 
 
 def _tuned(pick: _Pick, trial: _Trial, noise: Array) -> _Pick:
@@ -152,7 +151,7 @@ def _tuned(pick: _Pick, trial: _Trial, noise: Array) -> _Pick:
     shape = pick.feature.shape
     if not _near(shape, _TUNING[0]):
         return pick
-    least = trial.error(pick.feature, pick.columns, pick.joints)
+    least = trial.error(pick.feature, trial.scene.columns(pick.feature), pick.joints)
     for size in _TUNING:
         for moved in _near(shape, size):
             tried = attrs.evolve(pick.feature, shape=moved)
@@ -257,7 +256,13 @@ class _Joint:
         fit, slots = scene.judge.fit, scene.slots
         mine = [[k for k, pick in enumerate(picks) if pick.joints[j]] for j in joints]
         columns = [
-            np.concatenate([np.zeros((len(fit), 0)), *(_column(picks[k], j) for k in mine[j])], axis=1)
+            np.concatenate(
+                [
+                    np.zeros((len(fit), 0)),
+                    *(scene.taken(picks[k].feature, picks[k].joints)[j] for k in mine[j]),
+                ],
+                axis=1,
+            )
             for j in joints
         ]
         inverse = [
@@ -292,10 +297,6 @@ class _Joint:
                 self.parts[k][:, j] = columns[j][:, first:last] @ solution[first:last]
                 first = last
         self.left = np.where(scene.rows, left - sum(self.parts, start=np.zeros_like(left)), 0.0)
-
-
-def _column(pick: _Pick, j: int) -> Array:
-    return pick.columns[:, :, min(j, pick.columns.shape[2] - 1)]
 
 
 def _simplest(kept: Sequence[_Pick]) -> _Pick:
@@ -336,19 +337,13 @@ def _fitted_beside(picks: Sequence[_Pick], scene: Scene) -> Learned:
             after = step(best.slots, theta, joint.hessian, joint.gradient, damping)
             moved = with_slots(best.model, after[:-2]).with_delays(*np.round(after[-2:], 7))
             tried = Scene(moved, judge)
-            again = _seen(picks, tried)
-            left = float(np.sum((_Joint(again, tried, free=False).left * judge.fit) ** 2))
+            left = float(np.sum((_Joint(picks, tried, free=False).left * judge.fit) ** 2))
             if left < least:
-                least, best, picks = left, tried, again
+                least, best = left, tried
                 break
         if least > error * (1.0 - _SETTLED):
             break
     return _as_terms(picks, best)
-
-
-def _seen(picks: Sequence[_Pick], scene: Scene) -> list[_Pick]:
-    """The picks with the columns that another scene gives them."""
-    return [attrs.evolve(one, columns=scene.columns(one.feature)) for one in picks]
 
 
 def _as_terms(picks: Sequence[_Pick], scene: Scene) -> Learned:

@@ -37,7 +37,7 @@ STRETCH, FILLING = 0.75, 0.25
 
 _CACHED = 6, 64
 """sets of signals that are kept, at least and at most;"""
-_CACHED_VALUES = 2_500_000
+_CACHED_VALUES = 1_000_000
 """as many as have about so many values in each of their signals together"""
 
 _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row")
