@@ -1,7 +1,6 @@
 """Which command a walker has to be given to walk at the one wanted: its steady-state error, found and taken out.
 
-Used three times: for the teacher; once there is a student, for the student, whose averaging of what it cannot know costs
-it some speed; and for the finished policy, whose file carries its map along.
+Used twice: for the teacher, and for the finished policy, whose file carries its map along.
 """
 
 from __future__ import annotations

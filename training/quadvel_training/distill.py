@@ -39,13 +39,11 @@ def load_teacher(path: Path) -> Gaussian:
 class Teacher:
     """The teacher in a batch of environments, evaluated at every tick.
 
-    `own` is its command map; `goal` says at which velocity it is to walk for a command: the student's map, once there is one.
+    `own` is its command map.
     """
 
-    def __init__(
-        self, actor: Gaussian, env: VelocityEnv, own: CommandMap, gain: float, goal: CommandMap | None = None
-    ) -> None:
-        self.actor, self.env, self.own, self.goal = actor, env, own, goal or CommandMap()
+    def __init__(self, actor: Gaussian, env: VelocityEnv, own: CommandMap, gain: float) -> None:
+        self.actor, self.env, self.own = actor, env, own
         self.gait = GaitState(env.config.n)
         self.tracking = Tracking(env.config.n, gain)
         self._past = [np.zeros((env.config.n, 12)) for _ in range(teacher.HOLD)]
@@ -60,7 +58,7 @@ class Teacher:
     def targets(self) -> np.ndarray:
         """Joint targets (n, 12) for the present state."""
         env = self.env
-        command = self.tracking.corrected(self.own(self.goal(env.command)))
+        command = self.tracking.corrected(self.own(self.gait.pace))
         base = gait.targets(self.gait.phase, command, teacher.body_of(env), robot.KP)
         obs = teacher.observe(env, self.gait, command, self._past[0], base)
         with torch.no_grad():
@@ -70,8 +68,8 @@ class Teacher:
 
     def advance(self) -> None:
         """After the environment's tick."""
-        self.gait.advance(self.env)
-        self.tracking.advance(self.env, self.goal(self.env.command)[:, :3])
+        self.gait.advance(self.env.command)
+        self.tracking.advance(self.env, self.gait.pace[:, :3])
 
 
 class Student:
@@ -133,16 +131,15 @@ class DistillRun:
     """Teacher, student and environment of stage 2."""
 
     def __init__(self, config: DistillConfig, teacher_file: Path, start: Recurrent | None = None) -> None:
-        """`start`: a student to go on from; its steady-state error is measured and put into the teacher's goal."""
+        """`start`: a student to go on from."""
         self.config = config
         torch.manual_seed(config.seed)
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
         trial = held_commands(env_config)  # on flat ground
         own = fit_command_map(Teacher(actor, VelocityEnv(trial), CommandMap(), gain=0.6))
-        goal = fit_command_map(Student(start, VelocityEnv(trial), gain=0.6)) if start else CommandMap()
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
-        self.teacher = Teacher(actor, self.env, own, config.correction_gain, goal)
+        self.teacher = Teacher(actor, self.env, own, config.correction_gain)
         self.student = start or student.new_actor()
         self.map = student.action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)

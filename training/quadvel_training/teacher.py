@@ -25,6 +25,7 @@ from .ppo import Ppo, PpoConfig, Rollout
 
 HOLD = 4  # ticks a residual is held
 RESIDUAL = 0.2  # rad a unit of the network's output
+ACCELERATION = np.array([2.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2; thrown at once into a run it falls
 
 
 def _signs(*signs: float) -> Mirror:
@@ -47,22 +48,30 @@ def torch_mirror(
 
 
 class GaitState:
-    """The clock and the residual of `n` environments."""
+    """The clock, the residual and the pace of `n` environments.
+
+    pace (n, 4): the command that the gait walks at. It follows the wanted one by ACCELERATION, and stands once it has come
+    to rest.
+    """
 
     def __init__(self, n: int) -> None:
         self.phase = np.zeros(n)
         self.residual = np.zeros((n, 12))
         self.residual_before = np.zeros((n, 12))
+        self.pace = np.zeros((n, 4))
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
-        for array in (self.phase, self.residual, self.residual_before):
+        for array in (self.phase, self.residual, self.residual_before, self.pace):
             array[ids] = 0.0
 
-    def advance(self, env: VelocityEnv) -> None:
-        """One tick further; the clock rests at its start while the command is to stand."""
-        moving = env.command[:, 3] < 0.5
-        self.phase = np.where(moving, (self.phase + gait.frequency(env.command) * TICK) % 1.0, 0.0)
+    def advance(self, wanted: np.ndarray) -> None:
+        """One tick further towards the command `wanted` (n, 4); the clock rests at its start while the gait stands."""
+        step = ACCELERATION * TICK
+        self.pace[:, :3] += (wanted[:, :3] - self.pace[:, :3]).clip(-step, step)
+        self.pace[:, 3] = wanted[:, 3] * (self.pace[:, :3] == 0.0).all(axis=1)
+        moving = self.pace[:, 3] < 0.5
+        self.phase = np.where(moving, (self.phase + gait.frequency(self.pace) * TICK) % 1.0, 0.0)
 
 
 def body_of(env: VelocityEnv) -> gait.Body:
@@ -104,7 +113,7 @@ def critic_extra(env: VelocityEnv, tracking: Tracking) -> np.ndarray:
 
 def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
     """Reward of one tick, (n,): tracking (`lag`: its error over a stride), attitude, effort, smooth residuals, feet on time."""
-    c = env.command
+    c = g.pace
     ev = np.sum((c[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
     ew = (c[:, 2] - env.angular_velocity[:, 2]) ** 2
     tracking = (
@@ -205,9 +214,9 @@ class TeacherRun:
         }
         std = self.actor.log_std.exp().detach().numpy()
         errors, falls = [], 0
-        base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
+        base = gait.targets(g.phase, g.pace, body_of(env), robot.KP)
         for _ in range(c.length):
-            obs = observe(env, g, env.command, g.residual, base)
+            obs = observe(env, g, g.pace, g.residual, base)
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
             action = (mean + std * env.rng.standard_normal(mean.shape)).astype(np.float32)
@@ -216,9 +225,9 @@ class TeacherRun:
             total = np.zeros(c.n)
             for _ in range(HOLD):
                 env.tick(base + RESIDUAL * g.residual)
-                g.advance(env)
-                base = gait.targets(g.phase, env.command, body_of(env), robot.KP)
-                self.tracking.advance(env, env.command[:, :3])
+                g.advance(env.command)
+                base = gait.targets(g.phase, g.pace, body_of(env), robot.KP)
+                self.tracking.advance(env, g.pace[:, :3])
                 total += reward(env, g, self.tracking.error)
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
             lag = self.tracking.error
@@ -233,10 +242,10 @@ class TeacherRun:
                 env.reset(over)
                 g.reset(over)
                 self.tracking.reset(over)
-                base[over] = gait.targets(g.phase, env.command, body_of(env), robot.KP)[over]
+                base[over] = gait.targets(g.phase, g.pace, body_of(env), robot.KP)[over]
         self.samples += c.length * c.n
         last = np.concatenate(
-            [observe(env, g, env.command, g.residual, base), critic_extra(env, self.tracking)], axis=1
+            [observe(env, g, g.pace, g.residual, base), critic_extra(env, self.tracking)], axis=1
         )
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         rollout = Rollout(
