@@ -77,13 +77,12 @@ def _check_belongs(network: Path, evaluated: str, evaluation: Path) -> None:
 
 def _origin(metadata: Json) -> Iterable[tuple[str, str]]:
     recipe = metadata.get("recipe") or {}
-    for name, value in recipe.items():
-        if name == "configuration":
-            for field, setting in value.items():
-                yield f"`{field}`", f"`{json.dumps(setting)}`"
-        else:
-            yield name, f"{value:,}" if isinstance(value, int) else str(value)
-    yield "hours", "not kept" if recipe.get("hours") is None else str(recipe["hours"])
+    for name in ("stage", "recipe", "samples"):
+        value = recipe.get(name, "not kept")
+        yield name, f"{value:,}" if isinstance(value, int) else str(value)
+    yield "hours of training", str(recipe.get("hours") or "not kept")
+    for field, setting in recipe.get("configuration", {}).items():
+        yield f"`{field}`", f"`{json.dumps(setting)}`"
     yield "commit", metadata["commit"]
     if "actuator" in metadata:
         yield "actuator model", _drives(metadata["actuator"])
@@ -102,7 +101,8 @@ def _drives(actuator: Json | None) -> str:
 
 def _conditions(setup: Json) -> str:
     drawn = "drawn at random" if setup["randomised"] else "nominal"
-    return f"{setup['grid']} grid, {setup['seeds']} seeds, {setup['terrain']} ground, {drawn} robot, {setup['estimator']} estimator"
+    seeds = "1 seed" if setup["seeds"] == 1 else f"{setup['seeds']} seeds"
+    return f"{setup['grid']} grid, {seeds}, {setup['terrain']} ground, {drawn} robot, {setup['estimator']} estimator"
 
 
 def _policy_limits(metadata: Json, found: Json) -> Iterable[str]:
