@@ -212,11 +212,13 @@ def tune_kalman(
 @app.command("card")
 def write_card(
     network: Annotated[Path, typer.Argument(help="Policy or estimator file.")],
-    evaluation: Annotated[Path, typer.Argument(help="eval.json of `quadvel eval`, or the folder it is in.")],
+    evaluations: Annotated[
+        list[Path], typer.Argument(help="eval.json of `quadvel eval`, or the folder it is in; one or more.")
+    ],
 ) -> None:
     """The model card of a network, written beside it: FILE.md of FILE.onnx."""
     path = network.with_suffix(".md")
-    path.write_text(card(network, evaluation))
+    path.write_text(card(network, evaluations))
     print(f"written: {path}")
 
 

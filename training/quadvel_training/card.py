@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,29 +21,24 @@ Json = Mapping[str, Any]
 UNITS = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}
 
 
-def card(network: Path, evaluation: Path) -> str:
-    """The text for a network file with what an evaluation says of it. Raises ValueError or FileNotFoundError."""
-    metadata, found = _metadata(network), read_evaluation(evaluation)
+def card(network: Path, evaluations: Sequence[Path]) -> str:
+    """The text for a network file with what evaluations say of it. Raises ValueError or FileNotFoundError."""
+    metadata, found = _metadata(network), [read_evaluation(path) for path in evaluations]
     estimator = metadata.get("kind") == KIND
-    _check_belongs(network, found["setup"]["estimator_file" if estimator else "policy"], evaluation)
-    what, limits = (ESTIMATOR, _estimator_limits) if estimator else (POLICY, _policy_limits)
+    for path, one in zip(evaluations, found, strict=True):
+        _check_belongs(network, one["setup"]["estimator_file" if estimator else "policy"], path)
+    limits = _estimator_limits if estimator else _policy_limits
     digest = hashlib.sha256(network.read_bytes()).hexdigest()[:12]
-    measured = figures(found).items()
     return "\n".join(
         [
             f"# {network.name}",
             "",
-            what,
-            f"Written by `python -m quadvel_training card` from the file (SHA-256 {digest}...) and an evaluation; do not edit.",
+            ESTIMATOR if estimator else POLICY,
+            f"Written by `python -m quadvel_training card` from the file (SHA-256 {digest}...) and evaluations; do not edit.",
             "",
             *_table("how it was made", "", _origin(metadata)),
             "",
-            *_table(
-                f"evaluation: {_conditions(found['setup'])}",
-                "measured",
-                ((n, _number(v)) for n, v in measured),
-            ),
-            "",
+            *(line for one in found for line in (*_measured(one, estimator), "")),
             "Known limits:",
             "",
             *(f"- {limit}" for limit in limits(metadata, found)),
@@ -105,31 +100,37 @@ def _conditions(setup: Json) -> str:
     return f"{setup['grid']} grid, {seeds}, {setup['terrain']} ground, {drawn} robot, {setup['estimator']} estimator"
 
 
-def _policy_limits(metadata: Json, found: Json) -> Iterable[str]:
+def _measured(found: Json, estimator: bool) -> list[str]:
+    """The table of an evaluation; of an estimator's, what is said of estimators."""
+    rows = [
+        (name, _number(value))
+        for name, value in figures(found).items()
+        if not estimator or "estimator" in name or name in ("runs", "falls")
+    ]
+    return _table(f"evaluation: {_conditions(found['setup'])}", "measured", rows)
+
+
+def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
     limits = metadata["command_limits"]
     spans = ", ".join(
         f"{axis} {limits[axis][0]:g} to {limits[axis][1]:g} {unit}" for axis, unit in UNITS.items()
     )
     yield f"Commands beyond {spans} are cut to that."
     yield f"Its gains are part of it: kp {_one(metadata['kp'])} N m/rad, kd {_one(metadata['kd'])} N m s/rad."
-    yield from _failures(found)
+    for one in found:
+        where, stood = _conditions(one["setup"]), [cell for cell in one["cells"] if not cell["fell"]]
+        fell = sorted({_command(cell) for cell in one["cells"] if cell["fell"]})
+        if fell:
+            share = f"{one['falls']} of {len(one['cells'])} runs"
+            yield f"On the {where}: fell in {share}, at commands (vx, vy, wz) {'; '.join(fell)}."
+        if stood:
+            worst = max(stood, key=lambda cell: cell["error_xy"])
+            yield f"On the {where}: furthest off at the command {_command(worst)}, {worst['error_xy']:.3f} m/s."
 
 
-def _estimator_limits(metadata: Json, found: Json) -> Iterable[str]:
-    yield f"Measured on walks under {Path(found['setup']['policy']).name}; other gaits were not tried."
-    yield from _failures(found)
-
-
-def _failures(found: Json) -> Iterable[str]:
-    """Where the evaluated robot fell or was furthest off."""
-    fell = [cell for cell in found["cells"] if cell["fell"]]
-    if fell:
-        where = "; ".join(sorted({_command(cell) for cell in fell}))
-        yield f"The robot fell in {len(fell)} of {len(found['cells'])} runs, at commands (vx, vy, wz) {where}."
-    stood = [cell for cell in found["cells"] if not cell["fell"]]
-    if stood:
-        worst = max(stood, key=lambda cell: cell["error_xy"])
-        yield f"Furthest off at the command {_command(worst)}: {worst['error_xy']:.3f} m/s."
+def _estimator_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
+    policies = ", ".join(sorted({Path(one["setup"]["policy"]).name for one in found}))
+    yield f"Measured on walks under {policies} that ended on their feet; other gaits were not tried."
 
 
 def _command(cell: Json) -> str:
