@@ -33,12 +33,12 @@ TRUTH = {
     "hysteresis": {"F": 0.4, "reach": 0.05, "beta": 0.5},
     "gain_asymmetry": {"a": 0.1},
     "thermal_drift": {"rate": -0.05, "tau_t": 10.0, "of": "time"},
-    "supply_sag": {"sag": 0.002, "of": "power", "what": "gain", "full": 1.0},
+    "supply_sag": {"sag": 0.002, "T": 0.01, "of": "power", "what": "gain"},
     "cross_coupling": {"a": 0.2, "source": ["FL_hip_joint/q"] * 3},
     "command_hold": {"share": 0.1},
 }
 LATE = {"armature"}  # a running model takes the acceleration from the past alone
-UNLIKE = {"command_hold", "supply_sag"}  # random; the power is that of the step before
+UNLIKE = {"command_hold"}  # random
 
 
 def _motion(steps=800, dt=0.001):

@@ -38,19 +38,12 @@ class Instant:
         self.dt = dt
         self.t = np.zeros((*shape[:-1], 1))
         self.q = self.dq = self.ddq = self.q_des = np.zeros(shape)
-        self.measured = np.zeros(shape)  # the torque of the step before
         self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)
 
     @property
     def ddq_smooth(self) -> Array:
         """A running model has only the past to take an acceleration from."""
         return self.ddq
-
-    @property
-    def power(self) -> Array:
-        """Mechanical power that the joints draw together, (..., 1), W."""
-        power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)
-        return power
 
     def shifted(self, name: str, late: Array) -> Array:
         """The velocity `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
@@ -254,7 +247,6 @@ class RunningEffects:
             total = total + one.act(torque, now, new)
         for terms in self._terms:
             total = total + terms.act(total, now, new)
-        now.measured = np.array(total)
         return total
 
     def at_joint(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
@@ -286,13 +278,12 @@ class RunningEffects:
         return (
             [one.memory for one in self._memories],
             now.t,
-            now.measured,
             deque(now.past, now.past.maxlen),
             self.targets.head,
         )
 
     def recall(self, kept: Any) -> None:
         """Take steps since `remember` back."""
-        memories, self._now.t, self._now.measured, self._now.past, self.targets.head = kept
+        memories, self._now.t, self._now.past, self.targets.head = kept
         for one, memory in zip(self._memories, memories, strict=True):
             one.memory = memory

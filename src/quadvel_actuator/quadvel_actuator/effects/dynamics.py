@@ -31,12 +31,12 @@ _FADED = 40.0
 """time constants after which nothing is left; exp of as many for every row of a piece is a number"""
 
 
-def _lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
+def lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
     """One step of a first-order lag: from `before` towards `x`, which is held for `dt`."""
     return before - np.expm1(-dt / time) * (x - before)
 
 
-def _lagged(x: Array, s: Any, time: Array) -> Array:
+def lagged(x: Array, s: Any, time: Array) -> Array:
     """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
 
     y[k] = d[k] y[k-1] + (1 - d[k]) x[k] is summed over pieces of a few rows, all pieces at once: with D the product of
@@ -83,11 +83,11 @@ class FirstOrderLag(MemoryLaw):
         return (x,)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        given = _lag(memory[0], x, dt, p["T"])
+        given = lag(memory[0], x, dt, p["T"])
         return given, (given,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return _lagged(x, s, p["T"])
+        return lagged(x, s, p["T"])
 
 
 class VelocityFilter(MemoryLaw):
@@ -108,11 +108,11 @@ class VelocityFilter(MemoryLaw):
         return (u[0],)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        filtered = _lag(memory[0], u[0], dt, p["T"])
+        filtered = lag(memory[0], u[0], dt, p["T"])
         return (x[0], x[1] + u[0] - filtered), (filtered,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return x[0], x[1] + s.dq - _lagged(s.dq, s, p["T"])
+        return x[0], x[1] + s.dq - lagged(s.dq, s, p["T"])
 
 
 @attrs.frozen(eq=False)

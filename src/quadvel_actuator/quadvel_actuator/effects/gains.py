@@ -8,7 +8,22 @@ from typing import Any
 import attrs
 import numpy as np
 
-from .base import DRIVE, JOINT, AddedLaw, Array, EffectLaw, Parameter, Params, Stage, Start, TorqueLaw, View
+from .base import (
+    DRIVE,
+    JOINT,
+    AddedLaw,
+    Array,
+    EffectLaw,
+    Memory,
+    MemoryLaw,
+    Parameter,
+    Params,
+    Stage,
+    Start,
+    TorqueLaw,
+    View,
+)
+from .dynamics import lag, lagged
 
 
 class GainAsymmetry(TorqueLaw):
@@ -66,12 +81,11 @@ class ThermalDrift(TorqueLaw):
 
 @attrs.frozen(eq=False)
 class SupplySag(TorqueLaw):
-    """Gain or bound falls as the voltage, or as the joints' total power rises: by 1 - sag x, x = 1 - V / `full`, or W"""
+    """Gain or bound falls with the logged voltage, by 1 - sag (1 - V / `full`), or with the joints' power (`PowerSag`)"""
 
     name = "supply_sag"
-    signal = "power"
+    signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
-    of: str = "power"
     what: str = "gain"
     full: float = 1.0
 
@@ -81,46 +95,100 @@ class SupplySag(TorqueLaw):
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
-        sag = (
-            Parameter("sag", "1/W", 0.0, 0.5, 0.0005)
-            if self.of == "power"
-            else Parameter("sag", "1", 0.0, 20.0, 0.3)
-        )
-        return (sag,) if self.what == "gain" else (sag, Parameter("limit", "N m", 0.1, 500.0, 10.0))
+        return (Parameter("sag", "1", 0.0, 20.0, 0.3), *_limit(self.what))
 
     @classmethod
-    def variants(cls, about: Any) -> Sequence[SupplySag]:
+    def variants(cls, about: Any) -> Sequence[EffectLaw]:
         voltage = about.signals.voltage
         if voltage is not None and float(np.ptp(voltage)) > 0.01 * float(np.max(voltage)):
             full = float(np.quantile(voltage, 0.99))
-            return tuple(cls("voltage", what, full) for what in ("gain", "bound"))
-        return tuple(cls("power", what) for what in ("gain", "bound"))
+            return tuple(cls(what, full) for what in ("gain", "bound"))
+        return tuple(PowerSag(what) for what in ("gain", "bound"))
+
+    @classmethod
+    def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
+        own = {name: value for name, value in settings.items() if name != "of"}
+        return PowerSag(**own) if settings.get("of") == "power" else cls(**own)
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        top = float(np.quantile(self._strain(s), 0.95)) + 1e-6
-        sags = [{"sag": share / top} for share in (0.05, 0.2, 0.5)]
-        if self.what == "gain":
-            return sags
-        return [
-            sag | {"limit": np.quantile(np.abs(torque), at, axis=0)}
-            for sag in sags
-            for at in (0.9, 0.97, 1.0)
-        ]
-
-    def _strain(self, s: View) -> Array:
-        strain: Array = s.power if self.of == "power" else 1.0 - s.voltage / self.full
-        return strain
+        return _sags(self.what, self._strain(s), torque)
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        left = np.maximum(1.0 - p["sag"] * self._strain(s), 0.0)
-        if self.what == "gain":
-            return x * left
-        return np.clip(x, -p["limit"] * left, p["limit"] * left)
+        return _sagging(self.what, x, self._strain(s), p)
+
+    def _strain(self, s: View) -> Array:
+        strain: Array = np.maximum(1.0 - s.voltage / self.full, 0.0)
+        return strain
+
+
+@attrs.frozen(eq=False)
+class PowerSag(MemoryLaw):
+    """Gain or bound falls by 1 - sag P, where P is the power that the joints draw together, T s late (first order)"""
+
+    name = SupplySag.name
+    signal = SupplySag.signal
+    motion = SupplySag.motion
+    inputs = ("dq",)
+    what: str = "gain"
+
+    @property
+    def stage(self) -> Stage:  # type: ignore[override]
+        return Stage.GAIN if self.what == "gain" else Stage.LIMIT
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
+        late = Parameter("T", "s", 0.0005, 0.2, 0.01)
+        return (Parameter("sag", "1/W", 0.0, 0.5, 0.0005), late, *_limit(self.what))
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"of": "power", "what": self.what}
+
+    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        sags = _sags(self.what, _power(torque, s.dq), torque)
+        return [{**sag, "T": late} for sag in sags for late in (0.002, 0.012)]
+
+    def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
+        return (_power(x, u[0]),)
+
+    def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
+        level = lag(memory[0], _power(x, u[0]), dt, p["T"])
+        return _sagging(self.what, x, level, p), (level,)
+
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        return _sagging(self.what, x, lagged(_power(x, s.dq), s, p["T"]), p)
+
+
+def _limit(what: str) -> tuple[Parameter, ...]:
+    return () if what == "gain" else (Parameter("limit", "N m", 0.1, 500.0, 10.0),)
+
+
+def _power(torque: Array, dq: Array) -> Array:
+    """Mechanical power that the joints draw together, W, for each of them (..., J)."""
+    power = np.maximum(torque * dq, 0.0)
+    return np.broadcast_to(power.sum(axis=-1, keepdims=True), power.shape)
+
+
+def _sags(what: str, strain: Array, torque: Array) -> list[Start]:
+    top = float(np.quantile(strain, 0.95)) + 1e-6
+    sags: list[Start] = [{"sag": share / top} for share in (0.05, 0.2, 0.5)]
+    if what == "gain":
+        return sags
+    limits = [np.quantile(np.abs(torque), at, axis=0) for at in (0.9, 0.97, 1.0)]
+    return [{**sag, "limit": limit} for sag in sags for limit in limits]
+
+
+def _sagging(what: str, x: Array, strain: Array, p: Params) -> Array:
+    left = np.maximum(1.0 - p["sag"] * strain, 0.0)
+    return x * left if what == "gain" else np.clip(x, -p["limit"] * left, p["limit"] * left)
 
 
 @attrs.frozen(eq=False)
 class CrossCoupling(AddedLaw):
-    """a times q, dq or tau of another joint: `source` names one for each joint, as in FR_thigh_joint/dq"""
+    """a times q, dq or tau of another joint: `source` names one for each joint, as in FR_thigh_joint/dq
+
+    tau is what that joint's drive gives without such effects: a measured one would carry its noise over.
+    """
 
     name = "cross_coupling"
     parameters = (Parameter("a", "N m per unit of the source", -100.0, 100.0, 0.05),)
@@ -146,7 +214,7 @@ class CrossCoupling(AddedLaw):
     @staticmethod
     def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:
         joint, signal = source.split("/")
-        return ("measured" if signal == "tau" else signal), list(joints).index(joint)
+        return signal, list(joints).index(joint)
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[CrossCoupling]:
@@ -155,7 +223,7 @@ class CrossCoupling(AddedLaw):
         if len(joints) < 2:
             return ()
         names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
-        found = [names[k] for k in about.strongest_neighbour(("q", "dq", "measured"))]
+        found = [names[k] for k in about.strongest_neighbour()]
         columns = tuple(cls._column(one, joints) for one in found)
         return tuple(cls(tuple(found), columns, at=at) for at in (DRIVE, JOINT))
 
@@ -163,7 +231,9 @@ class CrossCoupling(AddedLaw):
         return [{}]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return p["a"] * np.stack([getattr(s, name)[..., k] for name, k in self.columns], axis=-1)
+        lead = x.shape[:-1]
+        of = (x[..., k] if name == "tau" else getattr(s, name)[..., k] for name, k in self.columns)
+        return p["a"] * np.stack([np.broadcast_to(one, lead) for one in of], axis=-1)
 
 
 LAWS = (GainAsymmetry, ThermalDrift, SupplySag, CrossCoupling)

@@ -83,13 +83,13 @@ class About:
             0
         ]
 
-    def strongest_neighbour(self, names: Sequence[str]) -> NDArray[np.intp]:
-        """For each joint the index (over names, then joints) of another joint's signal that its residual goes with.
+    def strongest_neighbour(self) -> NDArray[np.intp]:
+        """For each joint the index (over q, dq, tau, then joints) of another joint's signal that its residual goes with.
 
         What the joint's own signals explain linearly is taken out first.
         """
         s, joints = self.signals, len(self.samples.joints)
-        others = np.concatenate([getattr(s, name) for name in names], axis=1)
+        others = np.concatenate([s.q, s.dq, self.torque], axis=1)
         found = np.zeros(joints, dtype=np.intp)
         for j in range(joints):
             keep = self.judge.fit[:, j]

@@ -262,7 +262,6 @@ _BY_SIGNAL = {
     "ddq": "chirp",
     "q_des": "steps",
     "tau": "sweep",
-    "power": "sweep",
 }
 
 

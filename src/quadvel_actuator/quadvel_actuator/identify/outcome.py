@@ -42,7 +42,6 @@ _SIGNAL_UNITS = {
     "ddq": "rad/s^2",
     "tau": "N m",
     "t": "s",
-    "power": "W",
 }
 
 
@@ -374,6 +373,6 @@ def _signal(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
     kind = plain.partition("@")[0]
     series: dict[str, Array] = {
         "q": s.q, "dq": s.dq, "ddq": s.ddq, "q_des": s.q_des, "tau": samples.tau,
-        "t": np.broadcast_to(s.t, s.q.shape), "power": np.broadcast_to(s.power, s.q.shape),
+        "t": np.broadcast_to(s.t, s.q.shape),
     }  # fmt: skip
     return series[kind][:, j], _SIGNAL_UNITS[kind]

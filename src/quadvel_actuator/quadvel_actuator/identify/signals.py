@@ -42,7 +42,7 @@ _CACHED_VALUES = 1_000_000
 
 _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row")
 _OF_JOINTS = (
-    "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "measured", "temperature",
+    "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature",
 )  # fmt: skip
 
 Joints = slice | list[int]
@@ -65,19 +65,12 @@ class Signals:
     tau_ff: Array
     kp: Array
     kd: Array
-    measured: Array  # N m, torque as logged at `u`
     temperature: Array | None
     voltage: Array | None  # (N, 1)
     packet: NDArray[np.intp]  # (N, 1), the command row in force, counted over all logs
     row: NDArray[np.intp]  # (N, 1), which row of all logs this is
     sent: Array  # (M, J), q_des of every command row of all logs
     elsewhere: Callable[[str, Array], Array]
-
-    @property
-    def power(self) -> Array:
-        """Mechanical power that the joints draw together, (N, 1), W."""
-        power: Array = np.maximum(self.measured * self.dq, 0.0).sum(axis=-1, keepdims=True)
-        return power
 
     def shifted(self, name: str, late: Array) -> Array:
         """A signal of the joints' state `late` s earlier (negative: later); `late` (J,) or (B, 1, J)."""
@@ -113,7 +106,6 @@ class _LogSignals:
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
         self.states["ddq"] = derivative(log, self.states["dq"])
         self.states["ddq_smooth"] = smooth_derivative(log, self.states["dq"])
-        self.states["measured"] = _double(log.tau) if log.tau is not None else np.zeros_like(self.states["q"])
         if log.temperature is not None:
             self.states["temperature"] = _double(log.temperature)
         if log.voltage is not None:
@@ -204,7 +196,7 @@ class Samples:
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
         self.t = np.concatenate([_double(log.t) for log in logs])
         self.period = float(np.median(np.concatenate([np.diff(log.t) for log in logs])))
-        self.tau = np.concatenate([one.states["measured"] for one in self.logs])
+        self.tau = np.concatenate([_double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
         starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
         self.start: Bools = np.concatenate(starts)
         self.dt = np.concatenate(steps)
