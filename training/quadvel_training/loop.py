@@ -116,22 +116,24 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
     if known or parallel.size() > 1:
         run.restore(parallel.from_first(known or run.state()))
     journal = _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if parallel.rank() == 0 else None
-    started = time.monotonic()
+    started, spent = time.monotonic(), False
     try:
-        while True:
+        while not spent:
             minutes = (time.monotonic() - started) / 60
             done = parallel.from_first(max(run.samples / budget.samples, minutes / budget.minutes))
-            if done >= 1.0:
-                return True
-            seen = run.step(done)
-            if journal:
-                journal.note(done, seen)
+            spent = done >= 1.0
+            if not spent:
+                seen = run.step(done)
+                if journal:
+                    journal.note(done, seen)
     except KeyboardInterrupt:
         print("stopped; the checkpoint holds everything so far")
-        return False
     finally:
         if journal:
-            journal.close()
+            journal.end()
+    if journal:
+        journal.save()
+    return spent
 
 
 class _Journal:
@@ -157,19 +159,19 @@ class _Journal:
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()
         if now - self._saved > SAVE_EVERY:
-            self._save()
+            self.save()
             self._saved = now
             rate = (samples - self._first) / (now - self._started)
             self._progress.console.print(
                 f"{samples / 1e6:.2f} M samples, {rate:.0f}/s  {note}", soft_wrap=True
             )
 
-    def _save(self) -> None:
+    def save(self) -> None:
+        """Write the checkpoint, with the time that it took in all (s)."""
         seconds = self._before + time.monotonic() - self._started
         save(self._run.state() | {"seconds": seconds}, self._checkpoint)
 
-    def close(self) -> None:
-        """Save, and end what is shown."""
-        self._save()
+    def end(self) -> None:
+        """End what is shown."""
         self._progress.stop()
         self._curves.close()
