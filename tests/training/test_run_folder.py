@@ -1,0 +1,51 @@
+"""What a run of stage 3 leaves in its directory."""
+
+from __future__ import annotations
+
+import json
+
+import attrs
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
+from quadvel_description.robot import JOINT_NAMES  # noqa: E402
+from quadvel_policy.policy_file import PolicyFile  # noqa: E402
+from quadvel_training import loop, run_folder, stage3, student  # noqa: E402
+from quadvel_training.crl import CrlConfig  # noqa: E402
+from quadvel_training.loop import Budget  # noqa: E402
+
+
+@pytest.fixture
+def drives(tmp_path):
+    """An actuator file with an effect that is known within an interval."""
+    effect = Effect("coulomb_friction", JOINT_NAMES, {"c": 0.5, "v_0": 0.05}, {}, {"c": [0.3, 0.7]})
+    path = tmp_path / "actuator.yaml"
+    attrs.evolve(ActuatorParameters.default(), effects=(effect,)).save(path)
+    return path
+
+
+def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
+    torch.manual_seed(0)
+    figures = {"falls": 1, "mean_error_xy": 0.1, "max_error_xy": 0.2}
+    setups = []
+    monkeypatch.setattr(run_folder, "_evaluate", lambda setup: setups.append(setup) or figures)
+    start, folder = tmp_path / "start.pt", tmp_path / "run"
+    loop.save({"student": student.new_actor().state_dict(), "samples": 7}, start)
+    config = CrlConfig(n=2, length=3, threads=1, keep=10, actuator=str(drives), budget=Budget(15, 1.0))
+    assert stage3.learn(config, tmp_path / "mine.yaml", start, folder, "cpu")
+
+    about = json.loads((folder / "run.json").read_text())
+    assert (about["stage"], about["recipe"], about["configuration"]["n"]) == ("crl", "mine", 2)
+    assert about["commit"]
+    kept = sorted(path.name for path in (folder / "kept").iterdir())
+    assert kept == [f"000000k.{suffix}" for suffix in ("json", "onnx", "pt")]
+    assert json.loads((folder / "kept" / kept[0]).read_text()) == figures
+    assert [one.plant["actuator"] for one in setups] == [ActuatorParameters.load(drives)]
+    assert PolicyFile(folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"] == "coulomb_friction"
+    assert loop.load(folder / "kept" / kept[2])["samples"] == 12
+
+    made_of = run_folder.made_of("crl", None, config, folder / stage3.CHECKPOINT)
+    assert made_of["samples"] == 18
+    assert made_of["hours"] >= 0.0
