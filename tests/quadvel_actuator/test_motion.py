@@ -117,7 +117,7 @@ def test_a_measured_leg_in_the_air_is_never_replayed_worse_than_before():
     leg = [name.startswith("FL") for name in log.joints]
     states = {name: getattr(log, name)[:, leg] for name in ("q", "dq", "valid", "q_des", "kp", "kd")}
     one = attrs.evolve(log, joints=tuple(np.array(log.joints)[leg].tolist()), **states)
-    report = identify([one], options=Options(seconds=4.0)).report
+    report = identify([one], options=Options(values=6000)).report
     assert 0.01 < min(report["motion"]["inertia"]["value"]) < max(report["motion"]["inertia"]["value"]) < 0.1
     for name in ("heldout_q_rms_rad", "heldout_dq_rms_rad_s"):
         assert report["after"][name] <= report["before"][name]

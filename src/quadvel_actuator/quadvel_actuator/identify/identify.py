@@ -48,8 +48,8 @@ class Options:
     """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
     base: ActuatorParameters | None = None
     """its torque limits go into the corrected model"""
-    seconds: float = 6.0
-    """of log that is fitted at most, in blocks spread over all of it"""
+    values: int = 144_000
+    """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
 
 
 def identify(
@@ -72,9 +72,8 @@ def identify(
         tell(0.01, "the torque that the motion implies")
         logs, body = _moving(logs, kp, kd)
         windows = (logs[0].period,)
-    parts = [
-        [Piece(one.log, one.origin) for one in pieces(log, options.seconds / len(train))] for log in logs
-    ]
+    rows = options.values // (len(logs) * len(logs[0].joints))
+    parts = [pieces(log, rows * log.period) for log in logs]
     chosen = [piece for part in parts for piece in part]
     fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
     tell(0.02, "gains and delays")
