@@ -52,17 +52,13 @@ class Evaluated:
 
     run: CrlRun
     folder: Path
-    last: int = attrs.field(init=False)
-
-    def __attrs_post_init__(self) -> None:
-        self.last = self.run.samples
+    _asked_at: int | None = attrs.field(default=None, init=False)
 
     def due(self, samples: int) -> bool:
-        """Whether a multiple of `every` was passed since the last time."""
+        """Whether a multiple of the configuration's `keep` was passed since this was asked last."""
+        before, self._asked_at = self._asked_at, samples
         every = self.run.config.keep
-        passed = samples // every > self.last // every
-        self.last = samples
-        return passed
+        return before is not None and samples // every > before // every
 
     def keep(self) -> dict[str, float]:
         """Checkpoint, policy file and evaluation; falls and errors (m/s) for the curves."""
