@@ -19,7 +19,7 @@ TRUTH = {
     "quadratic_drag": {"c": 0.05},
     "load_dependent_friction": {"mu": 0.1, "v_0": 0.1},
     "torque_saturation": {"limit": 3.0},
-    "torque_speed_limit": {"stall": 6.0, "v_c": 0.5, "fall": 6.0},
+    "torque_speed_limit": {"stall": 6.0, "no_load": 6.5},
     "slew_limit": {"rate": 40.0},
     "first_order_lag": {"T": 0.005},
     "velocity_filter": {"T": 0.008},
@@ -73,7 +73,7 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
     series = Model(
-        Samples([log]), 0.0, np.ones((2, 4)), np.array([zero, zero]), np.zeros(4), np.zeros(4), zero,
+        Samples([log]), 0.001, np.ones((2, 4)), np.array([zero, zero]), np.zeros(4), np.zeros(4), zero,
         (Applied(law, active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-9)

@@ -35,7 +35,7 @@ class Instant:
     packet = row = sent = None
 
     def __init__(self, shape: tuple[int, ...], dt: float) -> None:
-        self.dt = dt
+        self.dt = self.age = dt
         self.t = np.zeros((*shape[:-1], 1))
         self.q = self.dq = self.ddq = self.q_des = np.zeros(shape)
         self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)

@@ -87,7 +87,10 @@ class FirstOrderLag(MemoryLaw):
         return given, (given,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return lagged(x, s, p["T"])
+        """A new command may come in the middle of a step: until then the torque before is followed."""
+        before = np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
+        late = -np.expm1(-np.minimum(s.age, s.dt) / p["T"]) / -np.expm1(-s.dt / p["T"])
+        return lagged(before + late * (x - before), s, p["T"])
 
 
 class VelocityFilter(MemoryLaw):

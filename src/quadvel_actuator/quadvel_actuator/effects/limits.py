@@ -29,14 +29,13 @@ class TorqueSaturation(TorqueLaw):
 
 
 class TorqueSpeedLimit(TorqueLaw):
-    """A bound `stall` that falls from the speed `v_c` in the direction of motion, to nothing at `v_c + fall`"""
+    """A bound that falls with the speed in the direction of motion: stall (1 - v / no_load), 0 to `stall`"""
 
     name = "torque_speed_limit"
     stage = Stage.LIMIT
     parameters = (
         Parameter("stall", "N m", 0.1, 500.0, 10.0),
-        Parameter("v_c", "rad/s", 0.0, 60.0, 2.0),
-        Parameter("fall", "rad/s", 0.1, 200.0, 10.0),
+        Parameter("no_load", "rad/s", 0.2, 300.0, 10.0),
     )
     signal = "dq"
     motion = _HARD
@@ -44,25 +43,24 @@ class TorqueSpeedLimit(TorqueLaw):
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         top = np.quantile(np.abs(s.dq), 0.98, axis=0)
         return [
-            {"stall": np.quantile(np.abs(torque), share, axis=0), "v_c": corner * top, "fall": fall * top}
-            for share in (0.85, 0.97, 1.0)
-            for corner in (0.0, 0.4)
-            for fall in (0.5, 1.0, 2.0, 4.0)
+            {"stall": np.quantile(np.abs(torque), share, axis=0) * over, "no_load": fast * top}
+            for share, over in ((0.85, 1.0), (0.97, 1.0), (1.0, 1.0), (1.0, 1.4))
+            for fast in (0.6, 0.9, 1.3, 2.0, 4.0)
         ]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         def bound(speed: Array) -> Array:
-            share = 1.0 - np.maximum(speed - p["v_c"], 0.0) / p["fall"]
-            return p["stall"] * np.maximum(share, 0.0)
+            return p["stall"] * np.clip(1.0 - speed / p["no_load"], 0.0, 1.0)
 
         return np.clip(x, -bound(-s.dq), bound(s.dq))
 
 
 class SlewLimit(MemoryLaw):
-    """|dtau/dt| held to `rate`"""
+    """|dtau/dt| held to `rate`, towards the torque before until a new command comes in the middle of a step"""
 
     name = "slew_limit"
     stage = Stage.FLOW
+    inputs = ("age",)
     parameters = (Parameter("rate", "N m/s", 5.0, 50000.0, 300.0),)
     signal = "tau@history"
     shifts = True
@@ -73,12 +71,15 @@ class SlewLimit(MemoryLaw):
         return [{"rate": np.quantile(slope, share, axis=0) + 5.0} for share in (0.5, 0.7, 0.85, 0.94, 0.98)]
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
-        return (x,)
+        return x, x
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        reach = p["rate"] * dt
-        given = memory[0] + np.minimum(np.maximum(x - memory[0], -reach), reach)
-        return given, (given,)
+        given, before = memory
+        new = np.minimum(u[0], dt)
+        for target, time in ((before, dt - new), (x, new)):
+            reach = p["rate"] * time
+            given = given + np.minimum(np.maximum(target - given, -reach), reach)
+        return given, (given, x)
 
 
 LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)

@@ -68,6 +68,7 @@ class Signals:
     temperature: Array | None
     voltage: Array | None  # (N, 1)
     packet: NDArray[np.intp]  # (N, 1), the command row in force, counted over all logs
+    age: Array  # (N, 1) s since that command acts, at least `dt` where commands are means over a drive's step
     row: NDArray[np.intp]  # (N, 1), which row of all logs this is
     sent: Array  # (M, J), q_des of every command row of all logs
     elsewhere: Callable[[str, Array], Array]
@@ -309,7 +310,7 @@ class Samples:
     ) -> Signals:
         """The signals of `joints`, or of all, at one pair of delays."""
         parts: dict[str, list[Array]] = {}
-        packets = []
+        packets, ages = [], []
         chosen = ALL if joints is None else joints
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
             for name in one.states:
@@ -321,6 +322,7 @@ class Samples:
             for name, values in one.gains.items():
                 parts.setdefault(name, []).append(values[:, chosen][row])
             packets.append((row + first)[:, None])
+            ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
             parts.setdefault("t", []).append((at - one.origin)[:, None])
         signals = {name: np.concatenate(part) for name, part in parts.items()}
         for name in ("temperature", "voltage"):
@@ -330,6 +332,7 @@ class Samples:
             dt=self.dt[:, None],
             start=self.start[:, None],
             packet=np.concatenate(packets),
+            age=np.maximum(np.concatenate(ages), 0.0),
             row=self.row[:, None],
             sent=self.sent,
             elsewhere=partial(self._elsewhere, output_delay),

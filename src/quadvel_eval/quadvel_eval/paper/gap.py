@@ -44,7 +44,7 @@ def plants() -> list[Condition]:
     drives = {
         "as in training": ActuatorParameters.default(),
         "friction": _with("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
-        "torque-speed limit": _with("torque_speed_limit", stall=20.0, v_c=2.0, fall=10.0),
+        "torque-speed limit": _with("torque_speed_limit", stall=24.0, no_load=12.0),
         "3 ms more delay": _delayed(),
         "backlash": _with("backlash", {"on": "q"}, gap=0.015),
     }
@@ -89,7 +89,7 @@ class Gap(Section):
     title: ClassVar[str] = "The gap: drives that training never saw"
     method: ClassVar[str] = (
         "Ten commands of 6 s on the plant of training and on four whose drives hold, in addition, dry friction (1.2 N m, 1.8 "
-        "at rest), a torque limit of 20 N m that falls from 2 rad/s to nothing at 12 rad/s in the direction of motion, 3 ms more "
+        "at rest), a torque limit of 24 N m that falls to nothing at 12 rad/s in the direction of motion, 3 ms more "
         "delay of the commands, and a backlash of ±15 mrad. Errors are those of the robots that did not fall; the cut of the "
         "error is against the first policy, on the walks that neither fell on. The paper's own gap is that between simulation "
         "and robot: RL-PD fell 3 times there, the EAM policies never."
