@@ -29,11 +29,15 @@ Cluster = Annotated[
 def eval_command(
     out: Annotated[Path, typer.Option(help="Folder for eval.json, eval.csv and eval.png.")],
     grid: Annotated[Literal["quick", "paper"], typer.Option(help="Which commands are tried.")],
-    policy: Annotated[Path, typer.Option(help="ONNX file of the policy.")] = SHIPPED_POLICY,
+    policy: Annotated[
+        Path, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
+    ] = SHIPPED_POLICY,
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
-    estimator_file: Annotated[Path, typer.Option(help="ONNX file of the learned one.")] = SHIPPED_MODEL,
+    estimator_file: Annotated[
+        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+    ] = SHIPPED_MODEL,
     terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
     randomised: Annotated[
         bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")

@@ -39,7 +39,9 @@ def paper_command(
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
-    estimator_file: Annotated[Path, typer.Option(help="ONNX file of the learned one.")] = SHIPPED_MODEL,
+    estimator_file: Annotated[
+        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+    ] = SHIPPED_MODEL,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
     again: Annotated[bool, typer.Option("--again", help="Run sections that are done already, too.")] = False,
     cluster: Cluster = None,
