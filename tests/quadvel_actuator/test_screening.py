@@ -8,6 +8,7 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
+from quadvel_actuator.identify import backlog
 from quadvel_actuator.identify.candidates import About, propose, started
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
@@ -86,6 +87,20 @@ def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     half = intervals(found.model, about.judge).effects[0]
     apart = np.abs(found.model.applied[0].values - other.model.applied[0].values)
     assert (half[0] > apart[0]).all()
+
+
+def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
+    """Of 3000 rows with a command every fifth, three are lost, at the edges of pieces."""
+    behind = np.zeros(3000, dtype=int)
+    for first in (595, 1400, 2400):
+        behind[first : first + 5] = 1
+    rng = np.random.default_rng(0)
+    emission = 5.0 * (behind[:, None, None] != np.arange(3)) + rng.exponential(0.3, (3000, 1, 3))
+    new = (np.arange(3000) % 5 == 0).astype(int)
+    several = backlog._likeliest(emission, new)
+    np.testing.assert_array_equal(several[:, 0], behind)
+    monkeypatch.setattr(backlog, "_PIECE", 3000)
+    np.testing.assert_array_equal(several, backlog._likeliest(emission, new))
 
 
 def test_the_share_of_lost_commands_has_the_width_of_as_many_tosses():

@@ -264,7 +264,7 @@ class MemoryLaw(EffectLaw):
 
 
 _PIECE = 800  # rows that advance one after the other
-_SAME = 1e-7
+_SAME = 1e-9
 
 
 def _side_by_side(values: Array) -> Array:
