@@ -28,7 +28,7 @@ TRUTH = {
     "torque_offset": {"offset": 0.4},
     "parallel_spring": {"k": 2.0, "q0": 0.1},
     "cogging": {"a": 0.3, "n": 30.0, "phi": 1.0},
-    "deadband": {"width": 0.02, "share": 1.0},
+    "deadband": {"width": 0.02, "edge": "hard"},
     "backlash": {"gap": 0.01, "on": "error"},
     "hysteresis": {"F": 0.4, "reach": 0.05, "beta": 0.5},
     "gain_asymmetry": {"a": 0.1},

@@ -115,25 +115,28 @@ class Cogging(AddedLaw):
         return p["a"] * np.sin(p["n"] * s.q + p["phi"])
 
 
+@attrs.frozen(eq=False)
 class Deadband(ErrorLaw):
-    """No answer to position errors below `width`; beyond it the error less `share` of the width"""
+    """No answer to position errors below `width`; beyond it the whole error (`edge` hard), or what exceeds it (soft)"""
 
     name = "deadband"
-    parameters = (Parameter("width", "rad", 0.0005, 0.5, 0.01), Parameter("share", "1", 0.0, 1.0, 0.5))
+    parameters = (Parameter("width", "rad", 0.0005, 0.5, 0.01),)
     signal = "q_des"
     motion = _STILL
+    edge: str = attrs.field(default="soft", validator=attrs.validators.in_(("soft", "hard")))
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[Deadband]:
+        return cls("soft"), cls("hard")
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         error = np.abs(s.q_des - s.q)
-        return [
-            {"width": np.quantile(error, at, axis=0) + 5e-4, "share": share}
-            for at in (0.05, 0.15, 0.3, 0.5)
-            for share in (0.0, 1.0)
-        ]
+        return [{"width": np.quantile(error, at, axis=0) + 5e-4} for at in (0.03, 0.07, 0.15, 0.25, 0.4, 0.6)]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         beyond = np.abs(e[0]) > p["width"]
-        return np.where(beyond, e[0] - p["share"] * p["width"] * np.sign(e[0]), 0.0), e[1]
+        less = p["width"] * np.sign(e[0]) if self.edge == "soft" else 0.0
+        return np.where(beyond, e[0] - less, 0.0), e[1]
 
 
 @attrs.frozen(eq=False)
