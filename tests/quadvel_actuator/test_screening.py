@@ -10,6 +10,7 @@ from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
 from quadvel_actuator.identify import backlog
 from quadvel_actuator.identify.candidates import About, propose, started
+from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
@@ -44,6 +45,17 @@ def test_signals_of_few_rows_are_those_of_all():
     for name in ("t", "q", "q_des", "ddq", "packet"):
         whole = getattr(samples.at(0.004, 0.001, 0.001), name)
         np.testing.assert_array_equal(getattr(few.at(0.004, 0.001, 0.001), name), whole[rows])
+
+
+def test_a_feature_has_columns_for_every_joint_that_asks_for_them():
+    about = _about(_log(seconds=1.0), 0.009, 0.003)
+    scene = Scene(about.model, about.judge)
+    feature = next(library(scene, scene.residual))
+    columns = scene.columns(feature)
+    for joints in ([True, False], [True, True]):
+        taken = scene.taken(feature, np.array(joints))
+        for j in np.flatnonzero(joints):
+            np.testing.assert_array_equal(taken[j], columns[:, :, j])
 
 
 def test_each_joint_reads_the_signals_at_its_own_delays():

@@ -59,13 +59,13 @@ class Scene:
 
     def taken(self, feature: Feature, joints: Bools) -> dict[int, Array]:
         """The same of each of these joints, (N, K); kept, as few features are taken and these are asked for often."""
-        if feature not in self._taken:
+        kept = self._taken.setdefault(feature, {})
+        missing = [j for j in np.flatnonzero(joints).tolist() if j not in kept]
+        if missing:
             columns = self.columns(feature)
             last = columns.shape[2] - 1
-            self._taken[feature] = {
-                int(j): columns[:, :, min(int(j), last)].copy() for j in np.flatnonzero(joints)
-            }
-        return self._taken[feature]
+            kept |= {j: columns[:, :, min(j, last)].copy() for j in missing}
+        return kept
 
     def columns(self, feature: Feature, rows: slice = EVERY) -> Array:
         """What the feature is a sum of, (N, K, J), at some rows."""
