@@ -88,8 +88,9 @@ def identify(
 
     def told(chosen_one: Diagnosis, learned: Learned | None) -> Outcome:
         model = chosen_one.model
+        named = diagnosis.model if chosen_one.findings else before
         return Outcome(
-            eam, before, chosen_one, learned, _worth(diagnosis.model, learned, judge), remainder(model, learned, judge),
+            eam, before, chosen_one, learned, _worth(named, learned, judge), remainder(model, learned, judge),
             intervals(model if learned is None else learned.beside, judge), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
         )  # fmt: skip
