@@ -22,7 +22,9 @@ class TorqueSaturation(TorqueLaw):
     motion = _HARD
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        return [{"limit": np.quantile(np.abs(torque), share, axis=0)} for share in (0.75, 0.9, 0.96, 0.99)]
+        shares = (0.75, 0.9, 0.96, 0.99, 0.997)
+        seldom = [{"limit": share * np.abs(torque).max(axis=0)} for share in (0.8, 0.9, 0.97)]
+        return [*({"limit": np.quantile(np.abs(torque), share, axis=0)} for share in shares), *seldom]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return np.clip(x, -p["limit"], p["limit"])
