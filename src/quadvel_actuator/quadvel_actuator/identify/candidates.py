@@ -75,7 +75,8 @@ class About:
         """The model fitted from other delays and with other steps of the drive: an effect may have hidden the right ones."""
         some, rows = self.few.of(model)
         windows = [attrs.evolve(some, window=one) for one in sorted({model.window, *WINDOWS})]
-        near = [] if remembers(model) else _LATER
+        cheap = not remembers(model) or model.applied[-1].law.shifts
+        near = _LATER if cheap else ()
         tried = [fit(at, rows, 2) for one in windows for at in (*divided(one), *later(one, near))]
         best = _best([fit_with_delays(one, rows, 2 * _STEPS) for one in _best(tried, rows, 3)], rows, 2)
         whole = [attrs.evolve(one, samples=model.samples) for one in best]
