@@ -62,8 +62,10 @@ def _work(kind: str, index: int, seed: int, path: Path) -> None:
     part.replace(path)
 
 
-def run_campaign(kinds: list[str], logs: int, seed: int, jobs: int, out: Path) -> list[dict[str, Any]]:
-    """Scores what is not scored yet and returns all rows of these kinds."""
+def run_campaign(
+    kinds: list[str], logs: int, seed: int, jobs: int, out: Path, done: bool = False
+) -> list[dict[str, Any]]:
+    """Scores what is not scored yet, unless only what is `done` is asked for, and returns all rows of these kinds."""
     folder = out / "cases"
     folder.mkdir(parents=True, exist_ok=True)
     settings = out / "settings.json"
@@ -73,6 +75,8 @@ def run_campaign(kinds: list[str], logs: int, seed: int, jobs: int, out: Path) -
         )
     settings.write_text(json.dumps({"seed": seed}))
     cases = [(kind, index, folder / f"{kind}-{index:03d}.json") for index in range(logs) for kind in kinds]
+    if done:
+        cases = [case for case in cases if case[2].exists()]
     missing = [case for case in cases if not case[2].exists()]
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(jobs, mp_context=context) as pool:
@@ -97,6 +101,9 @@ def main(
     out: Annotated[Path, typer.Option(help="Where verdicts, CSV and page go.")] = Path(
         "out/identification_score"
     ),
+    done: Annotated[
+        bool, typer.Option("--done", help="Score nothing more: the page of what is there.")
+    ] = False,
     write: Annotated[bool, typer.Option("--write", help=f"Write {PAGE.name} in the docs, too.")] = False,
 ) -> None:
     """Score the identification on logs with undeclared effects."""
@@ -107,7 +114,7 @@ def main(
         raise typer.BadParameter(
             f"--kinds: found {', '.join(sorted(unknown))}, expected some of {', '.join(GROUP_OF)}"
         )
-    rows = run_campaign(chosen, logs, seed, jobs, out)
+    rows = run_campaign(chosen, logs, seed, jobs, out, done)
     page = table.markdown(rows, seed)
     (out / "score.md").write_text(page)
     table.write_csv(rows, out / "score.csv")
