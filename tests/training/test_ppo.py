@@ -66,6 +66,13 @@ def test_a_fall_ends_the_future_and_a_timeout_does_not():
     assert late[5, 0].item() == pytest.approx(1.0 + 0.9 * 2.0 - 2.0)
 
 
+@pytest.mark.parametrize("steps", [1, 16])
+def test_the_critic_takes_its_steps_for_one_of_the_actor(steps):
+    ppo = learner(0.0, epochs=1, mini_batches=1, critic_steps=steps)
+    ppo.update(rollout(1.0, n=16), learn_actor=False)
+    assert float(ppo.critic.value.detach()) == pytest.approx(1e-3 * steps, rel=0.01)  # Adam's rate a step
+
+
 def test_masked_samples_have_no_advantage():
     mask = torch.ones(6, 1)
     mask[3:] = 0.0

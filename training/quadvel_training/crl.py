@@ -56,6 +56,7 @@ class CrlConfig:
         gae=0.97,
         epochs=1,
         mini_batches=1,
+        critic_steps=16,
         learning_rate=1.5e-4,
         target_kl=None,
         momentum=0.95,

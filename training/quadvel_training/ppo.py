@@ -29,6 +29,7 @@ class PpoConfig:
     clip: float = 0.2
     epochs: int = 4
     mini_batches: int = 4
+    critic_steps: int = 1  # for one of the actor's: having no memory, it takes many small ones in the time of a large one
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
     target_kl: float | None = 0.01
@@ -171,9 +172,13 @@ class Ppo:
             yield from torch.randperm(n).to(device).chunk(self.config.mini_batches)
 
     def _critic_step(self, obs: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
-        loss = _mean((self.critic(obs)[0][..., 0] - target) ** 2, mask)
-        self._step(self.critic_optimiser, self.critic, loss)
-        return {"value_loss": float(loss.detach())}
+        steps, total = self.config.critic_steps, 0.0
+        parts = zip(*(x.tensor_split(steps, dim=1) for x in (obs, target, mask)), strict=True)
+        for part_obs, part_target, part_mask in parts:
+            loss = _mean((self.critic(part_obs)[0][..., 0] - part_target) ** 2, part_mask)
+            self._step(self.critic_optimiser, self.critic, loss)
+            total += float(loss.detach())
+        return {"value_loss": total / steps}
 
     def _actor_step(
         self, r: Rollout, ids: Tensor, advantage: Tensor, old_log_prob: Tensor, mask: Tensor
