@@ -29,7 +29,7 @@ class PpoConfig:
     clip: float = 0.2
     epochs: int = 4
     mini_batches: int = 4
-    critic_steps: int = 1  # for one of the actor; without a memory, many small ones cost what a large one does
+    critic_steps: int = 1  # for one of the actor: without a memory, many small ones cost no more
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
     target_kl: float | None = 0.01
