@@ -11,6 +11,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import os
+import subprocess
 import time
 import traceback
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -26,7 +27,8 @@ from tests.identification import adapter, table
 from tests.identification.hidden.cases import GROUP_OF, make_case
 from tests.identification.judge import judge
 
-PAGE = Path(__file__).parents[2] / "docs" / "results" / "identification_score.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "results" / "identification_score.md"
 
 
 def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
@@ -54,9 +56,19 @@ def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
     return {"name": case.name, **found, "truth": case.truth}
 
 
+def engine() -> str:
+    """The last commit that touched the tool, with a + where its files differ from it."""
+    tool = "src/quadvel_actuator"
+    said = [
+        subprocess.run(["git", *call, "--", tool], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        for call in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
+    ]
+    return said[0].strip() + ("+" if said[1] else "")
+
+
 def _work(kind: str, index: int, seed: int, path: Path) -> None:
     """Scores a case into its file, whole or not at all."""
-    row = score_case(kind, index, seed)
+    row = score_case(kind, index, seed) | {"engine": engine()}
     part = path.with_suffix(f".{os.getpid()}.part")
     part.write_text(json.dumps(row, indent=1, default=float))
     part.replace(path)

@@ -61,6 +61,12 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
         lines.append(
             f"\nSeconds of computing a log: median {np.median(seconds):.1f}, most {max(seconds):.1f}."
         )
+    engines = Counter(row.get("engine", "unknown") for row in rows)
+    lines.append(
+        "\nCommits of src/quadvel_actuator that they were scored on: "
+        + ", ".join(f"{name} ({count} logs)" for name, count in engines.most_common())
+        + "."
+    )
     failed = len(rows) - len(done)
     if failed:
         lines.append(f"\n{failed} logs ended in an error.")
