@@ -60,7 +60,9 @@ def engine() -> str:
     """The last commit that touched the tool, with a + where its files differ from it."""
     tool = "src/quadvel_actuator"
     said = [
-        subprocess.run(["git", *call, "--", tool], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            ["git", *call, "--", tool], cwd=ROOT, capture_output=True, text=True, check=True
+        ).stdout
         for call in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
     ]
     return said[0].strip() + ("+" if said[1] else "")
