@@ -27,15 +27,15 @@ def _log(*effects, seconds=3.0, seed=2):
     return record(attrs.evolve(truth, joints=JOINTS), 2, seconds, 500, seed=seed)
 
 
-def _about(log, input_delay, output_delay):
+def about(log, input_delay, output_delay):
     samples = Samples([log])
     even = np.floor(samples.t / 0.2).astype(int) % 2 == 0
     judge = Judge.of(samples, samples.judged & even[:, None], samples.judged & ~even[:, None])
-    gains = np.ones((2, 2))
-    model = Model(
-        samples, 0.001, gains, np.array([ONE, ONE]), *np.full((2, 2), [[input_delay], [output_delay]]), ONE
-    )
-    return About(model, judge, np.full(2, 0.066), Few(model.samples, judge))
+    joints = len(log.joints)
+    one = np.zeros(joints, dtype=np.intp)
+    delays = np.repeat([[input_delay], [output_delay]], joints, axis=1)
+    model = Model(samples, 0.001, np.ones((2, joints)), np.array([one, one]), *delays, one)
+    return About(model, judge, np.full(joints, 0.066), Few(model.samples, judge))
 
 
 def test_signals_of_few_rows_are_those_of_all():
@@ -48,8 +48,8 @@ def test_signals_of_few_rows_are_those_of_all():
 
 
 def test_a_feature_has_columns_for_every_joint_that_asks_for_them():
-    about = _about(_log(seconds=1.0), 0.009, 0.003)
-    scene = Scene(about.model, about.judge)
+    looked = about(_log(seconds=1.0), 0.009, 0.003)
+    scene = Scene(looked.model, looked.judge)
     feature = next(library(scene, scene.residual))
     columns = scene.columns(feature)
     for joints in ([True, False], [True, True]):
@@ -68,8 +68,8 @@ def test_each_joint_reads_the_signals_at_its_own_delays():
 
 
 def test_friction_is_found_from_delays_that_it_has_bent():
-    about = _about(_log(FRICTION), input_delay=0.007, output_delay=0.0055)
-    found = propose(about, started(about, registry()["coulomb_friction"]()))
+    looked = about(_log(FRICTION), input_delay=0.007, output_delay=0.0055)
+    found = propose(looked, started(looked, registry()["coulomb_friction"]()))
     last = found.model.applied[-1]
     np.testing.assert_allclose(last.values[0], 0.5, atol=0.04)
     np.testing.assert_allclose(found.model.input_delay, 0.009, atol=0.0006)
@@ -77,26 +77,26 @@ def test_friction_is_found_from_delays_that_it_has_bent():
 
 
 def test_a_spring_is_found_from_delays_that_are_far_off():
-    about = _about(_log(Effect("parallel_spring", JOINTS, {"k": 3.0, "q0": -0.4})), 0.001, 0.0055)
-    found = propose(about, started(about, registry()["parallel_spring"]()))
-    model = about.fit_anew(found.model)
+    looked = about(_log(Effect("parallel_spring", JOINTS, {"k": 3.0, "q0": -0.4})), 0.001, 0.0055)
+    found = propose(looked, started(looked, registry()["parallel_spring"]()))
+    model = looked.fit_anew(found.model)
     np.testing.assert_allclose(model.applied[-1].values[0], 3.0, atol=0.3)
     np.testing.assert_allclose(model.input_delay + model.output_delay, 0.012, atol=0.0004)
 
 
 def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
-    about = _about(_log(), input_delay=0.009, output_delay=0.003)
-    assert started(about, registry()["coulomb_friction"]()) is None
+    looked = about(_log(), input_delay=0.009, output_delay=0.003)
+    assert started(looked, registry()["coulomb_friction"]()) is None
 
 
 @pytest.mark.parametrize("turn", ["tanh", "arctan"])
 def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     """Two hundredths of a radian a second are too few to show how the sign turns."""
-    about = _about(_log(Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.02})), 0.009, 0.003)
+    looked = about(_log(Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.02})), 0.009, 0.003)
     law = registry()["coulomb_friction"](at=JOINT, turn=turn)
-    found = propose(about, started(about, law))
-    other = propose(about, started(about, attrs.evolve(law, turn="arctan")))
-    half = intervals(found.model, about.judge).effects[0]
+    found = propose(looked, started(looked, law))
+    other = propose(looked, started(looked, attrs.evolve(law, turn="arctan")))
+    half = intervals(found.model, looked.judge).effects[0]
     apart = np.abs(found.model.applied[0].values - other.model.applied[0].values)
     assert (half[0] > apart[0]).all()
 
@@ -116,10 +116,10 @@ def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
 
 
 def test_the_share_of_lost_commands_has_the_width_of_as_many_tosses():
-    about = _about(_log(), 0.009, 0.003)
-    law = CommandHold(np.zeros((len(about.samples.t), 1), dtype=np.intp))
+    looked = about(_log(), 0.009, 0.003)
+    law = CommandHold(np.zeros((len(looked.samples.t), 1), dtype=np.intp))
     share = np.full((1, 2), 0.1)
-    model = about.model.plus(Applied(law, np.ones(2, dtype=bool), share, ONE))
-    half = intervals(model, about.judge).effects[0]
-    commands = len(np.unique(about.signals.packet))
+    model = looked.model.plus(Applied(law, np.ones(2, dtype=bool), share, ONE))
+    half = intervals(model, looked.judge).effects[0]
+    commands = len(np.unique(looked.signals.packet))
     np.testing.assert_allclose(half[0], 2 * np.sqrt(0.09 / commands), rtol=0.15)

@@ -21,7 +21,9 @@ from quadvel_actuator.parameters import Effect
 Array = NDArray[np.float64]
 
 _PAST = 0.03
-"""s of velocities that are kept"""
+"""s of positions and velocities that are kept"""
+
+_KNOWN = "q", "dq"
 
 SLOPE = 0.002
 """s over which the acceleration is taken, all of them past"""
@@ -38,7 +40,7 @@ class Instant:
         self.dt = self.age = dt
         self.t = np.zeros((*shape[:-1], 1))
         self.q = self.dq = self.ddq = self.q_des = np.zeros(shape)
-        self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)
+        self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)  # (2, ..., J), q and dq
 
     @property
     def ddq_smooth(self) -> Array:
@@ -46,13 +48,13 @@ class Instant:
         return self.ddq
 
     def shifted(self, name: str, late: Array) -> Array:
-        """The velocity `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
-        if name != "dq":
-            raise ValueError(f"shifted: found {name}, expected dq")
+        """q or dq `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
+        if name not in _KNOWN:
+            raise ValueError(f"shifted: found {name}, expected one of {', '.join(_KNOWN)}")
         last = len(self.past) - 1
         back = np.clip(np.broadcast_to(late, self.dq.shape) / self.dt, 0.0, last)
         first = back.astype(np.intp)
-        past = np.stack(self.past)
+        past = np.stack([one[_KNOWN.index(name)] for one in self.past])
         newer, older = (
             np.take_along_axis(past, at[None], 0)[0] for at in (first, np.minimum(first + 1, last))
         )
@@ -259,13 +261,14 @@ class RunningEffects:
     def _observe(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> Instant:
         now = self._now
         now.q, now.dq = np.array(q), np.broadcast_to(dq, q.shape).astype(float)
-        now.past.appendleft(now.dq)
+        seen = np.stack([now.q, now.dq])
+        now.past.appendleft(seen)
         now.t = now.t + now.dt
         if new is not None:
             now.t = np.where(new[..., None], 0.0, now.t)
-            now.past = deque((np.where(new[..., None], now.dq, old) for old in now.past), now.past.maxlen)
+            now.past = deque((np.where(new[..., None], seen, old) for old in now.past), now.past.maxlen)
         back = min(max(1, round(SLOPE / now.dt)), len(now.past) - 1)
-        now.ddq = (now.past[0] - now.past[back]) / (max(back, 1) * now.dt)
+        now.ddq = (now.dq - now.past[back][1]) / (max(back, 1) * now.dt)
         return now
 
     @property

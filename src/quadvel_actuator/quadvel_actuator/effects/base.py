@@ -81,6 +81,11 @@ class Parameter:
     scale: float
 
 
+def staged(field: str, **stages: Stage) -> Any:
+    """The stage of a law that can act at several: the one that stands here for what its `field` says."""
+    return property(lambda law: stages[getattr(law, field)])
+
+
 Start = Mapping[str, Any]
 """a guess of every parameter but the `linear` ones: a number, or one for each joint (J,)"""
 
@@ -98,8 +103,10 @@ class EffectLaw(ABC):
     """looks like a delay"""
     remembers: ClassVar[bool] = False
     """looks at other rows than the one that it acts on"""
+    between: ClassVar[bool] = False
+    """has to follow what happens between the rows of a log, too"""
     gainlike: ClassVar[bool] = False
-    """on all joints together it is a deviation of a gain: at least one joint is free of it"""
+    """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
     at: str = attrs.field(default=DRIVE, kw_only=True, validator=attrs.validators.in_((DRIVE, JOINT)))
@@ -208,48 +215,44 @@ class MemoryLaw(EffectLaw):
         Pieces of the series advance side by side, at first each from rest, then from what the piece before it ended
         with, until that changes nothing any more: memories fade, so that few pieces have to run again.
         """
-        pair = isinstance(x, tuple)
-        given = x if pair else (x,)
+        return _Pieces(self, x, s, p).out
+
+
+class _Pieces:
+    """A series of a law with a memory, cut to pieces that advance side by side, (row of the piece, ..., piece, J)."""
+
+    def __init__(self, law: MemoryLaw, x: Any, s: Any, p: Params) -> None:
+        self.law, self.p, self.pair = law, p, isinstance(x, tuple)
+        given = x if self.pair else (x,)
         lead = np.broadcast_shapes(*(np.shape(one)[:-2] for one in (*given, *p.values())))
-        rows, joints = given[0].shape[-2:]
-        xs = [_side_by_side(one) for one in given]
-        us = [_side_by_side(np.broadcast_to(getattr(s, name), (rows, joints))) for name in self.inputs]
-        dt, start = _side_by_side(s.dt), _side_by_side(s.start)
-        count = dt.shape[-2]
-        out = [np.empty((len(dt), *lead, count, joints)) for _ in given]
+        self.rows, joints = given[0].shape[-2:]
+        self.xs = [_side_by_side(one) for one in given]
+        self.us = [
+            _side_by_side(np.broadcast_to(getattr(s, name), (self.rows, joints))) for name in law.inputs
+        ]
+        self.dt, self.start = _side_by_side(s.dt), _side_by_side(s.start)
+        self.count = self.dt.shape[-2]
+        self.shape = (*lead, self.count, joints)
+        self.made = [np.empty((len(self.dt), *self.shape)) for _ in given]
+        self._settle()
 
-        def run(begin: Memory, which: NDArray[np.intp]) -> Memory:
-            """These pieces, from `begin` to the end; the memory that they end with."""
-            whole = len(which) == count
-            x_in, u_in, steps, anew = (
-                [one if whole else one[..., which, :] for one in group] for group in (xs, us, [dt], [start])
-            )
-            resets: list[bool] = np.any(anew[0], axis=(1, 2)).tolist()
-            memory = begin
-            for k, reset in enumerate(resets):
-                here = tuple(one[k] for one in x_in) if pair else x_in[0][k]
-                u = [one[k] for one in u_in]
-                if reset:
-                    rest = self.rest(here, u, p)
-                    memory = tuple(np.where(anew[0][k], r, m) for r, m in zip(rest, memory, strict=True))
-                now, memory = self.advance(here, u, steps[0][k], p, memory)
-                for one, value in zip(out, now if pair else (now,), strict=True):
-                    if whole:
-                        one[k] = value
-                    else:
-                        one[k][..., which, :] = value
-            return memory
+    @property
+    def out(self) -> Any:
+        """The whole series of what the law gives."""
+        back = tuple(_one_after_the_other(one, self.rows) for one in self.made)
+        return back if self.pair else back[0]
 
-        every = np.arange(count)
-        first = tuple(one[0] for one in xs) if pair else xs[0][0]
-        begin = ended = tuple(
-            np.array(np.broadcast_to(one, (*lead, count, joints)))
-            for one in self.rest(first, [one[0] for one in us], p)
-        )
-        which = every
+    def _given(self, xs: Sequence[Array], k: int) -> Any:
+        return tuple(one[k] for one in xs) if self.pair else xs[0][k]
+
+    def _settle(self) -> None:
+        """All pieces from rest, then again those that the piece before them leaves with another memory."""
+        rest = self.law.rest(self._given(self.xs, 0), [one[0] for one in self.us], self.p)
+        begin = tuple(np.array(np.broadcast_to(one, self.shape)) for one in rest)
+        ended = tuple(one.copy() for one in begin)
+        which = every = np.arange(self.count)
         while len(which):
-            last = run(tuple(one[..., which, :] for one in begin), which)
-            ended = tuple(one.copy() for one in ended)
+            last = self._run(tuple(one[..., which, :] for one in begin), which)
             for one, value in zip(ended, last, strict=True):
                 one[..., which, :] = value
             after = tuple(
@@ -257,10 +260,29 @@ class MemoryLaw(EffectLaw):
                 for b, e in zip(begin, ended, strict=True)
             )
             moved = [np.abs(a - b) > _SAME * (1.0 + np.abs(b)) for a, b in zip(after, begin, strict=True)]
-            changed = np.any([one.any(axis=(*range(len(lead)), -1)) for one in moved], axis=0)
-            which, begin = every[changed & ~start[0][:, 0]], after
-        back = tuple(_one_after_the_other(one, rows) for one in out)
-        return back if pair else back[0]
+            changed = np.any([one.any(axis=(*range(one.ndim - 2), -1)) for one in moved], axis=0)
+            which, begin = every[changed & ~self.start[0][:, 0]], after
+
+    def _run(self, memory: Memory, which: NDArray[np.intp]) -> Memory:
+        """These pieces, from this memory to the one that they end with."""
+        whole = len(which) == self.count
+        xs, us, (dt,), (start,) = (
+            [one if whole else one[..., which, :] for one in group]
+            for group in (self.xs, self.us, [self.dt], [self.start])
+        )
+        resets: list[bool] = np.any(start, axis=(1, 2)).tolist()
+        for k, reset in enumerate(resets):
+            here, u = self._given(xs, k), [one[k] for one in us]
+            if reset:
+                rest = self.law.rest(here, u, self.p)
+                memory = tuple(np.where(start[k], r, m) for r, m in zip(rest, memory, strict=True))
+            now, memory = self.law.advance(here, u, dt[k], self.p, memory)
+            for one, value in zip(self.made, now if self.pair else (now,), strict=True):
+                if whole:
+                    one[k] = value
+                else:
+                    one[k][..., which, :] = value
+        return memory
 
 
 _PIECE = 800  # rows that advance one after the other

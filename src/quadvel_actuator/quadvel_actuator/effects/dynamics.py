@@ -141,18 +141,32 @@ class Armature(AddedLaw):
         return -p["J"] * getattr(s, self.of)
 
 
+@attrs.frozen(eq=False)
 class TimestampSkew(ErrorLaw):
-    """The velocity was stamped `late` (s) after the position of the same row; negative: before it
+    """The drive knew `channel`, q or dq, as its rows have it `late` s before; negative: as they have it only later
 
-    The same as a position stamped early, the delays being fitted. To the model that runs it is a velocity that the
-    drive knows late; one known early is a fault of the record alone.
+    A position stamped on some joints early is no velocity stamped late there: the command stays where it is. To the
+    model that runs it is a signal that the drive knows late; one known early is a fault of the record alone.
     """
 
     name = "timestamp_skew"
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
-    signal = "dq@history"
     shifts = True
     motion = _FAST
+    channel: str = attrs.field(default="dq", validator=attrs.validators.in_(("q", "dq")))
+
+    @property
+    def signal(self) -> str:  # type: ignore[override]
+        return f"{self.channel}@history"
+
+    @property
+    def gainlike(self) -> bool:  # type: ignore[override]
+        """A position that is off on all joints is two other delays."""
+        return self.channel == "q"
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[TimestampSkew]:
+        return cls("dq"), cls("q")
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [
@@ -161,7 +175,8 @@ class TimestampSkew(ErrorLaw):
         ]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
-        return e[0], e[1] + s.dq - s.shifted("dq", p["late"])
+        shifted = s.shifted(self.channel, p["late"])
+        return (e[0] + s.q - shifted, e[1]) if self.channel == "q" else (e[0], e[1] + s.dq - shifted)
 
 
 LAWS = (FirstOrderLag, VelocityFilter, Armature, TimestampSkew)

@@ -21,6 +21,7 @@ from .base import (
     Start,
     View,
     rms,
+    staged,
 )
 
 _STIFFNESSES = (-10.0, -3.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0, 10.0, 30.0)  # N m/rad
@@ -144,11 +145,8 @@ class Backlash(MemoryLaw):
     """Play: the drive sees `on` (the position q, the error q_des - q, or the torque) through a gap of +-`gap`"""
 
     name = "backlash"
+    stage = staged("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.FLOW)
     on: str = "error"
-
-    @property
-    def stage(self) -> Stage:  # type: ignore[override]
-        return Stage.FLOW if self.on == "torque" else Stage.ERRORS
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

@@ -22,6 +22,7 @@ from .base import (
     Start,
     TorqueLaw,
     View,
+    staged,
 )
 from .dynamics import lag, lagged
 
@@ -84,14 +85,11 @@ class SupplySag(TorqueLaw):
     """Gain or bound falls with the logged voltage, by 1 - sag (1 - V / `full`), or with the joints' power (`PowerSag`)"""
 
     name = "supply_sag"
+    stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
     what: str = "gain"
     full: float = 1.0
-
-    @property
-    def stage(self) -> Stage:  # type: ignore[override]
-        return Stage.GAIN if self.what == "gain" else Stage.LIMIT
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -126,14 +124,11 @@ class PowerSag(MemoryLaw):
     """Gain or bound falls by 1 - sag P, where P is the power that the joints draw together, T s late (first order)"""
 
     name = SupplySag.name
+    stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = SupplySag.signal
     motion = SupplySag.motion
     inputs = ("dq",)
     what: str = "gain"
-
-    @property
-    def stage(self) -> Stage:  # type: ignore[override]
-        return Stage.GAIN if self.what == "gain" else Stage.LIMIT
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

@@ -58,10 +58,11 @@ class TorqueSpeedLimit(TorqueLaw):
 
 
 class SlewLimit(MemoryLaw):
-    """|dtau/dt| held to `rate`, towards the torque before until a new command comes in the middle of a step"""
+    """|dtau/dt| held to `rate`; until a new command comes in the middle of a step, the torque goes on as it went before"""
 
     name = "slew_limit"
     stage = Stage.FLOW
+    between = True
     inputs = ("age",)
     parameters = (Parameter("rate", "N m/s", 5.0, 50000.0, 300.0),)
     signal = "tau@history"
@@ -73,15 +74,26 @@ class SlewLimit(MemoryLaw):
         return [{"rate": np.quantile(slope, share, axis=0) + 5.0} for share in (0.5, 0.7, 0.85, 0.94, 0.98)]
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
-        return x, x
+        return x, x, 0.0 * x
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        given, before = memory
+        given, before, slope = memory
         new = np.minimum(u[0], dt)
-        for target, time in ((before, dt - new), (x, new)):
-            reach = p["rate"] * time
-            given = given + np.minimum(np.maximum(target - given, -reach), reach)
-        return given, (given, x)
+        slope = np.where(new < dt, slope, (x - before) / dt)
+        given = _chasing(given, before, slope, dt - new, p["rate"])
+        given = _chasing(given, x - slope * new, slope, new, p["rate"])
+        return given, (given, x, slope)
+
+
+def _chasing(given: Array, target: Array, slope: Array, time: Array, rate: Array) -> Array:
+    """Where `given` comes in `time` at `rate` at most after a target that moves evenly, by `slope`."""
+    side = np.sign(given - target)
+    nearing = rate + side * slope
+    apart = np.abs(given - target)
+    met = np.where(nearing > 0.0, apart / np.maximum(nearing, 1e-12), np.inf)
+    left = np.maximum(time - met, 0.0)
+    chased = np.minimum(met, time)
+    return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * left
 
 
 LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)

@@ -156,11 +156,11 @@ def propose(about: About, started: Started) -> Candidate | None:
 
 
 def _without_weakest(model: Model) -> Model | None:
-    """The last effect off the joint where it is weakest, which its gain then stands for; None of one joint."""
+    """The last effect off the joint where it is weakest, which gains or delays then stand for; None of one joint."""
     last = model.applied[-1]
     if last.active.sum() < 2:
         return None
-    active = last.active & (np.arange(len(last.active)) != np.argmin(last.values[0]))
+    active = last.active & (np.arange(len(last.active)) != np.argmin(np.abs(last.values[0])))
     return attrs.evolve(model, applied=(*model.applied[:-1], attrs.evolve(last, active=active)))
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects import DRIVE, EffectLaw, ErrorLaw, MemoryLaw, Stage
-from .signals import Array, Bools, Samples, Signals
+from .signals import BETWEEN, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
 
@@ -88,7 +88,17 @@ class Model:
         return self.error(rows) / max(int(rows.sum()), 1)
 
     def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
-        """Torque (B, N, J) for a batch of gains (B, 2, J) and of each effect's values (B, P, J)."""
+        """Torque (B, N, J) for a batch of gains (B, 2, J) and of each effect's values (B, P, J).
+
+        A drive that computes in steps does nothing between them; one that does not is followed between the rows.
+        """
+        if self.window == 0.0 and any(one.law.between for one in self.applied):
+            finer = attrs.evolve(self, samples=self.samples.finer)
+            return finer._evaluate(gains, values)[..., BETWEEN - 1 :: BETWEEN, :]
+        return self._evaluate(gains, values)
+
+    def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
+        """The same at the instants of `samples` alone."""
         s = self.signals
         todo = sorted(zip(self.applied, values, strict=True), key=lambda pair: pair[0].law.stage)
         error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)

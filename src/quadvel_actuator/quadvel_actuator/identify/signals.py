@@ -40,7 +40,10 @@ _CACHED = 6, 64
 _CACHED_VALUES = 1_000_000
 """as many as have about so many values in each of their signals together"""
 
-_OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row")
+_OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
+
+BETWEEN = 4
+"""Instants of a row, itself the last, for what has to be followed between the rows"""
 _OF_JOINTS = (
     "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature",
 )  # fmt: skip
@@ -204,6 +207,8 @@ class Samples:
         self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self.row = np.arange(len(self.t))
+        self.early = np.zeros(len(self.t))  # s, how much before the row of the log
+        self._finer: Samples | None = None
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._first_row = np.cumsum([0, *lengths])
         self._cache: dict[tuple[Any, ...], Signals] = {}
@@ -232,7 +237,7 @@ class Samples:
             for name in _OF_ROWS:
                 setattr(part, name, getattr(self, name)[:stop])
             part.sent = self.sent[: self._first_packet[count]]
-            part._cache, part.kept, part._parts = {}, {}, {}
+            part._cache, part.kept, part._parts, part._finer = {}, {}, {}, None
             self._parts[count] = part
         return self._parts[count]
 
@@ -258,11 +263,23 @@ class Samples:
         part.start = part.start | (place == 0)
         return part, rows, place * self.period >= FILLING
 
+    @property
+    def finer(self) -> Samples:
+        """These rows, each with BETWEEN - 1 instants before it, evenly over the time since the row before."""
+        if self._finer is None:
+            part = self._of(np.repeat(np.arange(len(self.t)), BETWEEN))
+            before = np.tile(np.arange(BETWEEN)[::-1], len(self.t)) / BETWEEN
+            part.early = np.where(part.start, 0.0, before * part.dt)
+            part.dt = part.dt / BETWEEN
+            part.start = part.start & (np.arange(len(part.t)) % BETWEEN == 0)
+            self._finer = part
+        return self._finer
+
     def _of(self, rows: NDArray[np.intp]) -> Samples:
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._cache, part.kept, part._parts = {}, {}, {}
+        part._cache, part.kept, part._parts, part._finer = {}, {}, {}, None
         return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
@@ -295,7 +312,7 @@ class Samples:
         """Of each log the instants at which the torque of these rows was asked for."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
         for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
-            yield _double(one.log.t)[self.row[a:b] - first] - output_delay
+            yield _double(one.log.t)[self.row[a:b] - first] - self.early[a:b] - output_delay
 
     def _elsewhere(self, output_delay: Array | float, name: str, late: Array) -> Array:
         """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
