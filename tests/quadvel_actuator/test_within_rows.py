@@ -8,6 +8,7 @@ from test_screening import about
 
 from quadvel_actuator.effects import registry
 from quadvel_actuator.identify.candidates import propose, started
+from quadvel_actuator.identify.eam import fit_eam
 from quadvel_actuator.identify.log import Log
 from quadvel_actuator.identify.model import Applied, Model
 from quadvel_actuator.identify.signals import Samples
@@ -56,3 +57,19 @@ def test_a_channel_stamped_early_or_late_on_one_joint_is_found(channel, late):
     assert best.law.channel == channel
     moved = np.where(best.joints, best.model.applied[-1].values[0], 0.0)
     np.testing.assert_allclose(moved - np.median(moved), [late, 0.0, 0.0], atol=0.0006)
+
+
+def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
+    t, rng = np.arange(3000) * 0.001, np.random.default_rng(1)
+    q = 0.3 * np.sin(2 * np.pi * 3.0 * t[:, None] + np.array([0.0, 1.0]))
+    dq = np.gradient(q, 0.001, axis=0)
+    q_des = q + 0.2 * np.sin(2 * np.pi * 5.0 * t[:, None])
+    tau = np.zeros_like(q)
+    tau[8:] = 29.0 * (q_des[:-8] - q[7:-1]) - 0.48 * dq[7:-1]
+    tau += 0.2 * rng.standard_normal(q.shape)
+    gains = {"kp": np.full(q.shape, 30.0), "kd": np.full(q.shape, 0.5)}
+    log = Log("grid", NAMES[:2], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau, **gains)
+    samples = Samples([log])
+    eam = fit_eam(samples, samples.judged)
+    assert eam.input_delay[0] == pytest.approx(0.007, abs=2e-4)
+    assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
