@@ -11,6 +11,8 @@ INDISTINGUISHABLE_MOST = 3
 REMOVED_LEAST = 0.6
 WITHIN = {"table 4": 1.05}
 WITHIN_OTHERS = 1.15
+SHOWS = 1.08
+"""of the floor: a joint with less error than this hides nothing that could be found"""
 
 # A true parameter by the names under which reports may give it, and the units in which they may do so.
 ALIASES = {
@@ -44,7 +46,7 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
         "named": [effect["name"] for effect in effects],
         "verdict": _VERDICTS[truth["group"]](report, truth),
         "extra": [e["name"] for e in effects if not any(_answers(e, true) for true in truth["effects"])],
-        "right_joints": _right_joints(effects, truth),
+        "right_joints": _right_joints(report, truth),
         "before": before,
         "after": after,
         "floor": truth["floor"],
@@ -116,11 +118,13 @@ def _all_signals(report: Report, truth: Truth) -> bool:
     return all(named & set(names) for true in truth["effects"] for names in true["signals"].get("all", []))
 
 
-def _right_joints(effects: list[dict[str, Any]], truth: Truth) -> bool:
-    """Every true effect is reported on its joints and on no other."""
+def _right_joints(report: Report, truth: Truth) -> bool:
+    """Every true effect is reported on joints of its own alone, and on all of those where without it something is left."""
+    after = dict(zip(report.get("joints", ()), report["after"].get("per_joint", ()), strict=True))
     for true in truth["effects"]:
-        on = {joint for entry in effects if _answers(entry, true) for joint in entry["joints"]}
-        if on != set(true["joints"]):
+        on = {joint for entry in report["effects"] if _answers(entry, true) for joint in entry["joints"]}
+        idle = {joint for joint, error in after.items() if error <= SHOWS * truth["floor"]}
+        if not (on and on <= set(true["joints"]) <= on | idle):
             return False
     return True
 

@@ -73,6 +73,15 @@ def test_an_effect_outside_the_registry_needs_its_signal_and_most_of_its_error_r
     assert judge(_report(), truth)["verdict"] == "missed"
 
 
+@pytest.mark.parametrize(("left", "right"), [(0.1, True), (0.13, False)])
+def test_a_joint_may_be_left_out_where_an_effect_leaves_nothing(left, right):
+    truth = _truth("alone", "cogging")
+    truth["effects"][0]["joints"] = ["A_hip_joint", "B_hip_joint"]
+    report = _report(_entry("cogging")) | {"joints": ["A_hip_joint", "B_hip_joint"]}
+    report["after"]["per_joint"] = [0.1, left]
+    assert judge(report, truth)["right_joints"] == right
+
+
 def test_an_interval_counts_in_the_units_that_the_report_gives():
     entry = _entry("cogging", c={"value": 520.0, "ci95": [480.0, 560.0], "unit": "mrad"})
     (interval,) = judge(_report(entry), _truth("alone", "cogging"))["intervals"]
