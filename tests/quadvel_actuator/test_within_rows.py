@@ -8,6 +8,7 @@ from test_screening import about
 
 from quadvel_actuator.effects import registry
 from quadvel_actuator.identify.candidates import propose, started
+from quadvel_actuator.identify.delays import latest
 from quadvel_actuator.identify.eam import fit_eam
 from quadvel_actuator.identify.log import Log
 from quadvel_actuator.identify.model import Applied, Model
@@ -71,5 +72,9 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     log = Log("grid", NAMES[:2], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau, **gains)
     samples = Samples([log])
     eam = fit_eam(samples, samples.judged)
-    assert eam.input_delay[0] == pytest.approx(0.007, abs=2e-4)
+    one = np.zeros(2, dtype=np.intp)
+    model = Model(
+        samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one
+    )
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
+    assert latest(model, samples.judged)[0] == pytest.approx(0.007, abs=2e-4)

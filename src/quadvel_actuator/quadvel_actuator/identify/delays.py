@@ -18,6 +18,8 @@ SLOPE = 0.0003
 
 _DAMPING = (1e-6, 1e-2, 1.0)
 _SETTLED = 2e-5
+_FINE = 5e-5  # s
+_EQUAL = 1e-9  # of the error
 LONGEST = (LONGEST_INPUT, LONGEST_OUTPUT)
 """s, input and output delay at most"""
 
@@ -51,6 +53,20 @@ def _at(model: Model, which: int, by: float) -> Model:
     delays = [model.input_delay, model.output_delay]
     delays[which] = np.clip(delays[which] + by, 0.0, LONGEST[which])
     return model.with_delays(*delays)
+
+
+def latest(model: Model, rows: Bools) -> Array:
+    """The longest input delays (J,), s, with which the model says the same of `rows` (N, J).
+
+    Where the stamps of rows and commands lie on a grid, a command is in force at the same rows for a whole step of
+    delays. A drive that works on that grid has the longest of them; a fit needs the room to either side.
+    """
+    found, error = model.input_delay, model.error(rows) * (1.0 + _EQUAL)
+    while (found + _FINE <= LONGEST_INPUT).all():
+        if model.with_delays(np.round(found + _FINE, 7), model.output_delay).error(rows) > error:
+            break
+        found = np.round(found + _FINE, 7)
+    return found
 
 
 def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:

@@ -23,7 +23,6 @@ WINDOWS = (0.0, 0.001)
 
 _REFINEMENTS = ((0.00075, 0.00025), (0.0002, 0.00005))  # s: reach about the best pair so far, step
 _ENOUGH = 1500  # rows for the first, coarse look
-_EQUAL = 1e-9  # of the error
 _CHUNK = 20000  # rows summed at once
 
 
@@ -196,7 +195,7 @@ def _best(
     inputs = totals[:, None] - outputs[None]
     allowed = (inputs >= -1e-9) & (inputs <= LONGEST_INPUT + 1e-9)
     mse = np.where(allowed[None], mse, np.inf)
-    where = [_least(one) for one in mse]
+    where = [np.unravel_index(np.argmin(one), one.shape) for one in mse]
     gains = np.array([[g[k][where[k]] for k in groups] for g in (g0, g1)])
     input_delay = np.array([max(inputs[where[k]], 0.0) for k in groups])
     output_delay = np.array([outputs[where[k][1]] for k in groups])
@@ -207,17 +206,6 @@ def _best(
         for a, b in zip(*np.nonzero(mse[0] < PROBABLE * mse[0].min()), strict=True)
     ]
     return Eam(gains, input_delay, output_delay, window, error, _probable([*known, *tried]))
-
-
-def _least(mse: Array) -> tuple[int, int]:
-    """Where the least error (T, O) is; of equal ones the longest sum of delays.
-
-    Where the stamps of rows and commands lie on one grid, all sums between two of its steps hold the same command, and a
-    drive that works on that grid has the longest.
-    """
-    equal = (mse <= mse.min() * (1.0 + _EQUAL)).any(axis=1)
-    total = int(np.flatnonzero(equal)[-1])
-    return total, int(np.argmin(mse[total]))
 
 
 def _probable(pairs: list[DelayPair]) -> tuple[DelayPair, ...]:
