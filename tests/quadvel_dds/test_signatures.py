@@ -97,3 +97,8 @@ def test_what_is_not_offered_says_so() -> None:
         _ = rclpy.spin_some
     with pytest.raises(UnsupportedError, match=r"rclpy\.qos\.qos_check_compatible"):
         from rclpy.qos import qos_check_compatible  # noqa: F401
+
+
+def test_a_module_that_is_not_offered_is_missing_to_those_who_look_for_it() -> None:
+    with pytest.raises(ImportError, match=r"rclpy\.experimental is not offered"):
+        importlib.import_module("rclpy.experimental")

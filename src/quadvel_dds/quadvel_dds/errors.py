@@ -16,6 +16,10 @@ class UnsupportedError(NotImplementedError):
         )
 
 
+class UnsupportedModuleError(UnsupportedError, ImportError):
+    """A module of rclpy that is not offered; an ImportError, for those who look whether it is there."""
+
+
 def unsupported(what: str) -> Callable[..., NoReturn]:
     """A function that raises UnsupportedError however it is called."""
 

@@ -11,7 +11,7 @@ from importlib.util import find_spec, spec_from_loader
 from pathlib import Path
 from types import ModuleType
 
-from quadvel_dds.errors import UnsupportedError
+from quadvel_dds.errors import UnsupportedModuleError
 
 EMBEDDED = str(Path(__file__).parent)
 
@@ -49,7 +49,7 @@ class EmbeddedFinder(MetaPathFinder):
             return PathFinder.find_spec(fullname, [EMBEDDED])
         if fullname.startswith("rclpy."):
             if PathFinder.find_spec(fullname, path) is None:
-                raise UnsupportedError(f"module {fullname}")
+                raise UnsupportedModuleError(f"module {fullname}")
             return None
         package, _, kind = fullname.partition(".")
         if kind not in ("", "msg", "srv"):

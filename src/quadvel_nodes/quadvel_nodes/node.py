@@ -6,7 +6,7 @@ import signal
 import sys
 from collections.abc import Callable
 from socket import socket, socketpair
-from threading import Thread
+from threading import Event, Thread
 from types import FrameType
 from typing import Any, TypeVar
 
@@ -56,8 +56,8 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
     """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1.
 
-    For the main of a process, which ends with it. SIGINT and SIGTERM end `spin` between two callbacks, instead of
-    pulling the context away under it as rclpy's own handlers do: they may come at any moment, and again, and cut
+    For the main of a process, which ends with it. SIGINT and SIGTERM end it between two callbacks, instead of
+    pulling the context away under them as rclpy's own handlers do: they may come at any moment, and again, and cut
     neither start nor end short (Ctrl-C comes twice where a launcher forwards it).
     """
     receiver, sender = socketpair()
@@ -69,8 +69,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
     node = None
     try:
         node = _start(make_node, args)
-        Thread(target=_stop_at, args=(receiver, rclpy.get_global_executor()), daemon=True).start()
-        rclpy.spin(node)
+        _serve(node, receiver)
     except ExternalShutdownException:
         pass
     finally:
@@ -89,15 +88,35 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
         sys.exit(" ".join(str(error).split()))
 
 
+def _serve(node: Node, signals: socket) -> None:
+    """Run the node's callbacks until the first byte from `signals`, or until the context is shut down."""
+    executor, stopped = _executor(), Event()
+
+    def stop_at_signal() -> None:
+        signals.recv(1)
+        stopped.set()
+        executor.create_task(lambda: None)  # ends its wait
+
+    executor.add_node(node)
+    Thread(target=stop_at_signal, daemon=True).start()
+    try:
+        while rclpy.ok() and not stopped.is_set():
+            executor.spin_once()
+    finally:
+        executor.remove_node(node)
+
+
+def _executor() -> Any:
+    """ROS 2's executor of events where it has one (Jazzy from April 2025 on), which the control loop needs there.
+
+    rclpy's usual ones walk through all that a node has, in Python, for each message: docs/decisions/0013.
+    """
+    try:
+        from rclpy.experimental import EventsExecutor
+    except ImportError:
+        return rclpy.get_global_executor()
+    return EventsExecutor()
+
+
 def _nothing_more(number: int, frame: FrameType | None) -> None:
     """The handler of a signal, which has already written to the wake-up socket."""
-
-
-def _stop_at(receiver: socket, executor: Any) -> None:
-    """Wait for the first signal, then let the executor end `spin`."""
-    receiver.recv(1)
-    executor.create_task(_stop)
-
-
-def _stop() -> None:
-    raise ExternalShutdownException
