@@ -9,7 +9,7 @@ from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
 from quadvel_actuator.identify import backlog
-from quadvel_actuator.identify.candidates import About, propose, started
+from quadvel_actuator.identify.candidates import About, propose, simplified, started
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
@@ -82,6 +82,16 @@ def test_a_spring_is_found_from_delays_that_are_far_off():
     model = looked.fit_anew(found.model)
     np.testing.assert_allclose(model.applied[-1].values[0], 3.0, atol=0.3)
     np.testing.assert_allclose(model.input_delay + model.output_delay, 0.012, atol=0.0004)
+
+
+def test_a_bound_that_does_not_fall_with_speed_is_found_from_one_that_could():
+    looked = about(_log(Effect("torque_saturation", JOINTS, {"limit": 1.0})), 0.009, 0.003)
+    wider = propose(looked, started(looked, registry()["torque_speed_limit"]()))
+    found = simplified(looked, wider)
+    assert found.name == "torque_saturation"
+    assert found.gain > 0.99 * wider.gain
+    np.testing.assert_allclose(found.model.applied[-1].values[0], 1.0, atol=0.05)
+    assert simplified(looked, found) is None
 
 
 def test_a_law_that_takes_nothing_off_the_error_is_not_tried():

@@ -122,6 +122,10 @@ class EffectLaw(ABC):
         """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""
         return ()
 
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+        """The law with fewer parameters that this one becomes at the end of one of them, and its parameters (J,)."""
+        return None
+
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
         """The form that a parameter file names: of its parameters those that are no numbers; the robot's `joints`."""

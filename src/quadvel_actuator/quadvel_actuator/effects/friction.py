@@ -5,7 +5,7 @@ How a sign turns hardly shows in a log, but what it says about the amplitude of 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import attrs
 import numpy as np
@@ -84,6 +84,9 @@ class StribeckFriction(_Rubbing):
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08)]
+
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+        return CoulombFriction(at=self.at, turn=self.turn), {"c": p["c"], "v_0": p["v_0"]}
 
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         return p | {"c_s": np.maximum(p["c_s"], p["c"])}

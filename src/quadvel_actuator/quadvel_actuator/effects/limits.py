@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from .base import Array, Memory, MemoryLaw, Parameter, Params, Stage, Start, TorqueLaw, View
+from .base import Array, EffectLaw, Memory, MemoryLaw, Parameter, Params, Stage, Start, TorqueLaw, View
 
 _HARD = "fast and large steps that ask for more torque than the drive gives"
 
@@ -49,6 +49,9 @@ class TorqueSpeedLimit(TorqueLaw):
             for share, over in ((0.85, 1.0), (0.97, 1.0), (1.0, 1.0), (1.0, 1.4))
             for fast in (0.6, 0.9, 1.3, 2.0, 4.0)
         ]
+
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+        return TorqueSaturation(), {"limit": p["stall"]}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         def bound(speed: Array) -> Array:

@@ -155,6 +155,18 @@ def propose(about: About, started: Started) -> Candidate | None:
     return few if few.gain >= 0.98 * everywhere.gain else everywhere
 
 
+def simplified(about: About, one: Candidate) -> Candidate | None:
+    """The simpler law that the candidate's can become, fitted from where the candidate is; None where there is none."""
+    last = one.model.applied[-1]
+    found = last.law.simpler(dict(zip(last.law.names, last.values, strict=True)))
+    if found is None:
+        return None
+    law, start = found
+    applied = attrs.evolve(last, law=law, values=np.array([start[name] for name in law.names]))
+    model = attrs.evolve(one.model, applied=(*one.model.applied[:-1], applied))
+    return _judged(about, law, about.fit(model))
+
+
 def _without_weakest(model: Model) -> Model | None:
     """The last effect off the joint where it is weakest, which gains or delays then stand for; None of one joint."""
     last = model.applied[-1]

@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, propose, started
+from .candidates import About, Candidate, propose, simplified, started
 from .delays import fit_with_delays
 from .few import Few
 from .judging import Judge
@@ -121,6 +121,10 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         found = propose(about, first)
         if found is not None and (name not in best or found.gain > best[name].gain):
             best[name] = found
+    leader = max(best.values(), key=lambda one: one.gain, default=None)
+    less = None if leader is None else simplified(about, leader)
+    if less is not None and less.name not in taken:
+        best[less.name] = max(less, best.get(less.name, less), key=lambda one: one.gain)
     out = [one for name, one in idle.items() if name not in best]
     return sorted(best.values(), key=lambda one: -one.gain), out
 
