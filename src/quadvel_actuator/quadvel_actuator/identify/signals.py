@@ -42,7 +42,7 @@ _CACHED_VALUES = 1_000_000
 
 _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 
-BETWEEN = 4
+BETWEEN = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
 _OF_JOINTS = (
     "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature",
