@@ -8,10 +8,9 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
-from quadvel_description import robot, symmetry  # noqa: E402
+from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_training import gait, loop  # noqa: E402
-from quadvel_training.command_map import CommandMap  # noqa: E402
 from quadvel_training.crl import PARTS, CrlConfig, CrlRun  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
@@ -131,29 +130,6 @@ def test_lifting_feet_pays_only_while_walking():
     assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == 0.0
     env.command[:] = 0.0
     assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == pytest.approx(0.12)
-
-
-def test_the_command_map_finds_a_map_of_its_own_kind():
-    rng = np.random.default_rng(0)
-    wanted = rng.uniform(-1, 1, (2000, 3))
-    x, _, r = wanted.T
-    given = wanted + np.stack([0.1 * x + 0.02, 0.2 * x * r, 0.3 * r], axis=1)
-    command_map = CommandMap()
-    assert command_map.fit(wanted, given) < 1e-4
-    out = command_map(np.column_stack([wanted, np.zeros(2000)]))
-    assert np.abs(out[:, :3] - given).max() < 1e-3
-    still = np.array([[0.0, 0.0, 0.0, 1.0]])
-    assert np.array_equal(command_map(still), still)
-
-
-def test_the_command_map_treats_left_and_right_alike():
-    rng = np.random.default_rng(1)
-    wanted = rng.uniform(-1, 1, (500, 3))
-    command_map = CommandMap()
-    command_map.fit(wanted, wanted + rng.normal(0, 0.1, (500, 3)))
-    command = np.column_stack([wanted, np.zeros(500)])
-    mirror = symmetry.PARTS["command"]
-    assert np.allclose(command_map(mirror(command)), mirror(command_map(command)))
 
 
 class Counter:

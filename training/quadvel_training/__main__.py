@@ -138,7 +138,13 @@ def tune_policy(
         typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
     ],
     policy: Annotated[Path, typer.Option(help="Checkpoint to start from.", exists=True)] = START,
-    minutes: Annotated[float, typer.Option(help="How long; counts anew where it is resumed.")] = 20.0,
+    minutes: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            help="How long; counts anew where it is resumed. 0: measure its command map, learn nothing.",
+        ),
+    ] = 20.0,
     out: Out = Path("out/tuned"),
     device: Device = "cpu",
 ) -> None:

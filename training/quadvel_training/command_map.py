@@ -40,8 +40,11 @@ ODD = [
 EXPONENTS = np.array(EVEN + ODD)
 """Of vx, vy, wz in each term: first those that mirroring leaves as they are, then as many that it turns round."""
 TERMS = len(EXPONENTS)
-BOUND = 0.6  # m/s, rad/s, of what the map adds
+BOUND = 1.0  # m/s, rad/s, of what the map adds
 STRIDE = 0.35  # s, time constant of velocities averaged over a stride
+SETTLED = 2.0  # s of walking until a robot's velocity counts
+RIDGE = 1e-4  # a robot
+OUTLIER = 0.3  # m/s, rad/s: a larger error counts as this
 
 
 class Tracking:
@@ -78,7 +81,8 @@ class Tracking:
 
 def features(command: np.ndarray) -> np.ndarray:
     """The polynomial's terms (n, TERMS) of vx, vy, wz (n, 3)."""
-    return np.prod(command[:, None, :] ** EXPONENTS, axis=-1)
+    powers = command[:, :, None] ** np.arange(EXPONENTS.max() + 1)
+    return powers[:, np.arange(3), EXPONENTS].prod(axis=-1)
 
 
 class CommandMap:
@@ -87,17 +91,14 @@ class CommandMap:
     def __init__(self, weights: np.ndarray | None = None) -> None:
         self.weights = np.zeros((TERMS, 3)) if weights is None else weights
 
-    def fit(self, wanted: np.ndarray, given: np.ndarray) -> float:
-        """Ridge regression of given - wanted, (n, 3) each; returns the residual's RMS."""
-        a = features(wanted[:, :3])
-        b = given - wanted
-        half = a.shape[1] // 2
-        self.weights = np.zeros((a.shape[1], 3))
+    def correct(self, wanted: np.ndarray, missing: np.ndarray) -> None:
+        """Add the ridge regression of what is missing of the wanted velocities, (n, 3) each."""
+        a = features(wanted)
+        half = TERMS // 2
         for axis, columns in ((0, slice(0, half)), (1, slice(half, None)), (2, slice(half, None))):
             part = a[:, columns]
-            gram = part.T @ part + 1e-2 * np.eye(part.shape[1])
-            self.weights[columns, axis] = np.linalg.solve(gram, part.T @ b[:, axis])
-        return float(np.sqrt(np.mean((a @ self.weights - b) ** 2)))
+            gram = part.T @ part + RIDGE * len(a) * np.eye(half)
+            self.weights[columns, axis] += np.linalg.solve(gram, part.T @ missing[:, axis])
 
     def __call__(self, command: np.ndarray) -> np.ndarray:
         """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
@@ -136,10 +137,15 @@ class CommandCorrection(torch.nn.Module):
 
 
 class Walker(Protocol):
-    """Something that walks on command in a batch of environments, with integral action."""
+    """Something that walks on command in a batch of environments, behind a command map of its own."""
 
     env: VelocityEnv
+    own: CommandMap
     tracking: Tracking
+
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the past of `ids`."""
+        ...
 
     def targets(self) -> np.ndarray:
         """Joint targets (n, 12) for the present state."""
@@ -153,24 +159,45 @@ class Walker(Protocol):
 def held_commands(config: EnvConfig) -> EnvConfig:
     """The same environments with one walking command each, for good."""
     return attrs.evolve(
-        config, commands=attrs.evolve(config.commands, hold=(1e3, 1e3), stance=0.0), episode=1e4
+        config, commands=attrs.evolve(config.commands, hold=(1e6, 1e6), stance=0.0), episode=1e6
     )
 
 
-def fit_command_map(walker: Walker, seconds: float = 10.0) -> CommandMap:
-    """Let integral action settle and fit the map on those that still walk; `walker` stands in `held_commands`."""
-    env, n, ticks = walker.env, walker.env.config.n, round(seconds / TICK)
-    total, fell = np.zeros((n, 3)), np.zeros(n, bool)
-    for tick in range(ticks):
+@attrs.frozen
+class MapFit:
+    """How the fit of a command map went: mean error of the robots that walk, m/s, and falls."""
+
+    before: float
+    after: float
+    falls: int
+    robots: int
+
+
+def fit_command_map(walker: Walker, seconds: float = 16.0, gain: float = 0.8) -> MapFit:
+    """Integral action (`gain`, 1/s) on the weights of `walker.own`, from all robots; `walker` stands in `held_commands`.
+
+    So the map makes the walked velocities right and not the given ones, which may be far off where little depends on
+    them, as at low speed with dry friction. A robot that falls starts over at another command: where none walks, none counts.
+    """
+    env, n, every = walker.env, walker.env.config.n, 20
+    age, falls, off = np.zeros(n), 0, []
+    for tick in range(round(seconds / TICK)):
         env.tick(walker.targets())
         walker.advance()
-        fell |= env.fallen
-        if tick >= ticks // 2:
-            total += walker.tracking.correction / (ticks - ticks // 2)
-    kept = ~fell & (np.abs(total) < 0.45).all(axis=1)
-    command_map = CommandMap()
-    left = command_map.fit(env.command[kept, :3], env.command[kept, :3] + total[kept])
-    print(
-        f"command map of {type(walker).__name__}: {kept.sum()} of {n} walked, residual {left:.3f} (m/s, rad/s)"
-    )
-    return command_map
+        age += TICK
+        over = np.flatnonzero(env.fallen)
+        age[over] = 0.0
+        falls += len(over)
+        env.reset(over)
+        walker.reset(over)
+        counts = age > SETTLED
+        if tick % every == 0 and counts.any():
+            error = walker.tracking.error[counts]
+            off.append(float(np.hypot(error[:, 0], error[:, 1]).mean()))
+            step = gain * every * TICK * error.clip(-OUTLIER, OUTLIER)
+            walker.own.correct(env.command[counts, :3], step)
+    if not off:
+        raise ValueError(f"command map: no robot of {n} walked for {SETTLED} s at its command")
+    fit = MapFit(off[0], off[-1], falls, n)
+    print(f"command map: {fit.before:.3f} to {fit.after:.3f} m/s off, {falls} falls of {n} robots")
+    return fit

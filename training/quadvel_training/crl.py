@@ -19,7 +19,7 @@ from quadvel_sim.terrain import Terrain
 
 from . import parallel, student
 from .command_map import CommandMap
-from .distill import student_map
+from .distill import map_student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares
 from .networks import Gaussian, Mlp, Recurrent, State
@@ -110,10 +110,10 @@ class CrlRun:
     @cached_property
     def command_map(self) -> CommandMap:
         """What stands in front of the policy, measured on the start before the first update or taken from a checkpoint."""
-        c = self.config
-        return (
-            student_map(self.policy(), c.commands, actuator(c.actuator))[0] if self._mapped else CommandMap()
-        )
+        own = CommandMap()
+        if self._mapped:
+            map_student(self.policy(), own, self.config.commands, actuator(self.config.actuator))
+        return own
 
     def policy(self) -> Recurrent:
         """A copy of the policy as it is now, on the CPU."""

@@ -20,7 +20,7 @@ from quadvel_description import robot, symmetry
 from quadvel_sim.terrain import Terrain
 
 from . import gait, student, teacher
-from .command_map import CommandMap, Tracking, fit_command_map, held_commands
+from .command_map import CommandMap, MapFit, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State
@@ -73,21 +73,27 @@ class Teacher:
 
 
 class Student:
-    """The student at the wheel, with integral action on its command."""
+    """The student at the wheel, behind its command map `own`."""
 
-    def __init__(self, actor: Recurrent, env: VelocityEnv, gain: float) -> None:
-        self.actor, self.env = actor, env
-        self.tracking = Tracking(env.config.n, gain)
+    def __init__(self, actor: Recurrent, env: VelocityEnv, own: CommandMap) -> None:
+        self.actor, self.env, self.own = actor, env, own
+        self.tracking = Tracking(env.config.n, gain=0.0)
         self._map = student.action_map(env)
         self._memory = actor.initial_state(env.config.n)
         self._action = np.zeros((env.config.n, 12), np.float32)
 
+    def reset(self, ids: np.ndarray) -> None:
+        """Forget the past of `ids`."""
+        self.tracking.reset(ids)
+        self._action[ids] = 0.0
+        for memory in self._memory:
+            memory[:, ids] = 0.0
+
     def targets(self) -> np.ndarray:
         """Joint targets (n, 12) for the present state."""
-        command = self.tracking.corrected(self.env.command)
-        obs = torch.from_numpy(student.observe(self.env, self._action, command)[None])
+        obs = student.observe(self.env, self._action, self.own(self.env.command))
         with torch.no_grad():
-            action, self._memory = self.actor(obs, self._memory)
+            action, self._memory = self.actor(torch.from_numpy(obs[None]), self._memory)
         self._action = action[0].numpy()
         return self._map.targets(self._action)
 
@@ -96,13 +102,13 @@ class Student:
         self.tracking.advance(self.env, self.env.command[:, :3])
 
 
-def student_map(
-    actor: Recurrent, commands: CommandRange, drives: ActuatorParameters, seconds: float = 12.0
-) -> tuple[CommandMap, VelocityEnv]:
-    """The command map of a student on the nominal plant with these actuators, and the environment it was measured in."""
-    plain = EnvConfig(commands=commands, actuator=drives, randomisation=Randomisation.calm())
-    env = VelocityEnv(held_commands(plain))
-    return fit_command_map(Student(actor, env, gain=0.6), seconds), env
+def map_student(
+    actor: Recurrent, own: CommandMap, commands: CommandRange, drives: ActuatorParameters
+) -> tuple[MapFit, VelocityEnv]:
+    """Fit a student's command map on the nominal plant with these actuators; and the environment it was measured in."""
+    plain = EnvConfig(n=256, commands=commands, actuator=drives, randomisation=Randomisation.calm())
+    walker = Student(actor, VelocityEnv(held_commands(plain)), own)
+    return fit_command_map(walker), walker.env
 
 
 @attrs.frozen
@@ -137,7 +143,8 @@ class DistillRun:
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
         trial = held_commands(env_config)  # on flat ground
-        own = fit_command_map(Teacher(actor, VelocityEnv(trial), CommandMap(), gain=0.6))
+        own = CommandMap()
+        fit_command_map(Teacher(actor, VelocityEnv(trial), own, gain=0.0))
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain)
         self.student = start or student.new_actor()

@@ -7,6 +7,7 @@ from pathlib import Path
 import attrs
 
 from . import distill, loop, parallel, recipe, student
+from .command_map import CommandMap
 from .crl import CrlConfig, CrlRun
 from .loop import Budget
 from .networks import Recurrent
@@ -46,11 +47,18 @@ def learn(config: CrlConfig, source: Path | None, start: Path | None, folder: Pa
     return loop.train(run, config.budget, folder / CHECKPOINT, Evaluated(run, folder))
 
 
+def map_of(checkpoint: Path) -> CommandMap:
+    """The command map in a checkpoint of stage 2 or 3; one that adds nothing where there is none."""
+    weights = loop.load(checkpoint).get("command_map")
+    return CommandMap(None if weights is None else weights.numpy())
+
+
 def export(config: CrlConfig, source: Path | None, checkpoint: Path, out: Path) -> None:
-    """The policy file of a checkpoint, behind a command map that is measured anew on the recipe's actuators."""
-    actor = policy_of(checkpoint)
-    command_map, walks = distill.student_map(actor, config.commands, actuator(config.actuator))
-    student.export_policy(actor, walks, out, made_of("crl", source, config, checkpoint), command_map)
+    """The policy file of a checkpoint, behind its command map, which is measured anew on the recipe's actuators."""
+    actor, own = policy_of(checkpoint), map_of(checkpoint)
+    fit, walks = distill.map_student(actor, own, config.commands, actuator(config.actuator))
+    about = made_of("crl", source, config, checkpoint) | {"command_map": attrs.asdict(fit)}
+    student.export_policy(actor, walks, out, about, own)
 
 
 def ablation(start: Path, samples: float, out: Path, device: str) -> bool:
@@ -72,11 +80,15 @@ def ablation(start: Path, samples: float, out: Path, device: str) -> bool:
 
 
 def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
-    """Tune the policy of a checkpoint on the actuators of a file; the policy file, exported also where it was stopped."""
+    """Tune the policy of a checkpoint on the actuators of a file; the policy file, exported also where it was stopped.
+
+    In 0 minutes only its command map is measured on them.
+    """
     config = recipe.read(CrlConfig, TUNE)
     budget = attrs.evolve(config.budget, minutes=minutes)
     config = attrs.evolve(config, actuator=str(drives), budget=budget)
-    learn(config, TUNE, start, out, device)
+    if minutes > 0:
+        learn(config, TUNE, start, out, device)
     if parallel.rank() == 0:
-        export(config, TUNE, out / CHECKPOINT, out / "tuned.onnx")
+        export(config, TUNE, out / CHECKPOINT if minutes > 0 else start, out / "tuned.onnx")
     return out / "tuned.onnx"
