@@ -183,6 +183,8 @@ class _Trial:
         parts = _Joint(picks, scene).parts
         self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows
         self.inverse = []
+        self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
+        self.onto = []  # of each joint: (X, n), weights of the columns that come closest on few of the fitted rows
         self.bare = np.empty_like(scene.residual)
         for j in range(len(scene.joints)):
             x = np.column_stack([scene.slopes[j].T, *(part[:, j] for part in parts)])
@@ -192,6 +194,9 @@ class _Trial:
             gram[np.diag_indices_from(gram)] += _RIDGE * keep.sum()
             self.others.append(x)
             self.inverse.append(np.linalg.inv(gram))
+            some = x[self.few][keep[self.few]]
+            ridge = 1e-9 * len(some) * np.eye(some.shape[1])
+            self.onto.append(np.linalg.lstsq(some.T @ some + ridge, some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
 
     def _without(self, j: int, values: Array) -> Array:
@@ -202,14 +207,14 @@ class _Trial:
 
     def promising(self, feature: Feature, noise: Array) -> Bools:
         """The joints where the feature fitted to some of the rows gains more than chance would."""
-        few = slice(None, None, max(1, len(self.bare) // _ENOUGH))
+        few = self.few
         columns, fit = self.scene.columns(feature, few), self.scene.judge.fit[few]
         found = np.zeros(len(noise), dtype=bool)
         for j, x in enumerate(self.others):
             keep = fit[:, j]
             left = self.bare[few, j][keep]
             b, x = columns[keep, :, min(j, columns.shape[2] - 1)], x[few][keep]
-            b = b - x @ np.linalg.lstsq(x.T @ x + 1e-9 * len(x) * np.eye(x.shape[1]), x.T @ b, rcond=None)[0]
+            b = b - x @ (self.onto[j] @ b)
             onto = b.T @ left
             gain = (onto @ _inverse(b, [feature.shape.penalty]) @ onto) / len(left)
             chance = float(np.mean(left * left)) * feature.shape.count / len(left)
