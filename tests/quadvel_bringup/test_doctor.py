@@ -37,3 +37,9 @@ def test_ros_is_found_where_rclpy_is_importable(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setenv("ROS_DISTRO", "jazzy")
     finding = next(f for f in doctor.examine() if f.subject == "ROS 2")
     assert finding.text.startswith("jazzy with ")
+
+
+def test_an_rclpy_too_old_for_real_time_on_two_cores_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.util, "find_spec", lambda name: object() if name == "rclpy" else None)
+    finding = next(f for f in doctor.examine() if f.subject == "ROS 2")
+    assert "rclpy 7.1.4" in finding.text

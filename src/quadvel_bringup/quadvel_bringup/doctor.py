@@ -57,7 +57,10 @@ def _middleware() -> Finding:
     if os.environ.get("QUADVEL_MIDDLEWARE") == "embedded":
         return Finding("ROS 2", True, f"{distro}, left aside: QUADVEL_MIDDLEWARE is 'embedded'")
     rmw = os.environ.get("RMW_IMPLEMENTATION", "its default middleware")
-    return Finding("ROS 2", True, f"{distro} with {rmw}: the nodes run on its rclpy")
+    text = f"{distro} with {rmw}: the nodes run on its rclpy"
+    if util.find_spec("rclpy.experimental") is None:
+        text += "; real time on two cores wants its executor of events, of rclpy 7.1.4 or newer"
+    return Finding("ROS 2", True, text)
 
 
 def _package(name: str) -> Finding:
