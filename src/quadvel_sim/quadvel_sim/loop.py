@@ -5,7 +5,8 @@ No ROS: `sim_node` puts topics around it.
 
 In real time the loop wakes once a period, at absolute deadlines, and then simulates the period that has just
 passed. A command takes effect at the simulated millisecond that follows its arrival: the robot behaves as if
-the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted.
+the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted: a stall of
+the machine stops the controller, too, and is no event in the robot's world.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, Ro
 from quadvel_sim.simulator import DT, Simulator
 
 REALTIME, LOCKSTEP, FAST = MODES = ("realtime", "lockstep", "fast")
-MAX_LAG = 0.1  # s
+MAX_LAG = 0.01  # s
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
