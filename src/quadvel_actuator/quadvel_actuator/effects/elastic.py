@@ -132,7 +132,7 @@ class Deadband(ErrorLaw):
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         error = np.abs(s.q_des - s.q)
-        return [{"width": np.quantile(error, at, axis=0) + 5e-4} for at in (0.03, 0.07, 0.15, 0.25, 0.4, 0.6)]
+        return [{"width": np.quantile(error, at, axis=0) + 5e-4} for at in np.linspace(0.03, 0.99, 33)]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         beyond = np.abs(e[0]) > p["width"]
