@@ -49,3 +49,4 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     made_of = run_folder.made_of("crl", None, config, folder / stage3.CHECKPOINT)
     assert made_of["samples"] == 18
     assert made_of["hours"] >= 0.0
+    assert made_of["configuration"]["actuator"] == drives.name  # in a file that goes elsewhere

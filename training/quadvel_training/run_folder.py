@@ -31,8 +31,13 @@ def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None
 
 
 def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> dict[str, Any]:
-    """How a network came to be, for the metadata of its file; hours of training where the checkpoint knows them."""
-    content = loop.load(checkpoint)
+    """How a network came to be, for the metadata of its file; hours of training where the checkpoint knows them.
+
+    An actuator file is told by its name: where it lay says nothing to those whom the network is handed to.
+    """
+    content, configuration = loop.load(checkpoint), cattrs.unstructure(config)
+    if "actuator" in configuration:
+        configuration["actuator"] = Path(configuration["actuator"]).name
     hours = round(content["seconds"] / 3600, 2) if "seconds" in content else None
     about = {
         "stage": stage,
@@ -40,7 +45,7 @@ def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> d
         "samples": content["samples"],
         "hours": hours,
     }
-    return about | {"configuration": cattrs.unstructure(config)}
+    return about | {"configuration": configuration}
 
 
 @attrs.define
