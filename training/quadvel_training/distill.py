@@ -59,7 +59,7 @@ class Teacher:
         """Joint targets (n, 12) for the present state."""
         env = self.env
         command = self.tracking.corrected(self.own(self.gait.pace))
-        base = gait.targets(self.gait.phase, command, teacher.body_of(env), robot.KP)
+        base = gait.targets(self.gait.phase, command, teacher.body_of(env, self.gait), robot.KP)
         obs = teacher.observe(env, self.gait, command, self._past[0], base)
         with torch.no_grad():
             residual = self.actor(torch.from_numpy(obs))[0].numpy().astype(float).clip(-5, 5)
@@ -68,7 +68,7 @@ class Teacher:
 
     def advance(self) -> None:
         """After the environment's tick."""
-        self.gait.advance(self.env.command)
+        self.gait.advance(self.env)
         self.tracking.advance(self.env, self.gait.pace[:, :3])
 
 

@@ -21,6 +21,7 @@ from quadvel_sim.terrain import Terrain
 from .randomisation import PlantSampler, Randomisation, sample_actuators
 
 TICK = 0.005  # s, one policy sample
+STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(robot.NOMINAL_Q)[:, :2], axis=0)  # m, between nominal feet
 
 
 def cores() -> int:
@@ -170,6 +171,14 @@ class VelocityEnv:
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
         return self.config.terrain.height(points[..., 0], points[..., 1])
+
+    @property
+    def ground_roll_pitch(self) -> np.ndarray:
+        """Roll and pitch (n, 2), rad, of a trunk parallel to the ground below the four feet."""
+        ground = self._ground(self.feet)
+        front, rear = ground[:, :2].mean(axis=1), ground[:, 2:].mean(axis=1)
+        right, left = ground[:, ::2].mean(axis=1), ground[:, 1::2].mean(axis=1)
+        return np.arctan(np.stack([(left - right) / STANCE_WIDTH, (rear - front) / STANCE_LENGTH], axis=-1))
 
     def _push(self) -> None:
         r = self.config.randomisation

@@ -30,6 +30,7 @@ class Body:
     velocity: np.ndarray  # (n, 2)
     angular_velocity: np.ndarray  # (n, 3)
     roll_pitch: np.ndarray  # (n, 2)
+    lean: np.ndarray  # (n, 2), roll and pitch that the trunk is to have: those of the ground
     height: np.ndarray  # (n,)
     vertical_speed: np.ndarray  # (n,)
 
@@ -69,7 +70,7 @@ def swing_height(phase: np.ndarray, command: np.ndarray) -> np.ndarray:
 def targets(phase: np.ndarray, command: np.ndarray, body: Body, kp: float) -> np.ndarray:
     """Joint targets (n, 12) rad: swing feet by position, stance feet by force, through the soft gains."""
     down = wants_contact(phase, command)
-    feet = _swing_feet(phase + LEAD * frequency(command), command, body.velocity)
+    feet = _swing_feet(phase + LEAD * frequency(command), command, body)
     swing = inverse_kinematics(feet) + LEG_WEIGHT / kp
     q = np.where(np.repeat(down, 3, axis=-1), body.q, swing)
     force = _stance_forces(command, body, down)
@@ -77,8 +78,11 @@ def targets(phase: np.ndarray, command: np.ndarray, body: Body, kp: float) -> np
     return q + torque.reshape(q.shape) / kp
 
 
-def _swing_feet(phase: np.ndarray, command: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Where the swinging feet are to be, trunk frame (n, 4, 3) m: half a stride ahead, corrected by the velocity error."""
+def _swing_feet(phase: np.ndarray, command: np.ndarray, body: Body) -> np.ndarray:
+    """Where the swinging feet are to be, trunk frame (n, 4, 3) m: half a stride ahead, corrected by the velocity error.
+
+    On a slope they go where the centre of mass would fall, not below the hips.
+    """
     d, f = duty(command)[..., None], frequency(command)[..., None]
     s = np.clip((leg_phase(phase) - d) / (1 - d), 0, 1)
     ahead = np.stack(
@@ -91,7 +95,9 @@ def _swing_feet(phase: np.ndarray, command: np.ndarray, velocity: np.ndarray) ->
     stride = ahead * (d / f)[..., None]
     along = -0.5 + s * s * (3 - 2 * s)
     feet = np.broadcast_to(_STAND, (len(command), 4, 3)).copy()
-    feet[..., :2] += along[..., None] * stride + 0.12 * s[..., None] * (velocity - command[:, :2])[:, None]
+    feet[..., :2] += along[..., None] * stride + 0.12 * s[..., None] * (body.velocity - command[:, :2])[:, None]
+    roll, pitch = body.lean.T
+    feet[..., :2] += HEIGHT * np.stack([np.tan(pitch), -np.tan(roll)], axis=-1)[:, None]
     feet[..., 2] += swing_height(phase, command)
     return feet
 
@@ -111,6 +117,7 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
     force[:, :2] += robot.MASS * CENTRING * place[:, :2]
     w = body.angular_velocity
     twist = 10 * (command[:, 2] - w[:, 2]) + CENTRING * place[:, 2]
+    roll, pitch = (body.roll_pitch - body.lean).T
     moment = np.stack([-250 * roll - 20 * w[:, 0], -400 * pitch - 30 * w[:, 1], twist], axis=-1)
     load = down / np.maximum(down.sum(-1, keepdims=True), 2)  # forces vanish on lifted feet
     map_ = np.zeros((n, 6, 4, 3))

@@ -25,6 +25,7 @@ from .ppo import Ppo, PpoConfig, Rollout
 
 HOLD = 4  # ticks a residual is held
 RESIDUAL = 0.2  # rad a unit of the network's output
+LEVELLING = 0.2  # s, in which the trunk follows the ground's slope
 ACCELERATION = np.array([2.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2; thrown at once into a run it falls
 
 
@@ -59,14 +60,17 @@ class GaitState:
         self.residual = np.zeros((n, 12))
         self.residual_before = np.zeros((n, 12))
         self.pace = np.zeros((n, 4))
+        self.lean = np.zeros((n, 2))
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
-        for array in (self.phase, self.residual, self.residual_before, self.pace):
+        for array in (self.phase, self.residual, self.residual_before, self.pace, self.lean):
             array[ids] = 0.0
 
-    def advance(self, wanted: np.ndarray) -> None:
-        """One tick further towards the command `wanted` (n, 4); the clock rests at its start while the gait stands."""
+    def advance(self, env: VelocityEnv) -> None:
+        """One tick further towards the command; the clock rests at its start while the gait stands."""
+        wanted = env.command
+        self.lean += (env.ground_roll_pitch - self.lean) * TICK / LEVELLING
         step = ACCELERATION * TICK
         self.pace[:, :3] += (wanted[:, :3] - self.pace[:, :3]).clip(-step, step)
         self.pace[:, 3] = wanted[:, 3] * (self.pace[:, :3] == 0.0).all(axis=1)
@@ -74,10 +78,10 @@ class GaitState:
         self.phase = np.where(moving, (self.phase + gait.frequency(self.pace) * TICK) % 1.0, 0.0)
 
 
-def body_of(env: VelocityEnv) -> gait.Body:
+def body_of(env: VelocityEnv, g: GaitState) -> gait.Body:
     """What the gait reads."""
     return gait.Body(
-        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, env.height, env.velocity[:, 2]
+        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, g.lean, env.height, env.velocity[:, 2]
     )
 
 
@@ -124,7 +128,7 @@ def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
     )
     tracking -= 1.5 * np.hypot(lag[:, 0], lag[:, 1]) + 0.5 * np.abs(lag[:, 2])
     body = (
-        -0.5 * np.abs(env.roll_pitch).sum(1)
+        -0.5 * np.abs(env.roll_pitch - g.lean).sum(1)
         - 0.3 * np.abs(env.velocity[:, 2])
         - 0.08 * np.hypot(env.angular_velocity[:, 0], env.angular_velocity[:, 1])
         - 3.0 * np.abs(env.height - gait.HEIGHT)
@@ -214,7 +218,7 @@ class TeacherRun:
         }
         std = self.actor.log_std.exp().detach().numpy()
         errors, falls = [], 0
-        base = gait.targets(g.phase, g.pace, body_of(env), robot.KP)
+        base = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)
         for _ in range(c.length):
             obs = observe(env, g, g.pace, g.residual, base)
             with torch.no_grad():
@@ -225,8 +229,8 @@ class TeacherRun:
             total = np.zeros(c.n)
             for _ in range(HOLD):
                 env.tick(base + RESIDUAL * g.residual)
-                g.advance(env.command)
-                base = gait.targets(g.phase, g.pace, body_of(env), robot.KP)
+                g.advance(env)
+                base = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)
                 self.tracking.advance(env, g.pace[:, :3])
                 total += reward(env, g, self.tracking.error)
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
@@ -242,7 +246,7 @@ class TeacherRun:
                 env.reset(over)
                 g.reset(over)
                 self.tracking.reset(over)
-                base[over] = gait.targets(g.phase, g.pace, body_of(env), robot.KP)[over]
+                base[over] = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)[over]
         self.samples += c.length * c.n
         last = np.concatenate(
             [observe(env, g, g.pace, g.residual, base), critic_extra(env, self.tracking)], axis=1
