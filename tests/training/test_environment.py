@@ -15,7 +15,6 @@ from quadvel_training.crl import PARTS, CrlConfig, CrlRun  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
-from quadvel_training.teacher import GaitState  # noqa: E402
 
 STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
 QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
@@ -35,22 +34,6 @@ def test_the_gait_stands_still_on_command():
     assert np.abs(env.velocity).max() < 0.05
     assert np.abs(env.height - gait.HEIGHT).max() < 0.03
     assert env.contact.all()
-
-
-def test_the_pace_follows_the_command_by_a_bounded_acceleration_and_stands_once_at_rest():
-    g, fast, stance = GaitState(1), np.array([[2.5, -0.6, 1.0, 0.0]]), np.array([[0.0, 0.0, 0.0, 1.0]])
-    for _ in range(round(0.5 / TICK)):
-        g.advance(fast)
-    assert np.allclose(g.pace, [[1.25, -0.6, 1.0, 0.0]])
-    for _ in range(round(1.0 / TICK)):
-        g.advance(fast)
-    assert np.allclose(g.pace, fast)
-    g.advance(stance)
-    assert g.pace[0, 3] == 0.0
-    for _ in range(round(1.1 / TICK)):
-        g.advance(stance)
-    assert np.array_equal(g.pace, stance)
-    assert g.phase == 0.0
 
 
 def test_equal_seeds_give_equal_runs_and_other_seeds_do_not():

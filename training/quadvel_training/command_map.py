@@ -110,7 +110,7 @@ class CommandMap:
 
 
 class CommandCorrection(torch.nn.Module):
-    """What the map adds to the command: observations (n, 48), which start with the command, to (n, 4).
+    """What the map adds to the command: observations (n, 48), which start with the command, to (n, 48).
 
     Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz; the last
     of the four factors is 0 in stance.
@@ -128,7 +128,7 @@ class CommandCorrection(torch.nn.Module):
         pick[3, :, 3] = -1.0
         self.factors.weight.copy_(torch.as_tensor(pick.reshape(-1, inputs)))
         self.factors.bias.copy_(torch.as_tensor(one.reshape(-1)))
-        weights = np.pad(command_map.weights, ((0, 0), (0, 1)))  # stance stays as it is
+        weights = np.pad(command_map.weights, ((0, 0), (0, inputs - 3)))  # all else stays as it is
         self.register_buffer("weights", torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:

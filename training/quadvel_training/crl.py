@@ -22,10 +22,11 @@ from .command_map import CommandMap
 from .distill import map_student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares
-from .networks import Gaussian, Mlp, Recurrent, State
+from .networks import Gaussian, Mlp, State
 from .ppo import Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
+from .student import Policy
 from .teacher import torch_mirror
 
 PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
@@ -71,7 +72,7 @@ class CrlConfig:
 class CrlRun:
     """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
 
-    def __init__(self, config: CrlConfig, start: Recurrent | None = None, device: str = "cpu") -> None:
+    def __init__(self, config: CrlConfig, start: Policy | None = None, device: str = "cpu") -> None:
         self.config = c = config
         self.device = parallel.join(device)
         torch.manual_seed(c.seed)
@@ -101,10 +102,11 @@ class CrlRun:
         self._action = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
         self._state = self._initial_state(c.n)
-        self._mirrored = self._initial_state(self.ppo.mirrored(c.n))
+        self._fresh_mirrored = self._initial_state(self.ppo.mirrored(c.n), mirrored=True)
+        self._mirrored = self._fresh_mirrored
 
-    def _initial_state(self, n: int) -> State:
-        h, c = self.actor.network.initial_state(n)
+    def _initial_state(self, n: int, mirrored: bool = False) -> State:
+        h, c = self.actor.network.initial_state(n, mirrored)
         return h.to(self.device), c.to(self.device)
 
     @cached_property
@@ -115,9 +117,9 @@ class CrlRun:
             map_student(self.policy(), own, self.config.commands, actuator(self.config.actuator))
         return own
 
-    def policy(self) -> Recurrent:
+    def policy(self) -> Policy:
         """A copy of the policy as it is now, on the CPU."""
-        network: Recurrent = copy.deepcopy(self.actor.network).cpu()
+        network: Policy = copy.deepcopy(self.actor.network).cpu()
         return network
 
     def state(self) -> dict[str, Any]:
@@ -229,5 +231,5 @@ class CrlRun:
             self._state, self._mirrored = (tuple(m.clone() for m in pair) for pair in (state, mirrored))
             for memory in self._state:
                 memory[:, over] = 0.0
-            for memory in self._mirrored:
-                memory[:, over[over < seen]] = 0.0
+            for memory, fresh in zip(self._mirrored, self._fresh_mirrored, strict=True):
+                memory[:, over[over < seen]] = fresh[:, over[over < seen]]

@@ -1,9 +1,10 @@
-"""Stage 2: the recurrent student learns from the teacher, which it needs neither clock nor true state to imitate.
+"""Stage 2: the recurrent student learns from the teacher, whose true state it does not need to imitate it.
 
 The teacher acts at every tick. Its own steady-state error is taken out first: a command map, found by integral action on
 held commands, says which command it has to be given to walk at the one wanted (docs/decisions/0003). The student sees the
-wanted command. The teacher drives under time-correlated noise: driven by the student, the labels of the teacher's clock
-would contradict the phase of the student's gait. Eq. 6 and 7 act on the student from the start.
+wanted command. Some robots the teacher drives, the others the student, both under time-correlated noise, and the teacher
+says everywhere what it would have done: so the student learns to get out of where its own errors lead (DAgger). Both go by
+the same clock (docs/decisions/0015). Eq. 6 and 7 act on the student from the start.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ class Teacher:
 
     def __init__(self, actor: Gaussian, env: VelocityEnv, own: CommandMap, gain: float) -> None:
         self.actor, self.env, self.own = actor, env, own
-        self.gait = GaitState(env.config.n)
+        self.gait = GaitState(env)
         self.tracking = Tracking(env.config.n, gain)
         self._past = [np.zeros((env.config.n, 12)) for _ in range(teacher.HOLD)]
 
@@ -68,7 +69,7 @@ class Teacher:
 
     def advance(self) -> None:
         """After the environment's tick."""
-        self.gait.advance(self.env)
+        self.gait.advance()
         self.tracking.advance(self.env, self.gait.pace[:, :3])
 
 
@@ -123,6 +124,9 @@ class DistillConfig:
     noise: float = (
         0.1  # rad, stationary std of the time-correlated noise on executed targets, up to, by environment
     )
+    driven: float = (
+        0.7  # share of robots that the student drives, from the middle of the run on; before, ever more
+    )
     noise_time: float = 0.05  # s
     mini_batches: int = 2
     symmetry: float = 0.5
@@ -136,7 +140,9 @@ class DistillConfig:
 class DistillRun:
     """Teacher, student and environment of stage 2."""
 
-    def __init__(self, config: DistillConfig, teacher_file: Path, start: Recurrent | None = None) -> None:
+    def __init__(
+        self, config: DistillConfig, teacher_file: Path, start: student.Policy | None = None
+    ) -> None:
         """`start`: a student to go on from."""
         self.config = config
         torch.manual_seed(config.seed)
@@ -152,10 +158,14 @@ class DistillRun:
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
         self._memory: State = self.student.initial_state(config.n)
-        self._mirrored: State = self.student.initial_state(config.n)
+        self._fresh_mirrored: State = self.student.initial_state(config.n, mirrored=True)
+        self._mirrored = self.student.initial_state(config.n, mirrored=True)
         self._previous = np.zeros((config.n, 12), np.float32)
         self._noise = np.zeros((config.n, 12))
         self._noise_std = np.linspace(0.0, config.noise, config.n)[:, None]
+        self._turn = np.random.default_rng(config.seed).random(
+            config.n
+        )  # at which share the student takes a robot over
         self._mirror_obs, self._mirror_action = (
             torch_mirror(symmetry.OBSERVATION),
             torch_mirror(symmetry.JOINTS),
@@ -179,29 +189,40 @@ class DistillRun:
         """One sequence and one step of the optimiser."""
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
-        obs, label, mask, seen = self.collect()
+        obs, label, mask, seen = self.collect(c.driven * min(1.0, 2.0 * done))
         return seen | self.learn(obs, label, mask)
 
-    def collect(self) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
-        """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N)."""
+    def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
+        """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N).
+
+        share: of robots that the student drives.
+        """
         env, c = self.env, self.config
         decay = np.exp(-TICK / c.noise_time)
         alive = np.ones(c.n, bool)
-        observations, labels, masks, falls = [], [], [], 0
+        driven = np.flatnonzero(self._turn < share)
+        memory = select(self._memory, torch.from_numpy(driven))
+        observations, labels, masks, falls = [], [], [], np.zeros(c.n, bool)
         for _ in range(c.length):
             observations.append(student.observe(env, self._previous))
             labels.append((self.teacher.targets() - self.map.offset) / self.map.scale)
             masks.append(alive.copy())
+            action = labels[-1].copy()
+            if len(driven):
+                with torch.no_grad():
+                    own, memory = self.student(torch.from_numpy(observations[-1][None, driven]), memory)
+                action[driven] = own[0].numpy()
             drawn = env.rng.standard_normal((c.n, 12))
             self._noise = decay * self._noise + np.sqrt(1 - decay**2) * self._noise_std * drawn
-            self._previous = (labels[-1] + self._noise / self.map.scale).astype(np.float32)
+            self._previous = (action + self._noise / self.map.scale).astype(np.float32)
             env.tick(self.map.targets(self._previous))
             self.teacher.advance()
-            falls += int((env.fallen & alive).sum())
+            falls |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
         self._over = np.flatnonzero(~alive)
         self.samples += c.length * c.n
-        lag = self.teacher.tracking.error
+        lag = np.hypot(*self.teacher.tracking.error[:, :2].T)
+        minutes = c.n * c.length * TICK / 60
         obs, label, mask = (
             torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
         )
@@ -210,8 +231,10 @@ class DistillRun:
             label,
             mask,
             {
-                "error_xy": float(np.hypot(lag[:, 0], lag[:, 1]).mean()),
-                "falls_per_minute": 60 * falls / (c.n * c.length * TICK),
+                "error_xy": float(lag.mean()),
+                "error_driven": float(lag[driven].mean()) if len(driven) else 0.0,
+                "falls_per_minute": falls.sum() / minutes,
+                "falls_driven": falls[driven].sum() / (minutes * max(share, 1 / c.n)),
             },
         )
 
@@ -228,8 +251,10 @@ class DistillRun:
             self.env.reset(over)
             self.teacher.reset(over)
             self._noise[over] = self._previous[over] = 0.0
-            for memory in (*self._memory, *self._mirrored):
+            for memory in self._memory:
                 memory[:, over] = 0.0
+            for memory, fresh in zip(self._mirrored, self._fresh_mirrored, strict=True):
+                memory[:, over] = fresh[:, over]
         return seen
 
     def _learn(

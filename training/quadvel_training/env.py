@@ -21,7 +21,9 @@ from quadvel_sim.terrain import Terrain
 from .randomisation import PlantSampler, Randomisation, sample_actuators
 
 TICK = 0.005  # s, one policy sample
-STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(robot.NOMINAL_Q)[:, :2], axis=0)  # m, between nominal feet
+STANCE_LENGTH, STANCE_WIDTH = np.ptp(
+    foot_positions(robot.NOMINAL_Q)[:, :2], axis=0
+)  # m, between nominal feet
 
 
 def cores() -> int:

@@ -192,7 +192,9 @@ class EstimatorRun:
     def export(self, path: Path, recipe: dict[str, Any]) -> None:
         """Write the estimator file."""
         metadata = features.metadata((1, 1, MEMORY + 3), recipe, student.commit())
-        student.export(self.network, path, list(features.OUTPUTS), json.dumps(metadata))
+        student.export(
+            self.network, features.DEFAULT_LAYOUT.size, path, list(features.OUTPUTS), json.dumps(metadata)
+        )
 
     def step(self, done: float) -> dict[str, float]:
         """One sequence on each ground, and steps of the optimiser for mini-batches of both."""

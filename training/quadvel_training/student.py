@@ -18,6 +18,7 @@ from quadvel_description import robot
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
 
+from . import clock
 from .command_map import CommandCorrection, CommandMap
 from .env import VelocityEnv
 from .networks import Recurrent, State
@@ -27,9 +28,40 @@ MEMORY = 256
 HIDDEN = (192, 128)
 
 
-def new_actor() -> Recurrent:
-    """The policy of Section 4.1."""
-    return Recurrent(DEFAULT_OBSERVATION.size, 12, MEMORY, HIDDEN)
+class Policy(Recurrent):
+    """The policy of Section 4.1 with a gait clock of its own beside the 48 observations (docs/decisions/0015).
+
+    The last five numbers of the state's first part are the clock. Those of its second part are what is added to it: half a
+    cycle for a robot in the mirror, else nothing. A tick goes by the clock as the command of the tick before left it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(DEFAULT_OBSERVATION.size + clock.FEATURES, 12, MEMORY, HIDDEN)
+
+    def initial_state(self, n: int, mirrored: bool = False) -> State:
+        """Of `n` robots, before their first tick; `mirrored`: of their mirror images."""
+        zeros = torch.zeros(1, n, MEMORY + clock.SIZE)
+        ahead = zeros.clone()
+        if mirrored:
+            ahead[..., MEMORY:] = torch.tensor(clock.HALF_CYCLE)
+        return zeros, ahead
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 261); N may be missing in all."""
+        (h, time), (c, ahead) = (part.split([MEMORY, clock.SIZE], dim=-1) for part in state)
+        now, seen = time[0], []
+        for command in x[..., :4]:
+            seen.append(clock.features(now + ahead[0]))
+            now = clock.advance(now, command)
+        y, (h, c) = super().forward(
+            torch.cat([x, torch.stack(seen)], dim=-1), (h.contiguous(), c.contiguous())
+        )
+        return y, (torch.cat([h, now[None]], dim=-1), torch.cat([c, ahead], dim=-1))
+
+
+def new_actor() -> Policy:
+    """A policy with random weights."""
+    return Policy()
 
 
 def action_map(env: VelocityEnv) -> ActionMap:
@@ -50,20 +82,20 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
 class _Cell(nn.Module):
     """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
 
-    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM. `added`: x goes on
-    with as many numbers that are to be added to its first ones, and the product does that as well.
+    Written out, at batch size one it is quicker than onnxruntime's own LSTM; and what comes from the state alone is a
+    product of its own, which a runtime may form before x is there.
     """
 
-    def __init__(self, lstm: nn.LSTM, added: int) -> None:
+    def __init__(self, lstm: nn.LSTM) -> None:
         super().__init__()
-        inputs = lstm.weight_ih_l0
-        weight = torch.cat([inputs, inputs[:, :added], lstm.weight_hh_l0], dim=1)
-        self.weight = nn.Parameter(weight.detach().T.contiguous())
+        self.inputs, self.recurrent = (
+            nn.Parameter(weight.detach().T.contiguous()) for weight in (lstm.weight_ih_l0, lstm.weight_hh_l0)
+        )
         self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         h, c = state
-        gates = torch.addmm(self.bias, torch.cat([x, h], dim=1), self.weight)
+        gates = torch.addmm(torch.addmm(self.bias, h, self.recurrent), x, self.inputs)
         admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
         memory = forget.sigmoid() * c + admit.sigmoid() * candidate.tanh()
         hidden = release.sigmoid() * memory.tanh()
@@ -76,10 +108,10 @@ class _Step(nn.Module):
     def __init__(self, network: Recurrent, outputs: int, correction: CommandCorrection | None) -> None:
         super().__init__()
         self.network, self.outputs, self.correction = copy.deepcopy(network), outputs, correction
-        self.network.lstm = _Cell(network.lstm, 4 if correction else 0)
+        self.network.lstm = _Cell(network.lstm)
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
-        x = torch.cat([obs, self.correction(obs)], dim=1) if self.correction else obs
+        x = obs + self.correction(obs) if self.correction else obs
         y, (hidden, memory) = self.network(x, (h.flatten(0, 1), c.flatten(0, 1)))
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
@@ -87,6 +119,7 @@ class _Step(nn.Module):
 
 def export(
     network: Recurrent,
+    size: int,
     path: Path,
     outputs: Sequence[str],
     metadata: str,
@@ -94,9 +127,9 @@ def export(
 ) -> None:
     """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
 
+    obs has the shape (1, size).
     `command_map`: what corrects the command, the observation's first four numbers.
     """
-    size = network.lstm.input_size
     state = network.initial_state(1)
     correction = CommandCorrection(command_map, size) if command_map else None
     part = path.with_suffix(".part")
@@ -140,9 +173,9 @@ def export_policy(
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(robot.NOMINAL_Q),
         command_limits={"vx": c.vx, "vy": (-c.vy, c.vy), "wz": (-c.wz, c.wz)},
-        state_shape=(1, 1, MEMORY),
+        state_shape=(1, 1, MEMORY + clock.SIZE),
         actuator=attrs.asdict(env.config.actuator),
         recipe=recipe,
         commit=commit(),
     )
-    export(actor, path, ["actions"], metadata.to_json(), command_map)
+    export(actor, DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json(), command_map)

@@ -16,7 +16,7 @@ from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 from quadvel_sim.terrain import Terrain
 
-from . import gait
+from . import clock, gait
 from .command_map import Tracking
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget
@@ -26,7 +26,6 @@ from .ppo import Ppo, PpoConfig, Rollout
 HOLD = 4  # ticks a residual is held
 RESIDUAL = 0.2  # rad a unit of the network's output
 LEVELLING = 0.2  # s, in which the trunk follows the ground's slope
-ACCELERATION = np.array([2.5, 1.5, 4.0])  # m/s^2, m/s^2, rad/s^2; thrown at once into a run it falls
 
 
 def _signs(*signs: float) -> Mirror:
@@ -49,39 +48,51 @@ def torch_mirror(
 
 
 class GaitState:
-    """The clock, the residual and the pace of `n` environments.
+    """The clock, the residual and the lean of `n` environments.
 
-    pace (n, 4): the command that the gait walks at. It follows the wanted one by ACCELERATION, and stands once it has come
-    to rest.
+    pace (n, 4): the command that the gait walks at. It follows the wanted one, and stands once it has come to rest.
     """
 
-    def __init__(self, n: int) -> None:
-        self.phase = np.zeros(n)
+    def __init__(self, env: VelocityEnv) -> None:
+        n = env.config.n
+        self.env = env
         self.residual = np.zeros((n, 12))
         self.residual_before = np.zeros((n, 12))
-        self.pace = np.zeros((n, 4))
         self.lean = np.zeros((n, 2))
+        self._clock = torch.zeros(n, clock.SIZE)
+        self._wanted = np.zeros((n, 4))
+        self.reset(np.arange(n))
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the past of `ids`."""
-        for array in (self.phase, self.residual, self.residual_before, self.pace, self.lean):
+        """Forget the past of `ids`, whose environments have just started over."""
+        for array in (self.residual, self.residual_before, self._clock):
             array[ids] = 0.0
+        self.lean[ids] = self.env.ground_roll_pitch[ids]
+        self._note()
 
-    def advance(self, env: VelocityEnv) -> None:
-        """One tick further towards the command; the clock rests at its start while the gait stands."""
-        wanted = env.command
-        self.lean += (env.ground_roll_pitch - self.lean) * TICK / LEVELLING
-        step = ACCELERATION * TICK
-        self.pace[:, :3] += (wanted[:, :3] - self.pace[:, :3]).clip(-step, step)
-        self.pace[:, 3] = wanted[:, 3] * (self.pace[:, :3] == 0.0).all(axis=1)
-        moving = self.pace[:, 3] < 0.5
-        self.phase = np.where(moving, (self.phase + gait.frequency(self.pace) * TICK) % 1.0, 0.0)
+    def advance(self) -> None:
+        """After the environment's tick: one tick further under the command that was in force in it."""
+        self.lean += (self.env.ground_roll_pitch - self.lean) * TICK / LEVELLING
+        self._clock = clock.advance(self._clock, torch.from_numpy(self._wanted.astype(np.float32)))
+        self._note()
+
+    def _note(self) -> None:
+        self._wanted = self.env.command.copy()
+        self.pace = self._clock[:, [0, 1, 2, 4]].numpy().astype(float)
+        self.pace[:, 3] = 1 - self.pace[:, 3]
+        self.phase = self._clock[:, 3].numpy().astype(float)
 
 
 def body_of(env: VelocityEnv, g: GaitState) -> gait.Body:
     """What the gait reads."""
     return gait.Body(
-        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, g.lean, env.height, env.velocity[:, 2]
+        env.q,
+        env.velocity[:, :2],
+        env.angular_velocity,
+        env.roll_pitch,
+        g.lean,
+        env.height,
+        env.velocity[:, 2],
     )
 
 
@@ -172,7 +183,7 @@ class TeacherRun:
         self.env = VelocityEnv(
             EnvConfig(n=config.n, seed=config.seed, commands=config.commands, terrain=config.terrain)
         )
-        self.gait = GaitState(config.n)
+        self.gait = GaitState(self.env)
         self.tracking = Tracking(config.n, gain=0.0)
         size = len(OBSERVATION_MIRROR.index)
         self.actor = Gaussian(Mlp(size, 12), 12, config.std)
@@ -229,7 +240,7 @@ class TeacherRun:
             total = np.zeros(c.n)
             for _ in range(HOLD):
                 env.tick(base + RESIDUAL * g.residual)
-                g.advance(env)
+                g.advance()
                 base = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)
                 self.tracking.advance(env, g.pace[:, :3])
                 total += reward(env, g, self.tracking.error)

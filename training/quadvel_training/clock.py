@@ -1,0 +1,40 @@
+"""The gait's clock: the pace that leads the robot to its command, and where in its cycle the gait is.
+
+Teacher and student walk by the same one; the policy file carries it in its memory. It depends on the commands alone.
+A clock is (..., 5) float32: pace vx, vy (m/s), wz (rad/s), phase in [0, 1), and 1 while it runs, 0 while the robot stands.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from . import gait
+from .env import TICK
+
+SIZE = 5
+ACCELERATION = (2.5, 1.5, 4.0)  # m/s^2, m/s^2, rad/s^2; thrown at once into a run a robot falls
+HALF_CYCLE = (0.0, 0.0, 0.0, 0.5, 0.0)
+"""By which the clock of the mirrored robot is ahead: its other diagonal pair begins."""
+
+
+def advance(clock: Tensor, command: Tensor) -> Tensor:
+    """The clock (..., 5) one tick further under `command` (..., 4): it stands once it is told to and has come to rest."""
+    pace, phase, _ = clock.split([3, 1, 1], dim=-1)
+    step = TICK * torch.tensor(ACCELERATION)
+    pace = pace + (command[..., :3] - pace).clamp(-step, step)
+    speed = (pace * torch.tensor(gait.SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
+    runs = 1 - command[..., 3:] * (speed == 0)
+    share = (speed / gait.FULL_SPEED).clamp(max=1.0)
+    phase = phase + TICK * (gait.SLOWEST + (gait.FASTEST - gait.SLOWEST) * share)
+    return torch.cat([pace, (phase - phase.floor()) * runs, runs], dim=-1)
+
+
+FEATURES = 6
+
+
+def features(clock: Tensor) -> Tensor:
+    """What a network sees of the clock (..., 5), (..., 6): pace, 1 while it runs, then sine and cosine of the phase."""
+    pace, phase, runs = clock.split([3, 1, 1], dim=-1)
+    angle = 2 * torch.pi * (phase + torch.tensor([0.0, 0.25]))
+    return torch.cat([pace, runs, angle.sin() * runs], dim=-1)
