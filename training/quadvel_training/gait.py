@@ -101,8 +101,7 @@ def _swing_feet(phase: np.ndarray, command: np.ndarray, body: Body) -> np.ndarra
     feet[..., :2] += (
         along[..., None] * stride + 0.12 * s[..., None] * (body.velocity - command[:, :2])[:, None]
     )
-    roll, pitch = body.lean.T
-    feet[..., :2] += HEIGHT * np.stack([np.tan(pitch), -np.tan(roll)], axis=-1)[:, None]
+    feet[..., :2] += _downhill(body.lean)[:, None]
     feet[..., 2] += swing_height(phase, command)
     return feet
 
@@ -118,7 +117,7 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
     )
     force[:, :2] += robot.MASS * 6.0 * error
     feet = foot_positions(body.q)
-    place = _standing_place(feet) * (command[:, 3:] > 0.5)
+    place = _standing_place(feet, body.lean) * (command[:, 3:] > 0.5)
     force[:, :2] += robot.MASS * CENTRING * place[:, :2]
     w = body.angular_velocity
     twist = 10 * (command[:, 2] - w[:, 2]) + CENTRING * place[:, 2]
@@ -142,7 +141,13 @@ def _stance_forces(command: np.ndarray, body: Body, down: np.ndarray) -> np.ndar
     return forces
 
 
-def _standing_place(feet: np.ndarray) -> np.ndarray:
+def _downhill(lean: np.ndarray) -> np.ndarray:
+    """How far from below the trunk the centre of mass would fall on the ground, (n, 2) m, trunk frame."""
+    roll, pitch = lean.T
+    return HEIGHT * np.stack([np.tan(pitch), -np.tan(roll)], axis=-1)
+
+
+def _standing_place(feet: np.ndarray, lean: np.ndarray) -> np.ndarray:
     """Where the trunk would stand over its feet (n, 4, 3) as in the nominal posture: forward, left (m), yaw (rad), (n, 3).
 
     Without this pull a standing trunk creeps: soft joints that are told to hold their force follow every lean.
@@ -152,4 +157,5 @@ def _standing_place(feet: np.ndarray) -> np.ndarray:
     turn = np.arctan2(
         (stand[:, 0] * arms[..., 1] - stand[:, 1] * arms[..., 0]).sum(-1), (stand * arms).sum((-1, -2))
     )
-    return np.concatenate([centre - _STAND[:, :2].mean(axis=0), turn[:, None]], axis=-1)
+    place = centre - _STAND[:, :2].mean(axis=0) - _downhill(lean)
+    return np.concatenate([place, turn[:, None]], axis=-1)
