@@ -10,7 +10,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
-from quadvel_training import gait, loop  # noqa: E402
+from quadvel_training import gait, loop, teacher  # noqa: E402
 from quadvel_training.crl import PARTS, CrlConfig, CrlRun  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
@@ -21,9 +21,7 @@ QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), co
 
 
 def body(env):
-    return gait.Body(
-        env.q, env.velocity[:, :2], env.angular_velocity, env.roll_pitch, env.height, env.velocity[:, 2]
-    )
+    return teacher.body_of(env, teacher.GaitState(env))
 
 
 def test_the_gait_stands_still_on_command():

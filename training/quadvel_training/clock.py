@@ -21,9 +21,9 @@ HALF_CYCLE = (0.0, 0.0, 0.0, 0.5, 0.0)
 def advance(clock: Tensor, command: Tensor) -> Tensor:
     """The clock (..., 5) one tick further under `command` (..., 4): it stands once it is told to and has come to rest."""
     pace, phase, _ = clock.split([3, 1, 1], dim=-1)
-    step = TICK * torch.tensor(ACCELERATION)
+    step = TICK * pace.new_tensor(ACCELERATION)
     pace = pace + (command[..., :3] - pace).clamp(-step, step)
-    speed = (pace * torch.tensor(gait.SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
+    speed = (pace * pace.new_tensor(gait.SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
     runs = 1 - command[..., 3:] * (speed == 0)
     share = (speed / gait.FULL_SPEED).clamp(max=1.0)
     phase = phase + TICK * (gait.SLOWEST + (gait.FASTEST - gait.SLOWEST) * share)
@@ -36,5 +36,5 @@ FEATURES = 6
 def features(clock: Tensor) -> Tensor:
     """What a network sees of the clock (..., 5), (..., 6): pace, 1 while it runs, then sine and cosine of the phase."""
     pace, phase, runs = clock.split([3, 1, 1], dim=-1)
-    angle = 2 * torch.pi * (phase + torch.tensor([0.0, 0.25]))
+    angle = 2 * torch.pi * (phase + phase.new_tensor([0.0, 0.25]))
     return torch.cat([pace, runs, angle.sin() * runs], dim=-1)

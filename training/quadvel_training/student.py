@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import subprocess
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -134,15 +135,19 @@ def export(
     correction = CommandCorrection(command_map, size) if command_map else None
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
-    torch.onnx.export(
-        _Step(network, len(outputs), correction).eval(),
-        (torch.zeros(1, size), *state),
-        str(part),
-        input_names=["obs", "h_in", "c_in"],
-        output_names=[*outputs, "h_out", "c_out"],
-        opset_version=17,
-        dynamo=False,
-    )
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", torch.jit.TracerWarning
+        )  # one step has one length, and constants are constants
+        torch.onnx.export(
+            _Step(network, len(outputs), correction).eval(),
+            (torch.zeros(1, size), *state),
+            str(part),
+            input_names=["obs", "h_in", "c_in"],
+            output_names=[*outputs, "h_out", "c_out"],
+            opset_version=17,
+            dynamo=False,
+        )
     model = onnx.load(part)
     onnx.helper.set_model_props(model, {METADATA_KEY: metadata})
     onnx.save(model, part)
