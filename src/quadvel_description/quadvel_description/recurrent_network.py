@@ -8,8 +8,10 @@ outputs mean is the caller's matter.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -78,7 +80,9 @@ class RecurrentNetwork:
         self._check_signature()
         self._try_out()
         self._input = np.zeros((1, self.input_size), np.float32)
-        self._results = {name: np.zeros((1, size), np.float32) for name, size in self._outputs.items()}
+        self._result = np.zeros((1, sum(self._outputs.values())), np.float32)  # all outputs side by side
+        ends = np.cumsum([0, *self._outputs.values()]).tolist()
+        self._places = [slice(*place) for place in pairwise(ends)]
         # Two memories that take turns: what one step writes, the next one reads, and nothing is copied.
         self._memories = [
             [np.zeros(self.metadata["state_shape"], np.float32) for _ in "hc"] for _ in range(2)
@@ -114,10 +118,13 @@ class RecurrentNetwork:
         self._input[0] = observation
         self._next[self._turn]()
         self._turn, self._next = 1 - self._turn, self._whole
-        for name, result in self._results.items():
-            if not np.isfinite(result).all():
-                raise FloatingPointError(f"{self.path}: the network's output {name} is not finite")
-        return [result[0].copy() for result in self._results.values()]
+        result = self._result[0].copy()
+        outputs = [result[place] for place in self._places]
+        if not all(map(math.isfinite, result.tolist())):  # for so few numbers quicker than NumPy
+            named = zip(self._outputs, outputs, strict=True)
+            broken = next(name for name, output in named if not np.isfinite(output).all())
+            raise FloatingPointError(f"{self.path}: the network's output {broken} is not finite")
+        return outputs
 
     @cached_property
     def _halves(self) -> tuple[list[_Run], list[_Run]] | None:
@@ -145,7 +152,10 @@ class RecurrentNetwork:
                 {
                     "obs": self._input,
                     **dict(zip((*MEMORY_INPUTS, *MEMORY_OUTPUTS), (*read, *write), strict=True)),
-                    **self._results,
+                    **{
+                        name: self._result[:, place]
+                        for name, place in zip(self._outputs, self._places, strict=True)
+                    },
                     **handed_over,
                 },
             )
