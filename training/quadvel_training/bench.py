@@ -1,6 +1,6 @@
 """How far training is from what its parts allow on this machine, as ratios measured in one run.
 
-`environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps of the same model. `training`:
+`environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps from the same states. `training`:
 a whole update (rollout and learning, symmetry and smoothness on) against the bare steps and bare passes of the same
 networks over the same sizes, and the shares that its parts have in it.
 """
@@ -10,14 +10,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 
-import attrs
-import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
 from numpy.typing import NDArray
 
-from quadvel_description import robot
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import student
@@ -55,21 +52,20 @@ def _rate_and_ratio(
     }
 
 
-def _bare_tick(config: EnvConfig, substeps: int) -> Callable[[], None]:
-    """One tick's physics alone, (substeps) steps of the whole batch standing on its feet."""
-    model = training_model(config.timestep, config.terrain)
-    batch = Batch(model, config.n, config.threads)
-    batch.reset(keyframe=model.key("stand").id, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    target = VelocityEnv(attrs.evolve(config, n=1)).stand_q
+def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
+    """One tick's physics alone: the steps of as many robots, none of them varied, from the states of `env` and on its torques.
+
+    From the same states, as robots on their feet are quicker to simulate than robots pushed and stumbling.
+    """
+    batch = Batch(training_model(env.config.timestep, env.config.terrain), env.config.n, env.config.threads)
+    rows = [(batch.bind(name), env.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")]
 
     def tick() -> None:
-        ctrl[:] = robot.KP * (target - qpos[:, 7:]) - robot.KD * qvel[:, 6:]
-        for _ in range(substeps):
+        for own, given in rows:
+            own[:] = given
+        for _ in range(env.substeps):
             batch.step()
 
-    for _ in range(40):  # land
-        tick()
     return tick
 
 
@@ -85,7 +81,7 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
         env.tick(np.tile(env.stand_q, (n, 1)))
         rewards(action)
 
-    seconds = _in_turn({"whole": tick, "bare": _bare_tick(config, env.substeps)}, 60)
+    seconds = _in_turn({"whole": tick, "bare": _bare_tick(env)}, 60)
     return _rate_and_ratio("steps", n * env.substeps, seconds["whole"], seconds["bare"])
 
 
@@ -111,7 +107,7 @@ def _bare_parts(run: CrlRun) -> dict[str, tuple[Callable[[], object], float]]:
     batch, batches = n // p.mini_batches, p.epochs * p.mini_batches
     few = 16  # ticks at once, to be seen beside a whole update
     return {
-        "physics": (_repeated(_bare_tick(run.env.config, run.env.substeps), few), length / few),
+        "physics": (_repeated(_bare_tick(run.env), few), length / few),
         "inference": (_repeated(infer, few), length / few),
         "actor": (learn(actor, size, batch), batches),
         "mirrored": (learn(actor, size, round(batch * p.symmetric_share)), batches),
