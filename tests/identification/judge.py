@@ -11,6 +11,8 @@ INDISTINGUISHABLE_MOST = 3
 REMOVED_LEAST = 0.6
 WITHIN = {"table 4": 1.05}
 WITHIN_OTHERS = 1.15
+SHARE_OFF, SHARE_LEAST = 0.25, 0.005
+"""A share of samples may be off by so much of itself and so much more."""
 SHOWS = 1.08
 """of the floor: a joint with less error than this hides nothing that could be found"""
 
@@ -52,7 +54,7 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
         "floor": truth["floor"],
         "floor_estimate": report["noise_floor"],
         "removed": (before - after) / removable if removable > 0 else 1.0,
-        "within": after <= WITHIN.get(truth["group"], WITHIN_OTHERS) * truth["floor"],
+        "within": _within(report, truth),
         "unexplained": report["unexplained"]["verdict"],
         "depends_on": report["unexplained"]["depends_on"],
         "all_signals": _all_signals(report, truth),
@@ -61,6 +63,15 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
     if truth["group"] == "outside" and row["verdict"] == "right" and row["removed"] < REMOVED_LEAST:
         row["verdict"] = "right, too little removed"
     return row
+
+
+def _within(report: Report, truth: Truth) -> bool:
+    """The error that is asked for; of an effect whose occurrences are random, the share of samples that it hit."""
+    if truth["group"] == "alone" and "share_of_samples" in truth["effects"][0]["params"]:
+        share = truth["effects"][0]["params"]["share_of_samples"]
+        said = [entry["samples_hit"] for entry in report["effects"] if "samples_hit" in entry]
+        return any(abs(one - share) <= SHARE_OFF * share + SHARE_LEAST for one in said)
+    return report["after"]["heldout_mse"] <= WITHIN.get(truth["group"], WITHIN_OTHERS) * truth["floor"]
 
 
 def _answers(entry: dict[str, Any], true: dict[str, Any]) -> bool:

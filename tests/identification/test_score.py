@@ -53,6 +53,13 @@ def test_one_effect_has_to_be_named_first_or_among_three_that_the_first_looks_li
     assert judge(_report(*effects), _truth("alone", "cogging"))["verdict"] == verdict
 
 
+@pytest.mark.parametrize(("said", "right"), [(0.09, True), (0.04, False)])
+def test_commands_lost_at_random_are_judged_by_their_share_and_not_by_the_error(said, right):
+    truth = _truth("alone", "command_hold", params={"share_of_samples": 0.1})
+    report = _report(_entry("command_hold") | {"samples_hit": said}, after=0.3)
+    assert judge(report, truth)["within"] == right
+
+
 def test_several_effects_have_all_to_be_named():
     truth = _truth("together", "cogging", "armature")
     assert judge(_report(_entry("armature"), _entry("cogging")), truth)["verdict"] == "right"

@@ -117,17 +117,40 @@ def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
     for first in (595, 1400, 2400):
         behind[first : first + 5] = 1
     rng = np.random.default_rng(0)
-    emission = 5.0 * (behind[:, None, None] != np.arange(3)) + rng.exponential(0.3, (3000, 1, 3))
+    costs = 5.0 * (behind[:, None, None] != np.arange(3)) + rng.exponential(0.3, (3000, 1, 3))
     new = (np.arange(3000) % 5 == 0).astype(int)
-    several = backlog._likeliest(emission, new)
-    np.testing.assert_array_equal(several[:, 0], behind)
+    several, moves = backlog._odds(costs, new, backlog.Chances())
+    np.testing.assert_array_equal(several[:, 0].argmax(axis=1), behind)
+    assert backlog.Chances.of(moves).lost == pytest.approx(3 / 600, rel=0.05)
     monkeypatch.setattr(backlog, "_PIECE", 3000)
-    np.testing.assert_array_equal(several, backlog._likeliest(emission, new))
+    np.testing.assert_allclose(several, backlog._odds(costs, new, backlog.Chances())[0], atol=1e-9)
+
+
+def test_lost_commands_are_told_without_a_look_at_the_torque_that_they_are_judged_by():
+    truth = parameters([Effect("command_hold", JOINTS, {"share": 0.1})], noise=0.01)
+    log = record(attrs.evolve(truth, joints=JOINTS), 2, 3.0, 500, seed=2)
+    sent = slice(None, None, 5)  # what changes at 200 Hz
+    log = attrs.evolve(log, **{name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")})
+    looked = about(log, 0.0075, 0.001)
+    looked.noise = np.full(2, 0.01)
+    ((odds, usual),) = looked.lost_commands(6)
+    other = log.tau.copy()
+    other[looked.judge.judge[:, 0], 0] += 2.0
+    changed = backlog.backlog(
+        about(attrs.evolve(log, tau=other), 0.0075, 0.001).model, looked.noise, 6, looked.judge.judge
+    )
+    same = backlog.backlog(looked.model, looked.noise, 6, looked.judge.judge)
+    judged = looked.judge.judge[:, 0]
+    np.testing.assert_allclose(changed[judged, 0], same[judged, 0], atol=1e-12)
+    assert np.abs(changed[judged, 1] - same[judged, 1]).max() > 0.5
+    law = CommandHold(odds, usual)
+    assert 0.05 < law.observed()["samples_hit"] < 0.2
+    assert np.ptp(law.foretold().odds, axis=(0, 1)).max() == 0.0
 
 
 def test_the_share_of_lost_commands_has_the_width_of_as_many_tosses():
     looked = about(_log(), 0.009, 0.003)
-    law = CommandHold(np.zeros((len(looked.samples.t), 1), dtype=np.intp))
+    law = CommandHold()
     share = np.full((1, 2), 0.1)
     model = looked.model.plus(Applied(law, np.ones(2, dtype=bool), share, ONE))
     half = intervals(model, looked.judge).effects[0]

@@ -31,6 +31,9 @@ class StandingPolicy:
     def reset(self) -> None:
         """Nothing to forget."""
 
+    def prepare(self) -> None:
+        """Nothing to do ahead."""
+
     def step(self, observation: np.ndarray) -> np.ndarray:
         return np.zeros(12, np.float32)
 

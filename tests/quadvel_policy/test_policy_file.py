@@ -12,7 +12,7 @@ import pytest
 
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_policy.observation import PolicyMetadata
-from quadvel_policy.policy_file import PolicyFile
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 WritePolicy = Callable[..., Path]
 
@@ -48,6 +48,20 @@ def test_a_reset_forgets_everything(write_policy: WritePolicy) -> None:
     first = [policy.step(o) for o in observations]
     policy.reset()
     np.testing.assert_array_equal([policy.step(o) for o in observations], first)
+
+
+@pytest.mark.parametrize("shipped", [True, False], ids=["shipped", "that can't be cut in two"])
+def test_a_prepared_policy_acts_as_one_that_is_not(write_policy: WritePolicy, shipped: bool) -> None:
+    path = SHIPPED_POLICY if shipped else write_policy()
+    plain, prepared = PolicyFile(path), PolicyFile(path)
+    observations = np.random.default_rng(3).normal(0.0, 0.3, (200, 48)).astype(np.float32)
+    for tick, observation in enumerate(observations):
+        if tick == 100:  # what was prepared belongs to the memory that is forgotten here
+            plain.reset()
+            prepared.reset()
+        np.testing.assert_allclose(prepared.step(observation), plain.step(observation), atol=2e-6)
+        if tick % 10:
+            prepared.prepare()
 
 
 def test_the_metadata_comes_with_the_file(write_policy: WritePolicy, metadata: PolicyMetadata) -> None:

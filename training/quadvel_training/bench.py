@@ -1,6 +1,6 @@
 """How far training is from what its parts allow on this machine, as ratios measured in one run.
 
-`environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps of the same model. `training`:
+`environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps from the same states. `training`:
 a whole update (rollout and learning, symmetry and smoothness on) against the bare steps and bare passes of the same
 networks over the same sizes, and the shares that its parts have in it.
 """
@@ -8,15 +8,13 @@ networks over the same sizes, and the shares that its parts have in it.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
-import attrs
-import mujoco
 import numpy as np
 import torch
 from mujoco.batch import Batch
+from numpy.typing import NDArray
 
-from quadvel_description import robot
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import student
@@ -26,33 +24,49 @@ from .networks import Mlp
 from .rewards import RewardWeights, Table2
 
 
-def _seconds(job: Callable[[], object], repeats: int) -> float:
-    """The median time of a call, after one to warm up."""
-    job()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
+def _in_turn(jobs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, NDArray[np.float64]]:
+    """Seconds (rounds,) that each job took, after a call of each to warm up.
+
+    In each round they run one after the other, so that what slows the machine down for a while falls on all of them
+    alike: ratios within a round hold where times do not.
+    """
+    for job in jobs.values():
         job()
-        times.append(time.perf_counter() - started)
-    return float(np.median(times))
+    seconds: dict[str, list[float]] = {name: [] for name in jobs}
+    for _ in range(rounds):
+        for name, job in jobs.items():
+            started = time.perf_counter()
+            job()
+            seconds[name].append(time.perf_counter() - started)
+    return {name: np.array(times) for name, times in seconds.items()}
 
 
-def _bare_steps(config: EnvConfig, substeps: int) -> float:
-    """Seconds of one tick's physics alone, (substeps) steps of the whole batch standing on its feet."""
-    model = training_model(config.timestep, config.terrain)
-    batch = Batch(model, config.n, config.threads)
-    batch.reset(keyframe=model.key("stand").id, stage=mujoco.mjtStage.mjSTAGE_NONE.value)
-    qpos, qvel, ctrl = (batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
-    target = VelocityEnv(attrs.evolve(config, n=1)).stand_q
+def _rate_and_ratio(
+    amount: str, count: int, whole: NDArray[np.float64], bare: NDArray[np.float64]
+) -> dict[str, float]:
+    """How many of `count` a second the whole and its bare parts do, and the ratio of both; medians over the rounds."""
+    return {
+        f"{amount}_per_s": count / float(np.median(whole)),
+        f"bare_{amount}_per_s": count / float(np.median(bare)),
+        "ratio": float(np.median(bare / whole)),
+    }
+
+
+def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
+    """One tick's physics alone: the steps of as many robots, none of them varied, from the states of `env` and on its torques.
+
+    From the same states, as robots on their feet are quicker to simulate than robots pushed and stumbling.
+    """
+    batch = Batch(training_model(env.config.timestep, env.config.terrain), env.config.n, env.config.threads)
+    rows = [(batch.bind(name), env.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")]
 
     def tick() -> None:
-        ctrl[:] = robot.KP * (target - qpos[:, 7:]) - robot.KD * qvel[:, 6:]
-        for _ in range(substeps):
+        for own, given in rows:
+            own[:] = given
+        for _ in range(env.substeps):
             batch.step()
 
-    for _ in range(40):  # land
-        tick()
-    return _seconds(tick, 40)
+    return tick
 
 
 def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict[str, float]:
@@ -67,17 +81,19 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
         env.tick(np.tile(env.stand_q, (n, 1)))
         rewards(action)
 
-    full, bare = _seconds(tick, 40), _bare_steps(config, env.substeps)
-    steps = n * env.substeps
-    return {"steps_per_s": steps / full, "bare_steps_per_s": steps / bare, "ratio": bare / full}
+    seconds = _in_turn({"whole": tick, "bare": _bare_tick(env)}, 60)
+    return _rate_and_ratio("steps", n * env.substeps, seconds["whole"], seconds["bare"])
 
 
-def _passes(config: CrlConfig) -> float:
-    """Seconds of one update's bare network passes: inference, actor, mirrored actor and critic, forward and backward."""
+def _bare_parts(run: CrlRun) -> dict[str, tuple[Callable[[], object], float]]:
+    """What an update can't do without, each with how often it needs it: physics, and passes of networks of its sizes.
+
+    The passes are inference, and forward and backward those of actor, mirrored actor and critic.
+    """
+    config, size = run.config, DEFAULT_OBSERVATION.size
     p, n, length = config.ppo, config.n, config.length
-    actor, critic = student.new_actor(), Mlp(DEFAULT_OBSERVATION.size + PRIVILEGED, 1)
-    one = torch.randn(1, n, DEFAULT_OBSERVATION.size)
-    state = actor.initial_state(n)
+    actor, critic = student.new_actor(), Mlp(size + PRIVILEGED, 1)
+    one, state = torch.randn(1, n, size), actor.initial_state(n)
 
     def infer() -> None:
         with torch.no_grad():
@@ -88,25 +104,35 @@ def _passes(config: CrlConfig) -> float:
         state = network.initial_state(envs)
         return lambda: network(x, state)[0].square().mean().backward()
 
-    size = n // p.mini_batches
-    batch = _seconds(learn(actor, DEFAULT_OBSERVATION.size, size), 3)
-    batch += _seconds(learn(actor, DEFAULT_OBSERVATION.size, round(size * p.symmetric_share)), 3)
-    batch += _seconds(learn(critic, DEFAULT_OBSERVATION.size + PRIVILEGED, size), 3)
-    return length * _seconds(infer, 20) + p.epochs * p.mini_batches * batch
+    batch, batches = n // p.mini_batches, p.epochs * p.mini_batches
+    few = 16  # ticks at once, to be seen beside a whole update
+    return {
+        "physics": (_repeated(_bare_tick(run.env), few), length / few),
+        "inference": (_repeated(infer, few), length / few),
+        "actor": (learn(actor, size, batch), batches),
+        "mirrored": (learn(actor, size, round(batch * p.symmetric_share)), batches),
+        "critic": (learn(critic, size + PRIVILEGED, batch), batches),
+    }
 
 
-def training(config: CrlConfig | None = None, updates: int = 3) -> dict[str, float]:
+def _repeated(job: Callable[[], object], times: int) -> Callable[[], None]:
+    def repeated() -> None:
+        for _ in range(times):
+            job()
+
+    return repeated
+
+
+def training(config: CrlConfig | None = None, updates: int = 5) -> dict[str, float]:
     """Policy samples a second of the whole loop, of its bare parts, their ratio, and the shares of the loop's parts."""
     config = config or CrlConfig(critic_first=0)
     run = CrlRun(config)
     seen: list[dict[str, float]] = []
-    whole = _seconds(lambda: seen.append(run.step(0.0)), updates)
-    physics = config.length * _bare_steps(run.env.config, run.env.substeps)
-    passes = _passes(config)
-    samples = config.n * config.length
-    return {
-        "samples_per_s": samples / whole,
-        "bare_samples_per_s": samples / (physics + passes),
-        "ratio": (physics + passes) / whole,
-        **{f"{part}_share": float(np.mean([one[part] for one in seen])) for part in PARTS},
-    }
+    parts = _bare_parts(run)
+    seconds = _in_turn(
+        {"whole": lambda: seen.append(run.step(0.0))} | {name: job for name, (job, _) in parts.items()},
+        updates,
+    )
+    bare = np.sum([calls * seconds[name] for name, (_, calls) in parts.items()], axis=0)
+    shares = {f"{part}_share": float(np.mean([one[part] for one in seen])) for part in PARTS}
+    return _rate_and_ratio("samples", config.n * config.length, seconds["whole"], bare) | shares

@@ -13,7 +13,7 @@ from importlib import metadata, util
 import attrs
 import numpy as np
 
-NEEDED = ("mujoco", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
+NEEDED = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 

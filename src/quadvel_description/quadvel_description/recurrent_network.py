@@ -1,14 +1,19 @@
 """An ONNX network with an LSTM's memory and a description of itself: policy files and estimator files.
 
 Loads the file, checks by name that it is what the caller expects, and runs it one step at a time on one
-thread. What the inputs and outputs mean is the caller's matter.
+thread; who is pressed for time has part of a step done before its observation comes. What the inputs and
+outputs mean is the caller's matter.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
+from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -25,6 +30,36 @@ MEMORY_OUTPUTS = ("h_out", "c_out")
 
 class NetworkFileError(ValueError):
     """A network file that is missing, unreadable or not what was asked for, in one sentence with its name."""
+
+
+def _session(model: str | bytes) -> onnxruntime.InferenceSession:
+    """A network, by its file's path or as the file's bytes, to be run on one thread."""
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    # At batch size one, weights are streamed as they lie; packed for larger products they are slower by a tenth.
+    options.add_session_config_entry("session.disable_prepacking", "1")
+    options.log_severity_level = 4  # what goes wrong is raised, not printed
+    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+
+
+class _Run:
+    """A session tied to our arrays, by their names, so that a run looks up, converts and allocates nothing."""
+
+    def __init__(
+        self, session: onnxruntime.InferenceSession, arrays: Mapping[str, NDArray[np.float32]]
+    ) -> None:
+        self._session, self._binding = session, session.io_binding()
+        self._arrays = arrays  # the binding holds their addresses alone
+        for tie, ends in (
+            (self._binding.bind_input, session.get_inputs()),
+            (self._binding.bind_output, session.get_outputs()),
+        ):
+            for array, name in ((arrays[end.name], end.name) for end in ends):
+                tie(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
+
+    def __call__(self) -> None:
+        self._session.run_with_iobinding(self._binding)
 
 
 class RecurrentNetwork:
@@ -45,12 +80,14 @@ class RecurrentNetwork:
         self._check_signature()
         self._try_out()
         self._input = np.zeros((1, self.input_size), np.float32)
-        self._results = [np.zeros((1, size), np.float32) for size in self._outputs.values()]
+        self._result = np.zeros((1, sum(self._outputs.values())), np.float32)  # all outputs side by side
+        ends = np.cumsum([0, *self._outputs.values()]).tolist()
+        self._places = [slice(*place) for place in pairwise(ends)]
         # Two memories that take turns: what one step writes, the next one reads, and nothing is copied.
         self._memories = [
             [np.zeros(self.metadata["state_shape"], np.float32) for _ in "hc"] for _ in range(2)
         ]
-        self._bindings = [self._bind(*self._memories), self._bind(*self._memories[::-1])]
+        self._whole = self._runs(self._session)
         self.reset()
 
     @property
@@ -60,9 +97,18 @@ class RecurrentNetwork:
 
     def reset(self) -> None:
         """Forget everything seen so far."""
-        self._turn = 0
+        self._turn, self._next = 0, self._whole
         for memory in self._memories[0]:
             memory[:] = 0.0
+
+    def prepare(self) -> None:
+        """Do of the next step what needs no observation, if the network has such a part; `step` then takes less time.
+
+        May be left out. The first call, which cuts the network in two, is slow.
+        """
+        if self._halves is not None:
+            ahead, self._next = self._halves
+            ahead[self._turn]()
 
     def step(self, observation: NDArray[np.float32]) -> list[NDArray[np.float32]]:
         """One time step: `obs` (n,) to the outputs, each (m,).
@@ -70,21 +116,51 @@ class RecurrentNetwork:
         Raises FloatingPointError where an output is not finite; the memory then is of no use until `reset`.
         """
         self._input[0] = observation
-        self._session.run_with_iobinding(self._bindings[self._turn])
-        self._turn = 1 - self._turn
-        for name, result in zip(self._outputs, self._results, strict=True):
-            if not np.isfinite(result).all():
-                raise FloatingPointError(f"{self.path}: the network's output {name} is not finite")
-        return [result[0].copy() for result in self._results]
+        self._next[self._turn]()
+        self._turn, self._next = 1 - self._turn, self._whole
+        result = self._result[0].copy()
+        outputs = [result[place] for place in self._places]
+        if not all(map(math.isfinite, result.tolist())):  # for so few numbers quicker than NumPy
+            named = zip(self._outputs, outputs, strict=True)
+            broken = next(name for name, output in named if not np.isfinite(output).all())
+            raise FloatingPointError(f"{self.path}: the network's output {broken} is not finite")
+        return outputs
 
-    def _bind(self, read: list[NDArray[np.float32]], write: list[NDArray[np.float32]]) -> Any:
-        """Tie the network to our arrays, so that a run looks up, converts and allocates nothing."""
-        binding = self._session.io_binding()
-        for name, array in zip(("obs", *MEMORY_INPUTS), (self._input, *read), strict=True):
-            binding.bind_input(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
-        for name, array in zip((*self._outputs, *MEMORY_OUTPUTS), (*self._results, *write), strict=True):
-            binding.bind_output(name, "cpu", 0, array.dtype, array.shape, array.ctypes.data)
-        return binding
+    @cached_property
+    def _halves(self) -> tuple[list[_Run], list[_Run]] | None:
+        """What runs ahead of an observation and what runs on it, or None where the network has no such parts."""
+        import onnx  # here, as those in no hurry need neither it nor `ahead`
+
+        from . import ahead
+
+        models = ahead.cut(onnx.load(self.path), "obs")
+        if models is None:
+            return None
+        before, after = (_session(model.SerializeToString()) for model in models)
+        handed_over = {end.name: np.zeros(end.shape, np.float32) for end in before.get_outputs()}
+        return self._runs(before, handed_over), self._runs(after, handed_over)
+
+    def _runs(
+        self,
+        session: onnxruntime.InferenceSession,
+        handed_over: Mapping[str, NDArray[np.float32]] = MappingProxyType({}),
+    ) -> list[_Run]:
+        """A run for each turn of the memories."""
+        return [
+            _Run(
+                session,
+                {
+                    "obs": self._input,
+                    **dict(zip((*MEMORY_INPUTS, *MEMORY_OUTPUTS), (*read, *write), strict=True)),
+                    **{
+                        name: self._result[:, place]
+                        for name, place in zip(self._outputs, self._places, strict=True)
+                    },
+                    **handed_over,
+                },
+            )
+            for read, write in (self._memories, self._memories[::-1])
+        ]
 
     def refuse(self, what: str, found: object, expected: object) -> NetworkFileError:
         """The error for a file of which `what` is `found`, for the caller to raise."""
@@ -109,14 +185,8 @@ class RecurrentNetwork:
     def _open(self) -> onnxruntime.InferenceSession:
         if not self.path.is_file():
             raise NetworkFileError(f"{self.path}: no such file, expected an ONNX network")
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1
-        options.inter_op_num_threads = 1
-        # At batch size one, weights are streamed as they lie; packed for larger products they are slower by a tenth.
-        options.add_session_config_entry("session.disable_prepacking", "1")
-        options.log_severity_level = 4  # what goes wrong is raised, not printed
         try:
-            return onnxruntime.InferenceSession(str(self.path), options, providers=["CPUExecutionProvider"])
+            return _session(str(self.path))
         except Exception as error:  # onnxruntime's exceptions share no other base
             raise NetworkFileError(
                 f"{self.path}: is not an ONNX network that onnxruntime can read"

@@ -60,7 +60,9 @@ class Controller(Node):
     def __init__(self) -> None:
         super().__init__("controller")
         self._settings = read_parameters(self, ControllerParameters)
-        self._supervisor = Supervisor(PolicyFile(self._settings.policy or SHIPPED_POLICY), self._settings)
+        policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
+        policy.prepare()  # now, as the first time is slow
+        self._supervisor = Supervisor(policy, self._settings)
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._stats, self._refusals = LoopStats(), Refusals()
         self._refused_before = self._overruns_before = 0
@@ -132,6 +134,7 @@ class Controller(Node):
             late = self._now(state.time) - state.time > PERIOD
             compute = time.perf_counter() - start
             self._stats.add(start, compute, self._supervisor.inference_seconds, periods - 1 + late)
+            self._supervisor.prepare()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
             self._answer.tick = state.tick
             self._publish()

@@ -27,6 +27,8 @@ class Policy(Protocol):
 
     def reset(self) -> None: ...
 
+    def prepare(self) -> None: ...
+
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
 
 
@@ -146,6 +148,10 @@ class Walk:
         """Start the policy over: its memory and the action that it is told it took."""
         self._policy.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
+
+    def prepare(self) -> None:
+        """Let the policy do ahead what it can of its next step."""
+        self._policy.prepare()
 
     def enter(self, tick: Tick) -> None:
         """Start the policy over, and remember what to fade from."""

@@ -40,6 +40,10 @@ class PolicyFile:
         """Forget everything seen so far."""
         self._network.reset()
 
+    def prepare(self) -> None:
+        """Do of the next step what needs no observation, so that it takes less time; may be left out."""
+        self._network.prepare()
+
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
         """One tick: the network's input, as `build_observation` makes it, to its raw output (12,).
 

@@ -162,6 +162,11 @@ class Supervisor:
         self._last, self._previous = seen, answer
         return answer
 
+    def prepare(self) -> None:
+        """Between two ticks, what can be done ahead of the next one, so that its answer comes sooner; may be left out."""
+        if self.mode == "walk":
+            self._walk.prepare()
+
     def _answer(self, state: RobotState, velocity: Array | None) -> JointCommand:
         mode = self._modes[self.mode]
         if self._entered is None:

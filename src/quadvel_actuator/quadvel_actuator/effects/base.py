@@ -153,6 +153,14 @@ class EffectLaw(ABC):
         """Half widths (J,) of the 95 % intervals of parameters that count what happened at random."""
         return {}
 
+    def foretold(self) -> EffectLaw:
+        """The law without what it read off the measured torque: all that it can say before that is known."""
+        return self
+
+    def observed(self) -> dict[str, float]:
+        """What it says of this record beside its parameters, by name."""
+        return {}
+
     def running(self, rng: np.random.Generator) -> EffectLaw:
         """The law as a running model has it; what happens at random is drawn from `rng`."""
         return self

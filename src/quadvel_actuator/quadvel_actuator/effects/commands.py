@@ -7,7 +7,6 @@ from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from .base import Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
 
@@ -17,9 +16,10 @@ MOST = 6
 
 @attrs.frozen(eq=False)
 class CommandHold(ErrorLaw):
-    """A `share` of the commands never acts, or late; which ones is read off the residual, `behind` (N, 1) or (N, J).
+    """A `share` of the commands never acts, or late; which ones is read off the torque, as far as that shows.
 
-    `behind` counts by how many commands the drive lags at each row. It is an inference about this record: a model that
+    `odds` (N, J, most + 1) are the chances that the drive is so many commands behind at each row, `usual` (most + 1,)
+    those of any row. The former are an inference about this record, which nobody could have made before; a model that
     runs draws its losses at random.
     """
 
@@ -28,7 +28,8 @@ class CommandHold(ErrorLaw):
     signal = "q_des@history"
     shifts = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
-    behind: NDArray[np.intp] | None = attrs.field(default=None, repr=False)
+    odds: Array | None = attrs.field(default=None, repr=False)
+    usual: Array | None = attrs.field(default=None, repr=False)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -36,22 +37,33 @@ class CommandHold(ErrorLaw):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[CommandHold]:
-        return tuple(cls(behind) for behind in about.lost_commands(MOST))
+        return tuple(cls(*odds) for odds in about.lost_commands(MOST))
+
+    def foretold(self) -> CommandHold:
+        if self.odds is None or self.usual is None:
+            return self
+        return attrs.evolve(self, odds=np.broadcast_to(self.usual, self.odds.shape))
+
+    def observed(self) -> dict[str, float]:
+        """The share of samples at which another command than the newest was in force."""
+        return {} if self.odds is None else {"samples_hit": float(1.0 - self.odds[..., 0].mean())}
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        if self.behind is None:
+        if self.odds is None:
             return [{"share": 0.05}]
         fresh = np.diff(s.packet[:, 0], prepend=s.packet[0, 0] - 1) > 0
-        lost = (self.behind[s.row[:, 0]] > 0) & fresh[:, None]
-        share = lost.sum(axis=0) / max(int(fresh.sum()), 1)
-        return [{"share": np.broadcast_to(share, s.q.shape[-1:]).copy()}]
+        share = 1.0 - self.odds[s.row[fresh, 0], :, 0].mean(axis=0)
+        return [{"share": share}]
 
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
-        if self.behind is None:
+        if self.odds is None:
             return e
-        behind = self.behind[s.row[:, 0]]
-        old: Array = s.sent[np.maximum(s.packet - behind, 0), np.arange(s.q.shape[-1])]
-        return np.where(behind > 0, e[0] + old - s.q_des, e[0]), e[1]
+        odds, joint = self.odds[s.row[:, 0]], np.arange(s.q.shape[-1])
+        late = sum(
+            odds[..., behind] * (s.sent[np.maximum(s.packet - behind, 0), joint] - s.q_des)
+            for behind in range(1, odds.shape[-1])
+        )
+        return e[0] + late, e[1]
 
     def chance(self, p: Params, s: View) -> dict[str, Array]:
         """As of as many tosses as there were commands."""

@@ -1,22 +1,66 @@
-"""Which commands never acted, or late: the likeliest course of the drive's backlog, read off the torque.
+"""Which commands never acted, or late: how likely the drive was how many commands behind, read off the torque.
 
-A Viterbi search over "how many commands is the drive behind". A command that is lost costs a fixed number of nats, so
-that noise alone is next to never explained by losses.
+A hidden Markov model of "how many commands is the drive behind": the chances of a loss are found from the log itself
+(Baum and Welch), then those of each row. Commands are lost for all joints at once, so what the others' torque says of a
+row stands in for the torque of a joint that is to be judged there.
 """
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
 from .model import Model
-from .signals import Array
+from .signals import Array, Bools
 
-LOST, STILL_LOST, LATE = 6.0, 3.0, 4.0
-"""nats: the first command lost, one more in a row, one that takes effect between two sendings"""
+LOST = 6.0
+"""nats by which a command has to look lost or late on its own"""
 
 _PIECE, _AROUND = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
+
+_ROUNDS = 8
+_RARE = 1e-6
+
+
+@attrs.frozen
+class Chances:
+    """Of a new command to be lost, of one more to be, and of a command that was held back to arrive at a row."""
+
+    lost: float = 0.02
+    still: float = 0.3
+    late: float = 0.02
+
+    def steps(self, most: int) -> Array:
+        """Chances (D, M, M) from so far behind to so far behind, as D = 0 to `most` + 1 commands were sent."""
+        count = most + 1
+        held = np.tril(np.full((count, count), self.late) / np.maximum(np.arange(count), 1)[:, None], -1)
+        held += np.diag(1.0 - held.sum(axis=1))
+        loses = np.where(np.arange(count) == 0, self.lost, self.still)
+        steps = [held]
+        for sent in range(1, count + 1):
+            step = np.zeros((count, count))
+            step[:, 0] = 1.0 - loses
+            step[np.arange(count), np.minimum(np.arange(count) + sent, most)] += loses
+            steps.append(step)
+        return np.array(steps)
+
+    @classmethod
+    def of(cls, counts: Array) -> Chances:
+        """The likeliest ones where moves were so frequent, `counts` (D, M, M)."""
+        sent = counts[1:].sum(axis=0)
+        held = counts[0]
+        back = np.tril(held, -1).sum()
+        return cls(
+            _share(sent[0, 1:].sum(), sent[0].sum()),
+            _share(sent[1:, 1:].sum(), sent[1:].sum()),
+            _share(back, held[1:].sum()),
+        )
+
+
+def _share(part: float, whole: float) -> float:
+    return float(np.clip(part / (whole + 1e-12), _RARE, 1.0 - _RARE))
 
 
 def suspicious(model: Model, noise: Array, least: float) -> bool:
@@ -30,13 +74,20 @@ def suspicious(model: Model, noise: Array, least: float) -> bool:
     return bool(((most > LOST).mean(axis=0) > least).any())
 
 
-def backlog(model: Model, noise: Array, most: int, together: bool) -> NDArray[np.intp]:
-    """By how many commands, 0 to `most`, the drive is behind at each row: (N, 1), or (N, J) unless `together`."""
-    emission = _costs(model, noise, most)
-    if together:
-        emission = emission.sum(axis=1, keepdims=True)
+def backlog(model: Model, noise: Array, most: int, unread: Bools) -> Array:
+    """Chances (N, J, most + 1) that the drive is 0 to `most` commands behind at each row.
+
+    Those of a joint do not look at its own torque in the rows `unread` (N, J), the chances of a loss at nobody's there.
+    """
+    costs = _costs(model, noise, most)
     packet = model.signals.packet[:, 0]
-    return _likeliest(emission, np.diff(packet, prepend=packet[0]))
+    new = np.minimum(np.diff(packet, prepend=packet[0]), most + 1)
+    hidden = np.where(unread[..., None], costs, 0.0)
+    read = (costs - hidden).sum(axis=1, keepdims=True)
+    chances = Chances()
+    for _ in range(_ROUNDS):
+        chances = Chances.of(_odds(read, new, chances)[1])
+    return _odds(costs.sum(axis=1, keepdims=True) - hidden, new, chances)[0]
 
 
 def _costs(model: Model, noise: Array, most: int) -> Array:
@@ -53,60 +104,41 @@ def _costs(model: Model, noise: Array, most: int) -> Array:
     return np.stack(cost, axis=-1)
 
 
-def _likeliest(emission: Array, new: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The cheapest path (N, G) through costs (N, G, M), `new` (N,) commands arriving before each row.
+def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array, Array]:
+    """Chances (N, G, M) of each state given the costs (N, G, M), and how often which move was made, (D, M, M).
 
-    Searched in pieces of the rows, side by side, each with some rows more at either end, from where paths agree.
+    `new` (N,) commands arrive before each row. Computed in pieces of the rows, side by side, each with some rows more
+    at either end, from where the start no longer counts.
     """
-    rows = len(emission)
-    count = -(-rows // _PIECE)
-    first = np.arange(count) * _PIECE - _AROUND
+    rows = len(costs)
+    first = np.arange(-(-rows // _PIECE)) * _PIECE - _AROUND
     at = np.clip(first + np.arange(_PIECE + 2 * _AROUND)[:, None], 0, rows - 1)  # (R, pieces)
-    inside = (first + np.arange(len(at))[:, None] == at)[..., None, None]
-    paths = _paths(np.where(inside, emission[at], 0.0), np.where(inside[..., 0, 0], new[at], 0))
-    path: NDArray[np.intp] = np.concatenate(paths[_AROUND : _AROUND + _PIECE].swapaxes(0, 1))[:rows]
-    return path
-
-
-def _paths(emission: Array, new: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The cheapest paths (R, S, G) of S pieces through costs (R, S, G, M), `new` (R, S)."""
-    rows, count = len(emission), emission.shape[-1]
-    came_from = np.zeros(emission.shape, dtype=np.int8)
-    price = np.where(np.arange(count) == 0, 0.0, LOST) + np.zeros(emission.shape[1:])
-    for n in range(rows):
-        after, best = _held_back(price)
-        for d in np.unique(new[n][new[n] > 0]):
-            which = new[n] == d
-            after[which], best[which] = _sent(price[which], min(int(d), count))
-        came_from[n] = best
-        price = after + emission[n]
-    path = np.zeros(emission.shape[:-1], dtype=np.intp)
-    at = np.argmin(price, axis=-1)
-    for n in range(rows - 1, -1, -1):
-        path[n] = at
-        at = np.take_along_axis(came_from[n], at[..., None], axis=-1)[..., 0].astype(np.intp)
-    return path
-
-
-def _held_back(price: Array) -> tuple[Array, NDArray[np.int8]]:
-    """Price (..., M) and origin of each state where nothing was sent: a command that was held back may arrive."""
-    after = price.copy()
-    best = np.broadcast_to(np.arange(price.shape[-1], dtype=np.int8), price.shape).copy()
-    least, origin = price[..., -1].copy(), best[..., -1].copy()
-    for m in range(price.shape[-1] - 2, -1, -1):
-        late = least + LATE < price[..., m]
-        after[..., m][late], best[..., m][late] = (least + LATE)[late], origin[late]
-        nearer = price[..., m] < least
-        least[nearer], origin[nearer] = price[..., m][nearer], m
-    return after, best
-
-
-def _sent(price: Array, d: int) -> tuple[Array, Array]:
-    """The same where `d` commands were sent: the last of them acts, or none."""
-    count = price.shape[-1]
-    stay = np.arange(count)
-    after, best = np.full_like(price, np.inf), np.zeros(price.shape)
-    after[..., 0], best[..., 0] = price.min(axis=-1), price.argmin(axis=-1)
-    after[..., d:] = price[..., : count - d] + np.where(stay[: count - d] == 0, LOST, STILL_LOST)
-    best[..., d:] = stay[: count - d]
-    return after, best
+    inside = first + np.arange(len(at))[:, None] == at
+    likely = np.exp(np.min(costs, axis=-1, keepdims=True) - costs)[at]
+    likely = np.where(inside[..., None, None], likely, 1.0)  # (R, S, G, M)
+    moves = chances.steps(costs.shape[-1] - 1)
+    which = np.where(inside, new[at], 0)
+    forward, backward = np.empty_like(likely), np.empty_like(likely)
+    state = np.zeros(likely.shape[1:])
+    state[..., 0] = 1.0
+    for n in range(len(at)):
+        state = (state @ moves[which[n]]) * likely[n]
+        state /= state.sum(axis=-1, keepdims=True)
+        forward[n] = state
+    state = np.ones(likely.shape[1:])
+    back = moves.swapaxes(-1, -2)
+    for n in range(len(at) - 1, -1, -1):
+        backward[n] = state
+        state = (state * likely[n]) @ back[which[n]]
+        state /= state.sum(axis=-1, keepdims=True)
+    odds = forward * backward
+    odds /= odds.sum(axis=-1, keepdims=True)
+    own = slice(_AROUND, _AROUND + _PIECE)
+    counts = np.zeros_like(moves)
+    before, after = forward[_AROUND - 1 : _AROUND + _PIECE - 1], (backward * likely)[own]
+    for d, step in enumerate(moves):
+        here = (which[own] == d) & inside[own]
+        made = before[here][..., :, None] * step * after[here][..., None, :]
+        counts[d] = (made / made.sum(axis=(-1, -2), keepdims=True)).sum(axis=(0, 1))
+    whole = odds[own].swapaxes(0, 1).reshape(-1, *costs.shape[1:])[:rows]
+    return whole, counts

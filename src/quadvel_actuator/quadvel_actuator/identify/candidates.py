@@ -103,33 +103,27 @@ class About:
             found[j] = int(np.argmax(score))
         return found
 
-    def lost_commands(self, most: int) -> list[NDArray[np.intp]]:
-        """By how many commands the drive seems to lag: (N, 1) for all joints together, (N, J) for each of them.
+    def lost_commands(self, most: int) -> list[tuple[Array, Array]]:
+        """How likely the drive lags by 0 to `most` commands: at each row, (N, J, most + 1), and at any; none if it rarely does.
 
-        Both are left out where next to nothing is lost.
+        For each joint without a look at the torque that it is judged by.
         """
-        found: list[NDArray[np.intp]] = []
-        if not suspicious(self.model, self.noise, _LOST_SHARE):
-            return found
-        for together in (True, False):
-            behind = backlog(self.model, self.noise, most, together)
-            if _share(behind, self.model) > _LOST_SHARE:
-                law = CommandHold(behind)
-                share = np.full((1, len(self.noise)), 0.05)
-                every = np.ones(len(self.noise), dtype=bool)
-                better = fit_with_delays(
-                    self.model.plus(Applied(law, every, share, np.arange(len(self.noise)))), self.judge.fit, 2
-                )
-                found.append(backlog(better.without(len(better.applied) - 1), self.noise, most, together))
-        return found
+        if len(self.noise) < 2 or not suspicious(self.model, self.noise, _LOST_SHARE):
+            return []
+        found = self._backlog(self.model, most)
+        if 1.0 - found[1][0] < _LOST_SHARE:
+            return []
+        every = np.ones(len(self.noise), dtype=bool)
+        lost = Applied(CommandHold(*found), every, np.full((1, len(every)), 0.05), np.arange(len(every)))
+        better = fit_with_delays(self.model.plus(lost), self.judge.fit, 2)
+        return [self._backlog(better.without(len(better.applied) - 1), most)]
+
+    def _backlog(self, model: Model, most: int) -> tuple[Array, Array]:
+        odds = backlog(model, self.noise, most, self.judge.judge)
+        return odds, odds[self.judge.fit].mean(axis=0)
 
 
 _LOST_SHARE = 0.003
-
-
-def _share(behind: NDArray[np.intp], model: Model) -> float:
-    fresh = np.diff(model.signals.packet[:, 0], prepend=-1) > 0
-    return float((behind[fresh] > 0).mean())
 
 
 def started(about: About, law: EffectLaw) -> Started | None:

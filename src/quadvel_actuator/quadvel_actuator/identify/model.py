@@ -163,6 +163,11 @@ class Model:
         """With one more effect."""
         return attrs.evolve(self, applied=(*self.applied, applied))
 
+    def foretold(self) -> Model:
+        """With laws that say no more than could be known before the torque was measured."""
+        applied = (attrs.evolve(one, law=one.law.foretold()) for one in self.applied)
+        return attrs.evolve(self, applied=tuple(applied))
+
     def holding(self, held: bool) -> Model:
         """With the memories of its laws held as they are, which makes fits of others cheap, or with all of it free."""
         applied = (attrs.evolve(one, held=held and one.law.remembers) for one in self.applied)

@@ -72,8 +72,8 @@ class Outcome:
 
     @property
     def after(self) -> Array:
-        """Torque of the corrected model, learned terms included, (N, J)."""
-        torque = self.model.predict()
+        """Torque that the corrected model foretells, learned terms included, (N, J)."""
+        torque = self.model.foretold().predict()
         return torque if self.learned is None else torque + self.learned.torque
 
 
@@ -223,6 +223,7 @@ def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) 
         "indistinguishable": list(finding.indistinguishable),
         "heldout_gain": finding.gain,
         "p_value": finding.p,
+        **one.law.observed(),
     }
     if settings:
         entry["form"] = settings
@@ -262,6 +263,12 @@ def _decision(report: Mapping[str, Any]) -> str:
         if rest["depends_on"]
         else ""
     )
+    for one in effects:
+        if "samples_hit" in one:
+            more += (
+                f"; {one['name']} hits {100.0 * one['samples_hit']:.2g} % of the samples at random, which the error after "
+                "holds, as no model foretells them"
+            )
     return f"{text} (noise floor {report['noise_floor']:.3g}){more}."
 
 

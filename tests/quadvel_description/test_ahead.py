@@ -1,0 +1,89 @@
+"""A network cut in two gives what the whole one gives, however its products are written."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnxruntime
+import pytest
+from onnx import ModelProto, TensorProto, helper, numpy_helper
+
+from quadvel_description.ahead import cut
+
+MEMORY = 4
+INPUTS = {"obs": (1, 3), "h_in": (1, 1, 2 * MEMORY), "c_in": (1, 1, MEMORY)}
+
+
+def network(order: tuple[str, ...] = ("obs", "h", "clock", "bent"), **gemm: float) -> ModelProto:
+    """A product of `order` put together, where h and clock are halves of h_in and bent is made of obs; `gemm`: its attributes."""
+    rng = np.random.default_rng(0)
+    widths = {"obs": 3, "bent": 3, "h": MEMORY, "clock": MEMORY}
+    weight = rng.normal(size=(sum(widths[name] for name in order), MEMORY)).astype(np.float32)
+    constants = {
+        "W": np.ascontiguousarray(weight.T) if gemm.get("transB") else weight,
+        "b": rng.normal(size=MEMORY).astype(np.float32),
+        "halves": np.array([MEMORY, MEMORY]),
+        "flat": np.array([1, -1]),
+        "deep": np.array([1, 1, -1]),
+    }
+    nodes = [
+        helper.make_node("Reshape", ["h_in", "flat"], ["memory"]),
+        helper.make_node("Split", ["memory", "halves"], ["h", "clock"], axis=1),
+        helper.make_node("Tanh", ["obs"], ["bent"]),
+        helper.make_node("Concat", order, ["joined"], axis=1),
+        helper.make_node("Gemm", ["joined", "W", "b"], ["sum"], **gemm),
+        helper.make_node("Sigmoid", ["sum"], ["actions"]),
+        helper.make_node("Concat", ["actions", "clock"], ["after"], axis=1),
+        helper.make_node("Reshape", ["after", "deep"], ["h_out"]),
+        helper.make_node("Tanh", ["c_in"], ["c_out"]),
+    ]
+    outputs = {"actions": (1, MEMORY), "h_out": INPUTS["h_in"], "c_out": INPUTS["c_in"]}
+    inputs, outputs = (
+        [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in ends.items()]
+        for ends in (INPUTS, outputs)
+    )
+    stored = [numpy_helper.from_array(value, name) for name, value in constants.items()]
+    graph = helper.make_graph(nodes, "network", inputs, outputs, stored)
+    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+
+
+def run(model: ModelProto, given: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    names = [end.name for end in session.get_outputs()]
+    return dict(
+        zip(
+            names,
+            session.run(names, {end.name: given[end.name] for end in session.get_inputs()}),
+            strict=True,
+        )
+    )
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        network(),
+        network(("h", "bent", "clock", "obs")),
+        network(("obs", "h")),
+        network(transB=1),
+    ],
+    ids=["mixed", "another order", "two terms", "transposed weights"],
+)
+def test_both_parts_together_are_the_network(model: ModelProto) -> None:
+    rng = np.random.default_rng(1)
+    given = {name: rng.normal(size=shape).astype(np.float32) for name, shape in INPUTS.items()}
+    parts = cut(model, "obs")
+    assert parts is not None
+    ahead = run(parts[0], {name: value for name, value in given.items() if name != "obs"})
+    found, expected = run(parts[1], given | ahead), run(model, given)
+    assert list(found) == list(expected)
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[name], value, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "model",
+    [network(("obs", "bent")), network(("h", "clock")), network(alpha=0.5)],
+    ids=["all awaits", "nothing awaits", "a scaled product"],
+)
+def test_a_network_without_a_product_of_both_kinds_stays_whole(model: ModelProto) -> None:
+    assert cut(model, "obs") is None
