@@ -13,6 +13,7 @@ from . import gait
 from .env import TICK
 
 SIZE = 5
+_RISE = (gait.FASTEST - gait.SLOWEST) / gait.FULL_SPEED  # Hz for 1 m/s
 ACCELERATION = (2.5, 1.5, 4.0)  # m/s^2, m/s^2, rad/s^2; thrown at once into a run a robot falls
 HALF_CYCLE = (0.0, 0.0, 0.0, 0.5, 0.0)
 """By which the clock of the mirrored robot is ahead: its other diagonal pair begins."""
@@ -24,10 +25,9 @@ def advance(clock: Tensor, command: Tensor) -> Tensor:
     step = TICK * pace.new_tensor(ACCELERATION)
     pace = pace + (command[..., :3] - pace).clamp(-step, step)
     speed = (pace * pace.new_tensor(gait.SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
-    runs = 1 - command[..., 3:] * (speed == 0)
-    share = (speed / gait.FULL_SPEED).clamp(max=1.0)
-    phase = phase + TICK * (gait.SLOWEST + (gait.FASTEST - gait.SLOWEST) * share)
-    return torch.cat([pace, (phase - phase.floor()) * runs, runs], dim=-1)
+    runs = torch.where(speed == 0, 1 - command[..., 3:], 1.0)
+    phase = phase + TICK * gait.SLOWEST + TICK * _RISE * speed.clamp(max=gait.FULL_SPEED)
+    return torch.cat([pace, phase.fmod(1.0) * runs, runs], dim=-1)
 
 
 FEATURES = 6
@@ -36,5 +36,5 @@ FEATURES = 6
 def features(clock: Tensor) -> Tensor:
     """What a network sees of the clock (..., 5), (..., 6): pace, 1 while it runs, then sine and cosine of the phase."""
     pace, phase, runs = clock.split([3, 1, 1], dim=-1)
-    angle = 2 * torch.pi * (phase + phase.new_tensor([0.0, 0.25]))
+    angle = 2 * torch.pi * phase + phase.new_tensor([0.0, torch.pi / 2])
     return torch.cat([pace, runs, angle.sin() * runs], dim=-1)

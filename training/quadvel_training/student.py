@@ -49,15 +49,14 @@ class Policy(Recurrent):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 261); N may be missing in all."""
-        (h, time), (c, ahead) = (part.split([MEMORY, clock.SIZE], dim=-1) for part in state)
-        now, seen = time[0], []
-        for command in x[..., :4]:
-            seen.append(clock.features(now + ahead[0]))
-            now = clock.advance(now, command)
-        y, (h, c) = super().forward(
-            torch.cat([x, torch.stack(seen)], dim=-1), (h.contiguous(), c.contiguous())
-        )
-        return y, (torch.cat([h, now[None]], dim=-1), torch.cat([c, ahead], dim=-1))
+        (h, now), (c, ahead) = (part.split([MEMORY, clock.SIZE], dim=-1) for part in state)
+        seen = []
+        for tick in range(len(x)):
+            seen.append(clock.features(now + ahead))
+            now = clock.advance(now, x[tick : tick + 1, ..., :4])
+        clocks = torch.cat(seen) if len(seen) > 1 else seen[0]
+        y, (h, c) = super().forward(torch.cat([x, clocks], dim=-1), (h.contiguous(), c.contiguous()))
+        return y, (torch.cat([h, now], dim=-1), torch.cat([c, ahead], dim=-1))
 
 
 def new_actor() -> Policy:
