@@ -127,7 +127,7 @@ class DistillConfig:
         0.1  # rad, stationary std of the time-correlated noise on executed targets, up to, by environment
     )
     driven: float = (
-        0.7  # share of robots that the student drives, from the middle of the run on; before, ever more
+        0.7  # share of robots that the student drives, from the first quarter of the run on; before, ever more
     )
     noise_time: float = 0.05  # s
     mini_batches: int = 8
@@ -192,7 +192,7 @@ class DistillRun:
         """One sequence and one step of the optimiser."""
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
-        obs, label, mask, seen = self.collect(c.driven * min(1.0, 2.0 * done))
+        obs, label, mask, seen = self.collect(c.driven * min(1.0, 4.0 * done))
         return seen | self.learn(obs, label, mask)
 
     def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
