@@ -6,7 +6,7 @@ Plain arrays and times in, joint commands out; it knows no ROS. `modes` holds wh
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import attrs
@@ -190,7 +190,8 @@ class Supervisor:
     def _limited(self, command: ArrayLike) -> Array:
         """The command in effect: stand still where it says so, is not finite, or walking is not allowed."""
         asked = np.asarray(command, float)
-        if not self.walk_allowed or not np.isfinite(asked).all() or asked[3] >= 0.5:
+        numbers = asked.tolist()
+        if not self.walk_allowed or not _finite(numbers) or numbers[3] >= 0.5:
             return STILL.copy()
         limited: Array = np.minimum(np.maximum(asked, self._low), self._high)
         return limited
@@ -227,7 +228,7 @@ class Supervisor:
             yield from self._joint_problems(state)
         if self.mode == "walk" and seen.velocity is None:
             yield "there is no fresh velocity estimate"
-        if seen.velocity is not None and not np.isfinite(seen.velocity).all():
+        if seen.velocity is not None and not _finite(seen.velocity.tolist()):
             yield "the velocity estimate is not finite"
 
     def _is_sound(self, state: RobotState) -> bool:
@@ -312,3 +313,8 @@ class Supervisor:
 
     def _after_lie_down(self, seen: Tick) -> Following:
         return ("passive", "lies") if self._lie_down.done(seen.elapsed) else None
+
+
+def _finite(numbers: Iterable[float]) -> bool:
+    """For a few numbers quicker than NumPy."""
+    return all(map(math.isfinite, numbers))
