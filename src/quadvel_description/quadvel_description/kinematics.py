@@ -102,14 +102,13 @@ def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def roll_pitch(quaternion: np.ndarray) -> np.ndarray:
     """Roll and pitch (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), (..., 4) -> (..., 2)."""
-    down = rotation_matrix(quaternion)[..., 2, :]
-    angles = np.empty((*down.shape[:-1], 2), down.dtype)
-    angles[..., 0] = np.arctan2(down[..., 1], down[..., 2])
-    angles[..., 1] = np.arcsin(np.minimum(np.maximum(-down[..., 0], -1.0), 1.0))
-    return angles
+    w, x, y, z = np.asarray(quaternion).T  # plain numbers for one robot, in which case these are quick
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.minimum(np.maximum(2 * (w * y - z * x), -1.0), 1.0))
+    return np.array((roll, pitch)).T
 
 
 def yaw(quaternion: np.ndarray) -> np.ndarray:
     """Yaw (rad), (..., 4) -> (...)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    w, x, y, z = np.asarray(quaternion).T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)).T

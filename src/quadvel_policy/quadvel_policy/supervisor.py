@@ -157,7 +157,7 @@ class Supervisor:
             self._check(seen, gap)
         if self.mode in self._after and (following := self._after[self.mode](seen)):
             self._switch(*following)
-        answer = self._answer(state, speed)
+        answer = self._answer(seen)
         answer.tick = state.tick
         self._last, self._previous = seen, answer
         return answer
@@ -167,13 +167,14 @@ class Supervisor:
         if self.mode == "walk":
             self._walk.prepare()
 
-    def _answer(self, state: RobotState, velocity: Array | None) -> JointCommand:
+    def _answer(self, seen: Tick) -> JointCommand:
         mode = self._modes[self.mode]
         if self._entered is None:
-            self._entered = state.time
-            mode.enter(self._seen(state, velocity))
+            self._entered = seen.state.time
+            seen = attrs.evolve(seen, elapsed=0.0)
+            mode.enter(seen)
         try:
-            answer = mode.tick(self._seen(state, velocity))
+            answer = mode.tick(seen)
         except FloatingPointError as error:
             self.fail(str(error))
             return JointCommand.damping(self.config.damping_kd)
