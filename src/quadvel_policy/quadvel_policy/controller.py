@@ -131,8 +131,8 @@ class Controller(Node):
         periods = self._grid.periods(state.time)
         if periods:
             self._tick(state)
-            late = self._now(state.time) - state.time > PERIOD
             compute = time.perf_counter() - start
+            late = self._now(state.time) - state.time > PERIOD
             self._stats.add(start, compute, self._supervisor.inference_seconds, periods - 1 + late)
             self._supervisor.prepare()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states

@@ -235,7 +235,7 @@ class Supervisor:
     def _is_sound(self, state: RobotState) -> bool:
         """Whether every number is finite and every joint within its limits: all in one look, as it mostly is."""
         numbers = np.concatenate((state.q, state.dq, state.quaternion, state.angular_velocity))
-        return bool((np.abs(numbers - self._middle) <= self._reach).all())
+        return np.count_nonzero(np.abs(numbers - self._middle) <= self._reach) == len(numbers)
 
     def _not_finite(self, state: RobotState) -> Iterator[str]:
         for name in ("q", "dq", "quaternion", "angular_velocity"):
