@@ -77,6 +77,10 @@ def test_leading_axes_are_kept():
     np.testing.assert_array_equal(
         kinematics.inverse_kinematics(feet)[1, 2], kinematics.inverse_kinematics(feet[1, 2])
     )
+    quaternions = _wxyz(_random_rotations(6, 4)).reshape(2, 3, 4)
+    quaternions /= np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    for angles in (kinematics.roll_pitch, kinematics.yaw):
+        np.testing.assert_allclose(angles(quaternions)[1, 2], angles(quaternions[1, 2]), atol=1e-15)
 
 
 def test_vectors_turn_as_the_quaternion_says():

@@ -6,37 +6,48 @@ import numpy as np
 
 from .robot import CALF_LENGTH, FRONT, HIP_OFFSET, LEFT, LEGS, THIGH_LENGTH, THIGH_OFFSET
 
-_SIDE = np.array([LEFT[leg] for leg in LEGS], float)
+_SIDEWAYS = THIGH_OFFSET * np.array([LEFT[leg] for leg in LEGS], float)
+_LINKS = -np.array([THIGH_LENGTH, CALF_LENGTH])
 HIPS = np.array([[HIP_OFFSET[0] * FRONT[leg], HIP_OFFSET[1] * LEFT[leg], 0.0] for leg in LEGS])
 """Hip joints in the trunk frame, (4, 3), m."""
 
 
-def _leg_plane(q: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Foot in the frame of each leg's own plane: x, depth z (negative), their derivatives' parts, hip sine, cosine."""
-    legs = np.asarray(q).reshape(*np.shape(q)[:-1], 4, 3)
-    hip, thigh, knee = legs[..., 0], legs[..., 1], legs[..., 1] + legs[..., 2]
-    thigh_x, thigh_z = -THIGH_LENGTH * np.sin(thigh), -THIGH_LENGTH * np.cos(thigh)
-    calf_x, calf_z = -CALF_LENGTH * np.sin(knee), -CALF_LENGTH * np.cos(knee)
-    return thigh_x + calf_x, thigh_z + calf_z, calf_x, calf_z, np.sin(hip), np.cos(hip)
+def _leg_planes(q: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Of each leg's own plane: thigh's and calf's way forward and up, (..., 4, 2) each, sine and cosine of the hip."""
+    angles = np.array(q, float).reshape(*np.shape(q)[:-1], 4, 3)
+    angles[..., 2] += angles[..., 1]
+    sines, cosines = np.sin(angles), np.cos(angles)
+    return sines[..., 1:] * _LINKS, cosines[..., 1:] * _LINKS, sines[..., 0], cosines[..., 0]
+
+
+def _from_hips(forward: np.ndarray, up: np.ndarray, s: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The feet as seen from the hip joints, (..., 4, 3)."""
+    feet, z = np.empty((*s.shape, 3)), up[..., 0] + up[..., 1]
+    feet[..., 0] = forward[..., 0] + forward[..., 1]
+    feet[..., 1], feet[..., 2] = _SIDEWAYS * c - z * s, _SIDEWAYS * s + z * c
+    return feet
 
 
 def foot_positions(q: np.ndarray) -> np.ndarray:
     """Centres of the foot spheres in the trunk frame, (..., 12) rad -> (..., 4, 3) m."""
-    x, z, _, _, s, c = _leg_plane(q)
-    y = THIGH_OFFSET * _SIDE
-    return np.stack([x, y * c - z * s, y * s + z * c], axis=-1) + HIPS
+    return _from_hips(*_leg_planes(q)) + HIPS
 
 
 def foot_jacobians(q: np.ndarray) -> np.ndarray:
     """d foot / d (hip, thigh, calf) in the trunk frame, (..., 12) -> (..., 4, 3, 3), m/rad; columns are joints."""
-    x, z, calf_x, calf_z, s, c = _leg_plane(q)
-    y = THIGH_OFFSET * _SIDE
-    jacobians = np.zeros((*x.shape, 3, 3))
-    jacobians[..., 1, 0], jacobians[..., 2, 0] = -y * s - z * c, y * c - z * s
-    for joint, forward, down in ((1, z, x), (2, calf_z, calf_x)):
-        jacobians[..., 0, joint] = forward
-        jacobians[..., 1, joint], jacobians[..., 2, joint] = down * s, -down * c
-    return jacobians
+    return foot_kinematics(q)[1]
+
+
+def foot_kinematics(q: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """`foot_positions` and `foot_jacobians` at once."""
+    forward, up, s, c = _leg_planes(q)
+    feet = _from_hips(forward, up, s, c)
+    jacobians = np.zeros((*feet.shape, 3))
+    jacobians[..., 1, 0], jacobians[..., 2, 0] = -feet[..., 2], feet[..., 1]
+    for joint, x, z in ((1, feet[..., 0], up[..., 0] + up[..., 1]), (2, forward[..., 1], up[..., 1])):
+        jacobians[..., 0, joint] = z
+        jacobians[..., 1, joint], jacobians[..., 2, joint] = x * s, -x * c
+    return feet + HIPS, jacobians
 
 
 def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
@@ -46,11 +57,10 @@ def inverse_kinematics(feet: np.ndarray) -> np.ndarray:
     """
     p = np.asarray(feet, float) - HIPS
     x, y, z = p[..., 0], p[..., 1], p[..., 2]
-    offset = THIGH_OFFSET * _SIDE
     depth = np.sqrt(
         np.maximum(y**2 + z**2 - THIGH_OFFSET**2, 1e-8)
     )  # leg plane: foot at depth below the thigh joint
-    hip = np.arctan2(z, y) - np.arctan2(-depth, offset)
+    hip = np.arctan2(z, y) - np.arctan2(-depth, _SIDEWAYS)
     hip = np.arctan2(np.sin(hip), np.cos(hip))
     reach = np.clip(np.hypot(x, depth), abs(THIGH_LENGTH - CALF_LENGTH) + 1e-6, THIGH_LENGTH + CALF_LENGTH)
     cos_knee = (reach**2 - THIGH_LENGTH**2 - CALF_LENGTH**2) / (2 * THIGH_LENGTH * CALF_LENGTH)
@@ -92,15 +102,13 @@ def rotate_inverse(quaternion: np.ndarray, v: np.ndarray) -> np.ndarray:
 
 def roll_pitch(quaternion: np.ndarray) -> np.ndarray:
     """Roll and pitch (rad) of R = Rz(yaw) Ry(pitch) Rx(roll), (..., 4) -> (..., 2)."""
-    q = np.asarray(quaternion)
-    w, x, y, z = (q[..., i] for i in range(4))
-    angles = np.empty((*q.shape[:-1], 2), np.result_type(q, np.float32))
-    angles[..., 0] = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    angles[..., 1] = np.arcsin(np.minimum(np.maximum(2 * (w * y - z * x), -1.0), 1.0))
-    return angles
+    w, x, y, z = np.asarray(quaternion).T  # plain numbers for one robot, in which case these are quick
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = np.arcsin(np.minimum(np.maximum(2 * (w * y - z * x), -1.0), 1.0))
+    return np.array((roll, pitch)).T
 
 
 def yaw(quaternion: np.ndarray) -> np.ndarray:
     """Yaw (rad), (..., 4) -> (...)."""
-    w, x, y, z = np.moveaxis(np.asarray(quaternion), -1, 0)
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    w, x, y, z = np.asarray(quaternion).T
+    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)).T

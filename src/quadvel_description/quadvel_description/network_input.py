@@ -63,15 +63,16 @@ class InputLayout:
 
         self._offset = spread(t.offset for t in self.terms)
         self._scale = spread(t.scale for t in self.terms)
-        self._clip = spread(np.inf if t.clip is None else t.clip for t in self.terms)
+        self._high = spread(np.inf if t.clip is None else t.clip for t in self.terms)
+        self._low = -self._high
 
     def build(self, values: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
         """The input (..., size) from each term's value (..., term.size); all leading axes are the same."""
         built = np.concatenate([values[name] for name in self.names], axis=-1, dtype=np.float64)
         built -= self._offset
         built *= self._scale
-        np.maximum(built, -self._clip, out=built)
-        return np.minimum(built, self._clip, out=built).astype(np.float32)
+        np.maximum(built, self._low, out=built)
+        return np.minimum(built, self._high, out=built).astype(np.float32)
 
     def to_metadata(self) -> list[dict[str, Any]]:
         """The list that a network file's metadata carries."""

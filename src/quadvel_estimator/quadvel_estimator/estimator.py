@@ -36,6 +36,7 @@ KINDS = ("learned", "kalman")
 ODOM_EVERY = 4  # estimates, which makes 50 Hz
 GYRO_VARIANCE = 1e-4  # (rad/s)^2, of the angular velocity that is passed on
 ORIENTATION_VARIANCE = 1e-4  # rad^2, of the orientation that is passed on
+_ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # of x, y, z and the rotations about them
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -180,7 +181,7 @@ def _vector(kind: Any, xyz: NDArray[np.float64]) -> Any:
 
 def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:
     """The 36 numbers, row by row, of x, y, z and the rotations about them."""
-    matrix = angular_variance * np.eye(6)
+    matrix = angular_variance * _ANGULAR
     matrix[:3, :3] = linear
     return matrix.ravel()
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_description.kinematics import rotate_inverse
+from quadvel_description.kinematics import rotation_matrix
 from quadvel_description.network_input import InputLayout, InputTerm
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, NOMINAL_Q
 from quadvel_description.state import MODE_SERVO, RobotState
@@ -40,8 +40,7 @@ KNOWN_INPUTS = {term.name: term.size for term in DEFAULT_LAYOUT.terms}
 
 
 def _gravity(state: RobotState, action: ArrayLike) -> ArrayLike:
-    quaternion = np.asarray(state.quaternion)
-    return rotate_inverse(quaternion, np.broadcast_to((0.0, 0.0, -1.0), (*quaternion.shape[:-1], 3)))
+    return -rotation_matrix(state.quaternion)[..., 2, :]
 
 
 def _leg_velocity(state: RobotState, action: ArrayLike) -> ArrayLike:

@@ -16,7 +16,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_description.kinematics import foot_jacobians, foot_positions, rotation_matrix
+from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import GRAVITY
 from quadvel_description.state import RobotState
 
@@ -112,8 +112,7 @@ class KalmanEstimator:
             raise ValueError(f"state.time is {state.time}, expected {self._time} or later, or a reset")
         self._time = state.time
         rotation = rotation_matrix(state.quaternion)
-        jacobians = foot_jacobians(state.q)
-        feet = foot_positions(state.q)
+        feet, jacobians = foot_kinematics(state.q)
         to_world = rotation.swapaxes(-1, -2)  # for rows of vectors
         foot_rolling = rolling(state, rotation) @ to_world
         leg_velocity = foot_rolling - against_trunk(state, feet, jacobians) @ to_world

@@ -14,6 +14,7 @@ from quadvel_description.state import RobotState
 
 from . import features
 
+_DIAGONAL = np.arange(3), np.arange(3)
 SHIPPED_MODEL = Path(__file__).parent / "models" / "estimator.onnx"
 
 
@@ -52,8 +53,9 @@ class LearnedEstimator:
         reset is needed then.
         """
         velocity, log_variance = self._network.step(features.build(state, previous_action, self._layout))
-        variance = np.exp(log_variance.astype(np.float64))
-        return self._scale * velocity.astype(np.float64), np.diag(self._scale**2 * variance)
+        covariance = np.zeros((3, 3))
+        covariance[_DIAGONAL] = self._scale**2 * np.exp(log_variance, dtype=np.float64)
+        return np.multiply(velocity, self._scale, dtype=np.float64), covariance
 
     def _expect(self, what: str, found: object, expected: object) -> None:
         if found != expected:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.kinematics import foot_jacobians, foot_positions, rotation_matrix
+from quadvel_description.kinematics import foot_kinematics, rotation_matrix
 from quadvel_description.robot import FOOT_RADIUS
 from quadvel_description.state import RobotState
 
@@ -20,8 +20,7 @@ CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
 
 def leg_velocity(state: RobotState) -> Array:
     """Velocity (..., 4, 3) of the trunk's origin, m/s, body frame, if the foot of that leg is planted."""
-    feet, jacobians = foot_positions(state.q), foot_jacobians(state.q)
-    return rolling(state, rotation_matrix(state.quaternion)) - against_trunk(state, feet, jacobians)
+    return rolling(state, rotation_matrix(state.quaternion)) - against_trunk(state, *foot_kinematics(state.q))
 
 
 def rolling(state: RobotState, rotation: Array) -> Array:
@@ -32,8 +31,9 @@ def rolling(state: RobotState, rotation: Array) -> Array:
     dq = np.reshape(state.dq, (*np.shape(state.dq)[:-1], 4, 3))
     hip = np.asarray(state.q)[..., ::3]
     knee = dq[..., 1] + dq[..., 2]
-    bending = np.stack([dq[..., 0], knee * np.cos(hip), knee * np.sin(hip)], axis=-1)
-    calf = np.asarray(state.angular_velocity)[..., None, :] + bending
+    calf = np.empty(dq.shape)
+    calf[..., 0], calf[..., 1], calf[..., 2] = dq[..., 0], knee * np.cos(hip), knee * np.sin(hip)
+    calf += np.asarray(state.angular_velocity)[..., None, :]
     velocity: Array = -calf @ _cross(FOOT_RADIUS * rotation[..., 2, :])
     return velocity
 

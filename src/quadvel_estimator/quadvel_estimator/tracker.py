@@ -84,7 +84,7 @@ class VelocityTracker:
         dt = 0.0 if self._taken is None else state.time - self._taken
         self._taken = state.time
         self._position = self._position + dt * rotate(state.quaternion, velocity)
-        self._deviation = self._deviation + dt * np.sqrt(np.diag(covariance))
+        self._deviation = self._deviation + dt * np.sqrt(covariance.diagonal())
         return Estimate(velocity, covariance, self._position, self._deviation)
 
     def _follow(self, time: float) -> None:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
-from itertools import accumulate
+from collections.abc import Mapping
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -50,22 +50,30 @@ def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
     return value
 
 
-def _all_numbers(message: Any, sizes: Mapping[str, int]) -> Iterator[NDArray[np.float64]]:
-    """`numbers` of several fields, which are checked in one piece: the control loop does this every tick."""
-    values = [getattr(message, field) for field in sizes]
-    block = np.concatenate(values, dtype=np.float64)
-    if list(map(len, values)) != list(sizes.values()) or not np.isfinite(block).all():
-        for field, size in sizes.items():
-            numbers(message, field, size)
-    ends = accumulate(sizes.values())
-    return (block[end - size : end] for size, end in zip(sizes.values(), ends, strict=True))
+class _Block:
+    """The fields of a message that hold numbers, read in one piece: the control loop does this every tick."""
+
+    def __init__(self, sizes: Mapping[str, int]) -> None:
+        self._fields, self._sizes = tuple(sizes), list(sizes.values())
+        self._places = [slice(*ends) for ends in pairwise(accumulate(self._sizes, initial=0))]
+
+    def read(self, message: Any) -> list[NDArray[np.float64]]:
+        """`numbers` of each field. Raises MessageError."""
+        values = [getattr(message, field) for field in self._fields]
+        block = np.concatenate(values, dtype=np.float64)
+        # Counting is quicker than `all`, which is Python inside.
+        if list(map(len, values)) != self._sizes or np.count_nonzero(np.isfinite(block)) < len(block):
+            for field, size in zip(self._fields, self._sizes, strict=True):
+                numbers(message, field, size)
+        return [block[place] for place in self._places]
+
+
+_LOW_STATE, _LOW_CMD = _Block(LOW_STATE), _Block(LOW_CMD)
 
 
 def read_low_state(message: Any) -> RobotState:
     """LowState to RobotState, the quaternion normalised. Raises MessageError."""
-    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _all_numbers(
-        message, LOW_STATE
-    )
+    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _LOW_STATE.read(message)
     norm = math.hypot(*quaternion.tolist())
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise MessageError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
@@ -92,7 +100,7 @@ def write_low_state(state: RobotState, message: Any) -> None:
 
 def read_low_cmd(message: Any) -> JointCommand:
     """LowCmd to JointCommand. Raises MessageError."""
-    fields = zip(LOW_CMD, _all_numbers(message, LOW_CMD), strict=True)
+    fields = zip(LOW_CMD, _LOW_CMD.read(message), strict=True)
     return JointCommand(**dict(fields), mode=message.mode, tick=message.tick)
 
 

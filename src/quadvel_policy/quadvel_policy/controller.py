@@ -69,7 +69,7 @@ class Controller(Node):
         self._grid = TickGrid(PERIOD)
         self._state: RobotState | None = None
         self._waiting: RobotState | None = None  # for the velocity estimate, on simulated time
-        self._answer = JointCommand.damping()
+        self._answer, self._message = JointCommand.damping(), LowCmd()
         self._velocity: tuple[float, Array] | None = None  # stamp and value
         self._command: tuple[float, Array] | None = None
         self._checks = {
@@ -131,8 +131,8 @@ class Controller(Node):
         periods = self._grid.periods(state.time)
         if periods:
             self._tick(state)
-            late = self._now(state.time) - state.time > PERIOD
             compute = time.perf_counter() - start
+            late = self._now(state.time) - state.time > PERIOD
             self._stats.add(start, compute, self._supervisor.inference_seconds, periods - 1 + late)
             self._supervisor.prepare()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
@@ -150,9 +150,9 @@ class Controller(Node):
         self._publish()
 
     def _publish(self) -> None:
-        message = LowCmd(stamp=self.get_clock().now().to_msg())
-        write_low_cmd(self._answer, message)
-        self._low_cmd.publish(message)
+        self._message.stamp = self.get_clock().now().to_msg()
+        write_low_cmd(self._answer, self._message)
+        self._low_cmd.publish(self._message)
 
     def _on_velocity(self, message: Any) -> None:
         try:

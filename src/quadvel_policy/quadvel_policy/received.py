@@ -46,7 +46,6 @@ def planar_velocity(twist: Any) -> Array:
 
 
 def _finite(field: str, values: list[float]) -> Array:
-    value = np.array(values, float)
-    if not np.isfinite(value).all():
-        raise MessageError(f"{field} is {value.tolist()}, expected finite numbers")
-    return value
+    if not all(map(math.isfinite, values)):
+        raise MessageError(f"{field} is {values}, expected finite numbers")
+    return np.array(values, float)

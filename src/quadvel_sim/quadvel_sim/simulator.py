@@ -315,15 +315,18 @@ def _law(command: JointCommand) -> _Law:
     ValueError names the field that has not 12 finite numbers.
     """
     rows = (command.q, command.kp, command.kd, command.dq, command.tau)
-    numbers = np.array(rows, dtype=float) if all(np.shape(row) == (12,) for row in rows) else np.array(np.nan)
-    if not np.isfinite(numbers).all():
+    try:
+        numbers = np.array(rows, dtype=float)
+    except ValueError:  # of different lengths
+        numbers = np.array(np.nan)
+    if numbers.shape != (len(rows), 12) or not np.isfinite(numbers).all():
         for field, row in zip(("q", "kp", "kd", "dq", "tau"), rows, strict=True):
             if np.shape(row) != (12,) or not np.isfinite(row).all():
                 raise ValueError(f"JointCommand.{field}: found {row}, expected 12 finite numbers")
     q, kp, kd, dq, tau = numbers
     if command.mode == MODE_DAMPING:
         kp[:] = tau[:] = 0.0
-    return q, kp, kd, dq if dq.any() else 0.0, tau if tau.any() else 0.0
+    return q, kp, kd, dq if np.count_nonzero(dq) else 0.0, tau if np.count_nonzero(tau) else 0.0
 
 
 def _turned(quaternion: _Array, rotation: _Array) -> _Array:
