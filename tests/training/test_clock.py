@@ -64,10 +64,10 @@ def walk():
             teachers.reset(over)
             for part in memory:
                 part[:, over] = 0.0
-        own = memory[0][0, :, student.MEMORY :].clone()
         obs = student.observe(env, previous)
         with torch.no_grad():
             _, memory = network(torch.from_numpy(obs[None]), memory)
+        own = memory[0][0].split(student.PARTS, dim=-1)[1].clone()
         seen.append((obs, teachers.pace, teachers.phase, own.numpy()))
         env.tick(np.tile(env.stand_q, (6, 1)))
         teachers.advance()

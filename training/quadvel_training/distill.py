@@ -126,9 +126,7 @@ class DistillConfig:
     noise: float = (
         0.1  # rad, stationary std of the time-correlated noise on executed targets, up to, by environment
     )
-    driven: float = (
-        0.7  # share of robots that the student drives, from the first quarter of the run on; before, ever more
-    )
+    driven: float = 0.7  # share of robots that the student drives, from the first quarter of the run on; before, ever more
     noise_time: float = 0.05  # s
     mini_batches: int = 8
     epochs: int = 2  # learning costs less than walking

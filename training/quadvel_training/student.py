@@ -27,13 +27,16 @@ from .networks import Recurrent, State
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 MEMORY = 256
 HIDDEN = (192, 128)
+PARTS = [MEMORY, clock.SIZE, 4]
+"""What a policy's state is put together of."""
 
 
 class Policy(Recurrent):
     """The policy of Section 4.1 with a gait clock of its own beside the 48 observations (docs/decisions/0015).
 
-    The last five numbers of the state's first part are the clock. Those of its second part are what is added to it: half a
-    cycle for a robot in the mirror, else nothing. A tick goes by the clock as the command of the tick before left it.
+    Behind the LSTM's memory the state's first part goes on with the clock and the command of the tick before, which moves
+    the clock on: so what a tick sees of it is known before the tick. The second part goes on with what is added to the
+    clock: half a cycle for a robot in the mirror, else nothing.
     """
 
     def __init__(self) -> None:
@@ -41,22 +44,23 @@ class Policy(Recurrent):
 
     def initial_state(self, n: int, mirrored: bool = False) -> State:
         """Of `n` robots, before their first tick; `mirrored`: of their mirror images."""
-        zeros = torch.zeros(1, n, MEMORY + clock.SIZE)
+        zeros = torch.zeros(1, n, sum(PARTS))
         ahead = zeros.clone()
         if mirrored:
-            ahead[..., MEMORY:] = torch.tensor(clock.HALF_CYCLE)
+            ahead.split(PARTS, dim=-1)[1].copy_(torch.tensor(clock.HALF_CYCLE))
         return zeros, ahead
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 261); N may be missing in all."""
-        (h, now), (c, ahead) = (part.split([MEMORY, clock.SIZE], dim=-1) for part in state)
+        """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 265); N may be missing in all."""
+        (h, now, command), (c, ahead, rest) = (part.split(PARTS, dim=-1) for part in state)
         seen = []
         for tick in range(len(x)):
+            now = clock.advance(now, command)
             seen.append(clock.features(now + ahead))
-            now = clock.advance(now, x[tick : tick + 1, ..., :4])
+            command = x[tick : tick + 1, ..., :4]
         clocks = torch.cat(seen) if len(seen) > 1 else seen[0]
         y, (h, c) = super().forward(torch.cat([x, clocks], dim=-1), (h.contiguous(), c.contiguous()))
-        return y, (torch.cat([h, now], dim=-1), torch.cat([c, ahead], dim=-1))
+        return y, (torch.cat([h, now, command], dim=-1), torch.cat([c, ahead, rest], dim=-1))
 
 
 def new_actor() -> Policy:
@@ -82,20 +86,18 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
 class _Cell(nn.Module):
     """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
 
-    Written out, at batch size one it is quicker than onnxruntime's own LSTM; and what comes from the state alone is a
-    product of its own, which a runtime may form before x is there.
+    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
     """
 
     def __init__(self, lstm: nn.LSTM) -> None:
         super().__init__()
-        self.inputs, self.recurrent = (
-            nn.Parameter(weight.detach().T.contiguous()) for weight in (lstm.weight_ih_l0, lstm.weight_hh_l0)
-        )
+        weight = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
+        self.weight = nn.Parameter(weight.detach().T.contiguous())
         self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         h, c = state
-        gates = torch.addmm(torch.addmm(self.bias, h, self.recurrent), x, self.inputs)
+        gates = torch.addmm(self.bias, torch.cat([x, h], dim=1), self.weight)
         admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
         memory = forget.sigmoid() * c + admit.sigmoid() * candidate.tanh()
         hidden = release.sigmoid() * memory.tanh()
@@ -177,7 +179,7 @@ def export_policy(
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(robot.NOMINAL_Q),
         command_limits={"vx": c.vx, "vy": (-c.vy, c.vy), "wz": (-c.wz, c.wz)},
-        state_shape=(1, 1, MEMORY + clock.SIZE),
+        state_shape=(1, 1, sum(PARTS)),
         actuator=attrs.asdict(env.config.actuator),
         recipe=recipe,
         commit=commit(),

@@ -65,8 +65,9 @@ class GaitState:
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`, whose environments have just started over."""
-        for array in (self.residual, self.residual_before, self._clock):
+        for array in (self.residual, self.residual_before):
             array[ids] = 0.0
+        self._clock[ids] = clock.advance(torch.zeros(clock.SIZE), torch.zeros(4))
         self.lean[ids] = self.env.ground_roll_pitch[ids]
         self._note()
 

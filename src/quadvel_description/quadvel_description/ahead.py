@@ -21,32 +21,42 @@ _PLAIN = {"alpha": 1.0, "beta": 1.0, "transA": 0}  # attributes of a Gemm that i
 def cut(model: ModelProto, awaited: str) -> tuple[ModelProto, ModelProto] | None:
     """`model` as (ahead, rest): the first does without the input `awaited`, the second has the less to do.
 
-    Both keep the names of the model's inputs and outputs; what ahead hands over are its outputs and further inputs
-    of rest. None where there is nothing to gain: no product, written as Gemm of a Concat with an initializer, has
+    Both keep the names of the model's inputs and outputs; what ahead hands over, float32 all, are its outputs and
+    further inputs of rest. None where there is nothing to gain: no product, written as Gemm of a Concat with an initializer, has
     terms that await the input beside terms that do not.
     """
     subgraphs = (one.type == AttributeProto.GRAPH for node in model.graph.node for one in node.attribute)
     if any(subgraphs) or model.graph.sparse_initializer or model.graph.quantization_annotation:
         return None  # can't be taken apart by the names that nodes give
     whole = onnx.shape_inference.infer_shapes(model)
-    handed_over = _cut_products(whole.graph, awaited)
-    if not handed_over:
+    inputs = [value.name for value in whole.graph.input]
+    if not _cut_products(whole.graph, awaited):
         return None
-    parts, inputs = onnx.utils.Extractor(whole), [value.name for value in whole.graph.input]
+    early = _made_of(whole.graph, set(inputs) - {awaited}) - _made_of(whole.graph, {awaited})
+    used_late = (
+        name for node in whole.graph.node if not early.issuperset(node.output) for name in node.input
+    )
+    handed_over = list(dict.fromkeys(name for name in used_late if name in early and name not in inputs))
+    parts = onnx.utils.Extractor(whole)
     return (
         parts.extract_model([name for name in inputs if name != awaited], handed_over),
         parts.extract_model([*inputs, *handed_over], [value.name for value in whole.graph.output]),
     )
 
 
-def _cut_products(graph: GraphProto, awaited: str) -> list[str]:
-    """Cut in `graph` every product that can be; the names of the parts that await nothing."""
-    late = {awaited}
+def _made_of(graph: GraphProto, names: set[str]) -> set[str]:
+    """`names` and all that is computed from any of them."""
+    made = set(names)
     for node in graph.node:
-        if late.intersection(node.input):
-            late.update(node.output)
+        if made.intersection(node.input):
+            made.update(node.output)
+    return made
+
+
+def _cut_products(graph: GraphProto, awaited: str) -> bool:
+    """Cut in `graph` every product that can be; whether there was one."""
+    late = _made_of(graph, {awaited})
     nodes: list[NodeProto] = []
-    handed_over: list[str] = []
     for node in graph.node:
         terms = _terms(graph, node)
         early = [term for term in terms if term[0] not in late]
@@ -56,10 +66,10 @@ def _cut_products(graph: GraphProto, awaited: str) -> list[str]:
         ahead = f"{node.output[0]}/ahead"
         nodes += _product(graph, early, node.input[2:], ahead)
         nodes += _product(graph, [term for term in terms if term[0] in late], [ahead], node.output[0])
-        handed_over.append(ahead)
+    found = len(nodes) > len(graph.node)
     del graph.node[:]
     graph.node.extend(nodes)
-    return handed_over
+    return found
 
 
 def _terms(graph: GraphProto, node: NodeProto) -> list[Term]:
