@@ -126,7 +126,8 @@ class DistillConfig:
     noise: float = (
         0.1  # rad, stationary std of the time-correlated noise on executed targets, up to, by environment
     )
-    driven: float = 0.7  # share of robots that the student drives, from the first quarter of the run on; before, ever more
+    driven: float = 0.7  # share of robots that the student drives
+    takeover: float = 0.25  # part of the run in which that share grows from nothing
     noise_time: float = 0.05  # s
     mini_batches: int = 8
     epochs: int = 2  # learning costs less than walking
@@ -190,7 +191,7 @@ class DistillRun:
         """One sequence and one step of the optimiser."""
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
-        obs, label, mask, seen = self.collect(c.driven * min(1.0, 4.0 * done))
+        obs, label, mask, seen = self.collect(c.driven * min(1.0, done / c.takeover))
         return seen | self.learn(obs, label, mask)
 
     def collect(self, share: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, dict[str, float]]:
