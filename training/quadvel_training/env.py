@@ -33,7 +33,7 @@ def cores() -> int:
 
 @attrs.frozen
 class CommandRange:
-    """How velocity commands are drawn: from a box, or from the paper's ellipsoid, there as many slow ones as fast ones."""
+    """How velocity commands are drawn: from a box, or from the paper's ellipsoid, there the radius in proportion to itself."""
 
     vx: tuple[float, float] = (-1.4, 2.0)
     vy: float = 0.7
@@ -48,7 +48,7 @@ class CommandRange:
         unit = rng.uniform(-1, 1, (n, 3))
         if self.ellipsoid:
             unit = rng.normal(size=(n, 3))
-            unit *= (rng.random(n) / np.linalg.norm(unit, axis=1))[:, None]
+            unit *= (np.sqrt(rng.random(n)) / np.linalg.norm(unit, axis=1))[:, None]
         centre, half = np.mean(self.vx), np.ptp(self.vx) / 2
         command = np.zeros((n, 4))
         command[:, :3] = unit * [half, self.vy, self.wz] + [centre, 0.0, 0.0]
