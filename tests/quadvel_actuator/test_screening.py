@@ -8,7 +8,7 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
-from quadvel_actuator.identify import backlog
+from quadvel_actuator.identify import backlog, diagnosis
 from quadvel_actuator.identify.candidates import About, propose, simplified, started
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
@@ -109,6 +109,37 @@ def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     half = intervals(found.model, looked.judge).effects[0]
     apart = np.abs(found.model.applied[0].values - other.model.applied[0].values)
     assert (half[0] > apart[0]).all()
+
+
+def test_an_effect_comes_to_a_joint_that_shows_it_later():
+    looked = about(_log(FRICTION), 0.009, 0.003)
+    friction = registry()["coulomb_friction"](at=JOINT)
+    first = Applied(friction, np.array([True, False]), np.array([[0.5, 0.0], [0.05, 0.05]]), np.arange(2))
+    spring = registry()["torque_offset"]()
+    last = Applied(spring, np.ones(2, dtype=bool), np.zeros((1, 2)), np.arange(2))
+    model = diagnosis._widened(looked.model.plus(first).plus(last), looked.judge, looked.noise, looked.few)
+    assert model.applied[0].active.all()
+    np.testing.assert_allclose(model.applied[0].values[0], 0.5, atol=0.04)
+
+
+@pytest.mark.parametrize(("kp", "held"), [(30.0, False), (60.0, True)])
+def test_gains_that_are_held_are_left_free_where_they_stay_near_the_commanded_ones(kp, held):
+    log = _log()
+    looked = about(attrs.evolve(log, kp=np.full_like(log.kp, kp)), 0.009, 0.003)
+    model = diagnosis._released(attrs.evolve(looked.model, gains_held=True), looked.few)
+    assert model.gains_held == held
+    np.testing.assert_allclose(model.gains[0], 1.0 if held else 29.294 / 30.0, atol=0.02)
+
+
+def test_a_law_is_looked_at_with_the_laws_of_the_model_left_free():
+    """Friction that is there with the half of its torque: only freed does it come to the other half."""
+    looked = about(_log(FRICTION), 0.009, 0.003)
+    friction = registry()["coulomb_friction"](at=JOINT)
+    half = Applied(friction, np.ones(2, dtype=bool), np.array([[0.25, 0.25], [0.05, 0.05]]), np.arange(2))
+    ground = About(looked.model.plus(half), looked.judge, looked.noise, looked.few).ground
+    spring = registry()["torque_offset"]()
+    bare, _ = ground.bare(spring)
+    assert (bare / ground.few.of(ground.model, spring)[1].sum(axis=0) < 1.15 * 0.066).all()
 
 
 def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):

@@ -10,6 +10,7 @@ import numpy as np
 import onnx
 import pytest
 
+from quadvel_description.ahead import cut
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
@@ -62,6 +63,13 @@ def test_a_prepared_policy_acts_as_one_that_is_not(write_policy: WritePolicy, sh
         np.testing.assert_allclose(prepared.step(observation), plain.step(observation), atol=2e-6)
         if tick % 10:
             prepared.prepare()
+
+
+def test_most_of_the_shipped_policy_needs_no_observation() -> None:
+    parts = cut(onnx.load(SHIPPED_POLICY), "obs")
+    assert parts is not None
+    ahead, rest = (sum(np.prod(one.dims) for one in part.graph.initializer) for part in parts)
+    assert ahead > rest
 
 
 def test_the_metadata_comes_with_the_file(write_policy: WritePolicy, metadata: PolicyMetadata) -> None:

@@ -114,10 +114,11 @@ class _TimedSupervisor(Supervisor):
     def tick(
         self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike
     ) -> JointCommand:
-        """As the supervisor's."""
+        """As the supervisor's, and between two ticks what the controller does there."""
         start = time.perf_counter()
         answer = super().tick(now, state, velocity, command)
         self.seconds.append(time.perf_counter() - start)
+        self.prepare()
         return answer
 
 

@@ -19,7 +19,7 @@ from .model import Applied, Model, fit
 from .screening import Ground, Started, divided, later, start
 from .signals import Array, Bools
 
-_STEPS, _LAST_STEPS = 6, 3
+_STEPS, _LAST_STEPS, _ON_ALL = 6, 3, 2
 _LATER = tuple(np.arange(-0.003, 0.0031, 0.0005))
 """s: commands that step make an error of many small valleys along the delays"""
 
@@ -69,7 +69,12 @@ class About:
         here = there.with_delays(self.model.input_delay, self.model.output_delay)
         starts = (there,) if remembers(model) else (there, here)
         near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in starts], rows, 1)[0]
-        return attrs.evolve(near, samples=model.samples)
+        near = attrs.evolve(near, samples=model.samples)
+        if model.applied[
+            -1
+        ].law.shifts:  # commands that step make small valleys, which few rows cannot tell apart
+            near = fit_with_delays(near, self.judge.fit, _ON_ALL)
+        return near
 
     def fit_anew(self, model: Model) -> Model:
         """The model fitted from other delays and with other steps of the drive: an effect may have hidden the right ones."""

@@ -30,6 +30,11 @@ WORTH = 0.03
 MOST = 5
 """Effects of one log at most."""
 
+_FAR = 0.4
+"""Logarithm of a gain over the commanded one that is hard to believe."""
+_AS_WELL = 0.02
+"""Of the noise: what an account with gains that can be believed may lose."""
+
 _FITTED = 5
 _PROMISING = (
     0.5  # of the most promising law: so much, or among the first few and quick, and a law is fitted further
@@ -69,6 +74,36 @@ class Diagnosis:
     rejected: tuple[Rejected, ...]
 
 
+def diagnosed(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
+    """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
+
+    What a joint swings freely can hide an inertia in lesser gains, and the other effects then come out bent. The account
+    with the commanded gains is taken where it predicts as well.
+    """
+    found = diagnose(model, judge, noise, tick)
+    if not _far(found.model) or not model.samples.commanded:
+        return found
+    as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
+    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick)
+    if not other.findings:
+        return found
+    tau = model.samples.tau
+    lost = judge.compare(tau - other.model.predict(), tau - found.model.predict()).gain
+    return other if lost < _AS_WELL * float(noise.mean()) else found
+
+
+def _far(model: Model) -> bool:
+    return bool((np.abs(np.log(np.maximum(model.gains[0], 1e-3))) > _FAR).any())
+
+
+def _released(model: Model, few: Few) -> Model:
+    """With gains that are held left free, if they then stay near those commanded."""
+    if not model.gains_held:
+        return model
+    free = few.fitted(attrs.evolve(model, gains_held=False), fit_with_delays, 10)
+    return model if _far(free) else free
+
+
 def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2."""
     few = Few(model.samples, judge)
@@ -86,9 +121,9 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
-        model = about.fit_anew(best.model.holding(False))
+        model = _released(_widened(about.fit_anew(best.model.holding(False)), judge, noise, few), few)
         ties.append(tied)
-    model, ties = _pruned(model.holding(False), ties, judge, noise, few)
+    model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
@@ -147,9 +182,27 @@ def _finer(
     return chosen
 
 
+def _widened(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
+    """The model with each effect also on joints that show it only now, as what came later hid it there."""
+    for k, one in enumerate(model.applied[:-1]):
+        if one.active.all() or one.law.gainlike:
+            continue
+        usual = one.values[:, one.active].mean(axis=1, keepdims=True)
+        everywhere = attrs.evolve(
+            one, active=np.ones_like(one.active), values=np.where(one.active, one.values, usual)
+        )
+        tried = few.fitted(model.replacing(k, everywhere), fit_with_delays, 5)
+        found = judge.compare(model.samples.tau - model.predict(), tried.samples.tau - tried.predict())
+        clear = (found.p_joints * len(registry()) < LEVEL) & (found.joint_gain > WORTH * noise)
+        if (clear & ~one.active).any():
+            wider = attrs.evolve(tried.applied[k], active=one.active | clear)
+            model = few.fitted(tried.replacing(k, wider), fit_with_delays, 5)
+    return model
+
+
 def _worth(one: Candidate, noise: Array) -> float:
     """Gain on the joints that it acts on, as a share of their noise."""
-    return float(np.mean((one.joint_gain / noise)[one.joints]))
+    return float(one.joint_gain[one.joints].sum() / noise[one.joints].sum())
 
 
 def _reason(one: Candidate, noise: Array, tried: int) -> Rejected:

@@ -84,7 +84,7 @@ def _past_only(s: Signals, dt: float) -> Signals:
     n = np.arange(len(s.dq))
     began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
     slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
-    return attrs.evolve(s, ddq=slope)
+    return attrs.evolve(s, slope=lambda name: slope)
 
 
 def library(scene: Scene, left: Array) -> Iterator[Feature]:

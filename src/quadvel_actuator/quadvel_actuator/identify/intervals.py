@@ -72,9 +72,7 @@ def _shape_error(model: Model, index: int, judge: Judge) -> Array:
     one = model.applied[index]
     moved = np.zeros(one.values.shape)
     for law in one.law.alternatives:
-        others = attrs.evolve(one, law=law)
-        applied = (*model.applied[:index], others, *model.applied[index + 1 :])
-        tried = fit_with_delays(attrs.evolve(model, applied=applied), judge.fit)
+        tried = fit_with_delays(model.replacing(index, attrs.evolve(one, law=law)), judge.fit)
         if tried.error(judge.fit) < _AS_WELL * model.error(judge.fit):
             moved = np.maximum(moved, np.abs(tried.applied[index].values - one.values))
     return moved

@@ -62,6 +62,8 @@ class Model:
     output_delay: Array
     delay_groups: Groups  # (J,)
     applied: tuple[Applied, ...] = ()
+    gains_held: bool = False
+    """do the gains stay as they are while everything else is fitted?"""
 
     @property
     def signals(self) -> Signals:
@@ -101,27 +103,38 @@ class Model:
         """The same at the instants of `samples` alone."""
         s = self.signals
         todo = sorted(zip(self.applied, values, strict=True), key=lambda pair: pair[0].law.stage)
-        error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
-        for one, value in todo:
-            if one.law.stage == Stage.ERRORS:
-                error = self._errors(one, error, s, value)
+        pull, drag = self._asked(s, [pair for pair in todo if pair[0].law.stage == Stage.ERRORS])
         g = _lean(gains)
-        x = (
-            g[..., 0, :][..., None, :] * (s.kp * error[0])
-            + g[..., 1, :][..., None, :] * (s.kd * error[1])
-            + s.tau_ff
-        )
+        x = g[..., 0, :][..., None, :] * pull + g[..., 1, :][..., None, :] * drag + s.tau_ff
         for one, value in todo:
             if Stage.ERRORS < one.law.stage < Stage.ADDED:
                 x = _where(one.active, self._series(one, x, s, value), x)
         total = x
         for one, value in todo:
             if one.law.stage == Stage.ADDED:
-                seen = s if one.law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
-                extra = self._series(one, x, seen, value)
-                total = total + (extra if one.active.all() else extra * one.active)
+                total = total + self.added(one, x, value)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *s.q.shape))
+
+    def added(self, one: Applied, x: Array, value: Array) -> Array:
+        """The torque (B, N, J) that a law of the stage ADDED adds to `x`, with a batch of its values (B, P, J)."""
+        seen = self.signals if one.law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
+        extra: Array = self._series(one, x, seen, value)
+        return extra if one.active.all() else extra * one.active
+
+    def driven(self) -> Array:
+        """Torque (N, J) of the drive, without what is added to it."""
+        drive = tuple(one for one in self.applied if one.law.stage < Stage.ADDED)
+        return attrs.evolve(self, applied=drive).predict()
+
+    def _asked(self, s: Signals, todo: Sequence[tuple[Applied, Array]]) -> tuple[Array, Array]:
+        """What the gains are factors of, after the laws `todo` that act on the errors."""
+        if not todo:
+            return s.pull, s.drag
+        error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
+        for one, value in todo:
+            error = self._errors(one, error, s, value)
+        return s.kp * error[0], s.kd * error[1]
 
     def _errors(
         self, one: Applied, error: tuple[Array, Array], s: Signals, value: Array
@@ -163,6 +176,10 @@ class Model:
         """With one more effect."""
         return attrs.evolve(self, applied=(*self.applied, applied))
 
+    def replacing(self, index: int, applied: Applied) -> Model:
+        """With another effect in the place of this index."""
+        return attrs.evolve(self, applied=(*self.applied[:index], applied, *self.applied[index + 1 :]))
+
     def foretold(self) -> Model:
         """With laws that say no more than could be known before the torque was measured."""
         applied = (attrs.evolve(one, law=one.law.foretold()) for one in self.applied)
@@ -175,7 +192,7 @@ class Model:
 
     def without(self, index: int) -> Model:
         """Without the effect of this index."""
-        return attrs.evolve(self, applied=tuple(one for k, one in enumerate(self.applied) if k != index))
+        return attrs.evolve(self, applied=(*self.applied[:index], *self.applied[index + 1 :]))
 
 
 def _lean(batch: Array) -> Array:
@@ -216,7 +233,7 @@ class Slots:
 
         everywhere = np.ones(joints, dtype=bool)
         for groups in model.gain_groups:
-            add(groups, everywhere, (-1e6, 1e6), _GAIN_SLOPE)
+            add(groups, everywhere & (not model.gains_held), (-1e6, 1e6), _GAIN_SLOPE)
         for one in model.applied:
             linear = getattr(one.law, "linear", ())
             for parameter in one.law.parameters:
@@ -281,7 +298,7 @@ def fit(model: Model, rows: Bools, iterations: int = 5) -> Model:
     """The model with gains and effects fitted to `rows` (N, J); the delays stay."""
     whole, model, rows = model.samples, *model.reaching(rows)
     slots = Slots.of(model)
-    for _ in range(iterations):
+    for _ in range(iterations if slots.count else 0):
         predicted, slopes = jacobian(model, slots)
         left = np.where(rows, model.samples.tau - predicted, 0.0)
         error = float(np.sum(left * left))

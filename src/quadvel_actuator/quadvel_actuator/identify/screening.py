@@ -8,6 +8,8 @@ Every joint takes the guess that suits it best.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
+from typing import Any
 
 import attrs
 import numpy as np
@@ -55,6 +57,7 @@ class Ground:
     def __init__(self, model: Model, few: Few, noise: Array) -> None:
         self.model, self.few, self.noise = model, few, noise
         self._bare: dict[bool, tuple[Array, int]] = {}
+        self._spots: dict[Any, list[_Spot]] = {}
         unbent = self._unbent()
         self.bases = (model,) if unbent is None else (model, unbent)
         """models with the gains and delays to start from: as fitted, and as a stand-in for any effect has them"""
@@ -71,7 +74,8 @@ class Ground:
         grid = [
             (np.full(joints, total - out), np.full(joints, out)) for total in _TOTALS for out in _OUTPUTS[::2]
         ]
-        tried = [_Screen(one, law, rows).best(nothing) for one in _possible(at, grid)]
+        spots = [_Spot(one) for one in _possible(model, grid)]
+        tried = [_Screen(spot, at.applied[-1], rows).best(nothing) for spot in spots]
         best = min(tried, key=lambda one: float(one[1].sum()))[0]
         apart = best.input_delay + best.output_delay - model.input_delay - model.output_delay
         if np.abs(apart).max() < _APART:
@@ -84,22 +88,28 @@ class Ground:
         if key not in self._bare:
             rows = self.few.of(self.model, law)[1]
             every = self.pairs(law, _EXCHANGED)
-            tried = [_Screen(at, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for at in every]
+            tried = [_Screen(spot, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for spot in every]
             self._bare[key] = (
                 min(tried, key=lambda error: float(error.sum())),
                 round(self.few.count / max(rows.sum(), 1)),
             )
         return self._bare[key]
 
-    def pairs(self, law: EffectLaw, moves: Sequence[tuple[float, float]]) -> Iterator[Model]:
-        """The model at the pairs of delays at which `law` is tried: `moves` away, or a grid of output delays."""
-        for base in self.bases:
-            at = self.few.of(base, law)[0]
-            if law.remembers or remembers(self.model):
-                moved = [(base.input_delay + a, base.output_delay + b) for a, b in moves]
-                yield from _possible(at, moved)
-            else:
-                yield from divided(at)
+    def pairs(self, law: EffectLaw, moves: tuple[tuple[float, float], ...]) -> list[_Spot]:
+        """The pairs of delays at which `law` is tried: `moves` away, or a grid of output delays."""
+        rowwise = law.remembers or remembers(self.model)
+        key = moves if rowwise else None
+        if key not in self._spots:
+            self._spots[key] = [_Spot(at) for base in self.bases for at in self._around(base, law, key)]
+        return self._spots[key]
+
+    def _around(
+        self, base: Model, law: EffectLaw, moves: tuple[tuple[float, float], ...] | None
+    ) -> Iterator[Model]:
+        at = self.few.of(base, law)[0]
+        if moves is None:
+            return divided(at)
+        return _possible(at, [(base.input_delay + a, base.output_delay + b) for a, b in moves])
 
 
 def divided(model: Model) -> Iterator[Model]:
@@ -152,8 +162,8 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     empty = Applied(law, np.ones(joints, dtype=bool), table[0], np.arange(joints))
     best: Model | None = None
     lowest = np.full(joints, np.inf)
-    for at in ground.pairs(law, (*_EXCHANGED, *(_SHORTENED if law.shifts else ()))):
-        found, error = _Screen(at.plus(empty), law, rows).best(table)
+    for spot in ground.pairs(law, (*_EXCHANGED, *(_SHORTENED if law.shifts else ()))):
+        found, error = _Screen(spot, empty, rows).best(table)
         if error.sum() < lowest.sum():
             lowest, best = error, found
     bare, weight = ground.bare(law)
@@ -168,36 +178,83 @@ def _within(value: Array | float, parameter: Parameter, joints: int) -> Array:
     return np.broadcast_to(value, joints).clip(parameter.low, parameter.high)
 
 
-class _Screen:
-    """Least squares of one model, its last effect being `law` if there is one, for many guesses of its parameters.
+class _Spot:
+    """A model at one pair of delays, and what every law that is looked at there needs of it."""
 
-    Unknown are the law's linear parameters, of each joint, and gains and delays, shared as the model shares them.
-    """
+    def __init__(self, model: Model) -> None:
+        self.model = model
+        self.moved = np.repeat(model.gains[None], 3, axis=0)
+        """gains as they are, and with either a little more"""
+        self.moved[1, 0] += _GAIN_STEP
+        self.moved[2, 1] += _GAIN_STEP
 
-    def __init__(self, model: Model, law: EffectLaw | None, rows: Bools) -> None:
-        self.model, self.rows = model, rows
-        self.others = model.applied[:-1] if law else model.applied
-        self.linear = [law.names.index(name) for name in getattr(law, "linear", ())] if law else []
-        self.bounds = (
-            np.array([(law.parameters[k].low, law.parameters[k].high) for k in self.linear]) if law else None
-        )
-        groups = np.concatenate([model.gain_groups, np.tile(model.delay_groups, (2, 1))])
-        offsets = np.cumsum([0, *(int(one.max()) + 1 for one in groups)])
-        self.index, self.count = groups + offsets[:4, None], int(offsets[4])
-        moved = np.repeat(model.gains[None], 3, axis=0)
-        moved[1, 0] += _GAIN_STEP
-        moved[2, 1] += _GAIN_STEP
-        self.moved = moved
+    @cached_property
+    def slopes(self) -> list[Array]:
+        """Change of the torque (N, J) with either delay."""
+        model = self.model
         delays = np.stack([model.input_delay, model.output_delay])
         moves = np.array([[0.0, 0.0], [_DELAY_STEP, 0.0], [0.0, _DELAY_STEP]])[..., None]
         at, *later = (pd_torque(model.samples, model.gains, a, b, model.window) for a, b in delays + moves)
-        self.slopes = [(one - at) / _DELAY_STEP for one in later]
+        return [(one - at) / _DELAY_STEP for one in later]
+
+    @cached_property
+    def torque(self) -> Array:
+        """Torque (3, N, J) with the moved gains."""
+        values = [np.repeat(one.values[None], 3, axis=0) for one in self.model.applied]
+        return self.model.evaluate(self.moved, values)
+
+    @cached_property
+    def driven(self) -> Array:
+        return self.model.driven()
+
+    @cached_property
+    def freed(self) -> list[tuple[int, int]]:
+        """Linear parameters of the model's own laws, (law, parameter): a new law may need others of them."""
+        return [
+            (k, one.law.names.index(name))
+            for k, one in enumerate(self.model.applied)
+            for name in getattr(one.law, "linear", ())
+        ]
+
+    @cached_property
+    def columns(self) -> list[Array]:
+        """What a unit of each of them adds, (1, N, J)."""
+        return [
+            _unit(self, self.model.applied[k], self.model.applied[k].values[None], p) for k, p in self.freed
+        ]
+
+
+def _unit(spot: _Spot, applied: Applied, values: Array, one: int) -> Array:
+    """What a unit of a law's linear parameter adds, the others being as in `values` (B, P, J): (B or 1, N, J)."""
+    unit = values.copy()
+    unit[:, [applied.law.names.index(name) for name in getattr(applied.law, "linear", ())]] = 0.0
+    unit[:, one] = 1.0
+    added = spot.model.added(applied, spot.driven, unit)
+    return added if added.ndim == 3 else added[None]
+
+
+class _Screen:
+    """Least squares of the model of a spot, with `tried` on it if there is one, for many guesses of its parameters.
+
+    Unknown are the linear parameters of the law, and of those on the model already, of each joint, and gains and delays,
+    shared as the model shares them.
+    """
+
+    def __init__(self, spot: _Spot, tried: Applied | None, rows: Bools) -> None:
+        self.spot, self.tried, self.rows = spot, tried, rows
+        law, model = None if tried is None else tried.law, spot.model
+        self.linear = [law.names.index(name) for name in getattr(law, "linear", ())] if law else []
+        bounds = [(law.parameters[k].low, law.parameters[k].high) for k in self.linear] if law else []
+        self.bounds = np.array([*bounds, *((-np.inf, np.inf) for _ in spot.freed)]).reshape(-1, 2)
+        groups = np.concatenate([model.gain_groups, np.tile(model.delay_groups, (2, 1))])
+        offsets = np.cumsum([0, *(int(one.max()) + 1 for one in groups)])
+        self.index, self.count = groups + offsets[:4, None], int(offsets[4])
 
     def best(self, table: Array) -> tuple[Model, Array]:
         """The model at the best of `table` (guesses, P, J) for each joint, and its squared error (J,)."""
         parts = [self._products(one) for one in np.split(table, range(_BATCH, len(table), _BATCH))]
         gram, right, square = (np.concatenate(one) for one in zip(*parts, strict=True))
-        free = _Quadratic.of(gram, right, square, len(self.linear))
+        free = _Quadratic.of(gram, right, square, len(self.bounds))
         joint = np.arange(table.shape[2])
         chosen = np.argmin(free.alone(), axis=0)
         outside = np.zeros(free.error.shape, dtype=bool)
@@ -208,9 +265,10 @@ class _Screen:
             change = self._shared(hessian, gradient)
             error, values, outside = free.at(change, self.bounds)
             chosen = np.argmin(error, axis=0)
+        found = values[chosen, joint].T
         best = table[chosen, :, joint].T.copy()
-        best[self.linear] = values[chosen, joint].T
-        return self._moved_by(change, best), error[chosen, joint]
+        best[self.linear] = found[: len(self.linear)]
+        return self._moved_by(change, best, found[len(self.linear) :]), error[chosen, joint]
 
     def _shared(self, hessian: Array, gradient: Array) -> Array:
         """The change (4, J) of gains and delays that lessens the error of all joints most."""
@@ -223,9 +281,9 @@ class _Screen:
         change[2:] = np.clip(change[2:], -_FARTHEST, _FARTHEST)
         return change
 
-    def _moved_by(self, change: Array, values: Array) -> Model:
-        """The model with gains and delays changed by (4, J) and these values of the last effect."""
-        model = self.model
+    def _moved_by(self, change: Array, values: Array, own: Array) -> Model:
+        """The model with gains and delays changed by (4, J), its own laws by `own`, and the new law at these values."""
+        model = self.spot.model
         delays = np.round(
             np.clip(
                 [model.input_delay + change[2], model.output_delay + change[3]],
@@ -234,46 +292,40 @@ class _Screen:
             ),
             7,
         )
-        applied = (
-            *self.others,
-            *(attrs.evolve(one, values=values) for one in model.applied[len(self.others) :]),
-        )
-        return attrs.evolve(model, gains=model.gains + change[:2], applied=applied).with_delays(*delays)
+        applied = list(model.applied)
+        for (k, p), by in zip(self.spot.freed, own, strict=True):
+            parameter, moved_to = applied[k].law.parameters[p], applied[k].values.copy()
+            moved_to[p] = np.clip(moved_to[p] + by, parameter.low, parameter.high)
+            applied[k] = attrs.evolve(applied[k], values=moved_to)
+        moved = attrs.evolve(model, gains=model.gains + change[:2], applied=tuple(applied))
+        moved = moved.with_delays(*delays)
+        return moved if self.tried is None else moved.plus(attrs.evolve(self.tried, values=values))
 
     def _products(self, values: Array) -> tuple[Array, Array, Array]:
         """Of each guess (B, P, J) and joint: products of the columns (B, J, M, M), with the target, and of the target."""
-        if self.linear:  # without them the law does nothing
-            zero = values.copy()
-            zero[:, self.linear] = 0.0
-            torque = self._bare(self.moved)
-        else:
-            torque = self._run(np.repeat(values, 3, axis=0), np.tile(self.moved, (len(values), 1, 1)))
+        plain = self.tried is None or bool(self.linear)  # without its linear parameters the law does nothing
+        torque = self.spot.torque if plain else self._run(values)
         base = torque[::3]
-        gains = [(torque[k::3] - base) / _GAIN_STEP for k in (1, 2)]
-        columns = []
-        for one in self.linear:
-            unit = zero.copy()
-            unit[:, one] = 1.0
-            columns.append(self._run(unit, self.model.gains[None]) - base)
+        step = np.inf if self.spot.model.gains_held else _GAIN_STEP
+        gains = [(torque[k::3] - base) / step for k in (1, 2)]
+        columns = [_unit(self.spot, self.tried, values, one) for one in self.linear] if self.tried else []
+        columns += self.spot.columns
         found = []
         for b in range(len(values)):
-            every = [one[min(b, len(one) - 1)] for one in (*columns, *gains)] + self.slopes
-            every.append(self.model.samples.tau - base[min(b, len(base) - 1)])
+            every = [one[min(b, len(one) - 1)] for one in (*columns, *gains)] + self.spot.slopes
+            every.append(self.spot.model.samples.tau - base[min(b, len(base) - 1)])
             wide = np.ascontiguousarray((np.stack(every) * self.rows).transpose(2, 0, 1))  # (J, M + 1, N)
             found.append(wide @ wide.transpose(0, 2, 1))
         gram = np.stack(found)
         return gram[..., :-1, :-1], gram[..., :-1, -1], gram[..., -1, -1]
 
-    def _bare(self, gains: Array) -> Array:
-        """Torque (B, N, J) without the last effect, of a batch of gains."""
-        bare = attrs.evolve(self.model, applied=self.others)
-        return bare.evaluate(gains, [np.repeat(one.values[None], len(gains), axis=0) for one in self.others])
-
-    def _run(self, values: Array, gains: Array) -> Array:
-        """Torque (B, N, J) of a batch of values (B, P, J) of the last effect and of gains, as many or one."""
-        batch = [np.repeat(one.values[None], max(len(values), len(gains)), axis=0) for one in self.others]
-        mine = [values] if len(self.others) < len(self.model.applied) else []
-        return self.model.evaluate(np.broadcast_to(gains, (len(values), *gains.shape[1:])), [*batch, *mine])
+    def _run(self, values: Array) -> Array:
+        """Torque (3 B, N, J) of a batch of values (B, P, J), each with the moved gains."""
+        assert self.tried is not None
+        model, count = self.spot.model, 3 * len(values)
+        batch = [np.repeat(one.values[None], count, axis=0) for one in model.applied]
+        gains = np.tile(self.spot.moved, (len(values), 1, 1))
+        return model.plus(self.tried).evaluate(gains, [*batch, np.repeat(values, 3, axis=0)])
 
 
 @attrs.frozen(eq=False)
@@ -317,12 +369,12 @@ class _Quadratic:
         error: Array = self.error - np.einsum("sjk,sjk->sj", self.gradient, best)
         return error
 
-    def at(self, change: Array, bounds: Array | None) -> tuple[Array, Array, Bools]:
+    def at(self, change: Array, bounds: Array) -> tuple[Array, Array, Bools]:
         """With the change (4, J): error (S, J), linear parameters (S, J, K), and where these would be out of bounds."""
         d = change.T
         values = self.local - np.einsum("sjka,ja->sjk", self.follows, d)
         outside = np.zeros(self.error.shape, dtype=bool)
-        if bounds is not None and len(bounds):
+        if len(bounds):
             outside = ((values < bounds[:, 0]) | (values > bounds[:, 1])).any(axis=-1)
         error, plain = (
             e - 2.0 * np.einsum("sja,ja->sj", g, d) + np.einsum("ja,sjab,jb->sj", d, h, d)

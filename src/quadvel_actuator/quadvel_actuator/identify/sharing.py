@@ -34,7 +34,7 @@ def regroupings(model: Model, few: Few) -> Iterator[tuple[str, Model]]:
     for word, groups in (("kind", kinds(joints)), ("joint", each)):
         if word == "kind" and len(np.unique(groups)) == len(joints):
             continue
-        if len(np.unique(groups)) > len(np.unique(model.gain_groups[0])):
+        if not model.gains_held and len(np.unique(groups)) > len(np.unique(model.gain_groups[0])):
             yield (
                 f"gains per {word}",
                 few.fitted(attrs.evolve(model, gain_groups=np.array([groups, groups])), fit, 4),
@@ -57,8 +57,7 @@ def pooled(model: Model, judge: Judge, noise: Array) -> Model:
                 alike = one.active & (groups == g)
                 values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
             common = attrs.evolve(one, groups=groups, values=values)
-            applied = (*model.applied[:k], common, *model.applied[k + 1 :])
-            tried = fit(attrs.evolve(model, applied=applied), judge.fit, 5)
+            tried = fit(model.replacing(k, common), judge.fit, 5)
             lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())
             if lost.gain < _HARMLESS * float(noise.mean()) or lost.p_any > _LEVEL:
                 model = tried

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from copy import copy
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -35,6 +35,9 @@ SMOOTH, SMOOTH_LATE = 0.006, 0.001
 STRETCH, FILLING = 0.75, 0.25
 """Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
 
+_SLOPES = {"ddq": 0.0, "ddq_smooth": SMOOTH_LATE}
+"""Signals that few laws ask for, and how much later they are read, s"""
+
 _CACHED = 6, 64
 """sets of signals that are kept, at least and at most;"""
 _CACHED_VALUES = 1_000_000
@@ -44,9 +47,7 @@ _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 
 BETWEEN = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
-_OF_JOINTS = (
-    "q", "dq", "ddq", "ddq_smooth", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature",
-)  # fmt: skip
+_OF_JOINTS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
 
 Joints = slice | list[int]
 ALL = slice(None)
@@ -61,8 +62,6 @@ class Signals:
     start: Bools  # (N, 1), does a stretch begin here
     q: Array
     dq: Array
-    ddq: Array
-    ddq_smooth: Array
     q_des: Array
     dq_des: Array
     tau_ff: Array
@@ -75,6 +74,27 @@ class Signals:
     row: NDArray[np.intp]  # (N, 1), which row of all logs this is
     sent: Array  # (M, J), q_des of every command row of all logs
     elsewhere: Callable[[str, Array], Array]
+    slope: Callable[[str], Array]
+
+    @cached_property
+    def ddq(self) -> Array:
+        """rad/s^2, over a few rows."""
+        return self.slope("ddq")
+
+    @cached_property
+    def ddq_smooth(self) -> Array:
+        """rad/s^2, over more rows, and of SMOOTH_LATE before."""
+        return self.slope("ddq_smooth")
+
+    @cached_property
+    def pull(self) -> Array:
+        """kp times the error of position, N m."""
+        return self.kp * (self.q_des - self.q)
+
+    @cached_property
+    def drag(self) -> Array:
+        """kd times the error of velocity, N m."""
+        return self.kd * (self.dq_des - self.dq)
 
     def shifted(self, name: str, late: Array) -> Array:
         """A signal of the joints' state `late` s earlier (negative: later); `late` (J,) or (B, 1, J)."""
@@ -129,6 +149,7 @@ class _LogSignals:
                 _double(log.kd) if kd is None and log.kd is not None else _or_one(kd), shape
             ),
         }
+        self.gains_known = kp is not None or log.kp is not None
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
         self.sums = {
             name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
@@ -136,20 +157,30 @@ class _LogSignals:
             if values.any()
         }
 
-    def state(self, name: str, at: Array, joints: Joints = ALL) -> Array:
-        """A state signal, linear between rows."""
+    def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+        """Of times: the state row before, and how far towards the next, 0 to 1; shape of `at`."""
         t = self.log.t
         row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-        share = np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)[:, None]
+        return row, np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)
+
+    def state(
+        self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
+    ) -> Array:
+        """A state signal, linear between rows; `found` is `between(at)` where that is known."""
+        row, share = self.between(at) if found is None else found
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        return values[row] + share * (values[row + 1] - values[row])
+        early = values[row]
+        late = values[row + 1]
+        late -= early
+        late *= share[:, None]
+        late += early
+        return late
 
     def shifted(self, name: str, at: Array) -> Array:
         """A state signal of every joint at times of its own, (..., N, J)."""
-        t, values = self.log.t, self.states[name]
-        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-        share = np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)
+        values = self.states[name]
+        row, share = self.between(at)
         joint = np.arange(values.shape[1])
         early: Array = values[row, joint]
         return early + share * (values[row + 1, joint] - early)
@@ -196,6 +227,8 @@ class Samples:
         origins = [float(log.t[0]) for log in logs] if origins is None else origins
         self.logs = [_LogSignals(log, kp, kd, at) for log, at in zip(logs, origins, strict=True)]
         self.joints = logs[0].joints
+        self.commanded = all(one.gains_known for one in self.logs)
+        """are the gains that were commanded known?"""
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
         self.t = np.concatenate([_double(log.t) for log in logs])
@@ -306,7 +339,14 @@ class Samples:
                 for pair, joints in every.items():
                     columns[name][:, joints] = getattr(made[pair], name)
         late = np.array([pair[1] for pair in pairs])
-        return attrs.evolve(first, **columns, elsewhere=partial(self._elsewhere, late))
+
+        def slope(name: str) -> Array:
+            values = np.empty(self.tau.shape)
+            for pair, joints in every.items():
+                values[:, joints] = getattr(made[pair], name)
+            return values
+
+        return attrs.evolve(first, **columns, elsewhere=partial(self._elsewhere, late), slope=slope)
 
     def _instants(self, output_delay: float) -> Iterator[Array]:
         """Of each log the instants at which the torque of these rows was asked for."""
@@ -330,9 +370,10 @@ class Samples:
         packets, ages = [], []
         chosen = ALL if joints is None else joints
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
+            found = one.between(at)
             for name in one.states:
-                moment = at - SMOOTH_LATE if name == "ddq_smooth" else at
-                parts.setdefault(name, []).append(one.state(name, moment, chosen))
+                if name not in _SLOPES:
+                    parts.setdefault(name, []).append(one.state(name, at, chosen, found))
             for name in one.commands:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
             row = one.log.command_rows(at - input_delay + 1e-9)
@@ -353,5 +394,15 @@ class Samples:
             row=self.row[:, None],
             sent=self.sent,
             elsewhere=partial(self._elsewhere, output_delay),
+            slope=partial(self._slope, output_delay, chosen),
             **signals,
         )
+
+    def _slope(self, output_delay: float, joints: Joints, name: str) -> Array:
+        """One of the accelerations at this output delay."""
+        late = _SLOPES[name]
+        parts = [
+            one.state(name, at - late, joints)
+            for one, at in zip(self.logs, self._instants(output_delay), strict=False)
+        ]
+        return np.concatenate(parts)
