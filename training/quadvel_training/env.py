@@ -15,7 +15,7 @@ from mujoco.batch import Batch
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
-from quadvel_description.kinematics import foot_jacobians, foot_positions, roll_pitch, rotate, rotate_inverse
+from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
 from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
@@ -197,10 +197,10 @@ class VelocityEnv:
         self.velocity = rotate_inverse(self.quaternion, qvel[:, :3])
         self.roll_pitch = roll_pitch(self.quaternion)
         quaternion = self.quaternion[:, None]
-        local = foot_positions(self.q)
+        local, jacobians = foot_kinematics(self.q)
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
         joints = self.dq.reshape(-1, 4, 3, 1)
-        swing = (foot_jacobians(self.q) @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
+        swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
         self.foot_velocity = rotate(quaternion, swing) + qvel[:, None, :3]
         self.clearance = self.feet[..., 2] - self._ground(self.feet) - robot.FOOT_RADIUS
         self.contact = self.clearance < 0.001
