@@ -22,7 +22,7 @@ from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMet
 from . import clock
 from .command_map import CommandCorrection, CommandMap
 from .env import VelocityEnv
-from .networks import Recurrent, State
+from .networks import Recurrent, State, mlp
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 MEMORY = 256
@@ -36,11 +36,14 @@ class Policy(Recurrent):
 
     Behind the LSTM's memory the state's first part goes on with the clock and the command of the tick before, which moves
     the clock on: so what a tick sees of it is known before the tick. The second part goes on with what is added to the
-    clock: half a cycle for a robot in the mirror, else nothing.
+    clock: half a cycle for a robot in the mirror, else nothing. What the LSTM sees the layers behind it see as well: what a
+    joint is to do depends on where it is, and on the half of its cycle, more than on the past.
     """
 
     def __init__(self) -> None:
-        super().__init__(DEFAULT_OBSERVATION.size + clock.FEATURES, 12, MEMORY, HIDDEN)
+        seen = DEFAULT_OBSERVATION.size + clock.FEATURES
+        super().__init__(seen, 12, MEMORY, HIDDEN)
+        self.body = mlp([MEMORY + seen, *HIDDEN, 12])
 
     def initial_state(self, n: int, mirrored: bool = False) -> State:
         """Of `n` robots, before their first tick; `mirrored`: of their mirror images."""
@@ -58,8 +61,9 @@ class Policy(Recurrent):
             now = clock.advance(now, command)
             seen.append(clock.features(now + ahead))
             command = x[tick : tick + 1, ..., :4]
-        clocks = torch.cat(seen) if len(seen) > 1 else seen[0]
-        y, (h, c) = super().forward(torch.cat([x, clocks], dim=-1), (h.contiguous(), c.contiguous()))
+        x = torch.cat([x, torch.cat(seen) if len(seen) > 1 else seen[0]], dim=-1)
+        y, (h, c) = self.lstm(x, (h.contiguous(), c.contiguous()))
+        y = self.body(torch.cat([nn.functional.silu(y), x], dim=-1))
         return y, (torch.cat([h, now, command], dim=-1), torch.cat([c, ahead, rest], dim=-1))
 
 
