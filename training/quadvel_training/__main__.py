@@ -17,6 +17,7 @@ from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, student, teacher
 from .card import card
+from .command_map import CommandMap
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -70,8 +71,10 @@ def train_student(
     run = distill.DistillRun(config, teacher_file, stage3.policy_of(start) if start else None)
     checkpoint = out / "student.pt"
     loop.train(run, config.budget, checkpoint)
-    made_of = run_folder.made_of("distill", source, config, checkpoint)
-    student.export_policy(run.student, run.env, out / "policy.onnx", made_of)
+    own = CommandMap()
+    fit, walks = distill.map_student(run.student, own, config.limits, ActuatorParameters.default())
+    about = run_folder.made_of("distill", source, config, checkpoint) | {"command_map": attrs.asdict(fit)}
+    student.export_policy(run.student, walks, out / "policy.onnx", about, own)
 
 
 @app.command("crl")

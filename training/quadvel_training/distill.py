@@ -136,6 +136,7 @@ class DistillConfig:
     correction_gain: float = 0.5  # 1/s, integral action of the teacher on top of the map
     seed: int = 1
     commands: CommandRange = CommandRange()
+    limits: CommandRange = CommandRange()  # of the policy file, where its command map is measured
     terrain: Terrain = Terrain()
 
 
