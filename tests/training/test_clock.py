@@ -94,3 +94,13 @@ def test_the_mirrored_policy_sees_the_other_diagonal_pair_begin(walk):
     signs = torch.tensor([1.0, -1.0, -1.0, 1.0, -1.0, -1.0])
     assert np.allclose(features[1], features[0] * signs, atol=1e-4)
     assert np.abs(features[0][..., 4:]).max() > 0.9
+
+
+def test_a_policy_from_before_there_was_a_clock_goes_on_without_one():
+    bare = student.Recurrent(48, 12, student.MEMORY, student.HIDDEN)
+    for network in (bare, student.new_actor()):
+        again = student.actor_of(network.state_dict())
+        assert type(again) is type(network)
+        x, state = torch.ones(1, 1, 48), network.initial_state(1)
+        with torch.no_grad():
+            assert torch.equal(again(x, state)[0], network(x, state)[0])

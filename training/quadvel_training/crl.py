@@ -22,11 +22,10 @@ from .command_map import CommandMap
 from .distill import map_student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares
-from .networks import Gaussian, Mlp, State
+from .networks import Gaussian, Mlp, Recurrent, State
 from .ppo import Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
-from .student import Policy
 from .teacher import torch_mirror
 
 PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
@@ -72,7 +71,7 @@ class CrlConfig:
 class CrlRun:
     """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
 
-    def __init__(self, config: CrlConfig, start: Policy | None = None, device: str = "cpu") -> None:
+    def __init__(self, config: CrlConfig, start: Recurrent | None = None, device: str = "cpu") -> None:
         self.config = c = config
         self.device = parallel.join(device)
         torch.manual_seed(c.seed)
@@ -117,9 +116,9 @@ class CrlRun:
             map_student(self.policy(), own, self.config.commands, actuator(self.config.actuator))
         return own
 
-    def policy(self) -> Policy:
+    def policy(self) -> Recurrent:
         """A copy of the policy as it is now, on the CPU."""
-        network: Policy = copy.deepcopy(self.actor.network).cpu()
+        network: Recurrent = copy.deepcopy(self.actor.network).cpu()
         return network
 
     def state(self) -> dict[str, Any]:

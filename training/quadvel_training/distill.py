@@ -143,9 +143,7 @@ class DistillConfig:
 class DistillRun:
     """Teacher, student and environment of stage 2."""
 
-    def __init__(
-        self, config: DistillConfig, teacher_file: Path, start: student.Policy | None = None
-    ) -> None:
+    def __init__(self, config: DistillConfig, teacher_file: Path, start: Recurrent | None = None) -> None:
         """`start`: a student to go on from."""
         self.config = config
         torch.manual_seed(config.seed)

@@ -10,6 +10,7 @@ from . import distill, loop, parallel, recipe, student
 from .command_map import CommandMap
 from .crl import CrlConfig, CrlRun
 from .loop import Budget
+from .networks import Recurrent
 from .randomisation import actuator
 from .run_folder import Evaluated, describe, made_of
 
@@ -20,17 +21,15 @@ CHECKPOINT = "crl.pt"
 NO_LIMIT = 1e6  # minutes
 
 
-def policy_of(checkpoint: Path) -> student.Policy:
+def policy_of(checkpoint: Path) -> Recurrent:
     """The recurrent policy in a checkpoint of stage 2 or 3."""
     content = loop.load(checkpoint)
-    actor = student.new_actor()
     if "student" in content:
-        actor.load_state_dict(content["student"])
-    else:
-        prefix = "network."
-        weights = {k.removeprefix(prefix): v for k, v in content["actor"].items() if k.startswith(prefix)}
-        actor.load_state_dict(weights)
-    return actor
+        return student.actor_of(content["student"])
+    prefix = "network."
+    return student.actor_of(
+        {k.removeprefix(prefix): v for k, v in content["actor"].items() if k.startswith(prefix)}
+    )
 
 
 def learn(config: CrlConfig, source: Path | None, start: Path | None, folder: Path, device: str) -> bool:

@@ -72,6 +72,15 @@ def new_actor() -> Policy:
     return Policy()
 
 
+def actor_of(weights: dict[str, Tensor]) -> Recurrent:
+    """The policy with these weights; those made before there was a clock go on without one."""
+    size = DEFAULT_OBSERVATION.size
+    bare = weights["lstm.weight_ih_l0"].shape[1] == size
+    actor = Recurrent(size, 12, MEMORY, HIDDEN) if bare else new_actor()
+    actor.load_state_dict(weights)
+    return actor
+
+
 def action_map(env: VelocityEnv) -> ActionMap:
     """Zero stands: the offset is the nominal posture with the gravity torque fed forward through kp."""
     return ActionMap(env.stand_q, ACTION_SCALE)
@@ -183,7 +192,7 @@ def export_policy(
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(robot.NOMINAL_Q),
         command_limits={"vx": c.vx, "vy": (-c.vy, c.vy), "wz": (-c.wz, c.wz)},
-        state_shape=(1, 1, sum(PARTS)),
+        state_shape=tuple(actor.initial_state(1)[0].shape),
         actuator=attrs.asdict(env.config.actuator),
         recipe=recipe,
         commit=commit(),
