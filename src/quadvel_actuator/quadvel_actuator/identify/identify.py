@@ -13,7 +13,7 @@ import numpy as np
 
 from ..parameters import ActuatorParameters
 from .delays import fit_with_delays
-from .diagnosis import Diagnosis, Rejected, diagnose, diagnosed
+from .diagnosis import Diagnosis, Rejected, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
 from .findings import Finding
@@ -79,11 +79,10 @@ def identify(
     tell(0.02, "gains and delays")
     samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd, windows)
     findings += remark
-    before = _plain(samples, eam, judge)
+    before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
-    seek = diagnosed if body is None else diagnose  # without measured torque the gains set the scale of everything
-    diagnosis = seek(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
+    diagnosis = diagnosed(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
     tell(0.88, "what no effect explains")
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
 
