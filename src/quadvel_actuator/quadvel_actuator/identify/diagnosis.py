@@ -78,10 +78,10 @@ def diagnosed(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
     What a joint swings freely can hide an inertia in lesser gains, and the other effects then come out bent. The account
-    with the commanded gains is taken where it predicts as well.
+    with the commanded gains is taken where it predicts as well. Without measured torque the gains set the scale of all.
     """
     found = diagnose(model, judge, noise, tick)
-    if not _far(found.model) or not model.samples.commanded:
+    if model.implied or not model.samples.commanded or not _far(found.model):
         return found
     as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
     other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick)

@@ -79,7 +79,7 @@ def identify(
     tell(0.02, "gains and delays")
     samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd, windows)
     findings += remark
-    before = _plain(samples, eam, judge)
+    before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
     diagnosis = diagnosed(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))

@@ -64,6 +64,8 @@ class Model:
     applied: tuple[Applied, ...] = ()
     gains_held: bool = False
     """do the gains stay as they are while everything else is fitted?"""
+    implied: bool = False
+    """is the torque that it is fitted to not measured, but what the motion implies?"""
 
     @property
     def signals(self) -> Signals:

@@ -209,7 +209,13 @@ class _Spot:
 
     @cached_property
     def freed(self) -> list[tuple[int, int]]:
-        """Linear parameters of the model's own laws, (law, parameter): a new law may need others of them."""
+        """Linear parameters of the model's own laws, (law, parameter): a new law may need others of them.
+
+        None where torque is what the motion implies: that is bent by the way it was derived, and a law already there,
+        free beside one like it, would be bent along.
+        """
+        if self.model.implied:
+            return []
         return [
             (k, one.law.names.index(name))
             for k, one in enumerate(self.model.applied)
