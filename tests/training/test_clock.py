@@ -54,7 +54,7 @@ def walk():
     commands = CommandRange(stance=0.4, hold=(0.1, 0.4))
     env = VelocityEnv(EnvConfig(n=6, threads=1, commands=commands, randomisation=Randomisation.calm()))
     torch.manual_seed(0)
-    network, teachers = student.new_actor(), GaitState(env)
+    network, teachers = student.Policy(), GaitState(env)
     memory, previous = network.initial_state(6), np.zeros((6, 12), np.float32)
     seen = []
     for tick in range(300):
@@ -98,7 +98,7 @@ def test_the_mirrored_policy_sees_the_other_diagonal_pair_begin(walk):
 
 def test_a_policy_from_before_there_was_a_clock_goes_on_without_one():
     bare = student.Recurrent(48, 12, student.MEMORY, student.HIDDEN)
-    for network in (bare, student.new_actor()):
+    for network in (bare, student.Policy()):
         again = student.actor_of(network.state_dict())
         assert type(again) is type(network)
         x, state = torch.ones(1, 1, 48), network.initial_state(1)

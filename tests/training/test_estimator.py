@@ -28,7 +28,7 @@ STILL = CommandRange(stance=1.0)
 @pytest.fixture(scope="module")
 def actor():
     torch.manual_seed(0)
-    return student.new_actor()
+    return student.Policy()
 
 
 def only(monkeypatch, mode):

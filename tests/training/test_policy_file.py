@@ -16,7 +16,7 @@ from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
     torch.manual_seed(0)
-    actor = student.new_actor()
+    actor = student.Policy()
     env = VelocityEnv(EnvConfig(n=2, threads=1, commands=CommandRange(vx=(-1.0, 1.5), vy=0.5, wz=1.2)))
     path = tmp_path_factory.mktemp("policy") / "policy.onnx"
     student.export_policy(actor, env, path, {"stage": "test"})

@@ -42,7 +42,7 @@ class OurLearner:
 
     def __init__(self, config: CrlConfig) -> None:
         self.config = config
-        self.actor = Gaussian(student.new_actor(), 12, config.std)
+        self.actor = Gaussian(student.Policy(), 12, config.std)
         self.actor.log_std.requires_grad_(False)
         self.ppo = Ppo(self.actor, Mlp(STATE, 1, CRITIC), config.ppo, MIRROR_OBS, MIRROR_ACTION)
         self.seen = self.ppo.mirrored(config.n)

@@ -92,7 +92,7 @@ def _bare_parts(run: CrlRun) -> dict[str, tuple[Callable[[], object], float]]:
     """
     config, size = run.config, DEFAULT_OBSERVATION.size
     p, n, length = config.ppo, config.n, config.length
-    actor, critic = student.new_actor(), Mlp(size + PRIVILEGED, 1)
+    actor, critic = student.Policy(), Mlp(size + PRIVILEGED, 1)
     one, state = torch.randn(1, n, size), actor.initial_state(n)
 
     def infer() -> None:

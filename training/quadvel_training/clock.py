@@ -13,7 +13,6 @@ from . import gait
 from .env import TICK
 
 SIZE = 5
-_RISE = (gait.FASTEST - gait.SLOWEST) / gait.FULL_SPEED  # Hz for 1 m/s
 ACCELERATION = (2.5, 1.5, 4.0)  # m/s^2, m/s^2, rad/s^2; thrown at once into a run a robot falls
 HALF_CYCLE = (0.0, 0.0, 0.0, 0.5, 0.0)
 """By which the clock of the mirrored robot is ahead: its other diagonal pair begins."""
@@ -24,13 +23,19 @@ def advance(clock: Tensor, command: Tensor) -> Tensor:
     pace, phase, _ = clock.split([3, 1, 1], dim=-1)
     step = TICK * pace.new_tensor(ACCELERATION)
     pace = pace + (command[..., :3] - pace).clamp(-step, step)
-    speed = (pace * pace.new_tensor(gait.SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
+    speed = gait.speed(pace)
     runs = torch.where(speed == 0, 1 - command[..., 3:], 1.0)
-    phase = phase + TICK * gait.SLOWEST + TICK * _RISE * speed.clamp(max=gait.FULL_SPEED)
+    phase = phase + TICK * gait.frequency(speed)
     return torch.cat([pace, phase.fmod(1.0) * runs, runs], dim=-1)
 
 
 FEATURES = 6
+
+
+def pace_and_phase(clock: Tensor) -> tuple[Tensor, Tensor]:
+    """What the gait walks at (..., 4), a command, and where in its cycle it is (..., 1), of the clock (..., 5)."""
+    pace, phase, runs = clock.split([3, 1, 1], dim=-1)
+    return torch.cat([pace, 1 - runs], dim=-1), phase
 
 
 def features(clock: Tensor) -> Tensor:

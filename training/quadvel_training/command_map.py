@@ -110,7 +110,7 @@ class CommandMap:
 
 
 class CommandCorrection(torch.nn.Module):
-    """What the map adds to the command: observations (n, 48), which start with the command, to (n, 48).
+    """What the map adds to the command: (..., `inputs`), which start with the command, to (..., `inputs`).
 
     Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz; the last
     of the four factors is 0 in stance.
@@ -132,7 +132,7 @@ class CommandCorrection(torch.nn.Module):
         self.register_buffer("weights", torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        terms = self.factors(obs).reshape(-1, 4, TERMS).prod(dim=1)
+        terms = self.factors(obs).reshape(*obs.shape[:-1], 4, TERMS).prod(dim=-2)
         return (terms @ self.weights).clamp(-BOUND, BOUND)
 
 

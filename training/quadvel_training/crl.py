@@ -88,7 +88,7 @@ class CrlRun:
         self.env = VelocityEnv(env_config)
         self.rewards = Table2(self.env, c.rewards)
         self._mapped = c.mapped and start is not None
-        self.actor = Gaussian(start or student.new_actor(), 12, c.std).to(self.device)
+        self.actor = Gaussian(start or student.Policy(self.env.stand_q), 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
         self.critic = Mlp(48 + PRIVILEGED, 1).to(self.device)
         self.mirror_obs, self.mirror_action = (

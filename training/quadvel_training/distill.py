@@ -17,10 +17,10 @@ import numpy as np
 import torch
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description import robot, symmetry
+from quadvel_description import symmetry
 from quadvel_sim.terrain import Terrain
 
-from . import gait, student, teacher
+from . import student, teacher
 from .command_map import CommandMap, MapFit, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
@@ -62,7 +62,7 @@ class Teacher:
         """Joint targets (n, 12) for the present state."""
         env = self.env
         command = self.tracking.corrected(self.own(self.gait.pace))
-        base = gait.targets(self.gait.phase, command, teacher.body_of(env, self.gait), robot.KP)
+        base = self.gait.targets(command)
         obs = teacher.observe(env, self.gait, command, self._past[0], base)
         with torch.no_grad():
             residual = self.actor(torch.from_numpy(obs))[0].numpy().astype(float).clip(-5, 5)
@@ -143,7 +143,7 @@ class DistillConfig:
 class DistillRun:
     """Teacher, student and environment of stage 2."""
 
-    def __init__(self, config: DistillConfig, teacher_file: Path, start: Recurrent | None = None) -> None:
+    def __init__(self, config: DistillConfig, teacher_file: Path, start: student.Policy | None = None) -> None:
         """`start`: a student to go on from."""
         self.config = config
         torch.manual_seed(config.seed)
@@ -154,7 +154,7 @@ class DistillRun:
         fit_command_map(Teacher(actor, VelocityEnv(trial), own, gain=0.0))
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain)
-        self.student = start or student.new_actor()
+        self.student = start or student.Policy(self.env.stand_q, own)
         self.map = student.action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
@@ -242,17 +242,21 @@ class DistillRun:
     def learn(self, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor) -> dict[str, float]:
         """Some epochs over one sequence; then carries the memories on and clears those of ended environments."""
         seen: dict[str, float] = {}
+        mirrored = self._mirror_obs(obs)
+        with torch.no_grad():
+            obs, self._memory = self.student.follow(obs, self._memory)
+            mirrored, self._mirrored = self.student.follow(mirrored, self._mirrored)
         batches = [
             b
             for _ in range(self.config.epochs)
             for b in torch.randperm(self.config.n).chunk(self.config.mini_batches)
         ]
         for ids in batches:
-            terms = self._learn(ids, obs[:, ids], label[:, ids], mask[:, ids])
+            terms = self._learn(ids, obs[:, ids], mirrored[:, ids], label[:, ids], mask[:, ids])
             seen = {name: seen.get(name, 0.0) + value / len(batches) for name, value in terms.items()}
         with torch.no_grad():
-            _, self._memory = self.student(obs, self._memory)
-            _, self._mirrored = self.student(self._mirror_obs(obs), self._mirrored)
+            _, self._memory = self.student.act(obs, self._memory)
+            _, self._mirrored = self.student.act(mirrored, self._mirrored)
         over = self._over
         if len(over):
             self.env.reset(over)
@@ -265,12 +269,17 @@ class DistillRun:
         return seen
 
     def _learn(
-        self, ids: torch.Tensor, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor
+        self,
+        ids: torch.Tensor,
+        obs: torch.Tensor,
+        mirrored_obs: torch.Tensor,
+        label: torch.Tensor,
+        mask: torch.Tensor,
     ) -> dict[str, float]:
         c = self.config
         some = ids % 2 == 0  # the symmetry term sees every other environment
-        action, _ = self.student(obs, select(self._memory, ids))
-        mirrored, _ = self.student(self._mirror_obs(obs[:, some]), select(self._mirrored, ids[some]))
+        action, _ = self.student.act(obs, select(self._memory, ids))
+        mirrored, _ = self.student.act(mirrored_obs[:, some], select(self._mirrored, ids[some]))
         alive = mask.sum().clamp(min=1)
         error = torch.nn.functional.huber_loss(action, label, reduction="none", delta=FAR)
         clone = (error.sum(-1) * mask).sum() / alive

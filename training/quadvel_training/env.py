@@ -175,12 +175,12 @@ class VelocityEnv:
         return self.config.terrain.height(points[..., 0], points[..., 1])
 
     @property
-    def ground_roll_pitch(self) -> np.ndarray:
-        """Roll and pitch (n, 2), rad, of a trunk parallel to the ground below the four feet."""
+    def ground_slope(self) -> np.ndarray:
+        """By how much (n, 2) the ground falls away below the four feet, for 1 m forward and for 1 m to the left."""
         ground = self._ground(self.feet)
-        front, rear = ground[:, :2].mean(axis=1), ground[:, 2:].mean(axis=1)
-        right, left = ground[:, ::2].mean(axis=1), ground[:, 1::2].mean(axis=1)
-        return np.arctan(np.stack([(left - right) / STANCE_WIDTH, (rear - front) / STANCE_LENGTH], axis=-1))
+        forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
+        left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
+        return np.stack([forward / STANCE_LENGTH, left / STANCE_WIDTH], axis=-1)
 
     def _push(self) -> None:
         r = self.config.randomisation

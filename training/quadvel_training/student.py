@@ -19,64 +19,124 @@ from quadvel_description import robot
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
 
-from . import clock
+from . import clock, gait, ground
 from .command_map import CommandCorrection, CommandMap
-from .env import VelocityEnv
+from .env import TICK, VelocityEnv
+from .legs import Legs
 from .networks import Recurrent, State, mlp
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 MEMORY = 256
 HIDDEN = (192, 128)
-PARTS = [MEMORY, clock.SIZE, 4]
-"""What a policy's state is put together of."""
+PARTS = [MEMORY, clock.SIZE, clock.SIZE, ground.SIZE]
+PARTS.append(MEMORY + DEFAULT_OBSERVATION.size - sum(PARTS))  # of no use: both halves have one size
+"""What the first half of a policy's state is put together of."""
 
 
 class Policy(Recurrent):
-    """The policy of Section 4.1 with a gait clock of its own beside the 48 observations (docs/decisions/0015).
+    """The policy of Section 4.1 on top of a trotting gait that it carries along (docs/decisions/0016).
 
-    Behind the LSTM's memory the state's first part goes on with the clock and the command of the tick before, which moves
-    the clock on: so what a tick sees of it is known before the tick. The second part goes on with what is added to the
-    clock: half a cycle for a robot in the mirror, else nothing. What the LSTM sees the layers behind it see as well: what a
-    joint is to do depends on where it is, and on the half of its cycle, more than on the past.
+    Behind the LSTM's memory the first part of the state goes on with the gait's clock, what is added to it (half a cycle for
+    a robot in the mirror, else nothing) and the ground that the feet feel; the second with the observation of the tick
+    before. So the gait's joint targets are known before the tick: the network adds to them. What the LSTM sees the layers
+    behind it see as well.
     """
 
-    def __init__(self) -> None:
-        seen = DEFAULT_OBSERVATION.size + clock.FEATURES
+    offset: Tensor
+    expect: Tensor
+    expect_offset: Tensor
+
+    def __init__(
+        self, offset: np.ndarray = robot.NOMINAL_Q, command_map: CommandMap | None = None
+    ) -> None:
+        """offset: joint angles (12,) rad at action zero. command_map: of the gait as its teacher walks it."""
+        seen = DEFAULT_OBSERVATION.size + clock.FEATURES + 4 + ground.SIZE + 12
         super().__init__(seen, 12, MEMORY, HIDDEN)
         self.body = mlp([MEMORY + seen, *HIDDEN, 12])
+        with torch.no_grad():
+            self.body[-1].weight.mul_(0.1)
+        self.lead = CommandCorrection(command_map or CommandMap(), 4).requires_grad_(False)
+        self.register_buffer("offset", torch.tensor(offset, dtype=torch.float32))
+        for name, array in zip(("expect", "expect_offset"), _expectation(), strict=True):
+            self.register_buffer(name, torch.as_tensor(array, dtype=torch.float32), persistent=False)
 
     def initial_state(self, n: int, mirrored: bool = False) -> State:
         """Of `n` robots, before their first tick; `mirrored`: of their mirror images."""
-        zeros = torch.zeros(1, n, sum(PARTS))
-        ahead = zeros.clone()
+        first, second = torch.zeros(1, n, sum(PARTS)), torch.zeros(1, n, sum(PARTS))
         if mirrored:
-            ahead.split(PARTS, dim=-1)[1].copy_(torch.tensor(clock.HALF_CYCLE))
-        return zeros, ahead
+            _unpack(first)[2].copy_(torch.tensor(clock.HALF_CYCLE))
+        return first, second
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 265); N may be missing in all."""
-        (h, now, command), (c, ahead, rest) = (part.split(PARTS, dim=-1) for part in state)
-        seen = []
+        """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 304); N may be missing in all."""
+        return self.act(*self.follow(x, state))
+
+    def follow(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """What the layers see (T, N, 73), the gait's targets at its end; and the state without the memory's progress.
+
+        Nothing is learned here: x, then the clock, the feet that should be down, the ground, and the targets as actions.
+        """
+        memory, now, ahead, below, rest = _unpack(state[0])
+        cell, before = state[1].split([MEMORY, DEFAULT_OBSERVATION.size], dim=-1)
+        past = torch.cat([before, x[:-1]]) if len(x) > 1 else before
+        roll_pitch, q, velocity, turn = (past @ self.expect + self.expect_offset).split([2, 12, 3, 3], dim=-1)
+        feet, up = Legs(q).feet, gait.upward(roll_pitch)
+        times, grounds = [], []
         for tick in range(len(x)):
-            now = clock.advance(now, command)
-            seen.append(clock.features(now + ahead))
-            command = x[tick : tick + 1, ..., :4]
-        x = torch.cat([x, torch.cat(seen) if len(seen) > 1 else seen[0]], dim=-1)
-        y, (h, c) = self.lstm(x, (h.contiguous(), c.contiguous()))
-        y = self.body(torch.cat([nn.functional.silu(y), x], dim=-1))
-        return y, (torch.cat([h, now, command], dim=-1), torch.cat([c, ahead, rest], dim=-1))
+            one = slice(tick, tick + 1)
+            now = clock.advance(now, past[one, ..., :4])
+            times.append(now + ahead)
+            pace, phase = clock.pace_and_phase(times[-1])
+            down = gait.wants_contact(phase, pace)
+            below = ground.advance(below, feet[one], up[one], velocity[one], down)
+            grounds.append(below)
+        time, known = _joined(times), _joined(grounds)
+        pace, phase = clock.pace_and_phase(time)
+        slope, height = known[..., 1:], known[..., :1] + gait.HEIGHT
+        body = gait.Body(q, velocity, turn, roll_pitch, slope, height)
+        base = (gait.targets(phase, pace + self.lead(pace), body) - self.offset) / ACTION_SCALE
+        contacts = gait.wants_contact(phase, pace).to(x.dtype)
+        seen = torch.cat([x, clock.features(time), contacts, 10 * known, base], dim=-1)
+        first = torch.cat([memory, now, ahead, below, rest], dim=-1)
+        return seen, (first, torch.cat([cell, x[-1:]], dim=-1))
+
+    def act(self, seen: Tensor, state: State) -> tuple[Tensor, State]:
+        """Actions (T, N, 12) and the new state, of what `follow` returns."""
+        (h, gait_state), (c, before) = (half.split([MEMORY, half.shape[-1] - MEMORY], dim=-1) for half in state)
+        y, (h, c) = self.lstm(seen, (h.contiguous(), c.contiguous()))
+        y = seen[..., -12:] + self.body(torch.cat([nn.functional.silu(y), seen], dim=-1))
+        return y, (torch.cat([h, gait_state], dim=-1), torch.cat([c, before], dim=-1))
 
 
-def new_actor() -> Policy:
-    """A policy with random weights."""
-    return Policy()
+def _unpack(first: Tensor) -> tuple[Tensor, ...]:
+    """Memory, clock, what is added to it, ground and nothing, of the first part of a policy's state."""
+    return first.split(PARTS, dim=-1)
+
+
+def _joined(ticks: list[Tensor]) -> Tensor:
+    return torch.cat(ticks) if len(ticks) > 1 else ticks[0]
+
+
+def _expectation() -> tuple[np.ndarray, np.ndarray]:
+    """A, b: x A + b are roll, pitch, q, linear and angular velocity (20,) one tick after an observation x (48,)."""
+    spec, first = DEFAULT_OBSERVATION, 0
+    rows: dict[str, slice] = {}
+    for term in spec.terms:
+        rows[term.name] = slice(first, first := first + term.size)
+    pick = np.zeros((spec.size, 20))
+    for columns, name, rate in ((slice(0, 2), "roll_pitch", "angular_velocity"), (slice(2, 14), "q", "dq")):
+        size = columns.stop - columns.start
+        pick[rows[name], columns] = np.eye(size)
+        pick[rows[rate], columns][:size] = TICK * np.eye(size)
+    for columns, name in ((slice(14, 17), "linear_velocity"), (slice(17, 20), "angular_velocity")):
+        pick[rows[name], columns] = np.eye(3)
+    return pick / spec.scale[:, None], spec.offset @ pick
 
 
 def actor_of(weights: dict[str, Tensor]) -> Recurrent:
-    """The policy with these weights; those made before there was a clock go on without one."""
-    size = DEFAULT_OBSERVATION.size
-    bare = weights["lstm.weight_ih_l0"].shape[1] == size
-    actor = Recurrent(size, 12, MEMORY, HIDDEN) if bare else new_actor()
+    """The policy with these weights; those made before it carried a gait along go on without one."""
+    bare = "offset" not in weights
+    actor = Recurrent(DEFAULT_OBSERVATION.size, 12, MEMORY, HIDDEN) if bare else Policy()
     actor.load_state_dict(weights)
     return actor
 

@@ -48,7 +48,7 @@ def torch_mirror(
 
 
 class GaitState:
-    """The clock, the residual and the lean of `n` environments.
+    """The clock, the residual and the ground's slope of `n` environments.
 
     pace (n, 4): the command that the gait walks at. It follows the wanted one, and stands once it has come to rest.
     """
@@ -58,7 +58,7 @@ class GaitState:
         self.env = env
         self.residual = np.zeros((n, 12))
         self.residual_before = np.zeros((n, 12))
-        self.lean = np.zeros((n, 2))
+        self.slope = np.zeros((n, 2))
         self._clock = torch.zeros(n, clock.SIZE)
         self._wanted = np.zeros((n, 4))
         self.reset(np.arange(n))
@@ -68,40 +68,34 @@ class GaitState:
         for array in (self.residual, self.residual_before):
             array[ids] = 0.0
         self._clock[ids] = clock.advance(torch.zeros(clock.SIZE), torch.zeros(4))
-        self.lean[ids] = self.env.ground_roll_pitch[ids]
+        self.slope[ids] = self.env.ground_slope[ids]
         self._note()
 
     def advance(self) -> None:
         """After the environment's tick: one tick further under the command that was in force in it."""
-        self.lean += (self.env.ground_roll_pitch - self.lean) * TICK / LEVELLING
+        self.slope += (self.env.ground_slope - self.slope) * TICK / LEVELLING
         self._clock = clock.advance(self._clock, torch.from_numpy(self._wanted.astype(np.float32)))
         self._note()
 
     def _note(self) -> None:
         self._wanted = self.env.command.copy()
-        self.pace = self._clock[:, [0, 1, 2, 4]].numpy().astype(float)
-        self.pace[:, 3] = 1 - self.pace[:, 3]
-        self.phase = self._clock[:, 3].numpy().astype(float)
+        pace, phase = clock.pace_and_phase(self._clock)
+        self.pace, self.phase = pace.numpy().astype(float), phase.numpy()
 
-
-def body_of(env: VelocityEnv, g: GaitState) -> gait.Body:
-    """What the gait reads."""
-    return gait.Body(
-        env.q,
-        env.velocity[:, :2],
-        env.angular_velocity,
-        env.roll_pitch,
-        g.lean,
-        env.height,
-        env.velocity[:, 2],
-    )
+    def targets(self, command: np.ndarray | None = None) -> np.ndarray:
+        """The gait's joint targets (n, 12) in the true state, at another command (n, 4) than `pace` if given."""
+        env = self.env
+        body = (env.q, env.velocity, env.angular_velocity, env.roll_pitch, self.slope, env.height[:, None])
+        given = self.pace if command is None else command
+        phase, given, *seen = (torch.from_numpy(x.astype(np.float32)) for x in (self.phase, given, *body))
+        return gait.targets(phase, given, gait.Body(*seen)).numpy().astype(float)
 
 
 def observe(
     env: VelocityEnv, g: GaitState, command: np.ndarray, previous: np.ndarray, base: np.ndarray
 ) -> np.ndarray:
     """The teacher's input (n, 67): the paper's 48 numbers from the true state, the clock, the gait's targets, contacts."""
-    angle = 2 * np.pi * g.phase[:, None]
+    angle = 2 * np.pi * g.phase
     moving = command[:, 3:] < 0.5
     return np.concatenate(
         [
@@ -139,17 +133,19 @@ def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
         + 0.25 * np.exp(-ew / 0.05)
     )
     tracking -= 1.5 * np.hypot(lag[:, 0], lag[:, 1]) + 0.5 * np.abs(lag[:, 2])
+    lean = gait.lean(torch.from_numpy(g.slope)).numpy()
     body = (
-        -0.5 * np.abs(env.roll_pitch - g.lean).sum(1)
+        -0.5 * np.abs(env.roll_pitch - lean).sum(1)
         - 0.3 * np.abs(env.velocity[:, 2])
         - 0.08 * np.hypot(env.angular_velocity[:, 0], env.angular_velocity[:, 1])
         - 3.0 * np.abs(env.height - gait.HEIGHT)
     )
     power = np.maximum(0.2 * env.torque**2 + env.torque * env.dq, 0).sum(1)
     effort = -6e-4 * power - 3e-4 * np.sum(env.dq**2, axis=1) * (1 + 20 * c[:, 3])
-    wanted = gait.wants_contact(g.phase, c)
+    cycle = torch.from_numpy(g.phase), torch.from_numpy(c.astype(np.float32))
+    wanted = gait.wants_contact(*cycle).numpy()
     slide = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
-    lift = gait.swing_height(g.phase, c)
+    lift = gait.swing_height(*cycle).numpy()
     feet = (
         -0.15 * (wanted != env.contact).sum(1)
         - 0.15 * (slide * env.contact).sum(1)
@@ -230,7 +226,7 @@ class TeacherRun:
         }
         std = self.actor.log_std.exp().detach().numpy()
         errors, falls = [], 0
-        base = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)
+        base = g.targets()
         for _ in range(c.length):
             obs = observe(env, g, g.pace, g.residual, base)
             with torch.no_grad():
@@ -242,7 +238,7 @@ class TeacherRun:
             for _ in range(HOLD):
                 env.tick(base + RESIDUAL * g.residual)
                 g.advance()
-                base = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)
+                base = g.targets()
                 self.tracking.advance(env, g.pace[:, :3])
                 total += reward(env, g, self.tracking.error)
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
@@ -258,7 +254,7 @@ class TeacherRun:
                 env.reset(over)
                 g.reset(over)
                 self.tracking.reset(over)
-                base[over] = gait.targets(g.phase, g.pace, body_of(env, g), robot.KP)[over]
+                base[over] = g.targets()[over]
         self.samples += c.length * c.n
         last = np.concatenate(
             [observe(env, g, g.pace, g.residual, base), critic_extra(env, self.tracking)], axis=1

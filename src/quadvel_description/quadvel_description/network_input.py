@@ -61,16 +61,17 @@ class InputLayout:
                 [np.broadcast_to(v, t.size) for t, v in zip(self.terms, values, strict=True)]
             )
 
-        self._offset = spread(t.offset for t in self.terms)
-        self._scale = spread(t.scale for t in self.terms)
+        self.offset = spread(t.offset for t in self.terms)
+        self.scale = spread(t.scale for t in self.terms)
+        """Of each number of the input, (size,)."""
         self._high = spread(np.inf if t.clip is None else t.clip for t in self.terms)
         self._low = -self._high
 
     def build(self, values: Mapping[str, ArrayLike]) -> NDArray[np.float32]:
         """The input (..., size) from each term's value (..., term.size); all leading axes are the same."""
         built = np.concatenate([values[name] for name in self.names], axis=-1, dtype=np.float64)
-        built -= self._offset
-        built *= self._scale
+        built -= self.offset
+        built *= self.scale
         np.maximum(built, self._low, out=built)
         return np.minimum(built, self._high, out=built).astype(np.float32)
 
