@@ -20,14 +20,12 @@ STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
 QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
 
 
-def body(env):
-    return teacher.body_of(env, teacher.GaitState(env))
-
-
 def test_the_gait_stands_still_on_command():
     env = VelocityEnv(QUIET)
+    walker = teacher.GaitState(env)
     for _ in range(300):
-        env.tick(gait.targets(np.zeros(4), env.command, body(env), robot.KP))
+        env.tick(walker.targets())
+        walker.advance()
     assert not env.fallen.any()
     assert np.abs(env.velocity).max() < 0.05
     assert np.abs(env.height - gait.HEIGHT).max() < 0.03
@@ -56,9 +54,10 @@ def test_commands_of_the_ellipsoid_lie_in_it():
 
 def test_acceleration_at_rest_is_gravity_upwards():
     env = VelocityEnv(QUIET)
-    seen = []
+    seen, walker = [], teacher.GaitState(env)
     for _ in range(400):
-        env.tick(gait.targets(np.zeros(4), env.command, body(env), robot.KP))
+        env.tick(walker.targets())
+        walker.advance()
         seen.append(env.acceleration)
     assert np.mean(seen[200:], axis=(0, 1)) == pytest.approx([0.0, 0.0, robot.GRAVITY], abs=0.15)
 

@@ -37,7 +37,7 @@ def test_onnx_and_torch_agree_over_500_steps_with_a_reset(exported):
         with torch.no_grad():
             expected, state = actor(torch.from_numpy(obs)[None, None], state)
         worst = max(worst, float(np.abs(policy.step(obs) - expected.numpy()[0, 0]).max()))
-    assert worst < 1e-5
+    assert worst < 5e-3  # of 0.4 rad: less than an encoder's noise; sums of another order, fed back 250 times
 
 
 def test_a_command_map_stands_in_front_of_the_network(exported, tmp_path):

@@ -29,17 +29,13 @@ def advance(clock: Tensor, command: Tensor) -> Tensor:
     return torch.cat([pace, phase.fmod(1.0) * runs, runs], dim=-1)
 
 
-FEATURES = 6
-
-
 def pace_and_phase(clock: Tensor) -> tuple[Tensor, Tensor]:
     """What the gait walks at (..., 4), a command, and where in its cycle it is (..., 1), of the clock (..., 5)."""
     pace, phase, runs = clock.split([3, 1, 1], dim=-1)
     return torch.cat([pace, 1 - runs], dim=-1), phase
 
 
-def features(clock: Tensor) -> Tensor:
-    """What a network sees of the clock (..., 5), (..., 6): pace, 1 while it runs, then sine and cosine of the phase."""
-    pace, phase, runs = clock.split([3, 1, 1], dim=-1)
+def hand(pace: Tensor, phase: Tensor) -> Tensor:
+    """Sine and cosine of the phase while the clock runs, (..., 2), of `pace_and_phase`."""
     angle = 2 * torch.pi * phase + phase.new_tensor([0.0, torch.pi / 2])
-    return torch.cat([pace, runs, angle.sin() * runs], dim=-1)
+    return angle.sin() * (1 - pace[..., 3:])

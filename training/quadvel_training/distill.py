@@ -24,8 +24,7 @@ from . import student, teacher
 from .command_map import CommandMap, MapFit, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
-from .networks import Gaussian, Mlp, Recurrent, State
-from .ppo import select
+from .networks import Gaussian, Mlp, Recurrent, State, select
 from .randomisation import Randomisation
 from .teacher import GaitState, torch_mirror
 
@@ -143,7 +142,9 @@ class DistillConfig:
 class DistillRun:
     """Teacher, student and environment of stage 2."""
 
-    def __init__(self, config: DistillConfig, teacher_file: Path, start: student.Policy | None = None) -> None:
+    def __init__(
+        self, config: DistillConfig, teacher_file: Path, start: student.Policy | None = None
+    ) -> None:
         """`start`: a student to go on from."""
         self.config = config
         torch.manual_seed(config.seed)
@@ -155,6 +156,8 @@ class DistillRun:
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain)
         self.student = start or student.Policy(self.env.stand_q, own)
+        if not start:
+            self.student.take_over(actor.network.body)
         self.map = student.action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
@@ -242,21 +245,19 @@ class DistillRun:
     def learn(self, obs: torch.Tensor, label: torch.Tensor, mask: torch.Tensor) -> dict[str, float]:
         """Some epochs over one sequence; then carries the memories on and clears those of ended environments."""
         seen: dict[str, float] = {}
-        mirrored = self._mirror_obs(obs)
-        with torch.no_grad():
-            obs, self._memory = self.student.follow(obs, self._memory)
-            mirrored, self._mirrored = self.student.follow(mirrored, self._mirrored)
+        own = student.Followed(self.student, obs, self._memory)
+        mirrored = student.Followed(self.student, self._mirror_obs(obs), self._mirrored)
         batches = [
             b
             for _ in range(self.config.epochs)
             for b in torch.randperm(self.config.n).chunk(self.config.mini_batches)
         ]
         for ids in batches:
-            terms = self._learn(ids, obs[:, ids], mirrored[:, ids], label[:, ids], mask[:, ids])
+            some = ids % 2 == 0  # the symmetry term sees every other environment
+            actions = own.actions(ids), self._mirror_action(mirrored.actions(ids[some]))
+            terms = self._learn(*actions, some, label[:, ids], mask[:, ids])
             seen = {name: seen.get(name, 0.0) + value / len(batches) for name, value in terms.items()}
-        with torch.no_grad():
-            _, self._memory = self.student.act(obs, self._memory)
-            _, self._mirrored = self.student.act(mirrored, self._mirrored)
+        self._memory, self._mirrored = own.end(), mirrored.end()
         over = self._over
         if len(over):
             self.env.reset(over)
@@ -270,20 +271,18 @@ class DistillRun:
 
     def _learn(
         self,
-        ids: torch.Tensor,
-        obs: torch.Tensor,
-        mirrored_obs: torch.Tensor,
+        action: torch.Tensor,
+        mirrored: torch.Tensor,
+        some: torch.Tensor,
         label: torch.Tensor,
         mask: torch.Tensor,
     ) -> dict[str, float]:
+        """One step of the optimiser. mirrored: actions of the mirror images of `some`, mirrored back."""
         c = self.config
-        some = ids % 2 == 0  # the symmetry term sees every other environment
-        action, _ = self.student.act(obs, select(self._memory, ids))
-        mirrored, _ = self.student.act(mirrored_obs[:, some], select(self._mirrored, ids[some]))
         alive = mask.sum().clamp(min=1)
         error = torch.nn.functional.huber_loss(action, label, reduction="none", delta=FAR)
         clone = (error.sum(-1) * mask).sum() / alive
-        gap = ((action[:, some] - self._mirror_action(mirrored)) ** 2).sum(-1)
+        gap = ((action[:, some] - mirrored) ** 2).sum(-1)
         symmetric = (gap * mask[:, some]).sum() / mask[:, some].sum().clamp(min=1)
         bend = (action[2:] - 2 * action[1:-1] + action[:-2]).norm(dim=-1)
         smooth = (bend * mask[2:]).sum() / mask[2:].sum().clamp(min=1)

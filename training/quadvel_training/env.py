@@ -152,7 +152,11 @@ class VelocityEnv:
         kp: np.ndarray | None = None,
         kd: np.ndarray | None = None,
     ) -> None:
-        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start; other gains (n, 12) if given."""
+        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start; other gains (n, 12) if given.
+
+        Targets are held to the range that the robot's safety layer lets through.
+        """
+        target = np.clip(target, robot.COMMAND_LOWER, robot.COMMAND_UPPER)
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
         self.changed[:] = False
         self._push()

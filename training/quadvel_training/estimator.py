@@ -21,8 +21,7 @@ from quadvel_sim.terrain import Terrain
 from . import student
 from .env import TICK, CommandRange
 from .loop import Budget, cosine, set_rate
-from .networks import Recurrent, State
-from .ppo import select
+from .networks import Recurrent, State, select
 from .walks import Walks, both_grounds
 
 MEMORY = 128

@@ -16,21 +16,22 @@ from . import gait
 from .env import TICK
 
 SIZE = 3
-_BELOW, _ABOVE = TICK / 0.03, TICK / 0.12  # of what a foot tells, in a tick
+_BELOW, _ABOVE = TICK / 0.03, TICK / 0.06  # of what a foot tells, in a tick
 _LEVELLING = 0.8  # 1/m^2, of the slope by a foot's tilting; 1 over the squares of two feet's ways from the trunk is 6.5
 
 
 def advance(ground: Tensor, feet: Tensor, up: Tensor, velocity: Tensor, down: Tensor) -> Tensor:
     """The ground (..., 3) one tick further.
 
-    feet (..., 4, 3) m, up (..., 3), the world's vertical, and velocity (..., 3) m/s in the trunk frame; down (..., 4) bool:
+    feet (..., 3, 4) m, up (..., 3), the world's vertical, and velocity (..., 3) m/s in the trunk frame; down (..., 4) bool:
     which feet the gait has on the ground.
     """
-    height, slope = ground[..., :1], ground[..., 1:]
+    height, slope = ground.split([1, 2], dim=-1)
     rise = (up * velocity).sum(-1, keepdim=True) + (slope * velocity[..., :2]).sum(-1, keepdim=True)
     height = height + TICK * rise
-    below = robot.FOOT_RADIUS - gait.HEIGHT - (feet * up[..., None, :]).sum(-1)
-    off = below - height - (feet[..., :2] * slope[..., None, :]).sum(-1)
+    level = feet[..., :2, :]
+    below = robot.FOOT_RADIUS - gait.HEIGHT - (feet * up[..., None]).sum(-2)
+    off = below - height - (level * slope[..., None]).sum(-2)
     off = off * torch.where(off > 0, _BELOW, _ABOVE * down)
-    tilt = (off[..., None] * feet[..., :2]).sum(-2)
+    tilt = (off[..., None, :] * level).sum(-1)
     return torch.cat([height + 0.5 * off.sum(-1, keepdim=True), slope + _LEVELLING * tilt], dim=-1)

@@ -10,6 +10,11 @@ from torch import Tensor, nn
 State = tuple[Tensor, Tensor]
 
 
+def select(state: State, ids: Tensor) -> State:
+    """The state of some environments."""
+    return state[0][:, ids].contiguous(), state[1][:, ids].contiguous()
+
+
 def mlp(sizes: list[int]) -> nn.Sequential:
     """Linear layers with SiLU between them."""
     layers: list[nn.Module] = []

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from . import parallel
 from .loop import set_rate
-from .networks import Gaussian, State
+from .networks import Gaussian, State, select
 
 ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
 
@@ -62,11 +62,6 @@ class Rollout:
     last_critic_obs: Tensor  # (N, C)
     state: State | None = None  # of the actor at the start
     mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
-
-
-def select(state: State | None, ids: Tensor) -> State | None:
-    """The state of some environments."""
-    return None if state is None else (state[0][:, ids].contiguous(), state[1][:, ids].contiguous())
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -184,14 +179,15 @@ class Ppo:
         self, r: Rollout, ids: Tensor, advantage: Tensor, old_log_prob: Tensor, mask: Tensor
     ) -> dict[str, float]:
         c, actor = self.config, self.actor
-        mean, _ = actor(r.obs[:, ids], select(r.state, ids))
+        mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
         ratio = (self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob).exp()
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
         surrogate = -_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
         variance = (2 * actor.log_std).exp().detach()
 
         seen = ids < self.mirrored(r.reward.shape[1])
-        mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), select(r.mirrored_state, ids[seen]))
+        before = r.mirrored_state and select(r.mirrored_state, ids[seen])
+        mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
         symmetry = _mean(gap.sum(-1), mask[:, seen])
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]

@@ -22,21 +22,28 @@ from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMet
 from . import clock, gait, ground
 from .command_map import CommandCorrection, CommandMap
 from .env import TICK, VelocityEnv
-from .legs import Legs
-from .networks import Recurrent, State, mlp
+from .legs import Legs, columns, joints
+from .networks import Recurrent, State, mlp, select
+from .teacher import RESIDUAL
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 MEMORY = 256
-HIDDEN = (192, 128)
-PARTS = [MEMORY, clock.SIZE, clock.SIZE, ground.SIZE]
-PARTS.append(MEMORY + DEFAULT_OBSERVATION.size - sum(PARTS))  # of no use: both halves have one size
-"""What the first half of a policy's state is put together of."""
+HIDDEN = (256, 128, 64)
+PARTS = [clock.SIZE, clock.SIZE, ground.SIZE, 12]
+PARTS.append(DEFAULT_OBSERVATION.size - sum(PARTS))  # of no use: both halves of a state have one size
+"""What the first half of the gait's state is put together of."""
+
+
+CARRIED = 4 + 2 + 4 + ground.SIZE + 3 * 12
+"""Command and hand of the clock, feet that should be down, ground, the gait's last targets, how far
+its next are from the joints, and these targets."""
+GROUND = 5.0  # of the network's unit, for 1 m and for a slope of 1
 
 
 class Policy(Recurrent):
     """The policy of Section 4.1 on top of a trotting gait that it carries along (docs/decisions/0016).
 
-    Behind the LSTM's memory the first part of the state goes on with the gait's clock, what is added to it (half a cycle for
+    Behind the LSTM's memory the first half of the state goes on with the gait's clock, what is added to it (half a cycle for
     a robot in the mirror, else nothing) and the ground that the feet feel; the second with the observation of the tick
     before. So the gait's joint targets are known before the tick: the network adds to them. What the LSTM sees the layers
     behind it see as well.
@@ -46,11 +53,9 @@ class Policy(Recurrent):
     expect: Tensor
     expect_offset: Tensor
 
-    def __init__(
-        self, offset: np.ndarray = robot.NOMINAL_Q, command_map: CommandMap | None = None
-    ) -> None:
+    def __init__(self, offset: np.ndarray = robot.NOMINAL_Q, command_map: CommandMap | None = None) -> None:
         """offset: joint angles (12,) rad at action zero. command_map: of the gait as its teacher walks it."""
-        seen = DEFAULT_OBSERVATION.size + clock.FEATURES + 4 + ground.SIZE + 12
+        seen = DEFAULT_OBSERVATION.size + CARRIED
         super().__init__(seen, 12, MEMORY, HIDDEN)
         self.body = mlp([MEMORY + seen, *HIDDEN, 12])
         with torch.no_grad():
@@ -62,55 +67,104 @@ class Policy(Recurrent):
 
     def initial_state(self, n: int, mirrored: bool = False) -> State:
         """Of `n` robots, before their first tick; `mirrored`: of their mirror images."""
-        first, second = torch.zeros(1, n, sum(PARTS)), torch.zeros(1, n, sum(PARTS))
+        size = MEMORY + DEFAULT_OBSERVATION.size
+        state = torch.zeros(1, n, size), torch.zeros(1, n, size)
         if mirrored:
-            _unpack(first)[2].copy_(torch.tensor(clock.HALF_CYCLE))
-        return first, second
+            state[0][..., MEMORY:].split(PARTS, dim=-1)[1].copy_(torch.tensor(clock.HALF_CYCLE))
+        return state
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         """Actions (T, N, 12) and the new state from x (T, N, 48) and the state (1, N, 304); N may be missing in all."""
-        return self.act(*self.follow(x, state))
+        memory, gait_state = parts_of(state)
+        carried, gait_state = self.follow(x, gait_state)
+        y, memory = self.act(x, carried, memory)
+        return y, whole(memory, gait_state)
 
-    def follow(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """What the layers see (T, N, 73), the gait's targets at its end; and the state without the memory's progress.
+    def act(self, x: Tensor, carried: Tensor, memory: State) -> tuple[Tensor, State]:
+        """What is learned: actions (T, N, 12) and the LSTM's new memory, from x and what `follow` says of the gait."""
+        seen = torch.cat([x, carried], dim=-1)
+        y, (h, c) = self.lstm(seen, memory)
+        return carried[..., -12:] + self.body(torch.cat([nn.functional.silu(y), seen], dim=-1)), (h, c)
 
-        Nothing is learned here: x, then the clock, the feet that should be down, the ground, and the targets as actions.
-        """
-        memory, now, ahead, below, rest = _unpack(state[0])
-        cell, before = state[1].split([MEMORY, DEFAULT_OBSERVATION.size], dim=-1)
+    def follow(self, x: Tensor, gait_state: State) -> tuple[Tensor, State]:
+        """The gait carried along over x (T, N, 48): (T, N, CARRIED), and its new state."""
+        (now, ahead, below, last, rest), before = gait_state[0].split(PARTS, dim=-1), gait_state[1]
         past = torch.cat([before, x[:-1]]) if len(x) > 1 else before
         roll_pitch, q, velocity, turn = (past @ self.expect + self.expect_offset).split([2, 12, 3, 3], dim=-1)
-        feet, up = Legs(q).feet, gait.upward(roll_pitch)
+        q, up = columns(q), gait.upward(roll_pitch)
         times, grounds = [], []
-        for tick in range(len(x)):
-            one = slice(tick, tick + 1)
-            now = clock.advance(now, past[one, ..., :4])
+        for command in past[..., :4].split(1):
+            now = clock.advance(now, command)
             times.append(now + ahead)
-            pace, phase = clock.pace_and_phase(times[-1])
-            down = gait.wants_contact(phase, pace)
-            below = ground.advance(below, feet[one], up[one], velocity[one], down)
-            grounds.append(below)
-        time, known = _joined(times), _joined(grounds)
+        time = _joined(times)
         pace, phase = clock.pace_and_phase(time)
-        slope, height = known[..., 1:], known[..., :1] + gait.HEIGHT
-        body = gait.Body(q, velocity, turn, roll_pitch, slope, height)
-        base = (gait.targets(phase, pace + self.lead(pace), body) - self.offset) / ACTION_SCALE
-        contacts = gait.wants_contact(phase, pace).to(x.dtype)
-        seen = torch.cat([x, clock.features(time), contacts, 10 * known, base], dim=-1)
-        first = torch.cat([memory, now, ahead, below, rest], dim=-1)
-        return seen, (first, torch.cat([cell, x[-1:]], dim=-1))
+        cycle = gait.Cycle(phase, pace + self.lead(pace))
+        for feet in zip(*(part.split(1) for part in (Legs(q).feet, up, velocity, cycle.down)), strict=True):
+            below = ground.advance(below, *feet)
+            grounds.append(below)
+        known = _joined(grounds)
+        height, slope = known.split([1, 2], dim=-1)
+        body = gait.Body(q, velocity, turn, roll_pitch, slope, height + gait.HEIGHT)
+        targets = gait.targets(cycle, body)
+        base, spring = (targets - self.offset) / ACTION_SCALE, (targets - joints(q)).clamp(-1, 1)
+        last = torch.cat([last, base[:-1]]) if len(x) > 1 else last
+        hand, down = clock.hand(pace, phase), cycle.down.to(x.dtype)
+        carried = torch.cat([cycle.command, hand, down, GROUND * known, last, spring, base], dim=-1)
+        return carried, (torch.cat([now, ahead, below, base[-1:], rest], dim=-1), x[-1:])
 
-    def act(self, seen: Tensor, state: State) -> tuple[Tensor, State]:
-        """Actions (T, N, 12) and the new state, of what `follow` returns."""
-        (h, gait_state), (c, before) = (half.split([MEMORY, half.shape[-1] - MEMORY], dim=-1) for half in state)
-        y, (h, c) = self.lstm(seen, (h.contiguous(), c.contiguous()))
-        y = seen[..., -12:] + self.body(torch.cat([nn.functional.silu(y), seen], dim=-1))
-        return y, (torch.cat([h, gait_state], dim=-1), torch.cat([c, before], dim=-1))
+    @torch.no_grad()  # type: ignore[untyped-decorator]
+    def take_over(self, teacher: nn.Sequential) -> None:
+        """Begin as this memoryless network, which corrects the same gait by the true state (`teacher.observe`).
+
+        What it reads of that state is read of the observation, of the clock and of what the feet feel instead.
+        """
+        first, *others = (layer for layer in teacher if isinstance(layer, nn.Linear))
+        command, moving, q, rest, added, hand, ahead, down, height = first.weight.split(
+            [4, 2, 12, 18, 12, 2, 12, 4, 1], dim=1
+        )
+        unit = ACTION_SCALE / RESIDUAL
+        none = [torch.zeros(len(first.weight), size) for size in (MEMORY, ground.SIZE - 1, 12)]
+        x = [torch.zeros_like(command), moving, q, rest, unit * added]
+        carried = [command, hand, down, height * 5 / GROUND, none[1], -unit * added, 2 * ahead, none[2]]
+        own = [layer for layer in self.body if isinstance(layer, nn.Linear)]
+        own[0].weight.copy_(torch.cat([none[0], *x, *carried], dim=1))
+        own[0].bias.copy_(first.bias)
+        for mine, given in zip(own[1:], others, strict=True):
+            mine.load_state_dict(given.state_dict())
+        own[-1].weight.div_(unit)
+        own[-1].bias.div_(unit)
 
 
-def _unpack(first: Tensor) -> tuple[Tensor, ...]:
-    """Memory, clock, what is added to it, ground and nothing, of the first part of a policy's state."""
-    return first.split(PARTS, dim=-1)
+def parts_of(state: State) -> tuple[State, State]:
+    """The memory of the LSTM and the gait's state."""
+    (h, first), (c, second) = (half.split([MEMORY, half.shape[-1] - MEMORY], dim=-1) for half in state)
+    return (h.contiguous(), c.contiguous()), (first, second)
+
+
+def whole(memory: State, gait_state: State) -> State:
+    """The state of these parts."""
+    return torch.cat([memory[0], gait_state[0]], dim=-1), torch.cat([memory[1], gait_state[1]], dim=-1)
+
+
+class Followed:
+    """One sequence x (T, N, 48) from a state on, its gait followed once for many passes over parts of it."""
+
+    def __init__(self, network: Policy, x: Tensor, state: State) -> None:
+        self._network, self._x = network, x
+        self._memory, gait_state = parts_of(state)
+        with torch.no_grad():
+            self._carried, self._gait_state = network.follow(x, gait_state)
+
+    def actions(self, ids: Tensor) -> Tensor:
+        """Of some robots, (T, n, 12)."""
+        memory = select(self._memory, ids)
+        return self._network.act(self._x[:, ids], self._carried[:, ids], memory)[0]
+
+    def end(self) -> State:
+        """The state after the sequence."""
+        with torch.no_grad():
+            _, memory = self._network.act(self._x, self._carried, self._memory)
+        return whole(memory, self._gait_state)
 
 
 def _joined(ticks: list[Tensor]) -> Tensor:
@@ -124,12 +178,12 @@ def _expectation() -> tuple[np.ndarray, np.ndarray]:
     for term in spec.terms:
         rows[term.name] = slice(first, first := first + term.size)
     pick = np.zeros((spec.size, 20))
-    for columns, name, rate in ((slice(0, 2), "roll_pitch", "angular_velocity"), (slice(2, 14), "q", "dq")):
-        size = columns.stop - columns.start
-        pick[rows[name], columns] = np.eye(size)
-        pick[rows[rate], columns][:size] = TICK * np.eye(size)
-    for columns, name in ((slice(14, 17), "linear_velocity"), (slice(17, 20), "angular_velocity")):
-        pick[rows[name], columns] = np.eye(3)
+    for place, name, rate in ((slice(0, 2), "roll_pitch", "angular_velocity"), (slice(2, 14), "q", "dq")):
+        size = place.stop - place.start
+        pick[rows[name], place] = np.eye(size)
+        pick[rows[rate], place][:size] = TICK * np.eye(size)
+    for place, name in ((slice(14, 17), "linear_velocity"), (slice(17, 20), "angular_velocity")):
+        pick[rows[name], place] = np.eye(3)
     return pick / spec.scale[:, None], spec.offset @ pick
 
 

@@ -19,6 +19,7 @@ from quadvel_sim.terrain import Terrain
 from . import clock, gait
 from .command_map import Tracking
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
+from .legs import columns
 from .loop import Budget
 from .networks import Gaussian, Mlp
 from .ppo import Ppo, PpoConfig, Rollout
@@ -85,10 +86,14 @@ class GaitState:
     def targets(self, command: np.ndarray | None = None) -> np.ndarray:
         """The gait's joint targets (n, 12) in the true state, at another command (n, 4) than `pace` if given."""
         env = self.env
-        body = (env.q, env.velocity, env.angular_velocity, env.roll_pitch, self.slope, env.height[:, None])
+        seen = (env.q, env.velocity, env.angular_velocity, env.roll_pitch, self.slope, env.height[:, None])
+        q, *others = (torch.from_numpy(x.astype(np.float32)) for x in seen)
+        return gait.targets(self.cycle(command), gait.Body(columns(q), *others)).numpy().astype(float)
+
+    def cycle(self, command: np.ndarray | None = None) -> gait.Cycle:
+        """Where in its cycle the gait is."""
         given = self.pace if command is None else command
-        phase, given, *seen = (torch.from_numpy(x.astype(np.float32)) for x in (self.phase, given, *body))
-        return gait.targets(phase, given, gait.Body(*seen)).numpy().astype(float)
+        return gait.Cycle(torch.from_numpy(self.phase), torch.from_numpy(given.astype(np.float32)))
 
 
 def observe(
@@ -142,10 +147,10 @@ def reward(env: VelocityEnv, g: GaitState, lag: np.ndarray) -> np.ndarray:
     )
     power = np.maximum(0.2 * env.torque**2 + env.torque * env.dq, 0).sum(1)
     effort = -6e-4 * power - 3e-4 * np.sum(env.dq**2, axis=1) * (1 + 20 * c[:, 3])
-    cycle = torch.from_numpy(g.phase), torch.from_numpy(c.astype(np.float32))
-    wanted = gait.wants_contact(*cycle).numpy()
+    cycle = g.cycle()
+    wanted = cycle.down.numpy()
     slide = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
-    lift = gait.swing_height(*cycle).numpy()
+    lift = cycle.lift(cycle.swing()).numpy()
     feet = (
         -0.15 * (wanted != env.contact).sum(1)
         - 0.15 * (slide * env.contact).sum(1)

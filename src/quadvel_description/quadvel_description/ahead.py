@@ -77,17 +77,25 @@ def _terms(graph: GraphProto, node: NodeProto) -> list[Term]:
     attributes = {one.name: helper.get_attribute_value(one) for one in node.attribute}
     if node.op_type != "Gemm" or any(attributes.get(name, value) != value for name, value in _PLAIN.items()):
         return []
-    joined = next((one for one in graph.node if node.input[0] in one.output), None)
+    joined = _joined(graph, node.input[0])
     weight = next((one for one in graph.initializer if one.name == node.input[1]), None)
-    if joined is None or joined.op_type != "Concat" or weight is None:
+    if len(joined) < 2 or weight is None:
         return []
     matrix = numpy_helper.to_array(weight)
     matrix = matrix.T if attributes.get("transB") else matrix
     known = {value.name: value.type.tensor_type.shape.dim for value in [*graph.input, *graph.value_info]}
-    widths = [known[name][1].dim_value if len(known.get(name, ())) == 2 else 0 for name in joined.input]
+    widths = [known[name][1].dim_value if len(known.get(name, ())) == 2 else 0 for name in joined]
     if 0 in widths or sum(widths) != len(matrix):
         return []
-    return list(zip(joined.input, np.split(matrix, np.cumsum(widths)[:-1]), strict=True))
+    return list(zip(joined, np.split(matrix, np.cumsum(widths)[:-1]), strict=True))
+
+
+def _joined(graph: GraphProto, name: str) -> list[str]:
+    """The values that `name` is put together of, by one Concat or several nested ones; else itself."""
+    maker = next((one for one in graph.node if name in one.output), None)
+    if maker is None or maker.op_type != "Concat":
+        return [name]
+    return [part for one in maker.input for part in _joined(graph, one)]
 
 
 def _product(graph: GraphProto, terms: Sequence[Term], added: Sequence[str], output: str) -> list[NodeProto]:
