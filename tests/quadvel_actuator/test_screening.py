@@ -8,13 +8,14 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
-from quadvel_actuator.identify import backlog, diagnosis
+from quadvel_actuator.identify import backlog, candidates, diagnosis
 from quadvel_actuator.identify.candidates import About, propose, simplified, started
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
 from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.screening import Started
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -99,6 +100,33 @@ def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
     assert started(looked, registry()["coulomb_friction"]()) is None
 
 
+def test_one_guess_of_a_slew_limit_bounds_nothing():
+    """For the joints that have none: what any bound would spoil there must not count against the law."""
+    looked = about(_log(), 0.009, 0.003)
+    law = registry()["slew_limit"]()
+    widest = law.starts(looked.seen, looked.torque, looked.fitted)[-1]
+    np.testing.assert_allclose(law.series(looked.torque, looked.seen, widest), looked.torque, atol=1e-6)
+
+
+def test_a_law_that_reads_the_torque_keeps_no_other_from_being_fitted(monkeypatch):
+    looked = about(_log(Effect("first_order_lag", JOINTS, {"T": 0.01})), 0.009, 0.003)
+    odds = np.full((*looked.samples.tau.shape, 3), [0.9, 0.1, 0.0])
+    monkeypatch.setattr(About, "lost_commands", lambda about, most: [(odds, odds[0, 0])])
+    few = {name: registry()[name] for name in ("first_order_lag", "command_hold")}
+    monkeypatch.setattr(diagnosis, "registry", lambda: few)
+
+    def loud(about, law):
+        found = started(about, law)
+        if law.name != "command_hold":
+            return found
+        lost = Applied(law, np.ones(2, dtype=bool), np.full((1, 2), 0.1), np.arange(2))
+        return Started(law, looked.model.plus(lost), 1e9)
+
+    monkeypatch.setattr(diagnosis, "started", loud)
+    found, _ = diagnosis.ranked(looked, lambda text: None, "")
+    assert found[0].name == "first_order_lag"
+
+
 @pytest.mark.parametrize("turn", ["tanh", "arctan"])
 def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     """Two hundredths of a radian a second are too few to show how the sign turns."""
@@ -109,6 +137,18 @@ def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     half = intervals(found.model, looked.judge).effects[0]
     apart = np.abs(found.model.applied[0].values - other.model.applied[0].values)
     assert (half[0] > apart[0]).all()
+
+
+def test_a_drive_in_steps_and_one_without_are_both_fitted_before_they_are_compared(monkeypatch):
+    """Each has valleys of its own along the delays."""
+    looked = about(_log(FRICTION), 0.009, 0.003)
+    found = started(looked, registry()["coulomb_friction"](at=JOINT))
+    seen = []
+    monkeypatch.setattr(
+        candidates, "fit_with_delays", lambda model, rows, n: seen.append(model.window) or model
+    )
+    looked.fit_anew(found.model)
+    assert min(seen.count(0.0), seen.count(0.001)) >= 2
 
 
 def test_an_effect_comes_to_a_joint_that_shows_it_later():
