@@ -162,6 +162,34 @@ def test_an_effect_comes_to_a_joint_that_shows_it_later():
     np.testing.assert_allclose(model.applied[0].values[0], 0.5, atol=0.04)
 
 
+def test_an_effect_leaves_a_joint_that_needs_it_no_more():
+    """With one joint's position stamped 9 ms off, delays half as wrong seem to be off on the other, too."""
+    log = _log()
+    q = log.q.copy()
+    q[:, 0] = np.interp(log.t - 0.009, log.t, q[:, 0])
+    looked = about(attrs.evolve(log, q=q), 0.009, 0.003)
+    skew = registry()["timestamp_skew"]("q")
+    both = Applied(skew, np.ones(2, dtype=bool), np.array([[-0.006, 0.003]]), np.arange(2))
+    delays = np.full(2, 0.012), np.full(2, 0.0)
+    bent = looked.model.plus(both).with_delays(*delays)
+    model = diagnosis._narrowed(bent, looked.judge, looked.noise, looked.few)
+    assert model.applied[0].active.tolist() == [True, False]
+    np.testing.assert_allclose(model.applied[0].values[0, 0], -0.009, atol=5e-4)
+
+
+def test_a_drift_with_temperature_counts_from_the_coolest_drive():
+    """Drives that start at 32 degrees have the gains that were found for them; those that stay so are not affected."""
+    log = _log()
+    warm = 32.0 + np.stack([12.0 * log.t / log.t[-1], np.zeros_like(log.t)], axis=1)
+    looked = about(attrs.evolve(log, temperature=warm), 0.009, 0.003)
+    of_temperature = registry()["thermal_drift"].variants(looked)[1]
+    moved = of_temperature.torque(
+        np.ones((1, 2)), attrs.evolve(looked.seen, temperature=warm), {"rate": np.full(2, -0.02)}
+    )
+    np.testing.assert_allclose(moved[:, 1], 1.0, atol=1e-3)
+    assert moved[-1, 0] == pytest.approx(0.76, abs=1e-3)
+
+
 @pytest.mark.parametrize(("kp", "held"), [(30.0, False), (60.0, True)])
 def test_gains_that_are_held_are_left_free_where_they_stay_near_the_commanded_ones(kp, held):
     log = _log()

@@ -126,6 +126,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         ties.append(tied)
     model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
     model, ties = _simplest(model, ties, judge, noise)
+    model = _narrowed(model, judge, noise, few)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
@@ -200,6 +201,25 @@ def _widened(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
         if (clear & ~one.active).any():
             wider = attrs.evolve(tried.applied[k], active=one.active | clear)
             model = few.fitted(tried.replacing(k, wider), fit_with_delays, 5)
+    return model
+
+
+def _narrowed(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
+    """The model with each effect off joints that need it no more, the weakest ones first.
+
+    What an effect bends before all of it is found, gains or delays of every joint, it can seem to mend on any of them.
+    """
+    for k in range(len(model.applied)):
+        while model.applied[k].active.sum() > 1:
+            one, given = model.applied[k], model.predict()
+            share = np.mean(np.where(judge.fit, given - model.without(k).predict(), 0.0) ** 2, axis=0) / noise
+            weakest = int(np.argmin(np.where(one.active, share, np.inf)))
+            fewer = attrs.evolve(one, active=one.active & (np.arange(len(noise)) != weakest))
+            tried = few.fitted(model.replacing(k, fewer), fit_with_delays, 10)
+            lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - given)
+            if lost.p_any * len(registry()) < LEVEL and lost.gain > WORTH * noise[weakest] / len(noise):
+                break
+            model = tried
     return model
 
 
