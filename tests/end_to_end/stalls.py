@@ -62,7 +62,8 @@ def run(out: Path, options: list[str], only: str, every: Range, pause: Range, rn
                 stalls += 1
             except (FileNotFoundError, ProcessLookupError):  # it has just ended
                 continue
-    said = [line.partition("planner: ")[2] for line in (out / "log.txt").read_text().splitlines()]
+    lines = (out / "log.txt").read_text().splitlines()
+    said = [line for line in lines if " | " in line or "ended with" in line or line.startswith("quadvel:")]
     verdict = f"exit {demo.returncode}, {stalls} stalls"
     if (out / "summary.json").exists():
         summary = json.loads((out / "summary.json").read_text())
@@ -72,7 +73,7 @@ def run(out: Path, options: list[str], only: str, every: Range, pause: Range, rn
             f"compute p50 {loop['compute_p50_us']:.0f}, p99 {loop['compute_p99_us']:.0f} us, "
             f"overruns {loop['overruns']}, real-time factor {summary['realtime_factor']:.3f}"
         )
-    return "; ".join([verdict, *filter(None, said)])
+    return "; ".join([verdict, *said])
 
 
 def stalls(
