@@ -8,13 +8,14 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
-from quadvel_actuator.identify import backlog, diagnosis
+from quadvel_actuator.identify import backlog, candidates, diagnosis
 from quadvel_actuator.identify.candidates import About, propose, simplified, started
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
 from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.screening import Started
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -99,6 +100,33 @@ def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
     assert started(looked, registry()["coulomb_friction"]()) is None
 
 
+def test_one_guess_of_a_slew_limit_bounds_nothing():
+    """For the joints that have none: what any bound would spoil there must not count against the law."""
+    looked = about(_log(), 0.009, 0.003)
+    law = registry()["slew_limit"]()
+    widest = law.starts(looked.seen, looked.torque, looked.fitted)[-1]
+    np.testing.assert_allclose(law.series(looked.torque, looked.seen, widest), looked.torque, atol=1e-6)
+
+
+def test_a_law_that_reads_the_torque_keeps_no_other_from_being_fitted(monkeypatch):
+    looked = about(_log(Effect("first_order_lag", JOINTS, {"T": 0.01})), 0.009, 0.003)
+    odds = np.full((*looked.samples.tau.shape, 3), [0.9, 0.1, 0.0])
+    monkeypatch.setattr(About, "lost_commands", lambda about, most: [(odds, odds[0, 0])])
+    few = {name: registry()[name] for name in ("first_order_lag", "command_hold")}
+    monkeypatch.setattr(diagnosis, "registry", lambda: few)
+
+    def loud(about, law):
+        found = started(about, law)
+        if law.name != "command_hold":
+            return found
+        lost = Applied(law, np.ones(2, dtype=bool), np.full((1, 2), 0.1), np.arange(2))
+        return Started(law, looked.model.plus(lost), 1e9)
+
+    monkeypatch.setattr(diagnosis, "started", loud)
+    found, _ = diagnosis.ranked(looked, lambda text: None, "")
+    assert found[0].name == "first_order_lag"
+
+
 @pytest.mark.parametrize("turn", ["tanh", "arctan"])
 def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     """Two hundredths of a radian a second are too few to show how the sign turns."""
@@ -111,6 +139,18 @@ def test_an_interval_of_friction_holds_what_other_smooth_signs_say(turn):
     assert (half[0] > apart[0]).all()
 
 
+def test_a_drive_in_steps_and_one_without_are_both_fitted_before_they_are_compared(monkeypatch):
+    """Each has valleys of its own along the delays."""
+    looked = about(_log(FRICTION), 0.009, 0.003)
+    found = started(looked, registry()["coulomb_friction"](at=JOINT))
+    seen = []
+    monkeypatch.setattr(
+        candidates, "fit_with_delays", lambda model, rows, n: seen.append(model.window) or model
+    )
+    looked.fit_anew(found.model)
+    assert min(seen.count(0.0), seen.count(0.001)) >= 2
+
+
 def test_an_effect_comes_to_a_joint_that_shows_it_later():
     looked = about(_log(FRICTION), 0.009, 0.003)
     friction = registry()["coulomb_friction"](at=JOINT)
@@ -120,6 +160,34 @@ def test_an_effect_comes_to_a_joint_that_shows_it_later():
     model = diagnosis._widened(looked.model.plus(first).plus(last), looked.judge, looked.noise, looked.few)
     assert model.applied[0].active.all()
     np.testing.assert_allclose(model.applied[0].values[0], 0.5, atol=0.04)
+
+
+def test_an_effect_leaves_a_joint_that_needs_it_no_more():
+    """With one joint's position stamped 9 ms off, delays half as wrong seem to be off on the other, too."""
+    log = _log()
+    q = log.q.copy()
+    q[:, 0] = np.interp(log.t - 0.009, log.t, q[:, 0])
+    looked = about(attrs.evolve(log, q=q), 0.009, 0.003)
+    skew = registry()["timestamp_skew"]("q")
+    both = Applied(skew, np.ones(2, dtype=bool), np.array([[-0.006, 0.003]]), np.arange(2))
+    delays = np.full(2, 0.012), np.full(2, 0.0)
+    bent = looked.model.plus(both).with_delays(*delays)
+    model = diagnosis._narrowed(bent, looked.judge, looked.noise, looked.few)
+    assert model.applied[0].active.tolist() == [True, False]
+    np.testing.assert_allclose(model.applied[0].values[0, 0], -0.009, atol=5e-4)
+
+
+def test_a_drift_with_temperature_counts_from_the_coolest_drive():
+    """Drives that start at 32 degrees have the gains that were found for them; those that stay so are not affected."""
+    log = _log()
+    warm = 32.0 + np.stack([12.0 * log.t / log.t[-1], np.zeros_like(log.t)], axis=1)
+    looked = about(attrs.evolve(log, temperature=warm), 0.009, 0.003)
+    of_temperature = registry()["thermal_drift"].variants(looked)[1]
+    moved = of_temperature.torque(
+        np.ones((1, 2)), attrs.evolve(looked.seen, temperature=warm), {"rate": np.full(2, -0.02)}
+    )
+    np.testing.assert_allclose(moved[:, 1], 1.0, atol=1e-3)
+    assert moved[-1, 0] == pytest.approx(0.76, abs=1e-3)
 
 
 @pytest.mark.parametrize(("kp", "held"), [(30.0, False), (60.0, True)])

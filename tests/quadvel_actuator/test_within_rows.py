@@ -10,14 +10,15 @@ from quadvel_actuator.effects import registry
 from quadvel_actuator.identify.candidates import propose, started
 from quadvel_actuator.identify.delays import latest
 from quadvel_actuator.identify.eam import fit_eam
+from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.log import Log
 from quadvel_actuator.identify.model import Applied, Model
 from quadvel_actuator.identify.signals import Samples
 
 
-def test_a_slew_limit_is_followed_between_the_rows():
-    """Of a drive that computes every 50 us, on rows of 2 ms with one or two commands between them."""
-    dt, rate, rng = 5e-5, 60.0, np.random.default_rng(4)
+def _slewing(rate):
+    """A drive that computes every 50 us, on rows of 2 ms with one or two commands between them, and what was asked."""
+    dt, rng = 5e-5, np.random.default_rng(4)
     t = np.arange(20000) * dt
     q = 0.3 * np.sin(2 * np.pi * 3.0 * t)
     sent = np.unique(np.round(np.cumsum(rng.uniform(0.0009, 0.004, 600)) / dt).astype(int))
@@ -30,14 +31,21 @@ def test_a_slew_limit_is_followed_between_the_rows():
     step = slice(None, None, 40)
     log = Log("slow", NAMES[:1], t[step], q[step, None], np.gradient(q, dt)[step, None], t[sent], targets[:, None],
               np.ones((500, 1), bool), tau=tau[step, None])  # fmt: skip
+    return log, asked[step]
+
+
+def test_a_slew_limit_is_followed_between_the_rows():
+    rate = 60.0
+    log, asked = _slewing(rate)
+    tau = log.tau[:, 0]
     law = registry()["slew_limit"]()
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
     limit = Applied(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
     model = Model(Samples([log]), 0.0, gains, np.array([one, one]), np.zeros(1), np.zeros(1), one, (limit,))
-    limited = np.abs(asked - tau)[step] > 0.05
+    limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
-    assert np.sqrt(np.mean((model.predict()[:, 0] - tau[step])[10:] ** 2)) < 0.008
+    assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
 
 
 @pytest.mark.parametrize(("channel", "late"), [("q", -0.009), ("q", 0.009), ("dq", -0.006), ("dq", 0.01)])
@@ -60,16 +68,37 @@ def test_a_channel_stamped_early_or_late_on_one_joint_is_found(channel, late):
     np.testing.assert_allclose(moved - np.median(moved), [late, 0.0, 0.0], atol=0.0006)
 
 
+def test_a_fit_on_a_grid_of_stamps_foretells_commands_that_come_between_its_rows():
+    """7 and 1 ms: on rows and commands of one grid, any input delay from 6 ms on says the same."""
+    fitted, judged = (_driven(0.001, 0.001, 1), _driven(0.001, 0.00525, 2))
+    report = identify([fitted], [judged]).report
+    assert report["before"]["input_delay_ms"] == pytest.approx(7.0, abs=0.2)
+    assert report["before"]["heldout_mse"] < 1.1 * 0.04
+
+
+def _driven(row, command, seed):
+    """A log with a row every `row` s and a command about every `command` s of a drive with delays of 7 and 1 ms."""
+    t, rng = np.arange(round(3.0 / row)) * row, np.random.default_rng(seed)
+    sent = np.round(np.arange(0.0, 3.0, command) / 0.00025) * 0.00025
+    phase = np.array([0.0, 1.0])
+
+    def q(at):
+        return 0.3 * np.sin(2 * np.pi * 3.0 * at[:, None] + phase)
+
+    def dq(at):
+        return 0.3 * 2 * np.pi * 3.0 * np.cos(2 * np.pi * 3.0 * at[:, None] + phase)
+
+    wide = rng.uniform(-0.1, 0.1, (len(sent), 2)) if command > row else 0.0
+    q_des = q(sent) + 0.2 * np.sin(2 * np.pi * 5.0 * sent[:, None]) + wide
+    newest = np.maximum(np.searchsorted(sent, t - 0.008 + 1e-9, side="right") - 1, 0)
+    tau = 29.0 * (q_des[newest] - q(t - 0.001)) - 0.48 * dq(t - 0.001)
+    tau += 0.2 * rng.standard_normal(tau.shape)
+    gains = {"kp": np.full(q_des.shape, 30.0), "kd": np.full(q_des.shape, 0.5)}
+    return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
+
+
 def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
-    t, rng = np.arange(3000) * 0.001, np.random.default_rng(1)
-    q = 0.3 * np.sin(2 * np.pi * 3.0 * t[:, None] + np.array([0.0, 1.0]))
-    dq = np.gradient(q, 0.001, axis=0)
-    q_des = q + 0.2 * np.sin(2 * np.pi * 5.0 * t[:, None])
-    tau = np.zeros_like(q)
-    tau[8:] = 29.0 * (q_des[:-8] - q[7:-1]) - 0.48 * dq[7:-1]
-    tau += 0.2 * rng.standard_normal(q.shape)
-    gains = {"kp": np.full(q.shape, 30.0), "kd": np.full(q.shape, 0.5)}
-    log = Log("grid", NAMES[:2], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau, **gains)
+    log = _driven(0.001, 0.001, 1)
     samples = Samples([log])
     eam = fit_eam(samples, samples.judged)
     one = np.zeros(2, dtype=np.intp)
@@ -77,4 +106,4 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
         samples, eam.window, eam.gains, np.array([one, one]), eam.input_delay, eam.output_delay, one
     )
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
-    assert latest(model, samples.judged)[0] == pytest.approx(0.007, abs=2e-4)
+    assert latest(model, samples.judged).input_delay[0] == pytest.approx(0.007, abs=2e-4)

@@ -109,6 +109,17 @@ def test_each_state_is_answered_with_the_network_s_velocity(
     )
 
 
+def test_a_stall_of_the_whole_machine_moves_nothing(bench: Bench) -> None:
+    for i, at in enumerate((3.0, 3.005, 3.205, 3.21)):  # by the robot's own clock all of them 5 ms apart
+        bench.send(at, tick=5 * i)
+        bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
+    bench.wait(lambda: bench.heard["odom"])
+    speeds = [answer.twist.twist.linear.x for answer in bench.heard["velocity_estimate"]]
+    np.testing.assert_allclose(np.diff(speeds), 0.5, atol=1e-5)  # the network goes on from where it was
+    assert bench.heard["odom"][0].pose.pose.position.x == pytest.approx(0.005 * sum(speeds[1:]))
+    bench.diagnosed("0.195")
+
+
 @pytest.mark.parametrize("bench", [["-p", "kind:=kalman"]], indirect=True)
 def test_odometry_and_transform_agree_and_carry_the_imu_s_orientation(bench: Bench) -> None:
     turned = np.array([np.cos(0.2), 0.0, 0.0, np.sin(0.2)])

@@ -53,6 +53,12 @@ def test_the_next_one_takes_over_when_the_first_falls_silent(mux: CommandMux) ->
     assert output.source == "planner"
 
 
+def test_a_mux_that_could_not_run_does_not_let_the_command_jump(mux: CommandMux) -> None:
+    run(mux, 0.0, 0.1, teleop=(0.0, 0.0, 0.0))
+    mux.receive("teleop", 0.5, FORWARD)
+    np.testing.assert_allclose(mux.update(0.5).velocity, [0.25, 0.0, 0.0])  # 5 m/s^2 for 50 ms, not for 400
+
+
 def test_the_command_changes_no_faster_than_allowed(mux: CommandMux) -> None:
     run(mux, 0.0, 0.02, teleop=(0.0, 0.0, 0.0))
     output = run(mux, 0.02, 0.02, teleop=(2.0, 0.5, 0.0))

@@ -206,6 +206,59 @@ def test_states_that_stop_are_a_fault(robot: Robot) -> None:
     assert robot.answers[-1].mode == MODE_DAMPING
 
 
+def test_a_stall_of_the_whole_machine_is_no_event_of_the_walk(
+    robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    walk(robot)
+    forgotten: list[bool] = []
+    monkeypatch.setattr(robot.graph.node._supervisor._walk, "forget", lambda: forgotten.append(True))
+    for _ in range(3):
+        robot.graph.pass_time(0.06)
+        robot.step(3)  # 5 ms by the robot's own clock
+    assert robot.report("walk").overruns == 0
+    assert not forgotten
+    robot.graph.diagnosed("stalled_s: 0.180")
+    robot.graph.diagnosed("pauses: 3")
+
+
+def test_a_state_that_a_stall_made_old_is_refused_and_the_next_one_taken(robot: Robot) -> None:
+    walk(robot)
+    robot.state.tick += 5
+    late = robot.message()
+    robot.graph.pass_time(0.06)
+    robot.send(late)
+    robot.graph.diagnosed("refused low_state: 1, last: stamp is 0.060 s old")
+    robot.step(5)
+    robot.report("walk")
+
+
+def test_a_robot_that_went_on_while_the_controller_could_not_run_is_a_fault(robot: Robot) -> None:
+    walk(robot)
+    robot.graph.pass_time(0.06)
+    robot.state.tick += 60
+    robot.step(5)
+    assert robot.report("fault").reason.endswith("limit 50 ms")
+
+
+def test_a_robot_that_stood_still_while_the_controller_listened_is_a_fault(robot: Robot) -> None:
+    walk(robot)
+    for _ in range(3):
+        robot.graph.pass_time(0.016)
+    robot.step(5)  # the first is 5 ms later by its own clock
+    assert robot.report("fault").reason.endswith("limit 50 ms")
+
+
+def test_states_that_do_not_come_after_a_stall_are_a_fault_a_period_later(robot: Robot) -> None:
+    walk(robot)
+    reports = len(robot.reports)
+    robot.graph.pass_time(0.06)
+    robot.graph.wait(lambda: len(robot.reports) > reports)
+    assert robot.reports[-1].mode_name == "walk"
+    for _ in range(2):
+        robot.graph.pass_time(0.02)
+    assert robot.report("fault").reason == "the state is 100 ms old, limit 50 ms"
+
+
 def unfit_states(robot: Robot) -> dict[str, Any]:
     short = robot.message(tick=1)
     short.q = np.zeros(11, np.float32)

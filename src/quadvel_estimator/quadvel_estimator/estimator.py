@@ -25,6 +25,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.scheduling import Scheduling
 
 from . import features
@@ -74,6 +75,7 @@ class EstimatorNode(Node):
         super().__init__("estimator")
         self._settings = read_parameters(self, EstimatorParameters)
         self._tracker = VelocityTracker(self._settings.make_estimator(), self._settings.reset_gap)
+        self._robot_time = RobotTime()
         self._refusals = Refusals()
         self._reported = _Report()
         self._count = 0
@@ -100,6 +102,7 @@ class EstimatorNode(Node):
         start = perf_counter()
         try:
             state = read_low_state(message)
+            state.time = self._robot_time.follow(state.time, state.tick)
             estimate = self._tracker.take(state)
         except (MessageError, FloatingPointError) as error:
             self._refusals.add("low_state", error)
@@ -152,6 +155,7 @@ class EstimatorNode(Node):
             "rate_hz": count,
             "compute_mean_us": f"{1e6 * busy / count:.0f}" if count else "",
             "restarts": self._tracker.restarts,
+            "stalled_s": f"{self._robot_time.stalled:.3f}",
             **self._refusals.values(),
         }
         stamp = self.get_clock().now().to_msg()

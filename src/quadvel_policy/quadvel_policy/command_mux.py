@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+LONGEST_STEP = 0.05  # s, of the ramp at one update: a process that could not run for longer does not jump
 Axes = tuple[float, float, float]
 
 
@@ -99,7 +100,7 @@ class CommandMux:
             source, target, limit = None, np.zeros(3), self._config.stop_acceleration
         else:
             target, limit = self._target(self._heard[source.name][1]), self._config.acceleration
-        elapsed = 0.0 if self._updated is None else max(now - self._updated, 0.0)
+        elapsed = 0.0 if self._updated is None else min(max(now - self._updated, 0.0), LONGEST_STEP)
         self._updated = now
         self._velocity = self._ramp(target, np.multiply(limit, elapsed))
         stance = not target.any() and not self._velocity.any()

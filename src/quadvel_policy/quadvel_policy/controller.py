@@ -5,6 +5,9 @@ is small and constant. What is due lies on an absolute grid in the states' own t
 states may come faster than 200 Hz; the deadline of a tick is one period after its state held. When states
 stop, a timer notices. With simulated time the same holds on that time. What a tick decides is the
 supervisor's matter.
+
+All times but that of the clock are the robot's own (`RobotTime`): a stall of the whole machine, simulator
+included, is no gap in them.
 """
 
 from __future__ import annotations
@@ -28,11 +31,13 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.robot_time import LONGEST, RobotTime
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
+from .pauses import Pauses
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import Array, StampCheck, linear_velocity, planar_velocity
 from .supervisor import MODES, STILL, Supervisor, SupervisorConfig, setting
@@ -65,12 +70,13 @@ class Controller(Node):
         self._supervisor = Supervisor(policy, self._settings)
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._stats, self._refusals = LoopStats(), Refusals()
-        self._refused_before = self._overruns_before = 0
+        self._robot_time, self._pauses = RobotTime(), Pauses(STATE_PERIOD, PERIOD)
+        self._refused_before = self._overruns_before = self._pauses_before = 0
         self._grid = TickGrid(PERIOD)
         self._state: RobotState | None = None
         self._waiting: RobotState | None = None  # for the velocity estimate, on simulated time
         self._answer, self._message = JointCommand.damping(), LowCmd()
-        self._velocity: tuple[float, Array] | None = None  # stamp and value
+        self._velocity: tuple[float, Array] | None = None  # time and value
         self._command: tuple[float, Array] | None = None
         self._checks = {
             "low_state": StampCheck(self._settings.max_state_age),
@@ -99,25 +105,29 @@ class Controller(Node):
         now = float(1e-9 * self.get_clock().now().nanoseconds)
         return max(now, stamp) if self._sim_time else now
 
-    def _accept(self, topic: str, stamp: Any) -> float:
-        """The stamp in s. Raises MessageError where it is not fit."""
-        value = seconds(stamp)
-        self._checks[topic].check(value, self._now(value))
-        return value
+    def _accept(self, topic: str, stamp: float) -> float:
+        """The clock of the stamps, s. Raises MessageError where the stamp (s) is not fit."""
+        now = self._now(stamp)
+        self._checks[topic].check(stamp, now)
+        return now
 
     def _on_state(self, message: Any) -> None:
         start = time.perf_counter()
         try:
             state = read_low_state(message)
-            self._accept("low_state", message.stamp)
+            now = self._accept("low_state", state.time)
         except MessageError as error:
             self._refusals.add("low_state", error)
             return
+        self._pauses.look(now)
+        longest = LONGEST if self._pauses.since_heard else self._settings.max_state_age
+        state.time = self._robot_time.follow(state.time, state.tick, longest)
+        self._pauses.heard()
         sent_again = self._waiting is not None and self._waiting.time == state.time
         if self._awaits_velocity(state) and not sent_again:
             self._waiting = state
         else:
-            self._take(state, start)
+            self._take(state, now, start)
 
     def _awaits_velocity(self, state: RobotState) -> bool:
         """Whether a simulator shall wait until the estimator has kept up, as it does by itself in real time."""
@@ -125,25 +135,26 @@ class Controller(Node):
             return False
         return 1.5 * PERIOD < state.time - self._velocity[0] <= self._settings.max_velocity_age
 
-    def _take(self, state: RobotState, start: float) -> None:
-        """Answer the state if it is due. start: when that began, s on the steady clock."""
+    def _take(self, state: RobotState, now: float, start: float) -> None:
+        """Answer the state if it is due. now, start: when that began, s, on the clock and on the steady clock."""
         self._waiting = None
         periods = self._grid.periods(state.time)
         if periods:
-            self._tick(state)
+            self._tick(state, now)
             compute = time.perf_counter() - start
-            late = self._now(state.time) - state.time > PERIOD
+            late = self._now() - self._robot_time.stalled - state.time > PERIOD
             self._stats.add(start, compute, self._supervisor.inference_seconds, periods - 1 + late)
             self._supervisor.prepare()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
             self._answer.tick = state.tick
             self._publish()
 
-    def _tick(self, state: RobotState) -> None:
+    def _tick(self, state: RobotState, now: float) -> None:
+        """One tick of the supervisor, and its command. now: s, on the clock; it is judged by what was known then."""
         if self._stats.in_a_row > self._settings.max_overruns:
             self._supervisor.fail(f"{self._stats.in_a_row} deadlines were missed in a row")
         self._state = state
-        now = self._now(state.time)
+        now -= self._robot_time.stalled
         velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age)
         command = _fresh(self._command, now, self._settings.command_timeout)
         self._answer = self._supervisor.tick(now, state, velocity, STILL if command is None else command)
@@ -156,18 +167,21 @@ class Controller(Node):
 
     def _on_velocity(self, message: Any) -> None:
         try:
-            stamp = self._accept("velocity_estimate", message.header.stamp)
-            self._velocity = stamp, linear_velocity(message.twist.twist)
+            stamp = seconds(message.header.stamp)
+            now = self._accept("velocity_estimate", stamp)
+            self._velocity = stamp - self._robot_time.stalled, linear_velocity(message.twist.twist)
         except MessageError as error:
             self._refusals.add("velocity_estimate", error)
             return
         if self._waiting is not None and not self._awaits_velocity(self._waiting):
-            self._take(self._waiting, time.perf_counter())
+            self._take(self._waiting, now, time.perf_counter())
 
     def _on_command(self, message: Any) -> None:
         try:
-            stamp = self._accept("command", message.stamp)
-            self._command = stamp, np.append(planar_velocity(message.twist), float(message.stance))
+            stamp = seconds(message.stamp)
+            self._accept("command", stamp)
+            command = np.append(planar_velocity(message.twist), float(message.stance))
+            self._command = stamp - self._robot_time.stalled, command
         except MessageError as error:
             self._refusals.add("command", error)
 
@@ -181,8 +195,11 @@ class Controller(Node):
 
     def _watch(self) -> None:
         """50 times a second: the supervisor learns when states stop, and controller/state is published."""
-        if self._state is not None and self._now() - self._state.time > self._settings.max_state_age:
-            self._tick(self._state)
+        now = self._now()
+        self._pauses.look(now)
+        silence = 0.0 if self._state is None else now - self._robot_time.stalled - self._state.time
+        if self._state and silence > self._settings.max_state_age and not self._pauses.excuse(now):
+            self._tick(self._state, now)
         self._controller_state.publish(self._describe())
 
     def _describe(self) -> Any:
@@ -211,6 +228,8 @@ class Controller(Node):
                 name: f"{value:.4g}"
                 for name, value in attrs.asdict(self._stats.summary(time.perf_counter())).items()
             },
+            "pauses": self._pauses.count,
+            "stalled_s": f"{self._robot_time.stalled:.3f}",
             **self._refusals.values(),
         }
         stamp = self.get_clock().now().to_msg()
@@ -220,7 +239,9 @@ class Controller(Node):
         """Level and summary of the last second."""
         refused = self._refusals.total - self._refused_before
         missed = self._stats.overruns - self._overruns_before
+        paused = self._pauses.count - self._pauses_before
         self._refused_before, self._overruns_before = self._refusals.total, self._stats.overruns
+        self._pauses_before = self._pauses.count
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.mode == "fault":
             return DiagnosticStatus.ERROR, status
@@ -228,6 +249,8 @@ class Controller(Node):
             return DiagnosticStatus.WARN, "no message on low_state yet"
         if refused:
             return DiagnosticStatus.WARN, f"{refused} messages refused in the last second; {status}"
+        if paused:
+            return DiagnosticStatus.WARN, f"could not run {paused} times in the last second; {status}"
         if missed:
             return DiagnosticStatus.WARN, f"{missed} deadlines missed in the last second; {status}"
         return DiagnosticStatus.OK, status

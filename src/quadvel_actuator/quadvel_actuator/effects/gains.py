@@ -45,13 +45,17 @@ class GainAsymmetry(TorqueLaw):
 
 @attrs.frozen(eq=False)
 class ThermalDrift(TorqueLaw):
-    """tau* (1 + drift): with temperature, drift = rate (temperature - 25), else rate tau_t (1 - exp(-t / tau_t))"""
+    """tau* (1 + drift): with temperature, drift = rate (temperature - `cold`), else rate tau_t (1 - exp(-t / tau_t))
+
+    `cold` is the least temperature of the log: the gains are those of a drive as cold as that, whichever of them warms.
+    """
 
     name = "thermal_drift"
     stage = Stage.GAIN
     signal = "t"
     motion = "one motion repeated from cold until the drives are warm, with their temperature logged"
     of: str = "time"
+    cold: float = 25.0
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -61,8 +65,10 @@ class ThermalDrift(TorqueLaw):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[ThermalDrift]:
-        warm = about.signals.temperature is not None and float(np.ptp(about.signals.temperature)) > 0.5
-        return (cls("time"), cls("temperature")) if warm else (cls("time"),)
+        temperature = about.signals.temperature
+        if temperature is None or float(np.ptp(temperature)) <= 0.5:
+            return (cls("time"),)
+        return (cls("time"), cls("temperature", float(np.quantile(temperature, 0.01))))
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         if self.of == "temperature":
@@ -76,7 +82,7 @@ class ThermalDrift(TorqueLaw):
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         if self.of == "temperature":
-            return x * (1.0 + p["rate"] * (s.temperature - 25.0))
+            return x * (1.0 + p["rate"] * (s.temperature - self.cold))
         return x * (1.0 - p["rate"] * p["tau_t"] * np.expm1(-np.maximum(s.t, 0.0) / p["tau_t"]))
 
 

@@ -82,8 +82,12 @@ class About:
         windows = [attrs.evolve(some, window=one) for one in sorted({model.window, *WINDOWS})]
         cheap = not remembers(model) or model.applied[-1].law.shifts
         near = _LATER if cheap else ()
-        tried = [fit(at, rows, 2) for one in windows for at in (*divided(one), *later(one, near))]
-        best = _best([fit_with_delays(one, rows, 2 * _STEPS) for one in _best(tried, rows, 3)], rows, 2)
+        near_best = [
+            found
+            for one in windows  # each has its own valleys, so that they are compared at the bottom
+            for found in _best([fit(at, rows, 2) for at in (*divided(one), *later(one, near))], rows, 2)
+        ]
+        best = _best([fit_with_delays(one, rows, 2 * _STEPS) for one in near_best], rows, 2)
         whole = [attrs.evolve(one, samples=model.samples) for one in best]
         return _best([fit_with_delays(one, self.judge.fit, _LAST_STEPS) for one in whole], self.judge.fit, 1)[
             0
@@ -156,14 +160,20 @@ def propose(about: About, started: Started) -> Candidate | None:
 
 def simplified(about: About, one: Candidate) -> Candidate | None:
     """The simpler law that the candidate's can become, fitted from where the candidate is; None where there is none."""
-    last = one.model.applied[-1]
-    found = last.law.simpler(dict(zip(last.law.names, last.values, strict=True)))
+    less = less_said(one.model.applied[-1])
+    if less is None:
+        return None
+    model = attrs.evolve(one.model, applied=(*one.model.applied[:-1], less))
+    return _judged(about, less.law, about.fit(model))
+
+
+def less_said(applied: Applied) -> Applied | None:
+    """The simpler law that this one can become, on the same joints; None where there is none."""
+    found = applied.law.simpler(dict(zip(applied.law.names, applied.values, strict=True)))
     if found is None:
         return None
     law, start = found
-    applied = attrs.evolve(last, law=law, values=np.array([start[name] for name in law.names]))
-    model = attrs.evolve(one.model, applied=(*one.model.applied[:-1], applied))
-    return _judged(about, law, about.fit(model))
+    return attrs.evolve(applied, law=law, values=np.array([start[name] for name in law.names]))
 
 
 def _without_weakest(model: Model) -> Model | None:

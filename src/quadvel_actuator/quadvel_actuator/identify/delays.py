@@ -55,17 +55,19 @@ def _at(model: Model, which: int, by: float) -> Model:
     return model.with_delays(*delays)
 
 
-def latest(model: Model, rows: Bools) -> Array:
-    """The longest input delays (J,), s, with which the model says the same of `rows` (N, J).
+def latest(model: Model, rows: Bools) -> Model:
+    """The model with the longest input delays with which it says the same of `rows` (N, J).
 
     Where the stamps of rows and commands lie on a grid, a command is in force at the same rows for a whole step of
-    delays. A drive that works on that grid has the longest of them; a fit needs the room to either side.
+    delays. A drive that works on that grid has the longest of them, and so has a model that is to foretell rows that
+    lie otherwise; a fit needs the room to either side.
     """
-    found, error = model.input_delay, model.error(rows) * (1.0 + _EQUAL)
-    while (found + _FINE <= LONGEST_INPUT).all():
-        if model.with_delays(np.round(found + _FINE, 7), model.output_delay).error(rows) > error:
+    found, error = model, model.error(rows) * (1.0 + _EQUAL)
+    while (found.input_delay + _FINE <= LONGEST_INPUT).all():
+        later = model.with_delays(np.round(found.input_delay + _FINE, 7), model.output_delay)
+        if later.error(rows) > error:
             break
-        found = np.round(found + _FINE, 7)
+        found = later
     return found
 
 

@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, propose, simplified, started
+from .candidates import About, Candidate, less_said, propose, simplified, started
 from .delays import fit_with_delays
 from .few import Few
 from .judging import Judge
@@ -36,12 +36,13 @@ _AS_WELL = 0.02
 """Of the noise: what an account with gains that can be believed may lose."""
 
 _FITTED = 5
-_PROMISING = (
-    0.5  # of the most promising law: so much, or among the first few and quick, and a law is fitted further
-)
+_PROMISING = 0.5
+"""Of the most promising law that does not read the torque: so much, or among the first few and quick, and a law is
+fitted further."""
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
+_SIMPLER_LOSES = 0.01  # of the noise
 
 Tick = Callable[[str], None]
 
@@ -124,6 +125,8 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         model = _released(_widened(about.fit_anew(best.model.holding(False)), judge, noise, few), few)
         ties.append(tied)
     model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
+    model, ties = _simplest(model, ties, judge, noise)
+    model = _narrowed(model, judge, noise, few)
     model = pooled(model, judge, noise)
     findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
@@ -146,10 +149,11 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
         looked += [one for one in (started(about, form) for form in law.variants(about)) if one is not None]
     looked.sort(key=lambda one: -one.promise)
+    most = max((one.promise for one in looked if one.law.foretold() is one.law), default=0.0)
     for k, first in enumerate(looked):
         name = first.law.name
         costly = k >= _FITTED or first.law.remembers
-        if costly and first.promise < _PROMISING * looked[0].promise:
+        if costly and first.promise < _PROMISING * most:
             idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
             continue
         tick(f"{what}: {name}, fitted")
@@ -200,6 +204,25 @@ def _widened(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
     return model
 
 
+def _narrowed(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
+    """The model with each effect off joints that need it no more, the weakest ones first.
+
+    What an effect bends before all of it is found, gains or delays of every joint, it can seem to mend on any of them.
+    """
+    for k in range(len(model.applied)):
+        while model.applied[k].active.sum() > 1:
+            one, given = model.applied[k], model.predict()
+            share = np.mean(np.where(judge.fit, given - model.without(k).predict(), 0.0) ** 2, axis=0) / noise
+            weakest = int(np.argmin(np.where(one.active, share, np.inf)))
+            fewer = attrs.evolve(one, active=one.active & (np.arange(len(noise)) != weakest))
+            tried = few.fitted(model.replacing(k, fewer), fit_with_delays, 10)
+            lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - given)
+            if lost.p_any * len(registry()) < LEVEL and lost.gain > WORTH * noise[weakest] / len(noise):
+                break
+            model = tried
+    return model
+
+
 def _worth(one: Candidate, noise: Array) -> float:
     """Gain on the joints that it acts on, as a share of their noise."""
     return float(one.joint_gain[one.joints].sum() / noise[one.joints].sum())
@@ -224,7 +247,7 @@ def _choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tupl
     size = {one.name: len(one.law.parameters) for one in equal}
     chosen = best
     for one in equal[1:]:
-        if size[one.name] < size[chosen.name] and best.gain - one.gain < 0.01 * float(noise.mean()):
+        if size[one.name] < size[chosen.name] and best.gain - one.gain < _SIMPLER_LOSES * float(noise.mean()):
             chosen = one
     return chosen, tuple(one.name for one in equal if one is not chosen)[:_TIES]
 
@@ -253,6 +276,23 @@ def _pruned(
         model = less
         ties = [tied for k, tied in enumerate(ties) if k != worst]
     return (fit_with_delays(model, judge.fit) if model.applied else model), ties
+
+
+def _simplest(
+    model: Model, ties: list[tuple[str, ...]], judge: Judge, noise: Array
+) -> tuple[Model, list[tuple[str, ...]]]:
+    """With simpler laws where these say as much: what came later may have been why the other law was needed."""
+    ties = list(ties)
+    for k, one in enumerate(model.applied):
+        less = less_said(one)
+        if less is None or any(other.law.name == less.law.name for other in model.applied):
+            continue
+        tried = fit_with_delays(model.replacing(k, less), judge.fit)
+        lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())
+        if lost.gain < _SIMPLER_LOSES * float(noise.mean()):
+            model = tried
+            ties[k] = (one.law.name, *(name for name in ties[k] if name != less.law.name))[:_TIES]
+    return model, ties
 
 
 def _loss(model: Model, index: int, judge: Judge, few: Few) -> tuple[float, float, Model]:

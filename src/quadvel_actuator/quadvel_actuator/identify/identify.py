@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from ..parameters import ActuatorParameters
-from .delays import fit_with_delays
+from .delays import fit_with_delays, latest
 from .diagnosis import Diagnosis, Rejected, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
@@ -90,7 +90,8 @@ def identify(
         model = chosen_one.model
         named = diagnosis.model if chosen_one.findings else before
         return Outcome(
-            eam, before, chosen_one, learned, _worth(named, learned, judge), remainder(model, learned, judge),
+            eam, latest(before, judge.fit), attrs.evolve(chosen_one, model=latest(model, judge.fit)), learned,
+            _worth(named, learned, judge), remainder(model, learned, judge),
             intervals(model if learned is None else learned.beside, judge), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
         )  # fmt: skip
@@ -128,10 +129,9 @@ def _steadiest(tries: Sequence[Outcome], body: Body) -> tuple[Outcome, tuple[Rep
     before = replay(tries[0], tries[0].before)
     best, after = tries[-1], before
     for one in tries[:-1]:
-        if one.model is not one.before:
-            found = replay(one, one.model)
-            if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
-                best, after = one, found
+        found = replay(one, one.model)
+        if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
+            best, after = one, found
     return best, (before, after)
 
 

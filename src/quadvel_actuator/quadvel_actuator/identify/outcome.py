@@ -12,7 +12,6 @@ from quadvel_description.robot import JOINT_NAMES
 
 from ..effects.terms import NAME as TERMS
 from ..parameters import ActuatorParameters, DelayPair, Effect
-from .delays import latest
 from .diagnosis import Diagnosis, Finding
 from .eam import Eam
 from .excerpts import Piece
@@ -113,7 +112,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         | {
             "delta_kp": float((o.before.gains[0, 0] - 1.0) * o.kp_ref),
             "delta_kd": float((o.before.gains[1, 0] - 1.0) * o.kd_ref),
-            "input_delay_ms": 1e3 * float(latest(o.before, judge.fit)[0]),
+            "input_delay_ms": 1e3 * float(o.before.input_delay[0]),
             "output_delay_ms": 1e3 * float(o.before.output_delay[0]),
         },
         "after": mses["after"] | _gains(o),
@@ -161,7 +160,7 @@ def _gains(o: Outcome) -> dict[str, Any]:
     rows = {
         "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
         "delta_kd": ((model.gains[1] - 1.0) * o.kd_ref, widths.gains[1] * o.kd_ref),
-        "input_delay_ms": (1e3 * latest(model, o.judge.fit), 1e3 * widths.delays[0]),
+        "input_delay_ms": (1e3 * model.input_delay, 1e3 * widths.delays[0]),
         "output_delay_ms": (1e3 * model.output_delay, 1e3 * widths.delays[1]),
     }
     for name, (values, half) in rows.items():

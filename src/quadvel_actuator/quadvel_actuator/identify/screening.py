@@ -48,7 +48,7 @@ class Started:
     law: EffectLaw
     model: Model
     promise: float
-    """what it takes off the squared error of the fitted rows, each joint's in units of its noise"""
+    """what it takes off the squared error of the fitted rows, each joint's in units of its noise, of joints where it does"""
 
 
 class Ground:
@@ -171,7 +171,9 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     count = np.maximum(rows.sum(axis=0), 1)
     if best is None or not (promise / count).max() > _PROMISE:
         return None
-    return Started(law, attrs.evolve(best, samples=ground.model.samples), weight * float(promise.sum()))
+    return Started(
+        law, attrs.evolve(best, samples=ground.model.samples), weight * float(np.maximum(promise, 0.0).sum())
+    )
 
 
 def _within(value: Array | float, parameter: Parameter, joints: int) -> Array:

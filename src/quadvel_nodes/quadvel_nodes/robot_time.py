@@ -1,0 +1,33 @@
+"""The robot's own time: that of its stamps, less what it stood still itself.
+
+Stamps are on the clock of the machine, ticks on the robot's own. Where a machine stalls together with the robot that it
+simulates, its clock goes on without the robot: what the robot does next follows what it did last, and nobody missed
+anything. A real robot lives on meanwhile, and its ticks tell so.
+"""
+
+from __future__ import annotations
+
+JITTER = 0.01  # s, by which stamps may be off the ticks for other reasons
+LONGEST = 0.5  # s, of a standstill that is left out
+_WRAP = 2**32
+
+
+class RobotTime:
+    """Follows the states of one robot. stalled: s that it stood still and that were left out, since the start."""
+
+    def __init__(self) -> None:
+        self.stalled = 0.0
+        self._last: tuple[float, int] | None = None
+
+    def follow(self, stamp: float, tick: int, longest: float = LONGEST) -> float:
+        """The robot's time of the next state, s. stamp: s. tick: ms, wraps. longest: standstill to leave out, s.
+
+        A tick that does not move is no clock: then stamps count.
+        """
+        if self._last is not None:
+            lived = 1e-3 * ((tick - self._last[1]) % _WRAP)
+            standstill = stamp - self._last[0] - lived
+            if lived > 0.0 and JITTER < standstill <= longest:
+                self.stalled += standstill
+        self._last = stamp, tick
+        return stamp - self.stalled
