@@ -13,8 +13,13 @@ MEMORY = 4
 INPUTS = {"obs": (1, 3), "h_in": (1, 1, 2 * MEMORY), "c_in": (1, 1, MEMORY)}
 
 
-def network(order: tuple[str, ...] = ("obs", "h", "clock", "bent"), **gemm: float) -> ModelProto:
-    """A product of `order` put together, where h and clock are halves of h_in and bent is made of obs; `gemm`: its attributes."""
+def network(
+    order: tuple[str, ...] = ("obs", "h", "clock", "bent"), nested: bool = False, **gemm: float
+) -> ModelProto:
+    """A product of `order` put together, where h and clock are halves of h_in and bent is made of obs; `gemm`: its attributes.
+
+    nested: all but the first are put together first.
+    """
     rng = np.random.default_rng(0)
     widths = {"obs": 3, "bent": 3, "h": MEMORY, "clock": MEMORY}
     weight = rng.normal(size=(sum(widths[name] for name in order), MEMORY)).astype(np.float32)
@@ -25,11 +30,17 @@ def network(order: tuple[str, ...] = ("obs", "h", "clock", "bent"), **gemm: floa
         "flat": np.array([1, -1]),
         "deep": np.array([1, 1, -1]),
     }
+    joining = [helper.make_node("Concat", order, ["joined"], axis=1)]
+    if nested:
+        joining = [
+            helper.make_node("Concat", order[1:], ["others"], axis=1),
+            helper.make_node("Concat", [order[0], "others"], ["joined"], axis=1),
+        ]
     nodes = [
         helper.make_node("Reshape", ["h_in", "flat"], ["memory"]),
         helper.make_node("Split", ["memory", "halves"], ["h", "clock"], axis=1),
         helper.make_node("Tanh", ["obs"], ["bent"]),
-        helper.make_node("Concat", order, ["joined"], axis=1),
+        *joining,
         helper.make_node("Gemm", ["joined", "W", "b"], ["sum"], **gemm),
         helper.make_node("Sigmoid", ["sum"], ["actions"]),
         helper.make_node("Concat", ["actions", "clock"], ["after"], axis=1),
@@ -65,8 +76,9 @@ def run(model: ModelProto, given: dict[str, np.ndarray]) -> dict[str, np.ndarray
         network(("h", "bent", "clock", "obs")),
         network(("obs", "h")),
         network(transB=1),
+        network(nested=True),
     ],
-    ids=["mixed", "another order", "two terms", "transposed weights"],
+    ids=["mixed", "another order", "two terms", "transposed weights", "put together in two steps"],
 )
 def test_both_parts_together_are_the_network(model: ModelProto) -> None:
     rng = np.random.default_rng(1)

@@ -10,8 +10,9 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_training import clock, gait, student  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.networks import Mlp  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
-from quadvel_training.teacher import GaitState, torch_mirror  # noqa: E402
+from quadvel_training.teacher import RESIDUAL, GaitState, torch_mirror  # noqa: E402
 
 STANCE = torch.tensor([0.0, 0.0, 0.0, 1.0])
 
@@ -95,6 +96,22 @@ def test_the_mirrored_policy_carries_the_mirrored_gait(walk):
     off = (mirrored[..., -12:] - joints(carried[..., -12:])).abs()
     assert off[20:].median() < 0.01  # but for the trunk's lateral asymmetry
     assert carried[..., 4:6].abs().max() > 0.9
+
+
+def test_a_student_begins_as_its_teacher(walk):
+    """The same network on the same numbers, where the observation and the gait tell the teacher's."""
+    obs, network = torch.from_numpy(np.array([row[0] for row in walk[1][:20]])), student.Policy()
+    torch.manual_seed(3)
+    actor = Mlp(67, 12)
+    network.take_over(actor.body)
+    with torch.no_grad():
+        carried, _ = network.follow(obs, student.parts_of(network.initial_state(6))[1])
+        action, _ = network(obs, network.initial_state(6))
+        command, hand, down, known, last, spring, base = carried.split([4, 2, 4, 3, 12, 12, 12], dim=-1)
+        added = (obs[..., 36:] - last) * student.ACTION_SCALE / RESIDUAL
+        seen = [command, obs[..., 4:36], added, hand, 2 * spring, down, known[..., :1]]
+        residual, _ = actor(torch.cat(seen, dim=-1))
+    assert np.allclose(action, base + residual * RESIDUAL / student.ACTION_SCALE, atol=1e-5)
 
 
 def test_a_sequence_followed_once_gives_what_single_ticks_give(walk):

@@ -32,6 +32,14 @@ def test_the_gait_stands_still_on_command():
     assert env.contact.all()
 
 
+def test_targets_are_held_to_the_range_that_the_robot_lets_through():
+    bold, held = VelocityEnv(QUIET), VelocityEnv(QUIET)
+    for _ in range(10):
+        bold.tick(np.full((4, 12), 9.0))
+        held.tick(np.tile(robot.COMMAND_UPPER, (4, 1)))
+    assert np.array_equal(bold.q, held.q)
+
+
 def test_equal_seeds_give_equal_runs_and_other_seeds_do_not():
     def run(seed):
         env = VelocityEnv(attrs.evolve(QUIET, seed=seed, randomisation=Randomisation()))
