@@ -34,7 +34,8 @@ PARTS.append(DEFAULT_OBSERVATION.size - sum(PARTS))  # of no use: both halves of
 """What the first half of the gait's state is put together of."""
 
 
-CARRIED = 4 + 2 + 4 + ground.SIZE + 3 * 12
+COMMAND = 4  # numbers, the observation's first
+CARRIED = COMMAND + 2 + 4 + ground.SIZE + 3 * 12
 """Command and hand of the clock, feet that should be down, ground, the gait's last targets, how far
 its next are from the joints, and these targets."""
 GROUND = 5.0  # of the network's unit, for 1 m and for a slope of 1
@@ -55,12 +56,13 @@ class Policy(Recurrent):
 
     def __init__(self, offset: np.ndarray = robot.NOMINAL_Q, command_map: CommandMap | None = None) -> None:
         """offset: joint angles (12,) rad at action zero. command_map: of the gait as its teacher walks it."""
-        seen = DEFAULT_OBSERVATION.size + CARRIED
+        seen = DEFAULT_OBSERVATION.size - COMMAND + CARRIED
         super().__init__(seen, 12, MEMORY, HIDDEN)
         self.body = mlp([MEMORY + seen, *HIDDEN, 12])
         with torch.no_grad():
             self.body[-1].weight.mul_(0.1)
-        self.lead = CommandCorrection(command_map or CommandMap(), 4).requires_grad_(False)
+        self.lead = CommandCorrection(command_map or CommandMap(), COMMAND).requires_grad_(False)
+        self.correction: CommandCorrection | None = None  # of the commands that the policy is given
         self.register_buffer("offset", torch.tensor(offset, dtype=torch.float32))
         for name, array in zip(("expect", "expect_offset"), _expectation(), strict=True):
             self.register_buffer(name, torch.as_tensor(array, dtype=torch.float32), persistent=False)
@@ -81,8 +83,11 @@ class Policy(Recurrent):
         return y, whole(memory, gait_state)
 
     def act(self, x: Tensor, carried: Tensor, memory: State) -> tuple[Tensor, State]:
-        """What is learned: actions (T, N, 12) and the LSTM's new memory, from x and what `follow` says of the gait."""
-        seen = torch.cat([x, carried], dim=-1)
+        """What is learned: actions (T, N, 12) and the LSTM's new memory, from x and what `follow` says of the gait.
+
+        Of the command the layers know what the gait made of it.
+        """
+        seen = torch.cat([x[..., COMMAND:], carried], dim=-1)
         y, (h, c) = self.lstm(seen, memory)
         return carried[..., -12:] + self.body(torch.cat([nn.functional.silu(y), seen], dim=-1)), (h, c)
 
@@ -93,7 +98,10 @@ class Policy(Recurrent):
         roll_pitch, q, velocity, turn = (past @ self.expect + self.expect_offset).split([2, 12, 3, 3], dim=-1)
         q, up = columns(q), gait.upward(roll_pitch)
         times, grounds = [], []
-        for command in past[..., :4].split(1):
+        commands = past[..., :COMMAND]
+        if self.correction:
+            commands = commands + self.correction(commands)
+        for command in commands.split(1):
             now = clock.advance(now, command)
             times.append(now + ahead)
         time = _joined(times)
@@ -110,7 +118,7 @@ class Policy(Recurrent):
         last = torch.cat([last, base[:-1]]) if len(x) > 1 else last
         hand, down = clock.hand(pace, phase), cycle.down.to(x.dtype)
         carried = torch.cat([cycle.command, hand, down, GROUND * known, last, spring, base], dim=-1)
-        return carried, (torch.cat([now, ahead, below, base[-1:], rest], dim=-1), x[-1:])
+        return carried, (torch.cat([now, ahead, below, base[-1:], rest], dim=-1), x[-1:] if len(x) > 1 else x)
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def take_over(self, teacher: nn.Sequential) -> None:
@@ -124,7 +132,7 @@ class Policy(Recurrent):
         )
         unit = ACTION_SCALE / RESIDUAL
         none = [torch.zeros(len(first.weight), size) for size in (MEMORY, ground.SIZE - 1, 12)]
-        x = [torch.zeros_like(command), moving, q, rest, unit * added]
+        x = [moving, q, rest, unit * added]
         carried = [command, hand, down, height * 5 / GROUND, none[1], -unit * added, 2 * ahead, none[2]]
         own = [layer for layer in self.body if isinstance(layer, nn.Linear)]
         own[0].weight.copy_(torch.cat([none[0], *x, *carried], dim=1))
@@ -210,6 +218,24 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
     )
 
 
+class _Mapped(Recurrent):
+    """A policy without a gait behind a command map."""
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        """As without."""
+        return super().forward(x + self.correction(x), state)
+
+
+def behind(actor: Recurrent, command_map: CommandMap | None) -> Recurrent:
+    """A copy of the policy that is given the commands which `command_map` makes of those wanted."""
+    mapped = copy.deepcopy(actor)
+    if command_map and isinstance(mapped, Policy):
+        mapped.correction = CommandCorrection(command_map, COMMAND)
+    elif command_map:
+        mapped.__class__, mapped.correction = _Mapped, CommandCorrection(command_map, DEFAULT_OBSERVATION.size)
+    return mapped
+
+
 class _Cell(nn.Module):
     """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
 
@@ -234,14 +260,13 @@ class _Cell(nn.Module):
 class _Step(nn.Module):
     """One time step with the signature of the policy file."""
 
-    def __init__(self, network: Recurrent, outputs: int, correction: CommandCorrection | None) -> None:
+    def __init__(self, network: Recurrent, outputs: int) -> None:
         super().__init__()
-        self.network, self.outputs, self.correction = copy.deepcopy(network), outputs, correction
+        self.network, self.outputs = copy.deepcopy(network), outputs
         self.network.lstm = _Cell(network.lstm)
 
     def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
-        x = obs + self.correction(obs) if self.correction else obs
-        y, (hidden, memory) = self.network(x, (h.flatten(0, 1), c.flatten(0, 1)))
+        y, (hidden, memory) = self.network(obs, (h.flatten(0, 1), c.flatten(0, 1)))
         outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
         return (*outputs, hidden[None], memory[None])
 
@@ -252,15 +277,12 @@ def export(
     path: Path,
     outputs: Sequence[str],
     metadata: str,
-    command_map: CommandMap | None = None,
 ) -> None:
     """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
 
     obs has the shape (1, size).
-    `command_map`: what corrects the command, the observation's first four numbers.
     """
     state = network.initial_state(1)
-    correction = CommandCorrection(command_map, size) if command_map else None
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     with warnings.catch_warnings():
@@ -268,7 +290,7 @@ def export(
             "ignore", torch.jit.TracerWarning
         )  # one step has one length, and constants are constants
         torch.onnx.export(
-            _Step(network, len(outputs), correction).eval(),
+            _Step(network, len(outputs)).eval(),
             (torch.zeros(1, size), *state),
             str(part),
             input_names=["obs", "h_in", "c_in"],
@@ -311,4 +333,4 @@ def export_policy(
         recipe=recipe,
         commit=commit(),
     )
-    export(actor, DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json(), command_map)
+    export(behind(actor, command_map), DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json())

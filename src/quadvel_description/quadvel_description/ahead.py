@@ -68,8 +68,18 @@ def _cut_products(graph: GraphProto, awaited: str) -> bool:
         nodes += _product(graph, [term for term in terms if term[0] in late], [ahead], node.output[0])
     found = len(nodes) > len(graph.node)
     del graph.node[:]
-    graph.node.extend(nodes)
+    graph.node.extend(_of_use(nodes, {end.name for end in graph.output}))
     return found
+
+
+def _of_use(nodes: Sequence[NodeProto], wanted: set[str]) -> list[NodeProto]:
+    """Those of `nodes`, which are in order, that `wanted` values are made by: what was put together for a product is not."""
+    kept = []
+    for node in reversed(nodes):
+        if wanted.intersection(node.output):
+            wanted.update(node.input)
+            kept.append(node)
+    return kept[::-1]
 
 
 def _terms(graph: GraphProto, node: NodeProto) -> list[Term]:
