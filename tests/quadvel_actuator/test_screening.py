@@ -96,6 +96,22 @@ def test_a_bound_that_does_not_fall_with_speed_is_found_from_one_that_could():
     assert simplified(looked, found) is None
 
 
+def test_a_constant_that_passed_for_a_weak_spring_far_away_is_called_one_in_the_end():
+    offset = Effect("torque_offset", JOINTS, {"offset": 0.25})
+    looked = about(_log(FRICTION, offset), 0.009, 0.003)
+    spring = np.array([[-0.01, -0.01], [-25.0, -25.0]])
+    friction = registry()["coulomb_friction"](at=JOINT)
+    both = (
+        Applied(registry()["parallel_spring"](at=JOINT), np.ones(2, dtype=bool), spring, np.arange(2)),
+        Applied(friction, np.ones(2, dtype=bool), np.array([[0.5, 0.5], [0.05, 0.05]]), np.arange(2)),
+    )
+    model = attrs.evolve(looked.model, applied=both)
+    found, ties = diagnosis._simplest(model, [("cogging",), ()], looked.judge, looked.noise)
+    assert [one.law.name for one in found.applied] == ["torque_offset", "coulomb_friction"]
+    assert ties == [("parallel_spring", "cogging"), ()]
+    np.testing.assert_allclose(found.applied[0].values[0], 0.25, atol=0.03)
+
+
 def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
     looked = about(_log(), input_delay=0.009, output_delay=0.003)
     assert started(looked, registry()["coulomb_friction"]()) is None
