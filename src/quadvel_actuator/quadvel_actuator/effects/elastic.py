@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import attrs
@@ -11,6 +11,7 @@ import numpy as np
 from .base import (
     AddedLaw,
     Array,
+    EffectLaw,
     ErrorLaw,
     Errors,
     Memory,
@@ -65,6 +66,10 @@ class ParallelSpring(AddedLaw):
         n = weight.sum(axis=0) + 1e-9
         q, r = (s.q * weight).sum(axis=0) / n, residual.sum(axis=0) / n
         return [{"q0": q}, *({"q0": np.clip(q + r / k, -25.0, 25.0)} for k in _STIFFNESSES)]
+
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+        """A weak spring that rests far away is a constant."""
+        return TorqueOffset(at=self.at), {"offset": p["k"] * p["q0"]}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["k"] * (s.q - p["q0"])

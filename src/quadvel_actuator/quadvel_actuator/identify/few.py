@@ -1,6 +1,6 @@
 """Some of the fitted rows, enough to fit a model to, whatever the length of the logs.
 
-Every so many-th row; stretches of rows where a law of the model needs those before. What is found on them is judged on
+One of so many rows; stretches of rows where a law of the model needs those before. What is found on them is judged on
 all held-out rows.
 """
 
