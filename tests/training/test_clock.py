@@ -126,13 +126,3 @@ def test_a_sequence_followed_once_gives_what_single_ticks_give(walk):
             assert np.allclose(some[tick], action[0, [1, 4]], atol=1e-5)
     for half, expected in zip(followed.end(), state, strict=True):
         assert np.allclose(half, expected, atol=1e-4)
-
-
-def test_a_policy_from_before_there_was_a_gait_goes_on_without_one():
-    bare = student.Recurrent(48, 12, student.MEMORY, student.HIDDEN)
-    for network in (bare, student.Policy()):
-        again = student.actor_of(network.state_dict())
-        assert type(again) is type(network)
-        x, state = torch.ones(1, 1, 48), network.initial_state(1)
-        with torch.no_grad():
-            assert torch.equal(again(x, state)[0], network(x, state)[0])

@@ -10,7 +10,6 @@ from . import distill, loop, parallel, recipe, student
 from .command_map import CommandMap
 from .crl import CrlConfig, CrlRun
 from .loop import Budget
-from .networks import Recurrent
 from .randomisation import actuator
 from .run_folder import Evaluated, describe, made_of
 
@@ -21,7 +20,7 @@ CHECKPOINT = "crl.pt"
 NO_LIMIT = 1e6  # minutes
 
 
-def policy_of(checkpoint: Path) -> Recurrent:
+def policy_of(checkpoint: Path) -> student.Policy:
     """The recurrent policy in a checkpoint of stage 2 or 3."""
     content = loop.load(checkpoint)
     if "student" in content:

@@ -195,10 +195,9 @@ def _expectation() -> tuple[np.ndarray, np.ndarray]:
     return pick / spec.scale[:, None], spec.offset @ pick
 
 
-def actor_of(weights: dict[str, Tensor]) -> Recurrent:
-    """The policy with these weights; those made before it carried a gait along go on without one."""
-    bare = "offset" not in weights
-    actor = Recurrent(DEFAULT_OBSERVATION.size, 12, MEMORY, HIDDEN) if bare else Policy()
+def actor_of(weights: dict[str, Tensor]) -> Policy:
+    """The policy with these weights."""
+    actor = Policy()
     actor.load_state_dict(weights)
     return actor
 
@@ -216,24 +215,6 @@ def observe(env: VelocityEnv, previous_action: np.ndarray, command: np.ndarray |
         previous_action=previous_action,
         **env.sense(),
     )
-
-
-class _Mapped(Recurrent):
-    """A policy without a gait behind a command map."""
-
-    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
-        """As without."""
-        return super().forward(x + self.correction(x), state)
-
-
-def behind(actor: Recurrent, command_map: CommandMap | None) -> Recurrent:
-    """A copy of the policy that is given the commands which `command_map` makes of those wanted."""
-    mapped = copy.deepcopy(actor)
-    if command_map and isinstance(mapped, Policy):
-        mapped.correction = CommandCorrection(command_map, COMMAND)
-    elif command_map:
-        mapped.__class__, mapped.correction = _Mapped, CommandCorrection(command_map, DEFAULT_OBSERVATION.size)
-    return mapped
 
 
 class _Cell(nn.Module):
@@ -313,7 +294,7 @@ def commit() -> str:
 
 
 def export_policy(
-    actor: Recurrent,
+    actor: Policy,
     env: VelocityEnv,
     path: Path,
     recipe: dict[str, Any],
@@ -333,4 +314,6 @@ def export_policy(
         recipe=recipe,
         commit=commit(),
     )
-    export(behind(actor, command_map), DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json())
+    mapped = copy.deepcopy(actor)
+    mapped.correction = CommandCorrection(command_map, COMMAND) if command_map else None
+    export(mapped, DEFAULT_OBSERVATION.size, path, ["actions"], metadata.to_json())

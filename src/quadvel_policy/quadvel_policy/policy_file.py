@@ -14,7 +14,7 @@ from quadvel_description.recurrent_network import NetworkFileError, RecurrentNet
 
 from .observation import JOINTS, METADATA_FIELDS, RATE_HZ, MetadataError, PolicyMetadata
 
-SHIPPED_POLICY = Path(__file__).parent / "policies" / "crl_eam.onnx"
+SHIPPED_POLICY = Path(__file__).parent / "policies" / "aliengo.onnx"
 
 
 class PolicyFile:
