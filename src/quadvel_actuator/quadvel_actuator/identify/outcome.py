@@ -325,7 +325,7 @@ def _stepped_delay(o: Outcome, model: Model) -> float:
     best = 0.5 * STEP
     for reach in (0.25 * STEP, 0.125 * STEP, 0.0625 * STEP):
         around = [best + k * reach for k in (-2, -1, 0, 1, 2) if best + k * reach >= 0.0]
-        meant = [attrs.evolve(beside, window=STEP, input_delay=beside.input_delay + by) for by in around]
+        meant = [attrs.evolve(beside, window=STEP, input_delay=model.input_delay + by) for by in around]
         best = around[int(np.argmin([one.error(o.judge.fit) for one in meant]))]
     return round(delay + best, 7)
 
