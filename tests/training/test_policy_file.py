@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import student  # noqa: E402
-from quadvel_training.command_map import CommandMap  # noqa: E402
+from quadvel_training.command_map import TERMS, CommandMap  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 
 
@@ -43,7 +43,7 @@ def test_onnx_and_torch_agree_over_500_steps_with_a_reset(exported):
 def test_a_command_map_stands_in_front_of_the_network(exported, tmp_path):
     actor, env, _ = exported
     rng = np.random.default_rng(2)
-    command_map = CommandMap(0.1 * rng.normal(size=(20, 3)))
+    command_map = CommandMap(0.1 * rng.normal(size=(TERMS, 3)))
     command_map.weights[0] = 0.0  # nothing is added to the zeros that a policy remembers before its first tick
     student.export_policy(actor, env, tmp_path / "mapped.onnx", {}, command_map)
     for stance in (0.0, 1.0):

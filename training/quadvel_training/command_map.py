@@ -24,6 +24,8 @@ EVEN = [
     (1, 2, 0),
     (1, 0, 2),
     (1, 1, 1),
+    (2, 2, 0),
+    (2, 0, 2),
 ]
 ODD = [
     (0, 1, 0),
@@ -36,10 +38,13 @@ ODD = [
     (0, 2, 1),
     (2, 1, 0),
     (2, 0, 1),
+    (3, 1, 0),
+    (3, 0, 1),
 ]
 EXPONENTS = np.array(EVEN + ODD)
 """Of vx, vy, wz in each term: first those that mirroring leaves as they are, then as many that it turns round."""
 TERMS = len(EXPONENTS)
+FACTORS = EXPONENTS.sum(axis=1).max() + 1  # of a term, with the one of stance
 BOUND = 1.0  # m/s, rad/s, of what the map adds
 STRIDE = 0.35  # s, time constant of velocities averaged over a stride
 SETTLED = 2.0  # s of walking until a robot's velocity counts
@@ -112,27 +117,27 @@ class CommandMap:
 class CommandCorrection(torch.nn.Module):
     """What the map adds to the command: (..., `inputs`), which start with the command, to (..., `inputs`).
 
-    Few steps, since it runs in every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz; the last
-    of the four factors is 0 in stance.
+    Few steps, since it runs for every tick: a linear layer picks the factors of each term out of 1, vx, vy, wz; the last
+    factor is 0 in stance.
     """
 
     weights: torch.Tensor
 
     def __init__(self, command_map: CommandMap, inputs: int) -> None:
         super().__init__()
-        self.factors = torch.nn.Linear(inputs, 4 * TERMS).requires_grad_(False)
-        pick, one = np.zeros((4, TERMS, inputs)), np.ones((4, TERMS))
+        self.factors = torch.nn.Linear(inputs, FACTORS * TERMS).requires_grad_(False)
+        pick, one = np.zeros((FACTORS, TERMS, inputs)), np.ones((FACTORS, TERMS))
         for term, exponents in enumerate(EXPONENTS):
             for place, axis in enumerate(np.repeat([0, 1, 2], exponents)):
                 pick[place, term, axis], one[place, term] = 1.0, 0.0
-        pick[3, :, 3] = -1.0
+        pick[-1, :, 3] = -1.0
         self.factors.weight.copy_(torch.as_tensor(pick.reshape(-1, inputs)))
         self.factors.bias.copy_(torch.as_tensor(one.reshape(-1)))
         weights = np.pad(command_map.weights, ((0, 0), (0, inputs - 3)))  # all else stays as it is
         self.register_buffer("weights", torch.as_tensor(weights, dtype=torch.float32))
 
     def forward(self, obs: torch.Tensor) -> torch.Tensor:
-        terms = self.factors(obs).reshape(*obs.shape[:-1], 4, TERMS).prod(dim=-2)
+        terms = self.factors(obs).reshape(*obs.shape[:-1], FACTORS, TERMS).prod(dim=-2)
         return (terms @ self.weights).clamp(-BOUND, BOUND)
 
 
