@@ -44,7 +44,7 @@ def test_a_command_map_stands_in_front_of_the_network(exported, tmp_path):
     actor, env, _ = exported
     rng = np.random.default_rng(2)
     command_map = CommandMap(0.1 * rng.normal(size=(TERMS, 3)))
-    command_map.weights[0] = 0.0  # nothing is added to the zeros that a policy remembers before its first tick
+    command_map.weights[0] = 0.0  # so nothing is added to the zeros remembered before the first tick
     student.export_policy(actor, env, tmp_path / "mapped.onnx", {}, command_map)
     for stance in (0.0, 1.0):
         obs = rng.normal(size=(1, 48)).astype(np.float32)
