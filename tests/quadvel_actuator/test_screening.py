@@ -16,7 +16,6 @@ from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
 from quadvel_actuator.identify.model import Applied, Model
 from quadvel_actuator.identify.screening import Started
-from quadvel_actuator.identify.sharing import pooled
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -123,31 +122,6 @@ def test_one_guess_of_a_slew_limit_bounds_nothing():
     law = registry()["slew_limit"]()
     widest = law.starts(looked.seen, looked.torque, looked.fitted)[-1]
     np.testing.assert_allclose(law.series(looked.torque, looked.seen, widest), looked.torque, atol=1e-6)
-
-
-def test_few_rows_of_a_log_in_step_with_its_commands_tell_delays_apart():
-    """Every other row at 1 kHz under commands at 500 Hz would say the same for 2 ms of delays."""
-    truth = attrs.evolve(parameters(input_delay=0.009, output_delay=0.003), joints=JOINTS)
-    log = record(truth, 2, 3.0, 1000, seed=2)
-    sent = np.arange(0, len(log.t_cmd), 2)
-    held = {name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")}
-    rows, _ = Samples([attrs.evolve(log, **held)]).thinned(2)
-    phase = (1000.0 * (rows.t - rows.t[0])).round().astype(int) % 2
-    assert 0.3 < phase.mean() < 0.7
-    assert len(rows.t) == len(log.t) // 2
-
-
-def test_a_phase_is_shared_by_joints_that_have_it_on_either_side_of_a_half_turn():
-    three = NAMES[:3]
-    truth = parameters(
-        [Effect("cogging", three, {"a": 0.4, "n": 30.0, "phi": np.pi})], input_delay=0.009, output_delay=0.003
-    )
-    looked = about(record(attrs.evolve(truth, joints=three), 3, 3.0, 500, seed=2), 0.009, 0.003)
-    values = np.array([[0.4, 0.4, 0.4], [30.0, 30.0, 30.0], [np.pi - 0.02, -np.pi + 0.02, -np.pi + 0.03]])
-    wave = Applied(registry()["cogging"](), np.ones(3, dtype=bool), values, np.arange(3))
-    found = pooled(looked.model.plus(wave), looked.judge, looked.noise).applied[0]
-    assert (found.values[:, :1] == found.values).all()
-    np.testing.assert_allclose(found.values[:2, 0], [0.4, 30.0], rtol=0.03)
 
 
 def test_a_law_that_reads_the_torque_keeps_no_other_from_being_fitted(monkeypatch):

@@ -1,6 +1,6 @@
 """Some of the fitted rows, enough to fit a model to, whatever the length of the logs.
 
-One of so many rows; stretches of rows where a law of the model needs those before. What is found on them is judged on
+Every so many-th row; stretches of rows where a law of the model needs those before. What is found on them is judged on
 all held-out rows.
 """
 

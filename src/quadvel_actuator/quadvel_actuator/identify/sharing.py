@@ -54,9 +54,8 @@ def pooled(model: Model, judge: Judge, noise: Array) -> Model:
                 continue
             values = one.values.copy()
             for g in np.unique(groups[one.active]):
-                alike = np.flatnonzero(one.active & (groups == g))
-                clearest = alike[np.argmax(np.abs(values[0, alike]))]  # a mean of phases, say, is none
-                values[:, alike] = values[:, [clearest]]
+                alike = one.active & (groups == g)
+                values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
             common = attrs.evolve(one, groups=groups, values=values)
             tried = fit(model.replacing(k, common), judge.fit, 5)
             lost = judge.compare(tried.samples.tau - tried.predict(), model.samples.tau - model.predict())

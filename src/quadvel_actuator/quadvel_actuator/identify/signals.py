@@ -35,9 +35,6 @@ SMOOTH, SMOOTH_LATE = 0.006, 0.001
 STRETCH, FILLING = 0.75, 0.25
 """Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
 
-_GOLDEN = 0.5 * (5.0**0.5 - 1.0)
-"""multiples of it lie evenly between whole numbers, and repeat never"""
-
 _SLOPES = {"ddq": 0.0, "ddq_smooth": SMOOTH_LATE}
 """Signals that few laws ask for, and how much later they are read, s"""
 
@@ -123,13 +120,6 @@ def smooth_derivative(log: Log, values: Array) -> Array:
     slope = sum(w * padded[i : i + len(values)] for i, w in enumerate(weight))
     result: Array = slope / (float(np.sum(weight * k)) * log.period)
     return result
-
-
-def scattered(count: int, every: int) -> NDArray[np.intp]:
-    """One of each `every` of `count` rows, not evenly: in step with the commands, rows cannot tell delays apart."""
-    first = np.arange(0, count, every)
-    found: NDArray[np.intp] = first + (np.arange(len(first)) * _GOLDEN % 1.0 * every).astype(np.intp)
-    return found[found < count]
 
 
 class _LogSignals:
@@ -285,9 +275,9 @@ class Samples:
         return self._parts[count]
 
     def thinned(self, every: int) -> tuple[Samples, NDArray[np.intp]]:
-        """Of each log one of `every` rows, and which these are; `dt` and `start` of the rows are those they had."""
+        """One row of `every` of each log, and which these are; `dt` and `start` of the rows are those they had."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
-        rows = np.concatenate([a + scattered(b - a, every) for a, b in pairwise(edges)])
+        rows = np.concatenate([np.arange(a, b, every) for a, b in pairwise(edges)])
         return self._of(rows), rows
 
     def stretches(self, most: int) -> tuple[Samples, NDArray[np.intp], Bools]:
