@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 Report = dict[str, Any]
 Truth = dict[str, Any]
 
@@ -141,7 +143,7 @@ def _right_joints(report: Report, truth: Truth) -> bool:
 
 
 def _intervals(effects: list[dict[str, Any]], truth: Truth) -> list[dict[str, Any]]:
-    """The 95 % intervals of rightly named effects' parameters, beside the truth."""
+    """The 95 % intervals of rightly named effects' parameters, of all joints or of each, beside the truth."""
     found = []
     for true in truth["effects"]:
         for entry in effects:
@@ -153,16 +155,17 @@ def _intervals(effects: list[dict[str, Any]], truth: Truth) -> list[dict[str, An
                 )
                 if given is not None and given.get("ci95"):
                     unit = UNITS.get(given.get("unit", ""), 1.0)
-                    low, high = (unit * edge for edge in given["ci95"])
-                    found.append(
-                        {
-                            "effect": true["name"],
-                            "param": name,
-                            "truth": value,
-                            "value": unit * given["value"],
-                            "low": low,
-                            "high": high,
-                            "covered": low <= value <= high,
-                        }
-                    )
+                    values, edges = np.atleast_1d(given["value"]), np.atleast_2d(given["ci95"])
+                    for number, (low, high) in zip(unit * values, unit * edges, strict=True):
+                        found.append(
+                            {
+                                "effect": true["name"],
+                                "param": name,
+                                "truth": value,
+                                "value": float(number),
+                                "low": float(low),
+                                "high": float(high),
+                                "covered": bool(low <= value <= high),
+                            }
+                        )
     return found

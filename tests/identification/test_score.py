@@ -96,6 +96,14 @@ def test_an_interval_counts_in_the_units_that_the_report_gives():
     assert interval["value"] == pytest.approx(0.52)
 
 
+def test_an_interval_of_each_joint_is_judged_for_itself():
+    values = {"value": [0.5, 0.7], "ci95": [[0.45, 0.55], [0.65, 0.75]], "unit": "N m"}
+    truth = _truth("alone", "cogging")
+    truth["effects"][0]["params"] = {"c": 0.52}
+    found = judge(_report(_entry("cogging", c=values)), truth)["intervals"]
+    assert [one["covered"] for one in found] == [True, False]
+
+
 def test_what_the_tool_raises_is_a_verdict_and_the_table_shows_it(monkeypatch):
     def fail(logs, holdout):
         raise ValueError("broken")
