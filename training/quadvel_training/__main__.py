@@ -15,7 +15,7 @@ from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
-from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, student, teacher
+from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, teacher
 from .card import card
 from .command_map import CommandMap
 
@@ -71,10 +71,8 @@ def train_student(
     run = distill.DistillRun(config, teacher_file, stage3.policy_of(start) if start else None)
     checkpoint = out / "student.pt"
     loop.train(run, config.budget, checkpoint)
-    own = CommandMap()
-    fit, walks = distill.map_student(run.student, own, config.limits, ActuatorParameters.default())
-    about = run_folder.made_of("distill", source, config, checkpoint) | {"command_map": attrs.asdict(fit)}
-    student.export_policy(run.student, walks, out / "policy.onnx", about, own)
+    drives, about = ActuatorParameters.default(), run_folder.made_of("distill", source, config, checkpoint)
+    distill.export_mapped(run.student, CommandMap(), config.limits, drives, about, out / "policy.onnx")
 
 
 @app.command("crl")

@@ -113,6 +113,19 @@ def map_student(
     return fit_command_map(walker), walker.env
 
 
+def export_mapped(
+    actor: student.Policy,
+    own: CommandMap,
+    commands: CommandRange,
+    drives: ActuatorParameters,
+    about: dict[str, Any],
+    path: Path,
+) -> None:
+    """Write the policy file of `actor` behind `own`, measured anew (`map_student`); about: how it came to be."""
+    fit, walks = map_student(actor, own, commands, drives)
+    student.export_policy(actor, walks, path, about | {"command_map": attrs.asdict(fit)}, own)
+
+
 @attrs.frozen
 class DistillConfig:
     """One run of stage 2."""

@@ -46,8 +46,8 @@ class VelocityNetwork(Recurrent):
             "spin", spin.reshape(3, 9), persistent=False
         )  # w @ spin is, as a matrix, b -> w x b for rows
 
-    def initial_state(self, n: int, mirrored: bool = False) -> State:
-        """Zero state of `n` environments, at rest, the same for their mirror images."""
+    def initial_state(self, n: int) -> State:
+        """Zero state of `n` environments, at rest."""
         zeros = torch.zeros(1, n, MEMORY + 3)
         return zeros, zeros.clone()
 

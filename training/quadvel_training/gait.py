@@ -122,8 +122,8 @@ def _swing_feet(cycle: Cycle, body: Body) -> Tensor:
 def _stance_forces(cycle: Cycle, body: Body, feet: Tensor, down: Tensor) -> Tensor:
     """Ground forces on the feet, trunk frame (..., 3, 4) N: least squares for a wrench that brings the trunk back."""
     w, v = body.angular_velocity, body.velocity
-    along, turn, stands = cycle.command.split([2, 1, 1], dim=-1)
-    push, twist = (stands * CENTRING * _standing_place(feet, body.slope)).split([2, 1], dim=-1)
+    along, turn, _ = cycle.command.split([2, 1, 1], dim=-1)
+    push, twist = (cycle.stands * CENTRING * _standing_place(feet, body.slope)).split([2, 1], dim=-1)
     carry = robot.GRAVITY + 100 * (HEIGHT - body.height) - 14 * v[..., 2:]
     push = 6 * (along - v[..., :2]) + push
     force = robot.MASS * (carry * upward(body.roll_pitch) + push @ push.new_tensor(np.eye(2, 3)))

@@ -52,8 +52,8 @@ class Recurrent(nn.Module):
         with torch.no_grad():
             self.body[-1].weight.mul_(0.1)
 
-    def initial_state(self, n: int, mirrored: bool = False) -> State:
-        """Zero state of `n` environments, the same for their mirror images."""
+    def initial_state(self, n: int) -> State:
+        """Zero state of `n` environments."""
         zeros = torch.zeros(1, n, self.lstm.hidden_size)
         return zeros, zeros.clone()
 

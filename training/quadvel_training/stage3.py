@@ -53,9 +53,8 @@ def map_of(checkpoint: Path) -> CommandMap:
 def export(config: CrlConfig, source: Path | None, checkpoint: Path, out: Path) -> None:
     """The policy file of a checkpoint, behind its command map, which is measured anew on the recipe's actuators."""
     actor, own = policy_of(checkpoint), map_of(checkpoint)
-    fit, walks = distill.map_student(actor, own, config.commands, actuator(config.actuator))
-    about = made_of("crl", source, config, checkpoint) | {"command_map": attrs.asdict(fit)}
-    student.export_policy(actor, walks, out, about, own)
+    about = made_of("crl", source, config, checkpoint)
+    distill.export_mapped(actor, own, config.commands, actuator(config.actuator), about, out)
 
 
 def ablation(start: Path, samples: float, out: Path, device: str) -> bool:

@@ -33,7 +33,6 @@ PARTS = [clock.SIZE, clock.SIZE, ground.SIZE, 12]
 PARTS.append(DEFAULT_OBSERVATION.size - sum(PARTS))  # of no use: both halves of a state have one size
 """What the first half of the gait's state is put together of."""
 
-
 COMMAND = 4  # numbers, the observation's first
 CARRIED = COMMAND + 2 + 4 + ground.SIZE + 3 * 12
 """Command and hand of the clock, feet that should be down, ground, the gait's last targets, how far
@@ -42,7 +41,7 @@ GROUND = 5.0  # of the network's unit, for 1 m and for a slope of 1
 
 
 class Policy(Recurrent):
-    """The policy of Section 4.1 on top of a trotting gait that it carries along (docs/decisions/0016).
+    """The policy of Section 4.1 on top of a trotting gait that it carries along (docs/decisions/0017).
 
     Behind the LSTM's memory the first half of the state goes on with the gait's clock, what is added to it (half a cycle for
     a robot in the mirror, else nothing) and the ground that the feet feel; the second with the observation of the tick
