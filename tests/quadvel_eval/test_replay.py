@@ -13,7 +13,7 @@ from quadvel_actuator import ActuatorParameters
 from quadvel_dds.messages import STORE
 from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand
-from quadvel_eval.replay import Joints, open_loop, read_joints, torque_error, tracking_gap
+from quadvel_eval.replay import COMMAND, Joints, open_loop, read_joints, torque_error, tracking_gap
 from quadvel_eval.segments import Segment
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
 
@@ -32,10 +32,11 @@ def run() -> tuple[Joints, Callable[[float], Truth]]:
         if step % 5 == 0:
             target = robot.NOMINAL_Q + sway * np.sin(2 * np.pi * 2.0 * step * 0.001)
             command = JointCommand(q=target, kp=np.full(12, robot.KP), kd=np.full(12, robot.KD))
+            command.dq, command.tau = 0.5 * sway, 8.0 * sway
         simulator.command(command)
         states.append(simulator.state())
         truths.append(simulator.truth())
-        rows.append(np.concatenate([command.q, command.kp, command.kd, [MODE_SERVO]]))
+        rows.append(np.concatenate([*(getattr(command, field) for field in COMMAND), [MODE_SERVO]]))
         simulator.step()
     time = np.array([state.time for state in states])
     q, dq, tau = (np.array([getattr(state, name) for state in states]) for name in ("q", "dq", "tau"))
@@ -90,7 +91,7 @@ def test_states_that_the_recorder_missed_are_marked_and_commands_held_over_them(
     np.testing.assert_allclose(joints.q[:, 3], joints.time, atol=1e-8)
     assert joints.seen.tolist() == [True] * 3 + [False] * 2 + [True] * 3
     np.testing.assert_allclose(joints.command[:, 0], [0, 0.006, 0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
-    assert joints.command[:, 36].tolist() == [0] + [MODE_SERVO] * 7
+    assert joints.command[:, -1].tolist() == [0] + [MODE_SERVO] * 7
     assert joints.whole(0, 3)
     assert not joints.whole(1, 5)
     assert not joints.whole(-1, 2)

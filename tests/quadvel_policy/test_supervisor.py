@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 import pytest
 
-from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, UPPER
+from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.supervisor import MODES, Supervisor, SupervisorConfig
@@ -171,7 +171,7 @@ def test_walking_feeds_the_policy_and_uses_its_gains_and_targets(rig: Rig) -> No
     np.testing.assert_allclose(seen[:4], [1.5, -0.5, 0.3, 0.0], atol=1e-6)  # held to the policy's limits
     np.testing.assert_allclose(seen[30:33], rig.velocity, atol=1e-6)
     np.testing.assert_allclose(seen[36:], rig.policy.action)
-    np.testing.assert_allclose(rig.asked.q, rig.policy.metadata.action.targets(rig.policy.action))
+    np.testing.assert_allclose(rig.asked.target, rig.policy.metadata.action.targets(rig.policy.action))
     assert rig.asked.mode == MODE_SERVO
     np.testing.assert_array_equal(rig.asked.kp, np.full(12, 30.0))
     np.testing.assert_array_equal(rig.asked.kd, np.full(12, 0.5))
@@ -184,10 +184,10 @@ def test_walking_starts_with_a_fresh_policy_and_without_a_jump_of_torque(rig: Ri
     before = rig.asked
     resets = rig.policy.resets
     q = rig.state.q - 0.1
-    last = before.kp * (before.q - q)
+    last = before.kp * (before.target - q)
     for i in range(40):
         command = rig.tick(FORWARD, q=q)
-        torque = command.kp * (command.q - q)
+        torque = command.kp * (command.target - q)
         assert np.abs(torque - last).max() < 0.6, f"tick {i}"  # 13 N m in 30 ticks
         last = torque
     assert rig.policy.resets == resets + 1
@@ -439,6 +439,20 @@ def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) 
     rig.stand()
     rig.run(0.4)
     np.testing.assert_array_equal(rig.asked.q, COMMAND_UPPER)
+
+
+def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(rig: Rig) -> None:
+    rig.walk()
+    rig.run(0.2)
+    rig.policy.action = np.full(12, 4.0, np.float32)
+    wanted = rig.policy.metadata.action.targets(rig.policy.action)
+    rig.tick(FORWARD)
+    np.testing.assert_array_equal(rig.asked.q, np.minimum(wanted, COMMAND_UPPER))
+    np.testing.assert_allclose(rig.asked.target, wanted)
+    rig.policy.action = np.full(12, 1e6, np.float32)
+    rig.tick(FORWARD)
+    np.testing.assert_array_equal(rig.asked.q, COMMAND_UPPER)
+    np.testing.assert_array_less(rig.asked.tau, TORQUE_LIMIT + 1e-9)
 
 
 @pytest.mark.parametrize("field", ["stand_kp", "rise_time", "max_state_age"])

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from quadvel_actuator.parameters import ActuatorParameters
-from quadvel_description import robot, symmetry
+from quadvel_description import symmetry
 from quadvel_sim.terrain import Terrain
 
 from . import student, teacher
@@ -172,10 +172,6 @@ class DistillRun:
         if not start:
             self.student.take_over(actor.network.body)
         self.map = student.action_map(self.env)
-        self._lowest, self._highest = (
-            torch.tensor((bound - self.map.offset) / self.map.scale, dtype=torch.float32)
-            for bound in (robot.COMMAND_LOWER, robot.COMMAND_UPPER)
-        )  # targets beyond the robot's range are alike
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=config.learning_rate)
         self.samples = 0
         self._memory: State = self.student.initial_state(config.n)
@@ -297,8 +293,7 @@ class DistillRun:
         """One step of the optimiser. mirrored: actions of the mirror images of `some`, mirrored back."""
         c = self.config
         alive = mask.sum().clamp(min=1)
-        held, wanted = (x.minimum(self._highest).maximum(self._lowest) for x in (action, label))
-        error = torch.nn.functional.huber_loss(held, wanted, reduction="none", delta=FAR)
+        error = torch.nn.functional.huber_loss(action, label, reduction="none", delta=FAR)
         clone = (error.sum(-1) * mask).sum() / alive
         gap = ((action[:, some] - mirrored) ** 2).sum(-1)
         symmetric = (gap * mask[:, some]).sum() / mask[:, some].sum().clamp(min=1)

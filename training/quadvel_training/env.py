@@ -15,6 +15,7 @@ from mujoco.batch import Batch
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
+from quadvel_description.command_range import within_range
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
 from quadvel_sim.terrain import Terrain
 
@@ -154,17 +155,17 @@ class VelocityEnv:
     ) -> None:
         """One policy sample (5 ms) with the joint targets (n, 12) sent at its start; other gains (n, 12) if given.
 
-        Targets are held to the range that the robot's safety layer lets through.
+        Targets beyond the range of commands are sent as the controller sends them.
         """
-        target = np.clip(target, robot.COMMAND_LOWER, robot.COMMAND_UPPER)
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
+        target, push = within_range(target, gains[0], self.q)
         self.changed[:] = False
         self._push()
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
         for step in range(self.substeps):
             if step == self.substeps - 1:
                 before = self._qvel[:, :3].copy()
-            self.torque = self.actuators.step(q, dq, target, *gains, target_speed)
+            self.torque = self.actuators.step(q, dq, target, *gains, target_speed, push)
             self._ctrl[:] = self.torque
             self.batch.step()
         self.time += TICK

@@ -78,7 +78,8 @@ class Modes:
     @property
     def previous_action(self) -> np.ndarray:
         """The estimator's input (n, 12), rad: targets in force minus the nominal posture, zeros while damping."""
-        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, self.target - UP)
+        sent = np.clip(self.target, robot.COMMAND_LOWER, robot.COMMAND_UPPER)
+        return np.where((self.mode == Mode.DAMPING)[:, None], 0.0, sent - UP)
 
     def begin(self, ids: np.ndarray) -> np.ndarray:
         """Draw a first mode for `ids`; returns the posture (n, 12) in which each is to start."""

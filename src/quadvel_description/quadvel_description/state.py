@@ -38,6 +38,11 @@ class JointCommand:
     mode: int = MODE_SERVO
     tick: int = 0  # tick of the state that this answers
 
+    @property
+    def target(self) -> np.ndarray:
+        """The angles (12,) rad at which the drives would push as little as without a target: q + tau / kp."""
+        return self.q + np.divide(self.tau, self.kp, out=np.zeros_like(self.q), where=self.kp > 0)
+
     @classmethod
     def damping(cls, kd: float = 5.0, tick: int = 0) -> JointCommand:
         """Brake every joint."""

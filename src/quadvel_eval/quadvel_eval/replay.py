@@ -35,6 +35,7 @@ STRETCH = 0.2  # s, of one replay
 STRIDE = 0.35  # s, from one to the next: no multiple of a step of the gait
 PAST = 60  # ms, that the drives live through before
 GROWTH = 10  # ms, from one point to the next of how an error grows
+COMMAND = ("q", "dq", "tau", "kp", "kd")  # of a command, 12 numbers each
 
 
 @attrs.frozen(eq=False)
@@ -45,7 +46,7 @@ class Joints:
     q: Array  # (n, 12) rad
     dq: Array  # (n, 12) rad/s
     tau: Array  # (n, 12) N m
-    command: Array  # (n, 37): q, kp, kd (12 each), mode
+    command: Array  # (n, 61): the fields of COMMAND, mode
     seen: NDArray[np.bool_]  # (n,), false: interpolated
 
     def whole(self, begin: int, end: int) -> bool:
@@ -94,10 +95,13 @@ def read_joints(path: Path) -> Joints:
 
 
 def _held(commands: Mapping[int, Any], ticks: Array) -> Array:
-    """The command held at each of the ticks (n,), (n, 37); before the first one the robot brakes."""
+    """The command held at each of the ticks (n,), (n, 61); before the first one the robot brakes."""
     sent = np.array(sorted(commands))
-    values = [np.concatenate([c.q, c.kp, c.kd, [c.mode]]) for c in map(commands.__getitem__, sent.tolist())]
-    table = np.array([np.zeros(37), *values], float)
+    values = [
+        np.concatenate([*(getattr(c, field) for field in COMMAND), [c.mode]])
+        for c in map(commands.__getitem__, sent.tolist())
+    ]
+    table = np.array([np.zeros(12 * len(COMMAND) + 1), *values], float)
     held: Array = table[np.searchsorted(sent, ticks, side="right")]
     return held
 
@@ -108,8 +112,8 @@ def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end
     begin, stop = np.searchsorted(joints.time, [start, end])
     squares = []
     for row in range(max(begin - PAST, 0), stop):
-        q, kp, kd = np.split(joints.command[row, :36], 3)
-        torque = model.step(joints.q[row], joints.dq[row], q, kp, kd)
+        c = _command(joints, row)
+        torque = model.step(joints.q[row], joints.dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
         if row >= begin and joints.whole(row - PAST, row + 1):
             squares.append(np.mean((joints.tau[row] - torque) ** 2))
     if not squares:
@@ -154,9 +158,8 @@ def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Trut
 
 
 def _command(joints: Joints, row: int) -> JointCommand:
-    q, kp, kd = np.split(joints.command[row, :36], 3)
-    mode = MODE_SERVO if joints.command[row, 36] else MODE_DAMPING
-    return JointCommand(q=q, kp=kp, kd=kd, mode=mode)
+    *fields, mode = np.split(joints.command[row], range(12, 12 * len(COMMAND) + 1, 12))
+    return JointCommand(**dict(zip(COMMAND, fields, strict=True)), mode=MODE_SERVO if mode else MODE_DAMPING)
 
 
 def trunk_at(recording: Recording) -> Callable[[float], Truth]:

@@ -151,7 +151,7 @@ def _walk(samples: Sequence[Sample]) -> Walk:
         velocity=np.column_stack([true[:, :2], turning[:, 2]]),
         heading=np.unwrap(yaw(np.array([s.truth.quaternion for s in samples]))),
         contact=np.array([s.truth.contact for s in samples]),
-        targets=np.array([s.command.q for s in samples]),
+        targets=np.array([s.command.target for s in samples]),
         joint_velocity=joint_velocity,
         torque=torque,
         power=drive_power(torque, joint_velocity),

@@ -18,7 +18,7 @@ from quadvel_description.kinematics import roll_pitch as roll_pitch_of
 from quadvel_description.network_input import InputLayout as ObservationSpec
 from quadvel_description.network_input import InputTerm as ObservationTerm
 from quadvel_description.recurrent_network import SCHEMA
-from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, NOMINAL_Q
+from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
 
 RATE_HZ = 200.0
 JOINTS = len(JOINT_NAMES)
@@ -291,11 +291,10 @@ METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
 
 
 class ActionMap:
-    """What an output means: target = offset + scale * clip(action), rad, within the range of commands.
+    """What an output means: target = offset + scale * clip(action), rad.
 
-    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. The
-    range (COMMAND_LOWER to COMMAND_UPPER) is part of the meaning: the robot's own safety layer clamps targets
-    to it, and training has to see what the robot will do.
+    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. How targets
+    beyond the range of commands are sent: `quadvel_description.command_range`.
     """
 
     def __init__(self, offset: ArrayLike, scale: ArrayLike, clip: float | Bounds | None = None) -> None:
@@ -308,5 +307,4 @@ class ActionMap:
         if self.clip is not None:
             action = np.clip(action, *self.clip)
         targets: NDArray[np.float64] = self.offset + self.scale * np.asarray(action)
-        np.maximum(targets, COMMAND_LOWER, out=targets)
-        return np.minimum(targets, COMMAND_UPPER, out=targets)
+        return targets

@@ -13,7 +13,8 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, JOINT_NAMES, LIE_Q, LOWER, UPPER
+from quadvel_description.command_range import within_range
+from quadvel_description.robot import JOINT_NAMES, LIE_Q, LOWER, UPPER
 from quadvel_description.state import JointCommand, RobotState
 
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
@@ -180,8 +181,8 @@ class Supervisor:
             return JointCommand.damping(self.config.damping_kd)
         if self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
-        np.maximum(answer.q, COMMAND_LOWER, out=answer.q)
-        np.minimum(answer.q, COMMAND_UPPER, out=answer.q)
+        answer.q, torque = within_range(answer.q, answer.kp, seen.state.q)
+        answer.tau = answer.tau + torque
         return answer
 
     def _seen(self, state: RobotState, velocity: Array | None) -> Tick:

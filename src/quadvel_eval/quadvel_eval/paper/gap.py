@@ -58,7 +58,7 @@ def record_walk(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
         raise ValueError(f"plant: found {plant!r}, expected one of {', '.join(known)}")
     study = Study(policies={"walker": policy})
     log = mixed(study.setup("walker", **known[plant].plant), seed, limits(study, "walker"))
-    fields = {name: getattr(log, name) for name in ("t", "q", "dq", "tau", "q_des", "kp", "kd")}
+    fields = {name: getattr(log, name) for name in ("t", "q", "dq", "tau", "q_des", "tau_ff", "kp", "kd")}
     with replacing(out) as draft:
         np.savez_compressed(draft, joint_names=np.array(log.joints), **fields)
 

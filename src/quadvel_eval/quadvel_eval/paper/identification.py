@@ -71,8 +71,11 @@ class RecordedSimulator(Simulator):
         states, commands = zip(*rows, strict=True)
         t = np.array([state.time for state in states]) - start
         q, dq, tau = (np.array([getattr(s, field) for s in states]) for field in ("q", "dq", "tau"))
-        q_des, kp, kd = (np.array([getattr(c, field) for c in commands]) for field in ("q", "kp", "kd"))
-        return Log(name, robot.JOINT_NAMES, t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau, kp=kp, kd=kd)
+        q_des, tau_ff, kp, kd = (
+            np.array([getattr(c, field) for c in commands]) for field in ("q", "tau", "kp", "kd")
+        )
+        valid = np.ones(q.shape, bool)
+        return Log(name, robot.JOINT_NAMES, t, q, dq, t, q_des, valid, tau=tau, tau_ff=tau_ff, kp=kp, kd=kd)
 
 
 def lifting(seed: int, seconds: float) -> Log:
