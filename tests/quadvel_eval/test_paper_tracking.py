@@ -9,8 +9,9 @@ from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.tracking import Tracking, left_right
 from quadvel_eval.segments import Segment
+from quadvel_policy.observation import CommandLimits
 
-LIMITS = {"vx": (-1.0, 2.0), "vy": (-0.5, 0.5), "wz": (-1.0, 1.0)}
+LIMITS = CommandLimits(np.array([-1.0, -0.5, -1.0]), np.array([2.0, 0.5, 1.0]), curve=2.5)
 
 
 def answer(vx: float, vy: float, error: float | None, inside: int = 1) -> tuple[dict, CellResult]:
@@ -26,6 +27,8 @@ def answer(vx: float, vy: float, error: float | None, inside: int = 1) -> tuple[
 def test_commands_beyond_the_limits_of_a_policy_are_told_from_those_within() -> None:
     assert within((2.0, -0.5, 1.0), LIMITS)
     assert not within((2.0, -0.6, 0.0), LIMITS)
+    assert not within((2.0, 0.5, 1.01), LIMITS)
+    assert not within((2.1, 0.0, 0.0), LIMITS)
     assert reach((-1.0, 0.0, 0.0), LIMITS) == 1.0
     assert reach((0.0, 0.0, 1.0), LIMITS) == 1.0
 

@@ -464,5 +464,18 @@ def test_settings_that_make_no_sense_are_refused_by_name(field: str) -> None:
 def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, rig: Rig) -> None:
     rig.walk()
     rig.tick((-9.0, 9.0, -9.0, 0.0))
-    low, high = metadata.command_bounds
+    low, high = metadata.limits.low, metadata.limits.high
     np.testing.assert_array_equal(rig.supervisor.command, [low[0], high[1], low[2], 0.0])
+
+
+def test_turns_are_held_to_what_the_policy_takes_in_a_curve(make_policy: Callable[..., Any]) -> None:
+    rig = Rig(make_policy(curve_limit=0.6))
+    rig.walk()
+    for asked, taken in (
+        ((1.0, -0.5, -1.0), -0.4),
+        ((-1.0, 0.5, 0.3), 0.3),
+        ((0.0, 0.0, 1.0), 1.0),
+        ((0.5, 0.0, 9.0), 1.0),
+    ):
+        rig.tick((*asked, 0.0))
+        np.testing.assert_allclose(rig.supervisor.command, [*asked[:2], taken, 0.0], err_msg=str(asked))

@@ -23,7 +23,7 @@ def within_range(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array,
     target, q: rad, wanted and measured; kp: N m/rad. A torque towards a mechanical stop fades out on the last of the way,
     and none is beyond the drive's limit.
     """
-    target, q = np.asarray(target, float), np.asarray(q, float)
+    target, kp, q = (np.asarray(x, float) for x in (target, kp, q))
     held: Array = np.minimum(np.maximum(target, COMMAND_LOWER), COMMAND_UPPER)
     torque: Array = kp * (target - held)
     if torque.any():

@@ -158,8 +158,8 @@ def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Trut
 
 
 def _command(joints: Joints, row: int) -> JointCommand:
-    *fields, mode = np.split(joints.command[row], range(12, 12 * len(COMMAND) + 1, 12))
-    return JointCommand(**dict(zip(COMMAND, fields, strict=True)), mode=MODE_SERVO if mode else MODE_DAMPING)
+    q, dq, tau, kp, kd, mode = np.split(joints.command[row], range(12, 12 * len(COMMAND) + 1, 12))
+    return JointCommand(q, dq, tau, kp, kd, MODE_SERVO if mode else MODE_DAMPING)
 
 
 def trunk_at(recording: Recording) -> Callable[[float], Truth]:

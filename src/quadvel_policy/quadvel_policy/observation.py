@@ -151,6 +151,15 @@ def _command_limits(field: str, value: Any) -> dict[str, Bounds]:
     return limits
 
 
+def _curve_limit(field: str, value: Any) -> float | None:
+    if value is None:
+        return None
+    array = _numbers(value)
+    if array.shape != () or not array > 0.0:
+        raise _refusal(field, value, "an acceleration above 0 or null")
+    return float(array)
+
+
 def _state_shape(field: str, value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple) or not value or not all(type(n) is int and n > 0 for n in value):
         raise _refusal(field, value, "the shape of h_in, whole numbers above 0")
@@ -204,6 +213,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "rate_hz": _rate,
     "observation": _observation,
     "command_limits": _command_limits,
+    "curve_limit": _curve_limit,
     "state_shape": _state_shape,
     "commit": _text,
 }
@@ -235,6 +245,8 @@ class PolicyMetadata:
     observation: ObservationSpec = DEFAULT_OBSERVATION
     command_limits: dict[str, Bounds]
     """what the policy was trained to follow: vx, vy (m/s), wz (rad/s), each (low, high)"""
+    curve_limit: float | None = None
+    """m/s^2, of |wz| (|vx| + |vy|); null, or not there: none"""
     state_shape: tuple[int, ...]
     """of h_in and of c_in"""
     actuator: Any = None
@@ -253,9 +265,10 @@ class PolicyMetadata:
         return ActionMap(self.action_offset, self.action_scale, self.action_clip)
 
     @property
-    def command_bounds(self) -> NDArray[np.float64]:
-        """The lowest and the highest (vx, vy, wz), (2, 3)."""
-        return np.array([self.command_limits[axis] for axis in COMMAND_AXES]).T
+    def limits(self) -> CommandLimits:
+        """The commands that it follows."""
+        low, high = np.array([self.command_limits[axis] for axis in COMMAND_AXES]).T
+        return CommandLimits(low, high, self.curve_limit)
 
     def to_json(self) -> str:
         """The JSON object of the policy file."""
@@ -273,10 +286,10 @@ class PolicyMetadata:
 
     @classmethod
     def from_fields(cls, data: Any) -> PolicyMetadata:
-        """From the JSON object as read; every field has to be there, and no other."""
+        """From the JSON object as read; every field but `curve_limit` has to be there, and no other."""
         if not isinstance(data, dict):
             raise MetadataError(f"metadata is {data!r}, expected an object")
-        for field in METADATA_FIELDS:
+        for field in REQUIRED_FIELDS:
             if field not in data:
                 raise MetadataError(f"metadata field {field} is missing")
         for field in data:
@@ -288,6 +301,30 @@ class PolicyMetadata:
 
 
 METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
+REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_limit")
+
+
+def hold_in_curves(command: NDArray[np.float64], limit: float | None) -> None:
+    """Hold the turns of commands (..., 3 or more), in place: |wz| (|vx| + |vy|) at most `limit` (m/s^2), None for no limit."""
+    if limit is not None:
+        bound = limit / np.maximum(np.abs(command[..., 0]) + np.abs(command[..., 1]), 1e-6)
+        command[..., 2] = np.minimum(np.maximum(command[..., 2], -bound), bound)
+
+
+@attrs.frozen(eq=False)
+class CommandLimits:
+    """What a policy follows: the lowest and the highest (vx, vy, wz), (3,) m/s and rad/s, and the `curve_limit`."""
+
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    curve: float | None = None
+
+    def held(self, command: ArrayLike) -> NDArray[np.float64]:
+        """The command (..., 3), or with stance (..., 4), held to these limits."""
+        held = np.array(command, float)
+        held[..., :3] = np.minimum(np.maximum(held[..., :3], self.low), self.high)
+        hold_in_curves(held, self.curve)
+        return held
 
 
 class ActionMap:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
 
-from .observation import JOINTS, METADATA_FIELDS, RATE_HZ, MetadataError, PolicyMetadata
+from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
 SHIPPED_POLICY = Path(__file__).parent / "policies" / "aliengo.onnx"
 
@@ -25,7 +25,7 @@ class PolicyFile:
     """
 
     def __init__(self, path: str | Path = SHIPPED_POLICY) -> None:
-        network = RecurrentNetwork(path, {"actions": JOINTS}, METADATA_FIELDS)
+        network = RecurrentNetwork(path, {"actions": JOINTS}, REQUIRED_FIELDS)
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
         except MetadataError as error:

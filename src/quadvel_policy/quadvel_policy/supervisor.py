@@ -78,8 +78,7 @@ class Supervisor:
     def __init__(self, policy: Policy, config: SupervisorConfig = SupervisorConfig()) -> None:
         self.config = c = config
         nominal = np.array(policy.metadata.nominal_q)
-        # The last number is stance, which is 0 wherever a velocity counts.
-        self._low, self._high = np.pad(policy.metadata.command_bounds, ((0, 0), (0, 1)))
+        self._limits = policy.metadata.limits
         low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
         speed, any_number = np.full(12, c.max_joint_speed), np.full(7, np.finfo(float).max)
         self._middle = np.concatenate((0.5 * (low + high), np.zeros(19)))
@@ -195,8 +194,7 @@ class Supervisor:
         numbers = asked.tolist()
         if not self.walk_allowed or not _finite(numbers) or numbers[3] >= 0.5:
             return STILL.copy()
-        limited: Array = np.minimum(np.maximum(asked, self._low), self._high)
-        return limited
+        return self._limits.held(np.append(asked[:3], 0.0))
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason

@@ -6,7 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from quadvel_policy.observation import COMMAND_AXES
+import numpy as np
+
+from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import PolicyFile
 
 from ..grid import Cell, CellResult, run_cell
@@ -53,25 +55,21 @@ def largest_error(records: Sequence[Record]) -> float:
     return largest(records, "error_xy")
 
 
-def limits(study: Study, policy: str) -> dict[str, tuple[float, float]]:
-    """The commands that a policy takes, (lowest, highest) by axis vx, vy, wz: m/s, rad/s."""
-    bounds = PolicyFile(study.policies[policy]).metadata.command_limits
-    return {axis: (float(bounds[axis][0]), float(bounds[axis][1])) for axis in COMMAND_AXES}
+def limits(study: Study, policy: str) -> CommandLimits:
+    """The commands that a policy takes."""
+    return PolicyFile(study.policies[policy]).metadata.limits
 
 
-def within(command: Command, bounds: dict[str, tuple[float, float]]) -> bool:
+def within(command: Command, taken: CommandLimits) -> bool:
     """Whether a policy with these limits takes the command as it is."""
-    return all(
-        low - 1e-9 <= value <= high + 1e-9
-        for value, (low, high) in zip(command, bounds.values(), strict=True)
-    )
+    return bool(np.allclose(taken.held(command), command, rtol=0.0, atol=1e-9))
 
 
-def reach(direction: Command, bounds: dict[str, tuple[float, float]]) -> float:
+def reach(direction: Command, bounds: CommandLimits) -> float:
     """How long the command along `direction` (one axis, of length 1) may become; m/s or rad/s."""
     ends = [
         (high if d > 0 else -low) / abs(d)
-        for d, (low, high) in zip(direction, bounds.values(), strict=True)
+        for d, low, high in zip(direction, bounds.low, bounds.high, strict=True)
         if d
     ]
-    return min(ends, default=math.inf)
+    return float(min(ends, default=math.inf))

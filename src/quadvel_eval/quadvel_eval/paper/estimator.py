@@ -9,6 +9,7 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
+from quadvel_policy.observation import CommandLimits
 from quadvel_sim.terrain import Terrain
 
 from ..walk import Setup, Walk, make_loop, record_to_the_fall
@@ -22,15 +23,14 @@ BESIDE = ("learned", "kalman")
 GROUNDS = ("flat", "rough")
 
 
-def wander(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]], seconds: float) -> Walk | None:
+def wander(setup: Setup, seed: int, bounds: CommandLimits, seconds: float) -> Walk | None:
     """A walk of random commands within the bounds and the ellipsoid that they span; as far as the robot got."""
     rng = np.random.default_rng(seed)
-    low, high = np.array(list(bounds.values())).T
     commands = []
     for _ in range(round(seconds / HOLD)):
         direction = rng.standard_normal(3)
         direction *= rng.uniform() ** (1.0 / 3.0) / np.linalg.norm(direction)
-        command = np.where(direction > 0, direction * high, -direction * low)
+        command = np.where(direction > 0, direction * bounds.high, -direction * bounds.low)
         command[:2] = np.clip(command[:2], -TOP, TOP)
         commands.append((command, HOLD))
     walk, _ = record_to_the_fall(make_loop(setup, seed, BESIDE), commands)

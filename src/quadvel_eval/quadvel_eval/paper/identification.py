@@ -14,6 +14,7 @@ from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.log import Log
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -93,7 +94,7 @@ def lifting(seed: int, seconds: float) -> Log:
     return simulator.log(f"Eq. 9, seed {seed}", EASE)
 
 
-def mixed(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]]) -> Log:
+def mixed(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
     """A walk of all kinds: stand, walk, run, turn, sideways, and stops in between; as far as the robot got."""
     simulator = RecordedSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
     simulator.reset("stand")
@@ -101,18 +102,16 @@ def mixed(setup: Setup, seed: int, bounds: dict[str, tuple[float, float]]) -> Lo
     loop = RobotLoop(simulator, Supervisor(PolicyFile(setup.policy)), estimator)
     loop.start_walking()
     start = simulator.time
-    fast, turn, aside = bounds["vx"][1], bounds["wz"][1], bounds["vy"][1]
+    fast, aside, turn = bounds.high
     program = [
         (0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (fast, 0.0, 0.0), (0.0, 0.0, 0.0),
-        (0.0, 0.0, turn), (0.0, -aside, 0.0), (bounds["vx"][0], 0.0, 0.0), (0.5 * fast, 0.0, -0.7 * turn),
+        (0.0, 0.0, turn), (0.0, -aside, 0.0), (bounds.low[0], 0.0, 0.0), (0.5 * fast, 0.0, -0.7 * turn),
     ]  # fmt: skip
     walk, _ = record_to_the_fall(loop, [(velocity, 1.5) for velocity in program])
     return simulator.log("mixed motion", start, start + (walk.time[-1] if walk else 0.0))
 
 
-def identified(
-    setup: Setup, data: str, bounds: dict[str, tuple[float, float]], seconds: float
-) -> list[Record]:
+def identified(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -> list[Record]:
     """Fit Eq. 9, judge on `data` (a key of PAPER); quantities, and the torques of the picture."""
     heldout = lifting(1, seconds) if data == "Eq. 9" else mixed(setup, 1, bounds)
     found = identify([lifting(0, seconds)], [heldout])

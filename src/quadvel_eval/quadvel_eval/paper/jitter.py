@@ -28,7 +28,7 @@ class Jitter(Section):
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            top = limits(study, policy)["vx"][1]
+            top = limits(study, policy).high[0]
             for speed in (s for s in self.speeds if s <= top):
                 for seed in range(study.seeds):
                     jobs.append(cell_job(study.setup(policy), (speed, 0.0, 0.0), seed, policy=policy))

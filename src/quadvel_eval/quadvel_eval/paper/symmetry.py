@@ -95,7 +95,7 @@ class Symmetry(Section):
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            top = limits(study, policy)["vx"][1]
+            top = limits(study, policy).high[0]
             for speed in self.speeds:
                 labels = {"policy": policy, "speed": min(speed, top)}
                 jobs.append(Job(labels, (walk_ahead, study.setup(policy), 0, labels["speed"])))
