@@ -11,7 +11,7 @@ from quadvel_eval.paper.tracking import Tracking, left_right
 from quadvel_eval.segments import Segment
 from quadvel_policy.observation import CommandLimits
 
-LIMITS = CommandLimits(np.array([-1.0, -0.5, -1.0]), np.array([2.0, 0.5, 1.0]), curve=2.5)
+LIMITS = CommandLimits((-1.0, -0.5, -1.0), (2.0, 0.5, 1.0), curve=2.6)
 
 
 def answer(vx: float, vy: float, error: float | None, inside: int = 1) -> tuple[dict, CellResult]:

@@ -106,8 +106,7 @@ def test_metadata_survives_its_json(metadata: PolicyMetadata) -> None:
     assert again.joint_names == JOINT_NAMES
     assert again.kp == (30.0,) * 12
     assert again.command_limits["vx"] == (-1.0, 1.5)
-    np.testing.assert_array_equal(again.limits.low, [-1.0, -0.5, -1.0])
-    np.testing.assert_array_equal(again.limits.high, [1.5, 0.5, 1.0])
+    assert (again.limits.low, again.limits.high) == ((-1.0, -0.5, -1.0), (1.5, 0.5, 1.0))
     assert again.limits.curve is None
     np.testing.assert_allclose(build_observation(again.observation, **VALUES), GOLDEN, atol=1e-6)
 
@@ -133,6 +132,7 @@ def test_metadata_survives_its_json(metadata: PolicyMetadata) -> None:
         ("observation", [{"name": "height", "size": 1, "offset": 0, "scale": 1, "clip": None}], "'height'"),
         ("observation", [{"name": "q", "size": 11, "offset": 0, "scale": 1, "clip": None}], "size 11"),
         ("curve_limit", -1.0, "curve_limit is -1.0"),
+        ("elliptic", 1, "elliptic is 1"),
         ("command_limits", {"vx": 1.0}, "command_limits is .* for each of vx, vy, wz"),
         ("command_limits", {"vx": (0.5, 1.0), "vy": 1.0, "wz": 1.0}, "command_limits.vx is .* zero between"),
         ("command_limits", {"vx": None, "vy": 1.0, "wz": 1.0}, "command_limits.vx is None"),

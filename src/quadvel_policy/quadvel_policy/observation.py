@@ -7,7 +7,8 @@ metadata, so that none of them can disagree with another. It runs no network; `p
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import attrs
@@ -160,6 +161,12 @@ def _curve_limit(field: str, value: Any) -> float | None:
     return float(array)
 
 
+def _flag(field: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise _refusal(field, value, "true or false")
+    return value
+
+
 def _state_shape(field: str, value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple) or not value or not all(type(n) is int and n > 0 for n in value):
         raise _refusal(field, value, "the shape of h_in, whole numbers above 0")
@@ -214,6 +221,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "observation": _observation,
     "command_limits": _command_limits,
     "curve_limit": _curve_limit,
+    "elliptic": _flag,
     "state_shape": _state_shape,
     "commit": _text,
 }
@@ -247,6 +255,8 @@ class PolicyMetadata:
     """what the policy was trained to follow: vx, vy (m/s), wz (rad/s), each (low, high)"""
     curve_limit: float | None = None
     """m/s^2, of |wz| (|vx| + |vy|); null, or not there: none"""
+    elliptic: bool = False
+    """whether vx and vy together are held to the ellipse that their limits span"""
     state_shape: tuple[int, ...]
     """of h_in and of c_in"""
     actuator: Any = None
@@ -267,8 +277,8 @@ class PolicyMetadata:
     @property
     def limits(self) -> CommandLimits:
         """The commands that it follows."""
-        low, high = np.array([self.command_limits[axis] for axis in COMMAND_AXES]).T
-        return CommandLimits(low, high, self.curve_limit)
+        low, high = zip(*(self.command_limits[axis] for axis in COMMAND_AXES), strict=True)
+        return CommandLimits(low, high, self.elliptic, self.curve_limit)
 
     def to_json(self) -> str:
         """The JSON object of the policy file."""
@@ -286,7 +296,7 @@ class PolicyMetadata:
 
     @classmethod
     def from_fields(cls, data: Any) -> PolicyMetadata:
-        """From the JSON object as read; every field but `curve_limit` has to be there, and no other."""
+        """From the JSON object as read; every one of REQUIRED_FIELDS has to be there, and no other."""
         if not isinstance(data, dict):
             raise MetadataError(f"metadata is {data!r}, expected an object")
         for field in REQUIRED_FIELDS:
@@ -301,30 +311,37 @@ class PolicyMetadata:
 
 
 METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
-REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_limit")
+REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field not in ("curve_limit", "elliptic"))
 
 
-def hold_in_curves(command: NDArray[np.float64], limit: float | None) -> None:
-    """Hold the turns of commands (..., 3 or more), in place: |wz| (|vx| + |vy|) at most `limit` (m/s^2), None for no limit."""
-    if limit is not None:
-        bound = limit / np.maximum(np.abs(command[..., 0]) + np.abs(command[..., 1]), 1e-6)
-        command[..., 2] = np.minimum(np.maximum(command[..., 2], -bound), bound)
+def largest_turn(vx: Any, vy: Any, curve: float) -> Any:
+    """The largest |wz| (rad/s) at these velocities (m/s, numbers or arrays) and this `curve_limit` (m/s^2)."""
+    return curve / (abs(vx) + abs(vy) + 1e-6)
 
 
 @attrs.frozen(eq=False)
 class CommandLimits:
-    """What a policy follows: the lowest and the highest (vx, vy, wz), (3,) m/s and rad/s, and the `curve_limit`."""
+    """What a policy follows: the lowest and the highest (vx, vy, wz), m/s and rad/s, of which vx and vy may span an
+    ellipse, and the `curve_limit`.
+    """
 
-    low: NDArray[np.float64]
-    high: NDArray[np.float64]
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    elliptic: bool = False
     curve: float | None = None
 
-    def held(self, command: ArrayLike) -> NDArray[np.float64]:
-        """The command (..., 3), or with stance (..., 4), held to these limits."""
-        held = np.array(command, float)
-        held[..., :3] = np.minimum(np.maximum(held[..., :3], self.low), self.high)
-        hold_in_curves(held, self.curve)
-        return held
+    def held(self, command: Iterable[float]) -> tuple[float, float, float]:
+        """The command (vx, vy, wz) held to these limits."""
+        bounds = zip(command, self.low, self.high, strict=True)
+        vx, vy, wz = (min(max(value, low), high) for value, low, high in bounds)
+        if self.elliptic and vx and vy:
+            ahead, aside = (self.low if v < 0 else self.high for v in (vx, vy))
+            beyond = max(math.hypot(vx / ahead[0], vy / aside[1]), 1.0)
+            vx, vy = vx / beyond, vy / beyond
+        if self.curve is not None:
+            turn = largest_turn(vx, vy, self.curve)
+            wz = min(max(wz, -turn), turn)
+        return vx, vy, wz
 
 
 class ActionMap:

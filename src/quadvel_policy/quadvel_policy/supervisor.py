@@ -194,7 +194,7 @@ class Supervisor:
         numbers = asked.tolist()
         if not self.walk_allowed or not _finite(numbers) or numbers[3] >= 0.5:
             return STILL.copy()
-        return self._limits.held(np.append(asked[:3], 0.0))
+        return np.array([*self._limits.held(numbers[:3]), 0.0])
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
