@@ -14,10 +14,10 @@ import pytest
 from quadvel_actuator.identify.inspect import Inspection, inspect
 from quadvel_actuator.identify.log import Log, LogError
 from quadvel_actuator.identify.read_log import read_log
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
 
 sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import fields
+from joint_logs import KP, fields
 
 SHARE = np.pi / 180.0
 
@@ -164,6 +164,17 @@ def test_saturation_and_friction_are_not_taken_for_damping() -> None:
     given = fields()
     tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)
     assert inspect(log(tau=tau)).log.valid.all()
+
+
+def test_torque_that_was_fed_forward_is_not_looked_for_in_the_position_error() -> None:
+    given = fields()
+    held = np.clip(given["q_des"], NOMINAL_Q - 0.05, NOMINAL_Q + 0.05)
+    inspection = inspect(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
+    assert said(inspection, "warning") == said(inspection, "refusal") == []
+    assert inspection.log.valid.all()
+    weight = np.full(held.shape, -40.0)
+    inspection = inspect(log(tau=given["tau"] + weight, tau_ff=weight))
+    assert said(inspection, "warning") == said(inspection, "refusal") == []
 
 
 def test_unknown_gains_and_missing_torque_are_said() -> None:

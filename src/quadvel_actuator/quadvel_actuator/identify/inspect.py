@@ -41,12 +41,12 @@ def inspect(log: Log) -> Inspection:
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     for check in CHECKS:
         findings += check(log)
-    valid, why = _explainable(log)
+    answer = log.without_feed_forward()
+    valid, why = _explainable(answer)
     findings += why
-    explainable = attrs.evolve(log, valid=valid)
     for check in CHECKS_UNDER_CONTROL:
-        findings += check(explainable if valid.any() else log)
-    return Inspection(explainable, tuple(findings))
+        findings += check(attrs.evolve(answer, valid=valid) if valid.any() else answer)
+    return Inspection(attrs.evolve(log, valid=valid), tuple(findings))
 
 
 def rates(log: Log) -> Iterator[Finding]:

@@ -84,6 +84,12 @@ class Log:
         """The command row that counts at the times `at`, s, the first one before there is any; shape of `at`."""
         return np.maximum(np.searchsorted(self.t_cmd, at, side="right") - 1, 0)
 
+    def without_feed_forward(self) -> Log:
+        """The log with the torque alone that answers angles and speeds: less `tau_ff` of the command in force."""
+        if self.tau is None or self.tau_ff is None:
+            return self
+        return attrs.evolve(self, tau=self.tau - self.tau_ff[self.command_rows(self.t)], tau_ff=None)
+
     def select(self, joints: Sequence[str]) -> Log:
         """The log with these joints only, in this order. Raises LogError for one that it does not hold."""
         names = tuple(joint_name(name) for name in joints)
