@@ -132,7 +132,6 @@ def test_metadata_survives_its_json(metadata: PolicyMetadata) -> None:
         ("observation", [{"name": "height", "size": 1, "offset": 0, "scale": 1, "clip": None}], "'height'"),
         ("observation", [{"name": "q", "size": 11, "offset": 0, "scale": 1, "clip": None}], "size 11"),
         ("curve_limit", -1.0, "curve_limit is -1.0"),
-        ("elliptic", 1, "elliptic is 1"),
         ("command_limits", {"vx": 1.0}, "command_limits is .* for each of vx, vy, wz"),
         ("command_limits", {"vx": (0.5, 1.0), "vy": 1.0, "wz": 1.0}, "command_limits.vx is .* zero between"),
         ("command_limits", {"vx": None, "vy": 1.0, "wz": 1.0}, "command_limits.vx is None"),

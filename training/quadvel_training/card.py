@@ -116,10 +116,9 @@ def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
         f"{axis} {limits[axis][0]:g} to {limits[axis][1]:g} {unit}" for axis, unit in UNITS.items()
     )
     yield f"Commands beyond {spans} are cut to that."
-    if metadata.get("elliptic"):
-        yield "Together vx and vy are held to the ellipse that these limits span."
-    if metadata.get("curve_limit"):
-        yield f"In curves wz is cut to {metadata['curve_limit']:g} m/s² over |vx| + |vy|."
+    if curve := metadata.get("curve_limit"):
+        yield "Together vx and vy are held to the ellipse that these limits span, of which they use the part r."
+        yield f"In curves |wz| is cut to {curve:g} m/s² (1 - r²) / (|vx| + |vy|)."
     yield f"Its gains are part of it: kp {_one(metadata['kp'])} N m/rad, kd {_one(metadata['kd'])} N m s/rad."
     for one in found:
         where, stood = _conditions(one["setup"]), [cell for cell in one["cells"] if not cell["fell"]]

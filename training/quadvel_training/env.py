@@ -17,7 +17,7 @@ from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf, robot
 from quadvel_description.command_range import within_range
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
-from quadvel_policy.observation import largest_turn
+from quadvel_policy.observation import CommandLimits
 from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
@@ -41,7 +41,7 @@ class CommandRange:
     vy: float = 0.7
     wz: float = 1.4
     ellipsoid: bool = False
-    curve: float | None = None  # m/s^2, what turns are held to: `quadvel_policy.observation.largest_turn`
+    curve: float | None = None  # m/s^2, held together as by `quadvel_policy.observation.CommandLimits`
     stance: float = 0.15  # share of stance commands
     straight: float = 0.2  # share of the walking commands without turning
     hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
@@ -57,8 +57,10 @@ class CommandRange:
         command[:, :3] = unit * [half, self.vy, self.wz] + [centre, 0.0, 0.0]
         command[rng.random(n) < self.straight, 2] = 0.0
         if self.curve:
-            turn = largest_turn(command[:, 0], command[:, 1], self.curve)
-            command[:, 2] = command[:, 2].clip(-turn, turn)
+            limits = CommandLimits(
+                (self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve
+            )
+            command[:, :3] = [limits.held(one) for one in command[:, :3].tolist()]
         still = rng.random(n) < self.stance
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command

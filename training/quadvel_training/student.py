@@ -309,7 +309,6 @@ def export_policy(
         nominal_q=tuple(robot.NOMINAL_Q),
         command_limits={"vx": c.vx, "vy": (-c.vy, c.vy), "wz": (-c.wz, c.wz)},
         curve_limit=c.curve,
-        elliptic=c.ellipsoid,
         state_shape=tuple(actor.initial_state(1)[0].shape),
         actuator=attrs.asdict(env.config.actuator),
         recipe=recipe,

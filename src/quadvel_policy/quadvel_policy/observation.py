@@ -161,12 +161,6 @@ def _curve_limit(field: str, value: Any) -> float | None:
     return float(array)
 
 
-def _flag(field: str, value: Any) -> bool:
-    if not isinstance(value, bool):
-        raise _refusal(field, value, "true or false")
-    return value
-
-
 def _state_shape(field: str, value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple) or not value or not all(type(n) is int and n > 0 for n in value):
         raise _refusal(field, value, "the shape of h_in, whole numbers above 0")
@@ -221,7 +215,6 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "observation": _observation,
     "command_limits": _command_limits,
     "curve_limit": _curve_limit,
-    "elliptic": _flag,
     "state_shape": _state_shape,
     "commit": _text,
 }
@@ -254,9 +247,7 @@ class PolicyMetadata:
     command_limits: dict[str, Bounds]
     """what the policy was trained to follow: vx, vy (m/s), wz (rad/s), each (low, high)"""
     curve_limit: float | None = None
-    """m/s^2, of |wz| (|vx| + |vy|); null, or not there: none"""
-    elliptic: bool = False
-    """whether vx and vy together are held to the ellipse that their limits span"""
+    """m/s^2, how fast it turns as it walks: `CommandLimits`; null, or not there: the limits hold one by one"""
     state_shape: tuple[int, ...]
     """of h_in and of c_in"""
     actuator: Any = None
@@ -277,8 +268,8 @@ class PolicyMetadata:
     @property
     def limits(self) -> CommandLimits:
         """The commands that it follows."""
-        low, high = zip(*(self.command_limits[axis] for axis in COMMAND_AXES), strict=True)
-        return CommandLimits(low, high, self.elliptic, self.curve_limit)
+        vx, vy, wz = (self.command_limits[axis] for axis in COMMAND_AXES)
+        return CommandLimits((vx[0], vy[0], wz[0]), (vx[1], vy[1], wz[1]), self.curve_limit)
 
     def to_json(self) -> str:
         """The JSON object of the policy file."""
@@ -311,37 +302,33 @@ class PolicyMetadata:
 
 
 METADATA_FIELDS = tuple(field.name for field in attrs.fields(PolicyMetadata))
-REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field not in ("curve_limit", "elliptic"))
+REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_limit")
 
 
-def largest_turn(vx: Any, vy: Any, curve: float) -> Any:
-    """The largest |wz| (rad/s) at these velocities (m/s, numbers or arrays) and this `curve_limit` (m/s^2)."""
-    return curve / (abs(vx) + abs(vy) + 1e-6)
-
-
-@attrs.frozen(eq=False)
+@attrs.frozen
 class CommandLimits:
-    """What a policy follows: the lowest and the highest (vx, vy, wz), m/s and rad/s, of which vx and vy may span an
-    ellipse, and the `curve_limit`.
+    """What a policy follows: the lowest and the highest (vx, vy, wz), m/s and rad/s; held together where `curve` is given.
+
+    Then vx and vy keep to the ellipse that their limits span, and |wz| to `curve` (1 - r^2) / (|vx| + |vy|), r being how far
+    out in this ellipse they are: who runs as fast as he can does not turn. curve: m/s^2.
     """
 
-    low: tuple[float, ...]
-    high: tuple[float, ...]
-    elliptic: bool = False
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
     curve: float | None = None
 
     def held(self, command: Iterable[float]) -> tuple[float, float, float]:
         """The command (vx, vy, wz) held to these limits."""
         bounds = zip(command, self.low, self.high, strict=True)
         vx, vy, wz = (min(max(value, low), high) for value, low, high in bounds)
-        if self.elliptic and vx and vy:
-            ahead, aside = (self.low if v < 0 else self.high for v in (vx, vy))
-            beyond = max(math.hypot(vx / ahead[0], vy / aside[1]), 1.0)
-            vx, vy = vx / beyond, vy / beyond
-        if self.curve is not None:
-            turn = largest_turn(vx, vy, self.curve)
-            wz = min(max(wz, -turn), turn)
-        return vx, vy, wz
+        if self.curve is None or not (vx or vy):
+            return vx, vy, wz
+        ends = [(self.low if v < 0 else self.high)[axis] for axis, v in enumerate((vx, vy))]
+        out = math.hypot(*(v / end for v, end in zip((vx, vy), ends, strict=True) if v))
+        if out > 1.0:
+            vx, vy, out = vx / out, vy / out, 1.0
+        turn = self.curve * (1.0 - out**2) / (abs(vx) + abs(vy))
+        return vx, vy, min(max(wz, -turn), turn)
 
 
 class ActionMap:
