@@ -56,7 +56,7 @@ def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() ->
 def test_the_grid_has_every_command_with_every_seed() -> None:
     jobs = Tracking(grids=("paper",)).jobs(Study(seeds=3))
     assert len(jobs) == 363
-    assert {job.labels["policy"] for job in jobs} == {"crl_eam"}
+    assert {job.labels["policy"] for job in jobs} == {"aliengo"}
 
 
 def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:

@@ -28,7 +28,7 @@ Record: TypeAlias = dict[str, Any]
 class Study:
     """What is evaluated: policies by the names they have in tables, the estimator in the loop, seeds 0, 1, ..."""
 
-    policies: Mapping[str, Path] = attrs.field(factory=lambda: {"crl_eam": SHIPPED_POLICY})
+    policies: Mapping[str, Path] = attrs.field(factory=lambda: {SHIPPED_POLICY.stem: SHIPPED_POLICY})
     estimator: str = "learned"
     estimator_file: Path = SHIPPED_MODEL
     seeds: int = 3
