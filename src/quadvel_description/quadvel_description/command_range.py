@@ -17,6 +17,11 @@ STOP_STIFFNESS = 100.0  # N m/rad: so much torque into a mechanical stop for the
 Array = NDArray[np.float64]
 
 
+def held(target: ArrayLike) -> Array:
+    """Targets (..., 12), rad, held to the range of commands."""
+    return np.minimum(np.maximum(target, COMMAND_LOWER), COMMAND_UPPER)
+
+
 def within_range(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array, Array]:
     """Targets (rad) held to the range of commands, and the torques (N m) that stand for the rest; (..., 12) all.
 
@@ -24,10 +29,10 @@ def within_range(target: ArrayLike, kp: ArrayLike, q: ArrayLike) -> tuple[Array,
     and none is beyond the drive's limit.
     """
     target, kp, q = (np.asarray(x, float) for x in (target, kp, q))
-    held: Array = np.minimum(np.maximum(target, COMMAND_LOWER), COMMAND_UPPER)
-    torque: Array = kp * (target - held)
+    sent = held(target)
+    torque: Array = kp * (target - sent)
     if torque.any():
         up = np.minimum(np.maximum(STOP_STIFFNESS * (UPPER - q), 0.0), TORQUE_LIMIT)
         down = np.minimum(np.maximum(STOP_STIFFNESS * (q - LOWER), 0.0), TORQUE_LIMIT)
         torque = np.minimum(np.maximum(torque, -down), up)
-    return held, torque
+    return sent, torque

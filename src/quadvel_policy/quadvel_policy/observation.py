@@ -152,13 +152,15 @@ def _command_limits(field: str, value: Any) -> dict[str, Bounds]:
     return limits
 
 
-def _curve_limit(field: str, value: Any) -> float | None:
-    if value is None:
-        return None
+def _positive(field: str, value: Any, expected: str) -> float:
     array = _numbers(value)
     if array.shape != () or not array > 0.0:
-        raise _refusal(field, value, "an acceleration above 0 or null")
+        raise _refusal(field, value, expected)
     return float(array)
+
+
+def _curve_limit(field: str, value: Any) -> float | None:
+    return None if value is None else _positive(field, value, "an acceleration above 0 or null")
 
 
 def _state_shape(field: str, value: Any) -> tuple[int, ...]:
@@ -168,10 +170,7 @@ def _state_shape(field: str, value: Any) -> tuple[int, ...]:
 
 
 def _rate(field: str, value: Any) -> float:
-    array = _numbers(value)
-    if array.shape != () or not array > 0.0:
-        raise _refusal(field, value, "a rate above 0")
-    return float(array)
+    return _positive(field, value, "a rate above 0")
 
 
 def _gains(field: str, value: Any) -> Vector:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description import robot
+from quadvel_description.command_range import held
 from quadvel_description.kinematics import HIPS, inverse_kinematics
 
 Array = NDArray[np.float64]
@@ -41,7 +42,7 @@ class Excitation(ABC):
     def targets(self) -> Array:
         """Joint targets within the limits, (n, 12) rad, one row each PERIOD."""
         t = PERIOD * np.arange(round(self.seconds / PERIOD), dtype=np.float64)
-        return within_speed(np.clip(self._motion(t), robot.COMMAND_LOWER, robot.COMMAND_UPPER))
+        return within_speed(held(self._motion(t)))
 
     @abstractmethod
     def _motion(self, t: Array) -> Array:

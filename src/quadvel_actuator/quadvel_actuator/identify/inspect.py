@@ -44,8 +44,10 @@ def inspect(log: Log) -> Inspection:
     answer = log.without_feed_forward()
     valid, why = _explainable(answer)
     findings += why
+    if valid.any():
+        answer = attrs.evolve(answer, valid=valid)
     for check in CHECKS_UNDER_CONTROL:
-        findings += check(attrs.evolve(answer, valid=valid) if valid.any() else answer)
+        findings += check(answer)
     return Inspection(attrs.evolve(log, valid=valid), tuple(findings))
 
 

@@ -72,4 +72,4 @@ def reach(direction: Command, bounds: CommandLimits) -> float:
         for d, low, high in zip(direction, bounds.low, bounds.high, strict=True)
         if d
     ]
-    return float(min(ends, default=math.inf))
+    return min(ends, default=math.inf)

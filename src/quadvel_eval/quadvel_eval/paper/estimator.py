@@ -30,9 +30,7 @@ def wander(setup: Setup, seed: int, bounds: CommandLimits, seconds: float) -> Wa
     for _ in range(round(seconds / HOLD)):
         direction = rng.standard_normal(3)
         direction *= rng.uniform() ** (1.0 / 3.0) / np.linalg.norm(direction)
-        command = np.where(
-            direction > 0, direction * np.array(bounds.high), -direction * np.array(bounds.low)
-        )
+        command = direction * np.where(direction > 0, bounds.high, np.negative(bounds.low))
         command[:2] = np.clip(command[:2], -TOP, TOP)
         commands.append((command, HOLD))
     walk, _ = record_to_the_fall(make_loop(setup, seed, BESIDE), commands)
