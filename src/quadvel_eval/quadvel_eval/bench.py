@@ -14,7 +14,9 @@ from importlib import metadata, util
 from typing import Any
 
 import numpy as np
+import onnxruntime
 from numpy.typing import ArrayLike
+from onnx import TensorProto, helper
 from rich.table import Table
 
 from quadvel_description.robot import NOMINAL_Q
@@ -81,20 +83,41 @@ def loop() -> dict[str, Any]:
 
 
 def policy() -> dict[str, Any]:
-    """Inference alone: from observation to action with the rest done ahead, as the controller runs it; and in one piece."""
+    """Inference alone: from observation to action with the rest done ahead, as the controller runs it; and in one piece.
+
+    Rested: as in the controller, which sleeps until the next state. Meanwhile the caches go to others; what this costs
+    anybody here shows a network that does nothing.
+    """
     network = PolicyFile()
     observation = np.zeros(network.metadata.observation.size, np.float32)
+    idle = _idle_network()
 
     def step() -> None:
         network.step(observation)
 
-    prepared, ahead, whole = (
-        _time(step, 5000, network.prepare),
-        _time(network.prepare, 5000),
-        _time(step, 5000),
-    )
-    medians = {"ahead_p50_us": ahead, "whole_p50_us": whole}
-    return _percentiles(prepared) | {name: _percentiles(times)["p50_us"] for name, times in medians.items()}
+    def rest() -> None:
+        network.prepare()
+        time.sleep(PERIOD)
+
+    medians = {
+        "ahead_p50_us": _time(network.prepare, 5000),
+        "whole_p50_us": _time(step, 5000),
+        "rested_p50_us": _time(step, 400, rest),
+        "rested_idle_p50_us": _time(idle, 400, rest),
+    }
+    prepared = _percentiles(_time(step, 5000, network.prepare))
+    return prepared | {name: _percentiles(times)["p50_us"] for name, times in medians.items()}
+
+
+def _idle_network() -> Callable[[], object]:
+    """A run of the smallest network there is: one number, handed on."""
+    number = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1])
+    same = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1])
+    graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "idle", [number], [same])
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), providers=["CPUExecutionProvider"])
+    x = {"x": np.zeros(1, np.float32)}
+    return lambda: session.run(None, x)
 
 
 def estimator() -> dict[str, Any]:
@@ -163,6 +186,8 @@ ROWS = (  # part, figure, what it is, what is wanted
     ("policy", "p99_us", "inference, observation to action, 99 %, us", ""),
     ("policy", "ahead_p50_us", "inference, part done ahead, median, us", ""),
     ("policy", "whole_p50_us", "inference, step in one piece, median, us", ""),
+    ("policy", "rested_p50_us", "inference after 5 ms of rest, median, us", ""),
+    ("policy", "rested_idle_p50_us", "a network that does nothing after 5 ms of rest, us", ""),
     ("supervisor", "p50_us", "supervisor tick, median, us", ""),
     ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
     ("estimator", "p50_us", "learned estimator, median, us", ""),
