@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from typing import Any
 
+import attrs
+import mujoco
 import numpy as np
 import pytest
 
 from quadvel_description import mjcf
-from quadvel_description.robot import KP, NOMINAL_HEIGHT, NOMINAL_Q
+from quadvel_description.robot import KP, LIE_Q, NOMINAL_HEIGHT, NOMINAL_Q
 from quadvel_policy.supervisor import Supervisor, SupervisorConfig
-from quadvel_sim.simulator import Simulator
+from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.terrain import Terrain
 
 STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
 
@@ -18,9 +21,15 @@ STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
 class Stand:
     """A simulated robot that lies, and a supervisor whose policy holds the nominal posture."""
 
-    def __init__(self, make_policy: Any) -> None:
+    def __init__(self, make_policy: Any, slope: float = 0.0, heading: float = 0.0) -> None:
+        """slope, heading: rad; where the heading is zero the robot looks uphill."""
         sag = mjcf.gravity_torque(mjcf.load_model(mjcf.Plant())) / KP
-        self.simulator = Simulator()
+        terrain = Terrain("slope", slope=slope)
+        self.simulator = Simulator(SimulatorConfig(terrain=terrain))
+        turned = np.array([np.cos(heading / 2), 0.0, 0.0, np.sin(heading / 2)])
+        quaternion = np.zeros(4)
+        mujoco.mju_mulQuat(quaternion, terrain.tilt, turned)
+        self.simulator.place(attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12))
         self.supervisor = Supervisor(
             make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=True)
         )
@@ -58,6 +67,23 @@ def test_it_stands_up_walks_on_command_and_lies_down_without_a_jump_of_torque(st
     assert stand.height < 0.2
     jumps = np.abs(np.diff(stand.torques[: -round(0.55 / 0.005)], axis=0))  # until it goes limp, lying
     assert jumps.max() < 4.0, f"{jumps.max():.1f} N m between two ticks"
+
+
+@pytest.mark.parametrize("heading", [0.0, 90.0, 180.0], ids=["uphill", "across", "downhill"])
+def test_it_stands_up_on_a_slope_of_15_degrees_stays_there_and_lies_down(
+    make_policy: Any, heading: float
+) -> None:
+    stand = Stand(make_policy, np.radians(15.0), np.radians(heading))
+    stand.run(2.5)
+    stood = stand.simulator.truth()
+    stand.run(4.0)
+    assert stand.supervisor.mode == "stance", stand.supervisor.reason
+    stays = stand.simulator.truth()
+    np.testing.assert_allclose(stays.quaternion, stood.quaternion, atol=0.02)
+    assert np.linalg.norm(stays.position - stood.position) < 0.1  # MuJoCo's feet creep downhill by 1.5 cm/s
+    assert stand.supervisor.request("lie_down")[0]
+    stand.run(1.5)
+    assert stand.supervisor.mode == "passive", stand.supervisor.reason
 
 
 def test_a_robot_that_is_pushed_over_goes_to_damping(stand: Stand) -> None:

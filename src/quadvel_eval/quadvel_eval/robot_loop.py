@@ -112,14 +112,14 @@ class RobotLoop:
         simulator.step(STEPS)
         return Sample(state, truth, estimates, command, self.supervisor.mode, fallen)
 
-    def start_walking(self, seconds: float = 0.5) -> None:
-        """From a simulator reset to "stand": some `seconds` in the nominal posture, then the policy stands.
+    def start_walking(self) -> None:
+        """From a simulator reset to "stand": half a second in the standing posture, then the policy stands.
 
         RuntimeError where the supervisor refuses.
         """
         self.tick()
         self._request("stance")
-        for _ in range(max(1, round(seconds / PERIOD))):
+        for _ in range(round(0.5 / PERIOD)):
             self.tick()
         self._request("walk")
 

@@ -76,10 +76,7 @@ def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
 
 
 def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalman")) -> RobotLoop:
-    """The standing robot under the policy, with the estimators `beside` the one that is followed.
-
-    On a slope the policy takes over at once: the supervisor's fixed posture topples on 15 degrees uphill.
-    """
+    """The standing robot under the policy, with the estimators `beside` the one that is followed."""
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
@@ -87,7 +84,7 @@ def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalm
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         beside={name: make_estimator(name, simulator, setup.estimator_file) for name in beside},
     )
-    loop.start_walking(0.0 if simulator.config.terrain.slope else 0.5)
+    loop.start_walking()
     return loop
 
 

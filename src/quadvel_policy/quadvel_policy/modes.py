@@ -5,6 +5,7 @@ A mode has `enter` and `tick`. When one may follow another, and what is unsafe, 
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from typing import Protocol
@@ -13,11 +14,15 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_description.kinematics import foot_positions, inverse_kinematics
 from quadvel_description.state import JointCommand, RobotState
 
 from .observation import JOINTS, PolicyMetadata, build_observation
 
 Array = NDArray[np.float64]
+
+LEAN_TIME = 0.3  # s
+MAX_LEAN = 0.35  # rad
 
 
 class Policy(Protocol):
@@ -82,23 +87,36 @@ class Damping:
         return JointCommand.damping(self._kd)
 
 
-class Posture:
-    """Moves smoothly through postures and holds the last one.
+def upright(state: RobotState) -> Array:
+    """Where the vertical through the trunk's origin goes, 1 m below it in the trunk's frame: forward and left, (2,) m."""
+    w, x, y, z = state.quaternion.tolist()
+    down = max(1.0 - 2.0 * (x * x + y * y), math.cos(MAX_LEAN))
+    way = np.array([-2.0 * (x * z - w * y), -2.0 * (y * z + w * x)]) / down
+    return way * min(1.0, math.tan(MAX_LEAN) / max(math.hypot(*way), 1e-9))
 
-    path: (seconds, q (12,) rad) for each posture; kp (N m/rad), kd (N m s/rad): gains of every joint. It
-    starts from the targets at which these gains ask for the torque that the mode before asked for, so that no
-    torque jumps; from there on torque changes no faster than kp times the path's speed.
+
+class Posture:
+    """Moves smoothly through postures and holds the last one, leaning against slopes.
+
+    path: (seconds, q (12,) rad) for each posture on level ground; kp (N m/rad), kd (N m s/rad): gains of every joint. The
+    feet go as far uphill or downhill of where a posture has them as keeps them below the trunk, by the trunk's tilt, smoothed
+    over LEAN_TIME and bounded by MAX_LEAN. It starts from the targets at which these gains ask for the torque that the mode
+    before asked for, so that no torque jumps; from there on torque changes no faster than kp times the path's speed.
     """
 
     def __init__(self, path: Sequence[tuple[float, Array]], kp: float, kd: float) -> None:
         self._times = np.cumsum([0.0, *(seconds for seconds, _ in path)])
         self._postures = np.array([np.zeros(JOINTS), *(q for _, q in path)])
+        self._feet = foot_positions(self._postures[1:])
+        self._offset = self._postures[1:] - inverse_kinematics(
+            self._feet
+        )  # not zero where a knee bends the other way
         self._kp, self._kd = np.full(JOINTS, kp), np.full(JOINTS, kd)
+        self._lean, self._leant_at = np.zeros(2), 0.0
 
-    @property
-    def goal(self) -> Array:
-        """The posture at the end, (12,) rad."""
-        goal: Array = self._postures[-1]
+    def goal(self, state: RobotState) -> Array:
+        """The posture at the end, (12,) rad, for a trunk that is tilted like this one."""
+        goal: Array = self._leaning(upright(state))[-1]
         return goal
 
     def done(self, elapsed: float) -> bool:
@@ -109,16 +127,27 @@ class Posture:
         """Take the start of the path from the joints and from what they were asked for."""
         measured, asked = tick.state.q, tick.previous
         self._postures[0] = measured + (asked.kp * (asked.q - measured) + asked.tau) / self._kp
+        self._lean, self._leant_at = upright(tick.state), tick.elapsed
 
     def tick(self, tick: Tick) -> JointCommand:
         """The posture on the path at this time."""
+        share = 1.0 - math.exp(-max(tick.elapsed - self._leant_at, 0.0) / LEAN_TIME)
+        self._lean, self._leant_at = self._lean + share * (upright(tick.state) - self._lean), tick.elapsed
+        self._postures[1:] = self._leaning(self._lean)
         q, dq = self._at(tick.elapsed)
         return JointCommand(q=q, dq=dq, kp=self._kp, kd=self._kd)
+
+    def _leaning(self, lean: Array) -> Array:
+        """The postures of the path, (n, 12) rad, for this `upright`."""
+        feet = self._feet.copy()
+        feet[..., :2] -= feet[..., 2:].mean(axis=1, keepdims=True) * lean
+        leaning: Array = inverse_kinematics(feet) + self._offset
+        return leaning
 
     def _at(self, elapsed: float) -> tuple[Array, Array]:
         """Quintic between postures: q (rad) and dq (rad/s), at rest with no acceleration in each of them."""
         if self.done(elapsed):
-            return self.goal.copy(), np.zeros(JOINTS)
+            return self._postures[-1].copy(), np.zeros(JOINTS)
         leg = int(np.searchsorted(self._times, elapsed, side="right"))
         seconds = self._times[leg] - self._times[leg - 1]
         s = (elapsed - self._times[leg - 1]) / seconds

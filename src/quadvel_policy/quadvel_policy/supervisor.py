@@ -286,7 +286,7 @@ class Supervisor:
 
     def _posture_error(self, seen: Tick) -> str | None:
         """A sentence where a joint is far from the nominal posture."""
-        error = seen.state.q - self._stance.goal
+        error = seen.state.q - self._stance.goal(seen.state)
         i = int(np.argmax(np.abs(error)))
         if abs(error[i]) <= self.config.max_posture_error:
             return None
