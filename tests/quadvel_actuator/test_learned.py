@@ -42,18 +42,29 @@ def _learned(name):
     assert learned is not None
     left = model.samples.tau - learned.model.predict() - learned.torque
     error = float(np.sum(np.where(judge.judge, left, 0.0) ** 2) / judge.judge.sum())
-    return learned, model.mse(judge.judge), error
+    return learned, model.mse(judge.judge), error, judge
 
 
 @pytest.mark.parametrize("name", odd_joints.ODD)
 def test_the_signal_behind_an_odd_effect_is_named_and_most_of_its_error_goes(name):
-    learned, before, after = _learned(name)
+    learned, before, after, _ = _learned(name)
     odd = odd_joints.ODD[name]
     heaviest = learned.terms[int(np.argmax(learned.gains))]
     assert set(odd.signals) & set(heaviest.inputs)
     assert before - after > 0.6 * (before - VARIANCE)
     assert np.flatnonzero(heaviest.active).tolist() == list(odd.joints)
     assert len(learned.terms) <= 3
+
+
+@pytest.mark.parametrize("name", odd_joints.ODD)
+def test_delays_that_are_moved_to_their_longest_say_the_same_together_with_the_terms(name):
+    learned, _, _, judge = _learned(name)
+    tau = learned.model.samples.tau
+    fitted, late = (
+        np.where(judge.fit, tau - model.predict() - learned.torque, 0.0)
+        for model in (learned.model, learned.latest(judge.fit))
+    )
+    assert np.sum(late**2) <= np.sum(fitted**2) * (1.0 + 1e-6)
 
 
 def test_nothing_is_learned_where_nothing_is():

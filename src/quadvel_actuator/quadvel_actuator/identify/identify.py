@@ -89,8 +89,9 @@ def identify(
     def told(chosen_one: Diagnosis, learned: Learned | None) -> Outcome:
         model = chosen_one.model
         named = diagnosis.model if chosen_one.findings else before
+        late = latest(model, judge.fit) if learned is None else learned.latest(judge.fit)
         return Outcome(
-            eam, latest(before, judge.fit), attrs.evolve(chosen_one, model=latest(model, judge.fit)), learned,
+            eam, latest(before, judge.fit), attrs.evolve(chosen_one, model=late), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),
             intervals(model if learned is None else learned.beside, judge), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),

@@ -14,6 +14,7 @@ import attrs
 import numpy as np
 
 from ..effects.terms import Lag, Resonance, Shape, Term
+from .delays import latest
 from .features import Feature, Scene, library, lines
 from .judging import Comparison, Judge
 from .model import Model, gather, pack, step, with_slots
@@ -58,6 +59,11 @@ class Learned:
         samples = copy(self.model.samples)
         samples.tau, samples._parts = samples.tau - self.torque, {}
         return attrs.evolve(self.model, samples=samples)
+
+    def latest(self, rows: Bools) -> Model:
+        """The model with the longest delays with which it says the same of `rows`, together with the terms."""
+        late = latest(self.beside, rows)
+        return self.model.with_delays(late.input_delay, late.output_delay)
 
     @property
     def joints(self) -> Bools:

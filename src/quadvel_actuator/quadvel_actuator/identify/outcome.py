@@ -256,7 +256,12 @@ def _decision(report: Mapping[str, Any]) -> str:
         )
     named = ", ".join(dict.fromkeys(one["name"] for one in effects))
     cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
-    text = f"Add {named}: the held-out error falls by {cut:.0f} %, from {before:.3g} to {after:.3g} N^2 m^2"
+    way = (
+        f"falls by {cut:.0f} %"
+        if cut >= 0.0
+        else f"rises by {-cut:.0f} %, as it holds what the fitted data do not show"
+    )
+    text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
     more = (
         f"; what was learned beyond them depends on {', '.join(rest['depends_on'])}"
         if rest["depends_on"]
