@@ -36,7 +36,8 @@ def about(log, input_delay, output_delay):
     one = np.zeros(joints, dtype=np.intp)
     delays = np.repeat([[input_delay], [output_delay]], joints, axis=1)
     model = Model(samples, 0.001, np.ones((2, joints)), np.array([one, one]), *delays, one)
-    return About(model, judge, np.full(joints, 0.066), Few(model.samples, judge))
+    few = Few(model.samples, judge, np.zeros((len(samples.t), joints)))
+    return About(model, judge, np.full(joints, 0.066), few)
 
 
 def test_signals_of_few_rows_are_those_of_all():
@@ -222,7 +223,7 @@ def test_a_law_is_looked_at_with_the_laws_of_the_model_left_free():
     half = Applied(friction, np.ones(2, dtype=bool), np.array([[0.25, 0.25], [0.05, 0.05]]), np.arange(2))
     ground = About(looked.model.plus(half), looked.judge, looked.noise, looked.few).ground
     spring = registry()["torque_offset"]()
-    bare, _ = ground.bare(spring)
+    bare = ground.bare(spring)
     assert (bare / ground.few.of(ground.model, spring)[1].sum(axis=0) < 1.15 * 0.066).all()
 
 

@@ -41,6 +41,7 @@ class Candidate:
     gain: float  # mean fall of the squared error over all judged rows, N^2 m^2
     p: float
     joint_gain: Array  # (J,) mean fall over the joint's own rows
+    left: float  # held-out error, N^2 m^2
 
     @property
     def name(self) -> str:
@@ -58,7 +59,9 @@ class About:
         self.model, self.judge, self.noise, self.few = model, judge, noise, few
         self.samples, self.signals = model.samples, model.signals
         self.residual = np.where(judge.fit | judge.judge, self.samples.tau - model.predict(), 0.0)
-        self.ground = Ground(model, few, noise)
+        self.left = np.sum(np.where(judge.fit, self.residual, 0.0) ** 2, axis=0) / noise
+        """squared error (J,) of the fitted rows, each joint's in units of its noise"""
+        self.ground = Ground(model, few, self.left)
         start = self.ground.bases[-1]
         self.seen, self.torque = start.signals, start.predict()
         self.fitted = np.where(judge.fit, self.samples.tau - self.torque, 0.0)
@@ -158,6 +161,12 @@ def propose(about: About, started: Started) -> Candidate | None:
     return few if few.gain >= 0.98 * everywhere.gain else everywhere
 
 
+def anew(about: About, one: Candidate) -> Candidate:
+    """The candidate fitted from other delays, too."""
+    found = _judged(about, one.law, about.fit_anew(one.model))
+    return found if found.gain > one.gain else one
+
+
 def simplified(about: About, one: Candidate) -> Candidate | None:
     """The simpler law that the candidate's can become, fitted from where the candidate is; None where there is none."""
     less = less_said(one.model.applied[-1])
@@ -188,7 +197,8 @@ def _without_weakest(model: Model) -> Model | None:
 def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
     residual = about.samples.tau - model.predict()
     found = about.judge.compare(about.residual, residual)
-    return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain)
+    left = float(np.mean(residual[about.judge.judge] ** 2))
+    return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain, left)
 
 
 def _acted_on(about: About, candidate: Candidate) -> Bools:

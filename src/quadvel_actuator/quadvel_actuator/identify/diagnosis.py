@@ -12,8 +12,8 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, less_said, propose, simplified, started
-from .delays import fit_with_delays
+from .candidates import About, Candidate, anew, less_said, propose, simplified, started
+from .delays import fit_with_delays, latest
 from .few import Few
 from .judging import Judge
 from .model import Model
@@ -36,9 +36,11 @@ _AS_WELL = 0.02
 """Of the noise: what an account with gains that can be believed may lose."""
 
 _FITTED = 5
-_PROMISING = 0.5
-"""Of the most promising law that does not read the torque: so much, or among the first few and quick, and a law is
-fitted further."""
+_PROMISING, _LITTLE = 0.5, 0.1
+"""A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
+keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it."""
+_ALL_SAID, _LEAD, _NEAR = 1.05, 3, 0.8
+"""Of the noise: so little left, and no other law is in question; so many in the lead, and so near the best one's gain."""
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
@@ -107,7 +109,7 @@ def _released(model: Model, few: Few) -> Model:
 
 def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2."""
-    few = Few(model.samples, judge)
+    few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
@@ -149,23 +151,50 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
         looked += [one for one in (started(about, form) for form in law.variants(about)) if one is not None]
     looked.sort(key=lambda one: -one.promise)
-    most = max((one.promise for one in looked if one.law.foretold() is one.law), default=0.0)
+    rows = about.few.fitted_rows
+    above = float(np.maximum(about.left - rows, 0.0).sum())
+    least = _LITTLE * above
+    if above < _LITTLE * rows.sum():
+        least = _PROMISING * max(
+            (one.promise for one in looked if one.law.foretold() is one.law), default=0.0
+        )
     for k, first in enumerate(looked):
         name = first.law.name
         costly = k >= _FITTED or first.law.remembers
-        if costly and first.promise < _PROMISING * most:
+        if costly and first.promise < least:
             idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
             continue
         tick(f"{what}: {name}, fitted")
         found = propose(about, first)
-        if found is not None and (name not in best or found.gain > best[name].gain):
+        if found is None:
+            continue
+        if name not in best or found.gain > best[name].gain:
             best[name] = found
+        if found.law.foretold() is found.law:
+            kept = float((np.maximum(found.joint_gain, 0.0) / about.noise * rows).sum())
+            least = max(least, _PROMISING * kept)
     leader = max(best.values(), key=lambda one: one.gain, default=None)
     less = None if leader is None else simplified(about, leader)
     if less is not None and less.name not in taken:
         best[less.name] = max(less, best.get(less.name, less), key=lambda one: one.gain)
     out = [one for name, one in idle.items() if name not in best]
-    return sorted(best.values(), key=lambda one: -one.gain), out
+    return _settled(about, sorted(best.values(), key=lambda one: -one.gain)), out
+
+
+def _settled(about: About, candidates: list[Candidate]) -> list[Candidate]:
+    """The candidates, those in the lead that look like a delay fitted from other delays, too, if none says all there is.
+
+    What they change and what the delays stand for goes together, and each can be stuck at delays that are not its own.
+    """
+    rows = about.judge.judge.sum(axis=0)
+    if not candidates or candidates[0].left < _ALL_SAID * float(np.average(about.noise, weights=rows)):
+        return candidates
+    most = candidates[0].gain
+    lead = [one for one in candidates[:_LEAD] if one.law.shifts and one.gain > _NEAR * most > 0.0]
+    if not lead or (len(lead) == 1 and lead[0] is candidates[0]):
+        return candidates
+    found = [anew(about, one) if one in lead else one for one in candidates]
+    return sorted(found, key=lambda one: -one.gain)
 
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:
@@ -178,9 +207,9 @@ def _finer(
     """The model with gains or delays shared by fewer joints, if that pays clearly more than any effect does."""
     best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(registry())) else 0.0
     chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
-    left = model.samples.tau - model.predict()
+    left = model.samples.tau - latest(model, judge.fit).predict()
     for _, tried in regroupings(model, few):
-        found = judge.compare(left, tried.samples.tau - tried.predict())
+        found = judge.compare(left, tried.samples.tau - latest(tried, judge.fit).predict())
         if found.gain > most and found.p_any * len(registry()) < LEVEL:
             chosen, most = tried, found.gain + 0.5 * WORTH * float(noise.mean())
     return chosen
@@ -224,8 +253,9 @@ def _narrowed(model: Model, judge: Judge, noise: Array, few: Few) -> Model:
 
 
 def _worth(one: Candidate, noise: Array) -> float:
-    """Gain on the joints that it acts on, as a share of their noise."""
-    return float(one.joint_gain[one.joints].sum() / noise[one.joints].sum())
+    """Gain as a share of the noise, on the joints that it acts on or on all, as it can set free what they share."""
+    on = one.joints
+    return float(max(one.joint_gain[on].sum() / noise[on].sum(), one.joint_gain.sum() / noise.sum()))
 
 
 def _reason(one: Candidate, noise: Array, tried: int) -> Rejected:

@@ -9,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import attrs
+import numpy as np
 
 from ..effects import EffectLaw
 from .judging import Judge
 from .model import Model
-from .signals import Bools, Samples
+from .signals import Array, Bools, Samples
 
 APART, TOGETHER = 1800, 4000
 """Rows, some more or less: one by one, and in stretches"""
@@ -27,14 +28,16 @@ def remembers(model: Model) -> bool:
 class Few:
     """The rows of `samples` that are fitted, or few of them."""
 
-    def __init__(self, samples: Samples, judge: Judge) -> None:
+    def __init__(self, samples: Samples, judge: Judge, left: Array) -> None:
+        """left: what a model leaves of each row, (N, J), in units of the noise: stretches lie where there is much of it."""
         whole = samples.reaching(judge.fit)
         fitted = judge.fit[: len(whole.t)]
-        self.count = int(fitted.sum())
-        """of all rows that are fitted, joints counted"""
+        self.fitted_rows = fitted.sum(axis=0)
+        """of all rows, those that are fitted, (J,)"""
         apart, rows = whole.thinned(max(1, int(fitted.any(axis=1).sum()) // APART))
         self._apart = apart, fitted[rows]
-        together, rows, known = whole.stretches(TOGETHER)
+        weight = np.where(fitted, left[: len(fitted)] ** 2, 0.0).sum(axis=1)
+        together, rows, known = whole.stretches(TOGETHER, weight)
         self._together = together, fitted[rows] & known[:, None]
 
     def of(self, model: Model, law: EffectLaw | None = None) -> tuple[Model, Bools]:

@@ -48,15 +48,17 @@ class Started:
     law: EffectLaw
     model: Model
     promise: float
-    """what it takes off the squared error of the fitted rows, each joint's in units of its noise, of joints where it does"""
+    """what it takes off the squared error of all fitted rows, each joint's in units of its noise, of joints where it does,
+    by the share that it takes off few of them"""
 
 
 class Ground:
     """The model that laws are looked at on, on few of its rows."""
 
-    def __init__(self, model: Model, few: Few, noise: Array) -> None:
-        self.model, self.few, self.noise = model, few, noise
-        self._bare: dict[bool, tuple[Array, int]] = {}
+    def __init__(self, model: Model, few: Few, left: Array) -> None:
+        """left: squared error (J,) of all fitted rows, each joint's in units of its noise."""
+        self.model, self.few, self.left = model, few, left
+        self._bare: dict[bool, Array] = {}
         self._spots: dict[Any, list[_Spot]] = {}
         unbent = self._unbent()
         self.bases = (model,) if unbent is None else (model, unbent)
@@ -82,17 +84,14 @@ class Ground:
             return None
         return attrs.evolve(best, samples=self.model.samples, applied=best.applied[:-1])
 
-    def bare(self, law: EffectLaw) -> tuple[Array, int]:
-        """Error (J,) of the model without the law on these rows, at its best delays, and how many rows one stands for."""
+    def bare(self, law: EffectLaw) -> Array:
+        """Squared error (J,) of the model without the law on the rows that suit it, at its best delays."""
         key = law.remembers
         if key not in self._bare:
             rows = self.few.of(self.model, law)[1]
             every = self.pairs(law, _EXCHANGED)
             tried = [_Screen(spot, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for spot in every]
-            self._bare[key] = (
-                min(tried, key=lambda error: float(error.sum())),
-                round(self.few.count / max(rows.sum(), 1)),
-            )
+            self._bare[key] = min(tried, key=lambda error: float(error.sum()))
         return self._bare[key]
 
     def pairs(self, law: EffectLaw, moves: tuple[tuple[float, float], ...]) -> list[_Spot]:
@@ -166,14 +165,11 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
         found, error = _Screen(spot, empty, rows).best(table)
         if error.sum() < lowest.sum():
             lowest, best = error, found
-    bare, weight = ground.bare(law)
-    promise = (bare - lowest) / ground.noise
-    count = np.maximum(rows.sum(axis=0), 1)
-    if best is None or not (promise / count).max() > _PROMISE:
+    bare = ground.bare(law)
+    promise = np.maximum(bare - lowest, 0.0) / (bare + 1e-300) * ground.left
+    if best is None or not (promise > _PROMISE * ground.few.fitted_rows).any():
         return None
-    return Started(
-        law, attrs.evolve(best, samples=ground.model.samples), weight * float(np.maximum(promise, 0.0).sum())
-    )
+    return Started(law, attrs.evolve(best, samples=ground.model.samples), float(promise.sum()))
 
 
 def _within(value: Array | float, parameter: Parameter, joints: int) -> Array:

@@ -280,16 +280,26 @@ class Samples:
         rows = np.concatenate([np.arange(a, b, every) for a, b in pairwise(edges)])
         return self._of(rows), rows
 
-    def stretches(self, most: int) -> tuple[Samples, NDArray[np.intp], Bools]:
-        """At most some `most` rows in stretches spread evenly over the logs, which these are, and those that count.
+    def stretches(self, most: int, weight: Array) -> tuple[Samples, NDArray[np.intp], Bools]:
+        """At most some `most` rows in stretches, which these are, and those that count.
 
-        The others fill memories: what was before a stretch is not known there.
+        Half of the stretches are spread evenly over the logs, half lie where most of `weight` (N,) is. The rows that do not
+        count fill memories: what was before a stretch is not known there.
         """
-        long = round(STRETCH / self.period)
+        long, filling = round(STRETCH / self.period), round(FILLING / self.period)
         count = max(most // long, 2)
         if len(self.t) <= (count + 1) * long:
             return self, self.row, np.ones(len(self.t), dtype=bool)
-        first = np.linspace(0, len(self.t) - long, count).astype(np.intp)
+        starts = np.linspace(0, len(self.t) - long, count - count // 2).astype(np.intp).tolist()
+        left = weight.copy()
+        for begin in starts:
+            left[begin + filling : begin + long] = 0.0
+        for _ in range(count // 2):
+            total = np.concatenate([[0.0], np.cumsum(left)])
+            begin = int(np.argmax(total[long:] - total[filling : len(total) - long + filling]))
+            left[begin + filling : begin + long] = 0.0
+            starts.append(begin)
+        first = np.array(sorted(starts))
         place = np.tile(np.arange(long), count)
         rows = np.repeat(first, long) + place
         part = self._of(rows)
