@@ -65,6 +65,16 @@ def test_friction_on_one_joint_is_found_there_only():
     ]
 
 
+def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
+    """The damping that all joints share stands for it: what is off are the joints without, until it is named."""
+    six = NAMES[:6]
+    drag = Effect("viscous_friction", six[:5], {"b": 0.2})
+    report = identify([record(attrs.evolve(parameters((drag,)), joints=six), 6, 3.0, 500, seed=1)]).report
+    assert [(one["name"], one["joints"]) for one in report["effects"]] == [
+        ("viscous_friction", list(six[:5]))
+    ]
+
+
 def test_hum_of_the_mains_is_told_as_a_line_in_time():
     def hum(k, q, dq, tau):
         return tau + 0.35 * np.sin(2 * np.pi * 50.0 * k * 0.001)

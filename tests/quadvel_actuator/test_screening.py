@@ -49,6 +49,18 @@ def test_signals_of_few_rows_are_those_of_all():
         np.testing.assert_array_equal(getattr(few.at(0.004, 0.001, 0.001), name), whole[rows])
 
 
+def test_stretches_lie_where_most_is_left_and_all_over_the_log():
+    samples = Samples([_log(seconds=16.0)])
+    left = np.zeros(len(samples.t))
+    burst = (samples.t > 5.1) & (samples.t < 5.3)
+    left[burst] = 1.0
+    _, rows, counted = samples.stretches(2000, left)
+    assert set(np.flatnonzero(burst)) <= set(rows[counted])
+    assert samples.t[rows].min() < 0.1
+    assert samples.t[rows].max() > 15.9
+    assert len(rows) <= 2000
+
+
 def test_a_feature_has_columns_for_every_joint_that_asks_for_them():
     looked = about(_log(seconds=1.0), 0.009, 0.003)
     scene = Scene(looked.model, looked.judge)
