@@ -97,7 +97,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
             yield curve(name, times, _MIDDLE)
     for times in ("", "direction", "dq"):
         yield curve("q", times, _FINE)
-    yield from (curve(name, times, _FINE) for name, times in (("dq", ""), ("q", "tau")))
+    yield from (curve(name, times, _FINE) for name, times in (("dq", ""), ("t", ""), ("q", "tau")))
     yield from (curve("q", times, _FINEST) for times in ("", "direction"))
     rows = max(round(_HISTORY / scene.dt), 4)
     edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
@@ -111,7 +111,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
     for joint in scene.joints if len(scene.joints) > 1 else ():
         for name in ("q", "dq", "tau"):
             yield curve(f"{joint}/{name}", "", _MIDDLE)
-            yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau"))
+            yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau", "dq"))
         yield curve(f"{joint}/q", "", _FINE)
         yield from (Feature(f"{joint}/{name}", "", Filter(edges)) for name in ("q", "tau"))
         yield from _ripples(scene, left, f"{joint}/q")
@@ -144,7 +144,7 @@ def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
 
 
 def lines(scene: Scene, left: Array) -> Iterator[Feature]:
-    """The strongest lines of the spectrum in time of what is left, each with two overtones."""
+    """The strongest lines of the spectrum in time of what is left, each alone and with two overtones."""
     t = scene.view.t[:, 0]
     span, period = float(np.ptp(t)), scene.dt
     grid = np.arange(max(2.0, 3.0 / span), 0.45 / period, 0.5 / span)
@@ -159,4 +159,4 @@ def lines(scene: Scene, left: Array) -> Iterator[Feature]:
         near = grid[best] + np.linspace(-0.5 / span, 0.5 / span, 21)
         waves = np.exp(-2j * np.pi * np.outer(near, t)) @ fitted
         frequency = near[int(np.argmax((np.abs(waves) ** 2).sum(axis=1)))]
-        yield Feature("t", "", Wave(2.0 * np.pi * frequency, 3))
+        yield from (Feature("t", "", Wave(2.0 * np.pi * frequency, count)) for count in (1, 3))
