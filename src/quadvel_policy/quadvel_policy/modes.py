@@ -14,7 +14,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.kinematics import foot_positions, inverse_kinematics
+from quadvel_description.kinematics import foot_positions, inverse_kinematics, rotate_inverse
 from quadvel_description.state import JointCommand, RobotState
 
 from .observation import JOINTS, PolicyMetadata, build_observation
@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 LEAN_TIME = 0.3  # s
 MAX_LEAN = 0.35  # rad
+UP = np.array([0.0, 0.0, 1.0])
 
 
 class Policy(Protocol):
@@ -89,9 +90,8 @@ class Damping:
 
 def upright(state: RobotState) -> Array:
     """Where the vertical through the trunk's origin goes, 1 m below it in the trunk's frame: forward and left, (2,) m."""
-    w, x, y, z = state.quaternion.tolist()
-    down = max(1.0 - 2.0 * (x * x + y * y), math.cos(MAX_LEAN))
-    way = np.array([-2.0 * (x * z - w * y), -2.0 * (y * z + w * x)]) / down
+    forward, left, up = -rotate_inverse(state.quaternion, UP)
+    way = np.array([forward, left]) / max(-up, math.cos(MAX_LEAN))
     return way * min(1.0, math.tan(MAX_LEAN) / max(math.hypot(*way), 1e-9))
 
 
@@ -108,9 +108,8 @@ class Posture:
         self._times = np.cumsum([0.0, *(seconds for seconds, _ in path)])
         self._postures = np.array([np.zeros(JOINTS), *(q for _, q in path)])
         self._feet = foot_positions(self._postures[1:])
-        self._offset = self._postures[1:] - inverse_kinematics(
-            self._feet
-        )  # not zero where a knee bends the other way
+        # Not zero where a knee bends the other way.
+        self._offset = self._postures[1:] - inverse_kinematics(self._feet)
         self._kp, self._kd = np.full(JOINTS, kp), np.full(JOINTS, kd)
         self._lean, self._leant_at = np.zeros(2), 0.0
 

@@ -74,16 +74,8 @@ class SlewLimit(MemoryLaw):
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         slope = np.abs(np.diff(torque, axis=0)) / s.dt[1:]
-        shares = (
-            0.5,
-            0.7,
-            0.85,
-            0.94,
-            0.98,
-            0.992,
-            0.998,
-            1.0,
-        )  # the last bounds nothing: not every joint need have it
+        # The last bounds nothing: not every joint need have it.
+        shares = (0.5, 0.7, 0.85, 0.94, 0.98, 0.992, 0.998, 1.0)
         return [{"rate": np.quantile(slope, share, axis=0) + 5.0} for share in shares]
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:

@@ -41,7 +41,6 @@ class Candidate:
     gain: float  # mean fall of the squared error over all judged rows, N^2 m^2
     p: float
     joint_gain: Array  # (J,) mean fall over the joint's own rows
-    left: float  # held-out error, N^2 m^2
 
     @property
     def name(self) -> str:
@@ -197,8 +196,7 @@ def _without_weakest(model: Model) -> Model | None:
 def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
     residual = about.samples.tau - model.predict()
     found = about.judge.compare(about.residual, residual)
-    left = float(np.mean(residual[about.judge.judge] ** 2))
-    return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain, left)
+    return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain)
 
 
 def _acted_on(about: About, candidate: Candidate) -> Bools:

@@ -186,10 +186,15 @@ def _settled(about: About, candidates: list[Candidate]) -> list[Candidate]:
 
     What they change and what the delays stand for goes together, and each can be stuck at delays that are not its own.
     """
-    rows = about.judge.judge.sum(axis=0)
-    if not candidates or candidates[0].left < _ALL_SAID * float(np.average(about.noise, weights=rows)):
+    if not candidates:
         return candidates
-    most = candidates[0].gain
+    rows, most = about.judge.judge, candidates[0].gain
+    left, floor = (
+        np.mean(candidates[0].residual[rows] ** 2),
+        np.average(about.noise, weights=rows.sum(axis=0)),
+    )
+    if left < _ALL_SAID * floor:
+        return candidates
     lead = [one for one in candidates[:_LEAD] if one.law.shifts and one.gain > _NEAR * most > 0.0]
     if not lead or (len(lead) == 1 and lead[0] is candidates[0]):
         return candidates
