@@ -22,6 +22,7 @@ COM = (0.004, 0.0018, -0.03)  # m, of the whole robot in the trunk frame, roughl
 OFFSET = (0.0, 0.5, 0.5, 0.0)  # of a cycle: diagonal pairs
 LIFT = 0.08  # m
 LEAD = 0.025  # s, by which the soft gains lag behind a swing
+HANDOVER = 0.04  # s, in which a leg passes from swing to push and back; the drives are late, so it ends with the change
 LEG_WEIGHT = np.tile([[-1.07, 1.07], [0.34, 0.34], [-0.27, -0.27]], 2)  # N m, of a lifted leg
 CENTRING = 30.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
 SPEED_WEIGHTS = (1.0, 1.3, 0.35)  # how fast the feet go for 1 m/s forward, 1 m/s sideways, 1 rad/s
@@ -75,10 +76,19 @@ class Cycle:
         self.stands = command[..., 3:]
         self.down = self._leg.fmod(1.0) < self.duty + self.stands
 
+    def load(self) -> Tensor:
+        """How much of its push each leg gives, (..., 4): 0 in its swing, 1 on the ground, without a jump between them."""
+        ahead = self._leg + 0.5 * HANDOVER * self.frequency
+        from_middle = ((ahead - 0.5 * self.duty + 0.5).fmod(1.0) - 0.5).abs()
+        inside = (0.5 * self.duty - from_middle) / (HANDOVER * self.frequency)
+        share = (0.5 + inside + self.stands).clamp(0.0, 1.0)
+        return share * share * (3 - 2 * share)
+
     def swing(self, lead: float = 0.0) -> Tensor:
-        """How far each leg's swing has come by `lead` (s) from now, (..., 4): 0 on the ground, 1 at its end."""
+        """How far each leg's swing has come by `lead` (s) from now, (..., 4): 1 in the first half on the ground, then 0."""
         leg = (self._leg + lead * self.frequency).fmod(1.0)
-        return ((leg - self.duty) / (1 - self.duty)).clamp(min=0.0)
+        landed = (leg < 0.5 * self.duty) & (self.stands == 0)
+        return torch.where(landed, 1.0, ((leg - self.duty) / (1 - self.duty)).clamp(min=0.0))
 
     def lift(self, swing: Tensor) -> Tensor:
         """Wanted height of each foot above ground, (..., 4) m, so far in its swing."""
@@ -88,10 +98,10 @@ class Cycle:
 def targets(cycle: Cycle, body: Body) -> Tensor:
     """Joint targets (..., 12) rad: swing feet by position, stance feet by force, through the soft gains."""
     legs = Legs(body.q)
-    down = cycle.down[..., None, :]
+    load = cycle.load()[..., None, :]
     swing = angles(_swing_feet(cycle, body)) + body.q.new_tensor(LEG_WEIGHT / robot.KP)
-    push = legs.torques(_stance_forces(cycle, body, legs.feet, down.to(swing.dtype)))
-    return joints(torch.where(down, body.q, swing) - push / robot.KP)
+    push = body.q - legs.torques(_stance_forces(cycle, body, legs.feet, load)) / robot.KP
+    return joints(swing + load * (push - swing))
 
 
 def lean(slope: Tensor) -> Tensor:
@@ -119,7 +129,7 @@ def _swing_feet(cycle: Cycle, body: Body) -> Tensor:
     return torch.cat([level, cycle.lift(swing)[..., None, :]], dim=-2) + turn.new_tensor(_STAND)
 
 
-def _stance_forces(cycle: Cycle, body: Body, feet: Tensor, down: Tensor) -> Tensor:
+def _stance_forces(cycle: Cycle, body: Body, feet: Tensor, load: Tensor) -> Tensor:
     """Ground forces on the feet, trunk frame (..., 3, 4) N: least squares for a wrench that brings the trunk back."""
     w, v = body.angular_velocity, body.velocity
     along, turn, _ = cycle.command.split([2, 1, 1], dim=-1)
@@ -130,21 +140,21 @@ def _stance_forces(cycle: Cycle, body: Body, feet: Tensor, down: Tensor) -> Tens
     tilt = (lean(body.slope) - body.roll_pitch) * w.new_tensor(_TILT)
     moment = torch.cat([tilt, _TURN[2] * turn + twist], dim=-1) - w * w.new_tensor(_TURN)
     arms = feet - feet.new_tensor(COM)[:, None]
-    forces = _shared_out(force[..., None], moment[..., None], arms, down)
+    forces = _shared_out(force[..., None], moment[..., None], arms, load)
     level, normal = forces.split([2, 1], dim=-2)
     normal = normal.clamp(0.0, _FORCE_BOUND)
     bound = _FRICTION * normal
     return torch.cat([level.minimum(bound).maximum(-bound), normal], dim=-2)
 
 
-def _shared_out(force: Tensor, moment: Tensor, feet: Tensor, down: Tensor) -> Tensor:
-    """Forces (..., 3, 4) on the feet that are down (..., 1, 4) which come nearest to a force and a moment (..., 3, 1).
+def _shared_out(force: Tensor, moment: Tensor, feet: Tensor, load: Tensor) -> Tensor:
+    """Forces (..., 3, 4) on the feet by their load (..., 1, 4), 0 to 1, which come nearest to a force and a moment (..., 3, 1).
 
     feet: (..., 3, 4) m from the centre of mass. The least squares of A f = w, f = A^T (A A^T + eps I)^-1 w, as the motion
     of a rigid body of point masses, one a foot and a small one (eps) at the centre of mass: the force accelerates all
     alike, and the moment about their centre turns them, with an inertia of theirs.
     """
-    mass = down / down.sum(-1, keepdim=True).clamp(min=2.0).square()  # lifted feet vanish
+    mass = load / load.sum(-1, keepdim=True).clamp(min=2.0).square()  # lifted feet vanish
     total = mass.sum(-1, keepdim=True) + _SINGULAR
     centre = (mass * feet).sum(-1, keepdim=True) / total
     arm, eye = feet - centre, torch.eye(3, dtype=feet.dtype)

@@ -25,6 +25,7 @@ from .base import (
     staged,
 )
 from .dynamics import lag, lagged
+from .limits import TorqueSaturation
 
 
 class GainAsymmetry(TorqueLaw):
@@ -117,6 +118,9 @@ class SupplySag(TorqueLaw):
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return _sags(self.what, self._strain(s), torque)
 
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+        return _unsagged(p)
+
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return _sagging(self.what, x, self._strain(s), p)
 
@@ -149,6 +153,9 @@ class PowerSag(MemoryLaw):
         sags = _sags(self.what, _power(torque, s.dq), torque)
         return [{**sag, "T": late} for sag in sags for late in (0.002, 0.012)]
 
+    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+        return _unsagged(p)
+
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return (_power(x, u[0]),)
 
@@ -162,6 +169,11 @@ class PowerSag(MemoryLaw):
 
 def _limit(what: str) -> tuple[Parameter, ...]:
     return () if what == "gain" else (Parameter("limit", "N m", 0.1, 500.0, 10.0),)
+
+
+def _unsagged(p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+    """The constant bound that is left where the supply does not sag; None of a gain."""
+    return (TorqueSaturation(), {"limit": p["limit"]}) if "limit" in p else None
 
 
 def _power(torque: Array, dq: Array) -> Array:

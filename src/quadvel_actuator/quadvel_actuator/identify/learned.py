@@ -33,6 +33,7 @@ _TRIED = 100  # features a joint that count as independent trials
 _KEPT = 12  # features that come into question after a look at all of them
 _AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
 _RIDGE = 1e-6
+_FREEDOM = 1e-3  # the same of the model's parameters, in shares of what they do to the joints that move most
 _STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model and terms together
 _MOST_DAMPED = 0.7
 _ENOUGH = 1500  # rows for a first look
@@ -187,22 +188,23 @@ class _Trial:
     def __init__(self, picks: Sequence[_Pick], scene: Scene) -> None:
         self.scene = scene
         parts = _Joint(picks, scene).parts
-        self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows
+        sizes = _sizes(scene)
+        self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows; slopes over those of all joints
         self.inverse = []
         self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
         self.onto = []  # of each joint: (X, n), weights of the columns that come closest on few of the fitted rows
         self.bare = np.empty_like(scene.residual)
         for j in range(len(scene.joints)):
-            x = np.column_stack([scene.slopes[j].T, *(part[:, j] for part in parts)])
             keep = scene.judge.fit[:, j]
-            x = x / (np.sqrt(np.mean(x[keep] ** 2, axis=0)) + 1e-12)
-            gram = x[keep].T @ x[keep]
-            gram[np.diag_indices_from(gram)] += _RIDGE * keep.sum()
+            taken = np.column_stack([np.zeros((len(keep), 0)), *(part[:, j] for part in parts)])
+            taken = taken / (np.sqrt(np.mean(taken[keep] ** 2, axis=0)) + 1e-12)
+            x = np.hstack([scene.slopes[j].T / sizes, taken])
+            ridge = np.repeat([_FREEDOM, _RIDGE], [len(sizes), len(parts)])
+            gram = x[keep].T @ x[keep] + np.diag(ridge * keep.sum())
             self.others.append(x)
             self.inverse.append(np.linalg.inv(gram))
             some = x[self.few][keep[self.few]]
-            ridge = 1e-9 * len(some) * np.eye(some.shape[1])
-            self.onto.append(np.linalg.lstsq(some.T @ some + ridge, some.T, rcond=None)[0])
+            self.onto.append(np.linalg.lstsq(some.T @ some + np.diag(ridge * len(some)), some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
 
     def _without(self, j: int, values: Array) -> Array:
@@ -245,6 +247,17 @@ class _Trial:
             inverse = _inverse(own[keep], [feature.shape.penalty])
             after[:, j] -= own @ (inverse @ (own[keep].T @ self.bare[keep, j]))
         return after
+
+
+def _sizes(scene: Scene) -> Array:
+    """What each of the model's parameters does, root mean square over the fitted rows of the joint that shows it most.
+
+    (A,). A joint that hardly moves while the model is fitted says nothing of them; it must not be free to make them up.
+    """
+    square = np.einsum("jan,nj->ja", scene.slopes**2, scene.judge.fit.astype(float))
+    rows = np.maximum(scene.judge.fit.sum(axis=0), 1)
+    sizes: Array = np.sqrt((square / rows[:, None]).max(axis=0)) + 1e-12
+    return sizes
 
 
 def _inverse(x: Array, penalties: Sequence[Array]) -> Array:
