@@ -26,8 +26,9 @@ HANDOVER = 0.04  # s, in which a leg passes from swing to push and back; the dri
 LEG_WEIGHT = np.tile([[-1.07, 1.07], [0.34, 0.34], [-0.27, -0.27]], 2)  # N m, of a lifted leg
 CENTRING = 30.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
 SPEED_WEIGHTS = (1.0, 1.3, 0.35)  # how fast the feet go for 1 m/s forward, 1 m/s sideways, 1 rad/s
-SLOWEST, FASTEST = 2.2, 3.8  # Hz
-FULL_SPEED = 2.5  # m/s, from which on the gait is at its fastest
+SLOWEST, QUICKER = 2.2, 0.64  # Hz, and Hz more for each m/s
+QUICKEST = 3.0  # m/s, from which on steps come no quicker
+FULL_SPEED = 2.5  # m/s, from which on feet stay on the ground for no smaller a share of the cycle
 _STAND = foot_positions(robot.NOMINAL_Q).T.copy()
 _CENTRE = _STAND[:2].mean(axis=1, keepdims=True)
 _FROM_CENTRE = _STAND[:2] - _CENTRE
@@ -57,8 +58,8 @@ def speed(command: Tensor) -> Tensor:
 
 
 def frequency(speed: Tensor) -> Tensor:
-    """Cycles a second, 2.2 Hz rising to 3.8 Hz at 2.5 m/s."""
-    return SLOWEST + (FASTEST - SLOWEST) / FULL_SPEED * speed.clamp(max=FULL_SPEED)
+    """Cycles a second, 2.2 Hz rising to 4.1 Hz at 3 m/s."""
+    return SLOWEST + QUICKER * speed.clamp(max=QUICKEST)
 
 
 class Cycle:
