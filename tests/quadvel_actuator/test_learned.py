@@ -6,15 +6,16 @@ import attrs
 import numpy as np
 import odd_joints
 import pytest
-from simulated_joints import parameters, record
+from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_actuator.identify.delays import fit_with_delays
 from quadvel_actuator.identify.eam import fit_eam
+from quadvel_actuator.identify.features import Scene
 from quadvel_actuator.identify.floor import noise_floor
 from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.judging import Judge
-from quadvel_actuator.identify.learned import learn
+from quadvel_actuator.identify.learned import Trial, learn
 from quadvel_actuator.identify.model import Model
 from quadvel_actuator.identify.signals import Samples
 
@@ -71,6 +72,18 @@ def test_nothing_is_learned_where_nothing_is():
     truth = attrs.evolve(parameters(), joints=odd_joints.NAMES[: odd_joints.JOINTS])
     model, judge, noise = looked_at(record(truth, odd_joints.JOINTS, 3.0, 500, "mixed", 5))
     assert learn(model, judge, noise) is None
+
+
+def test_a_joint_that_rests_while_the_model_is_fitted_makes_up_no_terms():
+    """What gains and delays do to it was not seen, so that its own free ones could be anything on the rows that judge."""
+    model, judge, noise = looked_at(record(attrs.evolve(parameters(), joints=NAMES[:2]), 2, motion="mixed"))
+    fit = judge.fit.copy()
+    fit[:, 0] &= np.abs(model.samples.logs[0].states["dq"][:, 0]) < 0.05
+    resting = attrs.evolve(judge, fit=fit)
+    scene = Scene(model, resting)
+    bare = Trial([], scene).bare[judge.judge[:, 0], 0]
+    assert np.mean(bare**2) < 1.3 * np.mean(scene.residual[judge.judge[:, 0], 0] ** 2)
+    assert learn(model, resting, noise) is None
 
 
 def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):

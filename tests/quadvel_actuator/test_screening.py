@@ -108,6 +108,15 @@ def test_a_bound_that_does_not_fall_with_speed_is_found_from_one_that_could():
     assert simplified(looked, found) is None
 
 
+@pytest.mark.parametrize("volts", [False, True])
+def test_a_supply_that_does_not_sag_leaves_a_constant_bound(volts):
+    law = registry()["supply_sag"].configured({"what": "bound"} | ({} if volts else {"of": "power"}), JOINTS)
+    less, start = law.simpler({"sag": np.zeros(2), "T": np.full(2, 0.01), "limit": np.array([4.0, 7.0])})
+    assert less.name == "torque_saturation"
+    assert start["limit"].tolist() == [4.0, 7.0]
+    assert registry()["supply_sag"].configured({"what": "gain"}, JOINTS).simpler({"sag": np.zeros(2)}) is None
+
+
 def test_a_constant_that_passed_for_a_weak_spring_far_away_is_called_one_in_the_end():
     offset = Effect("torque_offset", JOINTS, {"offset": 0.25})
     looked = about(_log(FRICTION, offset), 0.009, 0.003)

@@ -14,12 +14,13 @@ import numpy as np
 from ..effects import registry
 from .candidates import About, Candidate, anew, less_said, propose, simplified, started
 from .delays import fit_with_delays, latest
-from .few import Few
+from .few import Few, remembers
 from .judging import Judge
 from .model import Model
 from .screening import Started
 from .sharing import pooled, regroupings
 from .signals import Array
+from .valleys import deepest
 
 LEVEL = 0.01
 """An effect is named if chance would bring its gain with less than this probability, all candidates counted."""
@@ -124,15 +125,25 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(candidates, judge, noise)
-        model = _released(_widened(about.fit_anew(best.model.holding(False)), judge, noise, few), few)
+        found = _deepened(about.fit_anew(best.model.holding(False)), judge, few)
+        model = _released(_widened(found, judge, noise, few), few)
         ties.append(tied)
     model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
     model, ties = _simplest(model, ties, judge, noise)
     model = _narrowed(model, judge, noise, few)
     model = pooled(model, judge, noise)
+    if model.applied:
+        model = _deepened(model, judge, few)
     findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
+
+
+def _deepened(model: Model, judge: Judge, few: Few) -> Model:
+    """The model at the bottom of its deepest valley; with a memory, as few rows show it, since all would take long."""
+    if remembers(model):
+        return fit_with_delays(few.fitted(model, deepest, 1), judge.fit)
+    return deepest(model, judge.fit, 4)
 
 
 def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:

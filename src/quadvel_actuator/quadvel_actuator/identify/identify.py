@@ -93,7 +93,7 @@ def identify(
         return Outcome(
             eam, latest(before, judge.fit), attrs.evolve(chosen_one, model=late), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),
-            intervals(model if learned is None else learned.beside, judge), ideal, noise, judge,
+            intervals(model, judge, learned), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
         )  # fmt: skip
 

@@ -2,7 +2,8 @@
 
 Two covariances are compared and the wider one counts: that of white residuals, and the sandwich of sums over blocks of
 consecutive rows, which holds whatever the correlation within a block. The delays are unknowns of it, too. Where a law may
-have other shapes that no log tells apart, what these say of its parameters lies within the interval.
+have other shapes that no log tells apart, what these say of its parameters lies within the interval; and so does what
+other valleys of the error say that are as deep.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ from scipy import stats
 
 from .delays import fit_with_delays, jacobian_with_delays
 from .judging import Judge
+from .learned import Learned
 from .model import Model, gather
 from .signals import Array
+from .valleys import as_deep
 
 LEVEL = 0.95
 _AS_WELL = 1.003
@@ -31,11 +34,14 @@ class Intervals:
     on_bound: tuple[str, ...]
 
 
-def intervals(model: Model, judge: Judge) -> Intervals:
-    """Intervals of everything that was fitted to the rows `judge.fit`."""
+def intervals(model: Model, judge: Judge, learned: Learned | None = None) -> Intervals:
+    """Intervals of everything that was fitted to the rows `judge.fit`, the weights of learned terms left free beside it."""
+    model = model if learned is None else learned.beside
     predicted, slopes, slots = jacobian_with_delays(model)
     left = np.where(judge.fit, model.samples.tau - predicted, 0.0)
     slopes *= judge.fit.T[:, None]
+    if learned is not None:
+        slopes = _beside_terms(slopes, learned, judge)
     hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
     freedom = max(int(judge.fit.sum()) - slots.count, 1)
     scale = np.sqrt(np.diagonal(hessian)) + 1e-12
@@ -56,6 +62,9 @@ def intervals(model: Model, judge: Judge) -> Intervals:
     variance = np.maximum(*(np.diagonal(one) for one in covariance)) * (1.0 + slots.count / freedom)
     half = np.sqrt(np.maximum(variance, 0.0)) * stats.t.ppf(0.5 + LEVEL / 2, max(units - slots.count, 5))
     wide = np.where(slots.index >= 0, half[slots.index], 0.0)
+    here = _everything(model)
+    for other in as_deep(model, judge.fit):
+        wide = np.maximum(wide, np.abs(_everything(other) - here))
     effects: list[Array] = []
     first = 2
     for one in model.applied:
@@ -65,6 +74,23 @@ def intervals(model: Model, judge: Judge) -> Intervals:
         effects.append(chance + _shape_error(model, len(effects), judge))
         first += len(one.law.parameters)
     return Intervals(wide[:2], tuple(effects), wide[-2:], _on_bound(model))
+
+
+def _beside_terms(slopes: Array, learned: Learned, judge: Judge) -> Array:
+    """Of the slopes (J, A, N) what no weights of the terms of their joint explain."""
+    found = slopes.copy()
+    for j, columns in enumerate(learned.columns):
+        if columns.shape[1]:
+            x = columns * judge.fit[:, j, None]
+            weights = np.linalg.lstsq(x, slopes[j].T, rcond=1e-6)[0]
+            found[j] -= (x @ weights).T
+    return found
+
+
+def _everything(model: Model) -> Array:
+    """Gains, effects' values and delays, (A + 2, J)."""
+    values = [model.gains, *(one.values for one in model.applied)]
+    return np.concatenate([*values, model.input_delay[None], model.output_delay[None]])
 
 
 def _shape_error(model: Model, index: int, judge: Judge) -> Array:

@@ -53,6 +53,7 @@ class Learned:
     terms: tuple[Term, ...]
     torque: Array  # (N, J), of all terms, N m
     gains: tuple[float, ...]  # of each term: held-out error without it less that with it, N^2 m^2
+    columns: tuple[Array, ...]  # of each joint, what its terms are sums of, (N, K)
 
     @property
     def beside(self) -> Model:
@@ -110,7 +111,7 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
 def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
     """The signals that what `model` leaves goes with most clearly, whether or not a term of them would pay."""
     scene = Scene(model, judge)
-    trial, every = _Trial([], scene), np.ones(len(scene.joints), dtype=bool)
+    trial, every = Trial([], scene), np.ones(len(scene.joints), dtype=bool)
     best: tuple[str, ...] = ()
     least = 1.0
     for feature in library(scene, scene.residual):
@@ -127,7 +128,7 @@ def _again(kept: Sequence[_Pick], scene: Scene, left: Array) -> Iterator[Feature
 
 def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
     """Those that pay beside the picks, of the same signals the best one, best first."""
-    trial = _Trial(picks, scene)
+    trial = Trial(picks, scene)
     best: dict[tuple[str, ...], _Pick] = {}
     for feature in features:
         pick = _pick(feature, trial, noise)
@@ -139,7 +140,7 @@ def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, n
     return sorted(found, key=lambda one: -one.gain)
 
 
-def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
+def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
     """The feature on the joints where it pays; None where there are none."""
     promising = trial.promising(feature, noise)
     if not promising.any():
@@ -153,7 +154,7 @@ def _pick(feature: Feature, trial: _Trial, noise: Array) -> _Pick | None:
     return _Pick(feature, taken, gain) if taken.any() else None
 
 
-def _tuned(pick: _Pick, trial: _Trial, noise: Array) -> _Pick:
+def _tuned(pick: _Pick, trial: Trial, noise: Array) -> _Pick:
     """The pick with the time constant, frequency or damping with which it says most of the fitted rows."""
     shape = pick.feature.shape
     if not _near(shape, _TUNING[0]):
@@ -182,13 +183,13 @@ def _near(shape: Shape, size: float) -> list[Shape]:
     return []
 
 
-class _Trial:
+class Trial:
     """What a feature would add to the picks: each joint's torque on the feature, the model and the picks left free."""
 
     def __init__(self, picks: Sequence[_Pick], scene: Scene) -> None:
         self.scene = scene
         parts = _Joint(picks, scene).parts
-        sizes = _sizes(scene)
+        sizes, rows = _sizes(scene), int(scene.judge.fit.sum(axis=0).max())
         self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows; slopes over those of all joints
         self.inverse = []
         self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
@@ -200,11 +201,12 @@ class _Trial:
             taken = taken / (np.sqrt(np.mean(taken[keep] ** 2, axis=0)) + 1e-12)
             x = np.hstack([scene.slopes[j].T / sizes, taken])
             ridge = np.repeat([_FREEDOM, _RIDGE], [len(sizes), len(parts)])
-            gram = x[keep].T @ x[keep] + np.diag(ridge * keep.sum())
+            gram = x[keep].T @ x[keep] + np.diag(ridge * rows)
             self.others.append(x)
             self.inverse.append(np.linalg.inv(gram))
             some = x[self.few][keep[self.few]]
-            self.onto.append(np.linalg.lstsq(some.T @ some + np.diag(ridge * len(some)), some.T, rcond=None)[0])
+            share = ridge * rows * len(some) / max(int(keep.sum()), 1)
+            self.onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
 
     def _without(self, j: int, values: Array) -> Array:
@@ -311,6 +313,7 @@ class _Joint:
             moved = np.linalg.solve(self.hessian + np.diag(size), self.gradient)
             change = np.where(slots.index >= 0, moved[slots.index], 0.0)  # (A, J)
             left -= np.einsum("jan,aj->nj", scene.slopes, change)
+        self.columns = tuple(columns)
         self.weights = [np.zeros((pick.feature.shape.count, len(joints))) for pick in picks]
         self.parts = [np.zeros_like(left) for _ in picks]
         for j in joints:
@@ -380,4 +383,4 @@ def _as_terms(picks: Sequence[_Pick], scene: Scene) -> Learned:
     total: Array = np.sum(parts, axis=0)
     left = scene.residual - total
     gains = [scene.judge.compare(left + part, left).gain for part in parts]
-    return Learned(scene.model, tuple(terms), total, tuple(gains))
+    return Learned(scene.model, tuple(terms), total, tuple(gains), joint.columns)

@@ -1,0 +1,66 @@
+"""Down to the deepest of many small valleys, and which others are as deep.
+
+Commands that step and laws with hard edges give the error of a fit many small valleys, a few tenths of a millisecond or
+a hundredth of a parameter wide, and input and output delay trade against each other along a flat one. A fit that has
+settled is therefore fitted again from a little to either side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import attrs
+import numpy as np
+
+from ..effects import AddedLaw
+from .delays import LONGEST, fit_with_delays
+from .few import remembers
+from .model import Model
+from .signals import Array, Bools
+
+_DELAYS = np.array([(1.0, -1.0), (-1.0, 1.0), (0.3, -0.3), (-0.3, 0.3), (-0.3, 0.0), (0.3, 0.0)]) * 1e-3
+"""s more of input and output delay"""
+_SHARES = (0.98, 0.99, 1.01, 1.02)
+_STEPS = 5
+_DEEPER = 1.0
+"""Of the mean squared error: a sum of squares that has to fall by this much to count as less"""
+_AS_DEEP = 3.84  # the same, of what 95 % of the logs of one truth leave between it and the best fit
+
+
+def deepest(model: Model, rows: Bools, rounds: int) -> Model:
+    """The model fitted to `rows` (N, J) from either side of where it is, at most so often, while that says more."""
+    for _ in range(rounds):
+        best = min(_neighbours(model, rows), key=lambda one: one.error(rows))
+        if model.error(rows) - best.error(rows) < _DEEPER * model.mse(rows):
+            break
+        model = best
+    return model
+
+
+def as_deep(model: Model, rows: Bools) -> list[Model]:
+    """What the fits from either side come to, where nobody could tell that from the model by `rows` (N, J).
+
+    Not of laws with a memory, whose fits take long.
+    """
+    if remembers(model):
+        return []
+    bound = model.error(rows) + _AS_DEEP * model.mse(rows)
+    return [one for one in _neighbours(model, rows) if one.error(rows) < bound]
+
+
+def _neighbours(model: Model, rows: Bools) -> Iterator[Model]:
+    for start in _starts(model):
+        yield fit_with_delays(start, rows, _STEPS)
+
+
+def _starts(model: Model) -> Iterator[Model]:
+    for early, late in _DELAYS:
+        moved = model.input_delay + early, model.output_delay + late
+        yield model.with_delays(*(np.clip(one, 0.0, most) for one, most in zip(moved, LONGEST, strict=True)))
+    for k, one in enumerate(model.applied):
+        linear = one.law.linear if isinstance(one.law, AddedLaw) else ()
+        for p, parameter in enumerate(one.law.parameters):
+            for share in _SHARES if parameter.name not in linear else ():
+                values: Array = one.values.copy()
+                values[p] = np.clip(share * values[p], parameter.low, parameter.high)
+                yield model.replacing(k, attrs.evolve(one, values=values))
