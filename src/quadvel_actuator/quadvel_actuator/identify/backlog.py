@@ -139,6 +139,7 @@ def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array,
     for d, step in enumerate(moves):
         here = (which[own] == d) & inside[own]
         made = before[here][..., :, None] * step * after[here][..., None, :]
-        counts[d] = (made / made.sum(axis=(-1, -2), keepdims=True)).sum(axis=(0, 1))
+        total = made.sum(axis=(-1, -2), keepdims=True)  # 0 where what follows contradicts all that led here
+        counts[d] = (made / np.maximum(total, np.finfo(float).tiny)).sum(axis=(0, 1))
     whole = odds[own].swapaxes(0, 1).reshape(-1, *costs.shape[1:])[:rows]
     return whole, counts
