@@ -36,7 +36,7 @@ class MuxConfig:
     """Bounds of the command, each for vx, vy (m/s) and wz (rad/s)."""
 
     max_velocity: Axes = attrs.field(
-        default=(4.5, 2.0, 4.0),
+        default=(4.5, 2.2, 6.3),
         validator=_axes,
         metadata={"description": "largest vx, vy, wz passed on, m/s, rad/s"},
     )
