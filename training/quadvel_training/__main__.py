@@ -98,8 +98,14 @@ def export_policy(
     out: Annotated[Path, typer.Option(help="The policy file to write.")] = Path("out/training/crl_eam.onnx"),
     source: Recipe = None,
 ) -> None:
-    """A policy file of a checkpoint, behind a command map that takes out its steady-state error."""
-    stage3.export(recipe.read(crl.CrlConfig, source), source, checkpoint, out)
+    """A policy file of a checkpoint, behind a command map that takes out its steady-state error.
+
+    The recipe is that of the checkpoint's stage: it says which commands the file answers.
+    """
+    if stage3.is_student(checkpoint):
+        stage3.export_student(source, checkpoint, out)
+    else:
+        stage3.export(recipe.read(crl.CrlConfig, source), source, checkpoint, out)
     print(f"written: {out}")
 
 

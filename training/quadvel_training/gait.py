@@ -22,7 +22,8 @@ COM = (0.004, 0.0018, -0.03)  # m, of the whole robot in the trunk frame, roughl
 OFFSET = (0.0, 0.5, 0.5, 0.0)  # of a cycle: diagonal pairs
 LIFT = 0.08  # m
 LEAD = 0.025  # s, by which the soft gains lag behind a swing
-HANDOVER = 0.04  # s, in which a leg passes from swing to push and back; the drives are late, so it ends with the change
+HANDOVER, OF_STANCE = 0.04, 0.27
+"""s, in which a leg passes from swing to push and back, and the most of its time on the ground that this may take"""
 LEG_WEIGHT = np.tile([[-1.07, 1.07], [0.34, 0.34], [-0.27, -0.27]], 2)  # N m, of a lifted leg
 CENTRING = 30.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
 SPEED_WEIGHTS = (1.0, 1.3, 0.35)  # how fast the feet go for 1 m/s forward, 1 m/s sideways, 1 rad/s
@@ -78,10 +79,14 @@ class Cycle:
         self.down = self._leg.fmod(1.0) < self.duty + self.stands
 
     def load(self) -> Tensor:
-        """How much of its push each leg gives, (..., 4): 0 in its swing, 1 on the ground, without a jump between them."""
-        ahead = self._leg + 0.5 * HANDOVER * self.frequency
+        """How much of its push each leg gives, (..., 4): 0 in its swing, 1 on the ground, without a jump between them.
+
+        The drives are late, so that a handover ends with the change.
+        """
+        handover = torch.minimum(HANDOVER * self.frequency, OF_STANCE * self.duty)
+        ahead = self._leg + 0.5 * handover
         from_middle = ((ahead - 0.5 * self.duty + 0.5).fmod(1.0) - 0.5).abs()
-        inside = (0.5 * self.duty - from_middle) / (HANDOVER * self.frequency)
+        inside = (0.5 * self.duty - from_middle) / handover
         share = (0.5 + inside + self.stands).clamp(0.0, 1.0)
         return share * share * (3 - 2 * share)
 

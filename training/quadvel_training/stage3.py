@@ -6,6 +6,8 @@ from pathlib import Path
 
 import attrs
 
+from quadvel_actuator import ActuatorParameters
+
 from . import distill, loop, parallel, recipe, student
 from .command_map import CommandMap
 from .crl import CrlConfig, CrlRun
@@ -18,6 +20,11 @@ ABLATION = ("rl_pd", "rl_eam", "crl_eam")
 TUNE = RECIPES / "tune.yaml"
 CHECKPOINT = "crl.pt"
 NO_LIMIT = 1e6  # minutes
+
+
+def is_student(checkpoint: Path) -> bool:
+    """Is this a checkpoint of stage 2?"""
+    return "student" in loop.load(checkpoint)
 
 
 def policy_of(checkpoint: Path) -> student.Policy:
@@ -48,6 +55,14 @@ def map_of(checkpoint: Path) -> CommandMap:
     """The command map in a checkpoint of stage 2 or 3; one that adds nothing where there is none."""
     weights = loop.load(checkpoint).get("command_map")
     return CommandMap(None if weights is None else weights.numpy())
+
+
+def export_student(source: Path | None, checkpoint: Path, out: Path) -> None:
+    """The policy file of a checkpoint of stage 2 within its recipe's `limits`, behind its command map, measured anew."""
+    config = recipe.read(distill.DistillConfig, source)
+    about = made_of("distill", source, config, checkpoint)
+    drives = ActuatorParameters.default()
+    distill.export_mapped(policy_of(checkpoint), map_of(checkpoint), config.limits, drives, about, out)
 
 
 def export(config: CrlConfig, source: Path | None, checkpoint: Path, out: Path) -> None:
