@@ -17,7 +17,6 @@ from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, teacher
 from .card import card
-from .command_map import CommandMap
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -71,8 +70,7 @@ def train_student(
     run = distill.DistillRun(config, teacher_file, stage3.policy_of(start) if start else None)
     checkpoint = out / "student.pt"
     loop.train(run, config.budget, checkpoint)
-    drives, about = ActuatorParameters.default(), run_folder.made_of("distill", source, config, checkpoint)
-    distill.export_mapped(run.student, CommandMap(), config.limits, drives, about, out / "policy.onnx")
+    stage3.export_student(config, source, checkpoint, out / "policy.onnx")
 
 
 @app.command("crl")
@@ -103,7 +101,7 @@ def export_policy(
     The recipe is that of the checkpoint's stage: it says which commands the file answers.
     """
     if stage3.is_student(checkpoint):
-        stage3.export_student(source, checkpoint, out)
+        stage3.export_student(recipe.read(distill.DistillConfig, source), source, checkpoint, out)
     else:
         stage3.export(recipe.read(crl.CrlConfig, source), source, checkpoint, out)
     print(f"written: {out}")

@@ -98,7 +98,7 @@ class Cycle:
 
     def lift(self, swing: Tensor) -> Tensor:
         """Wanted height of each foot above ground, (..., 4) m, so far in its swing."""
-        return LIFT * (torch.pi * swing).sin().square() * (1 - self.stands)
+        return LIFT * (torch.pi * swing.minimum(1 - swing)).sin().square() * (1 - self.stands)
 
 
 def targets(cycle: Cycle, body: Body) -> Tensor:

@@ -57,9 +57,8 @@ def map_of(checkpoint: Path) -> CommandMap:
     return CommandMap(None if weights is None else weights.numpy())
 
 
-def export_student(source: Path | None, checkpoint: Path, out: Path) -> None:
-    """The policy file of a checkpoint of stage 2 within its recipe's `limits`, behind its command map, measured anew."""
-    config = recipe.read(distill.DistillConfig, source)
+def export_student(config: distill.DistillConfig, source: Path | None, checkpoint: Path, out: Path) -> None:
+    """The policy file of a checkpoint of stage 2 within the recipe's `limits`, behind its command map, measured anew."""
     about = made_of("distill", source, config, checkpoint)
     drives = ActuatorParameters.default()
     distill.export_mapped(policy_of(checkpoint), map_of(checkpoint), config.limits, drives, about, out)
