@@ -206,6 +206,11 @@ def test_stretches_end_where_the_command_changes_or_the_planner_falls_silent() -
     assert commands(np.zeros(0), np.zeros((0, 3))) == []
 
 
+def test_a_planner_that_is_late_by_less_than_the_mux_waits_for_has_not_stopped() -> None:
+    time = np.concatenate([np.arange(0.0, 2.0, 0.02), np.arange(2.45, 4.0, 0.02)])
+    assert len(commands(time, np.tile([0.5, 0.0, 0.0], (len(time), 1)))) == 1
+
+
 def test_lying_down_is_no_fall_but_tilting_over_is_one() -> None:
     lying, still = np.array([0.4, 0.1, 0.1, 0.4]), np.tile(UPRIGHT, (4, 1))
     assert count_falls(lying, still, np.array([True, True, True, True])) == 1

@@ -62,7 +62,7 @@ SCRIPTS: dict[str, tuple[Step, ...]] = {
     "quick": (
         STAND_UP,
         Drive("forward 0.5 m/s", (0.5, 0.0, 0.0), 4.0),
-        Drive("stop", (0.0, 0.0, 0.0), 3.0),
+        Drive("stop", (0.0, 0.0, 0.0), 4.0),
         LIE_DOWN,
     ),
 }

@@ -22,6 +22,7 @@ _PIECE, _AROUND = 600, 150
 
 _ROUNDS = 8
 _RARE = 1e-6
+_SURE = 50.0  # nats that one row can say at most: it may be an outlier, and what no state explains is no proof
 
 
 @attrs.frozen
@@ -114,7 +115,7 @@ def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array,
     first = np.arange(-(-rows // _PIECE)) * _PIECE - _AROUND
     at = np.clip(first + np.arange(_PIECE + 2 * _AROUND)[:, None], 0, rows - 1)  # (R, pieces)
     inside = first + np.arange(len(at))[:, None] == at
-    likely = np.exp(np.min(costs, axis=-1, keepdims=True) - costs)[at]
+    likely = np.exp(np.maximum(np.min(costs, axis=-1, keepdims=True) - costs, -_SURE))[at]
     likely = np.where(inside[..., None, None], likely, 1.0)  # (R, S, G, M)
     moves = chances.steps(costs.shape[-1] - 1)
     which = np.where(inside, new[at], 0)
@@ -139,7 +140,6 @@ def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array,
     for d, step in enumerate(moves):
         here = (which[own] == d) & inside[own]
         made = before[here][..., :, None] * step * after[here][..., None, :]
-        total = made.sum(axis=(-1, -2), keepdims=True)  # 0 where what follows contradicts all that led here
-        counts[d] = (made / np.maximum(total, np.finfo(float).tiny)).sum(axis=(0, 1))
+        counts[d] = (made / made.sum(axis=(-1, -2), keepdims=True)).sum(axis=(0, 1))
     whole = odds[own].swapaxes(0, 1).reshape(-1, *costs.shape[1:])[:rows]
     return whole, counts
