@@ -81,6 +81,38 @@ def test_a_leg_passes_from_swing_to_push_and_back_without_a_jump():
     assert (step < 0.25 * reach).all()
 
 
+def standing_legs(command, phase=0.25):
+    """A robot in its nominal posture that walks as commanded, where legs 0 and 3 stand: cycle, body."""
+    given = tensor([command])
+    vx, vy, wz, _ = command
+    q, level = columns(tensor(robot.NOMINAL_Q))[None], torch.zeros(1, 2)
+    body = gait.Body(
+        q, tensor([[vx, vy, 0.0]]), tensor([[0.0, 0.0, wz]]), level, level, tensor([[gait.HEIGHT]])
+    )
+    return gait.Cycle(tensor([[phase]]), given), body
+
+
+def test_in_a_curve_the_feet_push_inward_and_nothing_else_than_the_weight():
+    """A trunk that goes round at v with w accelerates by w x v; drives know of no force but what they are told."""
+    cycle, body = standing_legs([1.2, 0.3, 0.8, 0.0])
+    legs = Legs(body.q)
+    force = gait._stance_forces(cycle, body, legs.feet, cycle.load()[..., None, :]).sum(-1)[0]
+    expected = robot.MASS * np.array([-0.8 * 0.3, 0.8 * 1.2, robot.GRAVITY])
+    assert np.allclose(force, expected, rtol=0.01, atol=2.0)  # shared out by least squares, with moments
+
+
+def test_standing_feet_are_led_as_the_trunk_goes_over_them():
+    """Targets at a command less those at rest: the joint velocities of a foot at rest on the ground, for LEAD."""
+    feet, jacobians = kinematics.foot_kinematics(robot.NOMINAL_Q[None])
+    at, before = feet[0, 0], robot.NOMINAL_Q[:3]
+    over_ground = np.array([0.3, 0.05, 0.0]) + np.cross([0.0, 0.0, 0.2], at)
+    expected = -gait.LEAD * np.linalg.solve(jacobians[0, 0], over_ground)
+    cycle, body = standing_legs([0.3, 0.05, 0.2, 0.0])
+    force = gait._stance_forces(cycle, body, Legs(body.q).feet, cycle.load()[..., None, :])
+    held = before - (Legs(body.q).torques(force) / robot.KP)[0, :, 0].numpy()
+    assert np.allclose(gait.targets(cycle, body)[0, :3].numpy() - held, expected, atol=1e-3)
+
+
 def test_every_leg_pushes_wholly_in_stance_and_as_the_first_step_begins():
     begin = tensor([0.0])
     assert (gait.Cycle(begin, tensor([0.0, 0.0, 0.0, 1.0])).load() == 1).all()

@@ -21,7 +21,7 @@ from quadvel_description import symmetry
 from quadvel_sim.terrain import Terrain
 
 from . import student, teacher
-from .command_map import CommandMap, MapFit, Tracking, fit_command_map, held_commands
+from .command_map import CommandCorrection, CommandMap, MapFit, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
@@ -168,7 +168,8 @@ class DistillRun:
         fit_command_map(Teacher(actor, VelocityEnv(trial), own, gain=0.0))
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain)
-        self.student = start or student.Policy(self.env.stand_q, own)
+        self.student = start or student.Policy(self.env.stand_q)
+        self.student.lead = CommandCorrection(own, student.COMMAND)
         if not start:
             self.student.take_over(actor.network.body)
         self.map = student.action_map(self.env)

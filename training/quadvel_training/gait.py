@@ -21,7 +21,7 @@ HEIGHT = 0.40  # m, wanted trunk height
 COM = (0.004, 0.0018, -0.03)  # m, of the whole robot in the trunk frame, roughly
 OFFSET = (0.0, 0.5, 0.5, 0.0)  # of a cycle: diagonal pairs
 LIFT = 0.08  # m
-LEAD = 0.025  # s, by which the soft gains lag behind a swing
+LEAD = 0.025  # s, by which soft and late drives lag behind a foot's motion
 HANDOVER, OF_STANCE = 0.04, 0.27
 """s, in which a leg passes from swing to push and back, and the most of its time on the ground that this may take"""
 LEG_WEIGHT = np.tile([[-1.07, 1.07], [0.34, 0.34], [-0.27, -0.27]], 2)  # N m, of a lifted leg
@@ -105,8 +105,10 @@ def targets(cycle: Cycle, body: Body) -> Tensor:
     """Joint targets (..., 12) rad: swing feet by position, stance feet by force, through the soft gains."""
     legs = Legs(body.q)
     load = cycle.load()[..., None, :]
-    swing = angles(_swing_feet(cycle, body)) + body.q.new_tensor(LEG_WEIGHT / robot.KP)
-    push = body.q - legs.torques(_stance_forces(cycle, body, legs.feet, load)) / robot.KP
+    on_ground = legs.feet - LEAD * _over_ground(cycle, legs.feet)
+    swing, push = angles(torch.stack([_swing_feet(cycle, body), on_ground]))
+    swing = swing + body.q.new_tensor(LEG_WEIGHT / robot.KP)
+    push = push - legs.torques(_stance_forces(cycle, body, legs.feet, load)) / robot.KP
     return joints(swing + load * (push - swing))
 
 
@@ -135,13 +137,21 @@ def _swing_feet(cycle: Cycle, body: Body) -> Tensor:
     return torch.cat([level, cycle.lift(swing)[..., None, :]], dim=-2) + turn.new_tensor(_STAND)
 
 
+def _over_ground(cycle: Cycle, feet: Tensor) -> Tensor:
+    """How fast the trunk goes over feet (..., 3, 4) m that stand still, where each of them is: (..., 3, 4) m/s."""
+    along, turn, _ = cycle.command[..., None].split([2, 1, 1], dim=-2)
+    across = feet[..., [1, 0, 2], :] * feet.new_tensor([[-1.0], [1.0], [0.0]])
+    return torch.cat([along, torch.zeros_like(turn)], dim=-2) + turn * across
+
+
 def _stance_forces(cycle: Cycle, body: Body, feet: Tensor, load: Tensor) -> Tensor:
     """Ground forces on the feet, trunk frame (..., 3, 4) N: least squares for a wrench that brings the trunk back."""
     w, v = body.angular_velocity, body.velocity
     along, turn, _ = cycle.command.split([2, 1, 1], dim=-1)
     push, twist = (cycle.stands * CENTRING * _standing_place(feet, body.slope)).split([2, 1], dim=-1)
     carry = robot.GRAVITY + 100 * (HEIGHT - body.height) - 14 * v[..., 2:]
-    push = 6 * (along - v[..., :2]) + push
+    inward = turn * along.flip(-1) * along.new_tensor([-1.0, 1.0])  # in a curve
+    push = 6 * (along - v[..., :2]) + inward + push
     force = robot.MASS * (carry * upward(body.roll_pitch) + push @ push.new_tensor(np.eye(2, 3)))
     tilt = (lean(body.slope) - body.roll_pitch) * w.new_tensor(_TILT)
     moment = torch.cat([tilt, _TURN[2] * turn + twist], dim=-1) - w * w.new_tensor(_TURN)

@@ -53,14 +53,14 @@ class Policy(Recurrent):
     expect: Tensor
     expect_offset: Tensor
 
-    def __init__(self, offset: np.ndarray = robot.NOMINAL_Q, command_map: CommandMap | None = None) -> None:
-        """offset: joint angles (12,) rad at action zero. command_map: of the gait as its teacher walks it."""
+    def __init__(self, offset: np.ndarray = robot.NOMINAL_Q) -> None:
+        """offset: joint angles (12,) rad at action zero."""
         seen = DEFAULT_OBSERVATION.size - COMMAND + CARRIED
         super().__init__(seen, 12, MEMORY, HIDDEN)
         self.body = mlp([MEMORY + seen, *HIDDEN, 12])
         with torch.no_grad():
             self.body[-1].weight.mul_(0.1)
-        self.lead = CommandCorrection(command_map or CommandMap(), COMMAND).requires_grad_(False)
+        self.lead = CommandCorrection(CommandMap(), COMMAND)  # of the gait, as its teacher walks it
         self.correction: CommandCorrection | None = None  # of the commands that the policy is given
         self.register_buffer("offset", torch.tensor(offset, dtype=torch.float32))
         for name, array in zip(("expect", "expect_offset"), _expectation(), strict=True):

@@ -22,7 +22,8 @@ _PIECE, _AROUND = 600, 150
 
 _ROUNDS = 8
 _RARE = 1e-6
-_SURE = 50.0  # nats that one row can say at most: it may be an outlier, and what no state explains is no proof
+_SURE = 50.0
+"""nats that one row can say at most: it may be an outlier"""
 
 
 @attrs.frozen
