@@ -24,6 +24,7 @@ _ROUNDS = 8
 _RARE = 1e-6
 _SURE = 50.0
 """nats that one row can say at most: it may be an outlier"""
+_NEVER = 1e-100  # a chance, so that two accounts that contradict each other leave one
 
 
 @attrs.frozen
@@ -125,14 +126,14 @@ def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array,
     state[..., 0] = 1.0
     for n in range(len(at)):
         state = (state @ moves[which[n]]) * likely[n]
-        state /= state.sum(axis=-1, keepdims=True)
+        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _NEVER)
         forward[n] = state
     state = np.ones(likely.shape[1:])
     back = moves.swapaxes(-1, -2)
     for n in range(len(at) - 1, -1, -1):
         backward[n] = state
         state = (state * likely[n]) @ back[which[n]]
-        state /= state.sum(axis=-1, keepdims=True)
+        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _NEVER)
     odds = forward * backward
     odds /= odds.sum(axis=-1, keepdims=True)
     own = slice(_AROUND, _AROUND + _PIECE)

@@ -40,8 +40,8 @@ _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it."""
-_ALL_SAID, _LEAD, _NEAR = 1.05, 3, 0.8
-"""Of the noise: so little left, and no other law is in question; so many in the lead, and so near the best one's gain."""
+_LEAD, _NEAR = 3, 0.8
+"""So many in the lead, and so near the best one's gain"""
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
@@ -193,19 +193,13 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
 
 
 def _settled(about: About, candidates: list[Candidate]) -> list[Candidate]:
-    """The candidates, those in the lead that look like a delay fitted from other delays, too, if none says all there is.
+    """The candidates, those in the lead that look like a delay fitted from other delays, too.
 
     What they change and what the delays stand for goes together, and each can be stuck at delays that are not its own.
     """
     if not candidates:
         return candidates
-    rows, most = about.judge.judge, candidates[0].gain
-    left, floor = (
-        np.mean(candidates[0].residual[rows] ** 2),
-        np.average(about.noise, weights=rows.sum(axis=0)),
-    )
-    if left < _ALL_SAID * floor:
-        return candidates
+    most = candidates[0].gain
     lead = [one for one in candidates[:_LEAD] if one.law.shifts and one.gain > _NEAR * most > 0.0]
     if not lead or (len(lead) == 1 and lead[0] is candidates[0]):
         return candidates

@@ -64,3 +64,14 @@ def _starts(model: Model) -> Iterator[Model]:
                 values: Array = one.values.copy()
                 values[p] = np.clip(share * values[p], parameter.low, parameter.high)
                 yield model.replacing(k, attrs.evolve(one, values=values))
+        if len(np.unique(one.groups[one.active])) > 1:
+            clearest = _clearest(model, k)
+            yield model.replacing(k, attrs.evolve(one, values=np.where(one.active, clearest, one.values)))
+
+
+def _clearest(model: Model, index: int) -> Array:
+    """The values (P, 1) of the joint whose torque an effect changes most: drives are often alike, and it shows them best."""
+    one = model.applied[index]
+    change = np.square(model.predict() - model.without(index).predict()).mean(axis=0)
+    joint = int(np.argmax(np.where(one.active, change, -1.0)))
+    return one.values[:, joint, None]
