@@ -45,3 +45,18 @@ def test_intervals_hold_what_is_as_deep(stuck):
     assert others
     for other in others:
         assert (np.abs(other.applied[0].values - found.applied[0].values) <= half + 1e-12).all()
+
+
+def test_what_the_clearest_joint_shows_is_tried_on_all():
+    """Three equal drives cog; fits of two of them have settled a lobe of the spectrum away."""
+    truth = attrs.evolve(
+        parameters([Effect("cogging", NAMES[:3], {"a": 0.8, "n": 60.0, "phi": 0.5})]), joints=NAMES[:3]
+    )
+    log = record(truth, joints=3, seconds=4.0, motion="mixed", seed=6)
+    plain, judge, _ = looked_at(log)
+    values = np.array([[0.8, 0.3, 0.3], [60.0, 75.0, 45.0], [0.5, 1.0, -1.0]])
+    cogs = Applied(registry()["cogging"](), np.ones(3, dtype=bool), values, np.arange(3))
+    settled = fit_with_delays(plain.plus(cogs), judge.fit, 10)
+    assert np.abs(settled.applied[0].values[1] - 60.0).max() > 5.0
+    found = deepest(settled, judge.fit, 4).applied[0].values
+    assert found[1] == pytest.approx(np.full(3, 60.0), abs=0.5)

@@ -48,6 +48,38 @@ def test_a_slew_limit_is_followed_between_the_rows():
     assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
 
 
+def _of_one_joint(log, law, value, input_delay=0.0):
+    one = np.zeros(1, dtype=np.intp)
+    applied = Applied(law, np.ones(1, dtype=bool), np.array([[value]]), one)
+    gains = np.array([[30.0], [1.0]])
+    delay = np.full(1, input_delay)
+    return Model(Samples([log]), 0.0, gains, np.array([one, one]), delay, np.zeros(1), one, (applied,))
+
+
+def test_a_lag_at_other_delays_is_computed_anew_where_rows_see_the_same_commands():
+    """Commands and rows on one grid of 2 ms: delays of 0.5 and 1.5 ms show the same commands, of other age."""
+    law = registry()["first_order_lag"]()
+    model = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0005)
+    model.predict()
+    later = model.with_delays(np.full(1, 0.0015), model.output_delay)
+    fresh = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0015)
+    assert np.array_equal(later.predict(), fresh.predict())
+    assert np.abs(later.predict() - model.predict()).max() > 0.01
+
+
+def test_a_filtered_velocity_is_followed_between_the_rows():
+    """A sine of 8 Hz through a lag of 6 ms, known from rows of 2 ms: amplitude and phase in closed form."""
+    w, lag = 2 * np.pi * 8.0, 0.006
+    t = np.arange(0.0, 2.0, 0.002)
+    dq = np.sin(w * t)
+    log = Log("sine", NAMES[:1], t, 0.0 * t[:, None], dq[:, None], t, 0.0 * t[:, None], np.ones((len(t), 1), bool),
+              tau=0.0 * t[:, None])  # fmt: skip
+    predicted = _of_one_joint(log, registry()["velocity_filter"](), lag).predict()[:, 0]
+    filtered = np.sin(w * t - np.arctan(w * lag)) / np.hypot(1.0, w * lag)
+    settled = t > 0.1
+    assert np.abs(predicted + filtered)[settled].max() < 0.01
+
+
 @pytest.mark.parametrize(("channel", "late"), [("q", -0.009), ("q", 0.009), ("dq", -0.006), ("dq", 0.01)])
 def test_a_channel_stamped_early_or_late_on_one_joint_is_found(channel, late):
     """Beside the others: what all are off by is next to a delay. Damping may say as much of a position, but not more."""

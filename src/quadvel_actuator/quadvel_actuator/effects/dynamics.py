@@ -36,6 +36,11 @@ def lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
     return before - np.expm1(-dt / time) * (x - before)
 
 
+def _evenly(before: Array, x: Array, dt: Any, time: Array) -> Array:
+    """What, held for `dt`, moves a first-order lag as far as a signal that goes evenly from `before` to `x`."""
+    return x + (x - before) * (1.0 / np.expm1(dt / time) - time / dt)
+
+
 def lagged(x: Array, s: Any, time: Array) -> Array:
     """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
 
@@ -108,14 +113,16 @@ class VelocityFilter(MemoryLaw):
         return [{"T": time} for time in (0.001, 0.002, 0.004, 0.008, 0.015, 0.03)]
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
-        return (u[0],)
+        return u[0], u[0]
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        filtered = lag(memory[0], u[0], dt, p["T"])
-        return (x[0], x[1] + u[0] - filtered), (filtered,)
+        filtered, before = memory
+        filtered = lag(filtered, _evenly(before, u[0], dt, p["T"]), dt, p["T"])
+        return (x[0], x[1] + u[0] - filtered), (filtered, u[0])
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return x[0], x[1] + s.dq - lagged(s.dq, s, p["T"])
+        before = np.where(s.start, s.dq, np.concatenate([s.dq[:1], s.dq[:-1]]))
+        return x[0], x[1] + s.dq - lagged(_evenly(before, s.dq, s.dt, p["T"]), s, p["T"])
 
 
 @attrs.frozen(eq=False)

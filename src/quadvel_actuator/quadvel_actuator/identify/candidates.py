@@ -69,7 +69,8 @@ class About:
         """The model fitted with its delays to few rows, from these or those without its last effect."""
         there, rows = self.few.of(model)
         here = there.with_delays(self.model.input_delay, self.model.output_delay)
-        starts = (there,) if remembers(model) else (there, here)
+        cheap = not remembers(model) or model.applied[-1].law.shifts
+        starts = (there, here) if cheap else (there,)
         near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in starts], rows, 1)[0]
         near = attrs.evolve(near, samples=model.samples)
         if model.applied[

@@ -3,7 +3,7 @@
 Two covariances are compared and the wider one counts: that of white residuals, and the sandwich of sums over blocks of
 consecutive rows, which holds whatever the correlation within a block. The delays are unknowns of it, too. Where a law may
 have other shapes that no log tells apart, what these say of its parameters lies within the interval; and so does what
-other valleys of the error say that are as deep.
+other valleys of the error say that are as deep, and what the held-out rows say where they contradict the fitted ones.
 """
 
 from __future__ import annotations
@@ -16,10 +16,12 @@ from .delays import fit_with_delays, jacobian_with_delays
 from .judging import Judge
 from .learned import Learned
 from .model import Model, gather
-from .signals import Array
+from .signals import Array, Bools
 from .valleys import as_deep
 
 LEVEL = 0.95
+_CLOCK = 0.25e-3
+"""s, by which times may be off besides: the clock of a drive, whose step is up to 1 ms, is in no log"""
 _AS_WELL = 1.003
 """of the error: a shape of a law that leaves no more explains the log as well"""
 
@@ -37,51 +39,68 @@ class Intervals:
 def intervals(model: Model, judge: Judge, learned: Learned | None = None) -> Intervals:
     """Intervals of everything that was fitted to the rows `judge.fit`, the weights of learned terms left free beside it."""
     model = model if learned is None else learned.beside
-    predicted, slopes, slots = jacobian_with_delays(model)
-    left = np.where(judge.fit, model.samples.tau - predicted, 0.0)
-    slopes *= judge.fit.T[:, None]
-    if learned is not None:
-        slopes = _beside_terms(slopes, learned, judge)
-    hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
-    freedom = max(int(judge.fit.sum()) - slots.count, 1)
-    scale = np.sqrt(np.diagonal(hessian)) + 1e-12
-    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(
-        scale, scale
-    )
-    noise = np.array([np.sum(one**2) for one in left.T]) / np.maximum(judge.fit.sum(axis=0), 1)
-    white = gather(slots, noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
-    meat = np.zeros_like(hessian)
-    units = 0
-    for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
-        used = slots.index[:, j] >= 0
-        sums = judge.sums(moment[used].T)
-        units += int((judge.sums(judge.fit[:, j].astype(float)) > 0).sum())
-        at = slots.index[used, j]
-        np.add.at(meat, (at[:, None], at[None]), sums.T @ sums)
-    covariance = [inverse @ middle @ inverse for middle in (white, meat)]
-    variance = np.maximum(*(np.diagonal(one) for one in covariance)) * (1.0 + slots.count / freedom)
-    half = np.sqrt(np.maximum(variance, 0.0)) * stats.t.ppf(0.5 + LEVEL / 2, max(units - slots.count, 5))
-    wide = np.where(slots.index >= 0, half[slots.index], 0.0)
+    wide = _half_widths(model, judge, judge.fit, learned)
     here = _everything(model)
     for other in as_deep(model, judge.fit):
         wide = np.maximum(wide, np.abs(_everything(other) - here))
+    wide = np.maximum(wide, _contradicted(model, judge, wide, learned))
     effects: list[Array] = []
     first = 2
     for one in model.applied:
         mine = wide[first : first + len(one.law.parameters)]
         random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
         chance = np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
-        effects.append(chance + _shape_error(model, len(effects), judge))
+        clock = np.array([[_CLOCK if parameter.unit == "s" else 0.0] for parameter in one.law.parameters])
+        effects.append(chance + _shape_error(model, len(effects), judge) + clock * one.active)
         first += len(one.law.parameters)
-    return Intervals(wide[:2], tuple(effects), wide[-2:], _on_bound(model))
+    return Intervals(wide[:2], tuple(effects), wide[-2:] + _CLOCK, _on_bound(model))
 
 
-def _beside_terms(slopes: Array, learned: Learned, judge: Judge) -> Array:
+def _half_widths(model: Model, judge: Judge, rows: Bools, learned: Learned | None) -> Array:
+    """Half widths (A + 2, J) of what was fitted to `rows` (N, J), from the slopes there; 0 where nothing was."""
+    predicted, slopes, slots = jacobian_with_delays(model)
+    left = np.where(rows, model.samples.tau - predicted, 0.0)
+    slopes *= rows.T[:, None]
+    if learned is not None:
+        slopes = _beside_terms(slopes, learned, rows)
+    hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
+    freedom = max(int(rows.sum()) - slots.count, 1)
+    scale = np.sqrt(np.diagonal(hessian)) + 1e-12
+    inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True) / np.outer(
+        scale, scale
+    )
+    noise = np.array([np.sum(one**2) for one in left.T]) / np.maximum(rows.sum(axis=0), 1)
+    white = gather(slots, noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
+    meat = np.zeros_like(hessian)
+    units = 0
+    for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
+        used = slots.index[:, j] >= 0
+        sums = judge.sums(moment[used].T)
+        units += int((judge.sums(rows[:, j].astype(float)) > 0).sum())
+        at = slots.index[used, j]
+        np.add.at(meat, (at[:, None], at[None]), sums.T @ sums)
+    covariance = [inverse @ middle @ inverse for middle in (white, meat)]
+    variance = np.maximum(*(np.diagonal(one) for one in covariance)) * (1.0 + slots.count / freedom)
+    half = np.sqrt(np.maximum(variance, 0.0)) * stats.t.ppf(0.5 + LEVEL / 2, max(units - slots.count, 5))
+    return np.where(slots.index >= 0, half[slots.index], 0.0)
+
+
+def _contradicted(model: Model, judge: Judge, wide: Array, learned: Learned | None) -> Array:
+    """How far off the model fitted to the held-out rows is, (A + 2, J), where the two contradict each other, else 0.
+
+    Then neither of the two widths holds: the model lacks something that bends what is fitted on one of them.
+    """
+    other = fit_with_delays(model, judge.judge)
+    apart = np.abs(_everything(other) - _everything(model))
+    return np.where(apart > wide + _half_widths(other, judge, judge.judge, learned), apart, 0.0)
+
+
+def _beside_terms(slopes: Array, learned: Learned, rows: Bools) -> Array:
     """Of the slopes (J, A, N) what no weights of the terms of their joint explain."""
     found = slopes.copy()
     for j, columns in enumerate(learned.columns):
         if columns.shape[1]:
-            x = columns * judge.fit[:, j, None]
+            x = columns * rows[:, j, None]
             weights = np.linalg.lstsq(x, slopes[j].T, rcond=1e-6)[0]
             found[j] -= (x @ weights).T
     return found

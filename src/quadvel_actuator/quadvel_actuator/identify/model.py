@@ -156,7 +156,7 @@ class Model:
         if len(_lean(value)) > 1:
             return law.series(x, s, p)
         given = () if law.stage == Stage.ADDED else x if isinstance(x, tuple) else (x,)
-        seen = (*given, *(getattr(s, name) for name in law.inputs))
+        seen = (*given, s.age, *(getattr(s, name) for name in law.inputs))
         kept = self.samples.kept
         key = (id(law), value[0].tobytes(), *(hash(part.tobytes()) for part in seen))
         if key not in kept:

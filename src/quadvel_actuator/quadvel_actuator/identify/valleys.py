@@ -14,12 +14,17 @@ import numpy as np
 
 from ..effects import AddedLaw
 from .delays import LONGEST, fit_with_delays
+from .eam import WINDOWS
 from .few import remembers
 from .model import Model
 from .signals import Array, Bools
 
-_DELAYS = np.array([(1.0, -1.0), (-1.0, 1.0), (0.3, -0.3), (-0.3, 0.3), (-0.3, 0.0), (0.3, 0.0)]) * 1e-3
-"""s more of input and output delay"""
+_DELAYS = np.array(
+    [(1.0, -1.0), (-1.0, 1.0), (0.3, -0.3), (-0.3, 0.3), (-0.3, 0.0), (0.3, 0.0), (0.0, -1.0), (0.0, 1.0)]
+) * 1e-3  # fmt: skip
+_OUTPUTS = (0.0, -1e-3, 1e-3)
+"""s more of input and output delay, and of the latter where the drive takes other steps"""
+_OF_STEP = 0.6  # of a drive's step, by which commands seem later with it
 _SHARES = (0.98, 0.99, 1.01, 1.02)
 _STEPS = 5
 _DEEPER = 1.0
@@ -55,8 +60,10 @@ def _neighbours(model: Model, rows: Bools) -> Iterator[Model]:
 
 def _starts(model: Model) -> Iterator[Model]:
     for early, late in _DELAYS:
-        moved = model.input_delay + early, model.output_delay + late
-        yield model.with_delays(*(np.clip(one, 0.0, most) for one, most in zip(moved, LONGEST, strict=True)))
+        yield _moved(model, early, late)
+    for window in WINDOWS if model.window in WINDOWS else ():
+        for late in _OUTPUTS if window != model.window else ():
+            yield _moved(attrs.evolve(model, window=window), _OF_STEP * (window - model.window), late)
     for k, one in enumerate(model.applied):
         linear = one.law.linear if isinstance(one.law, AddedLaw) else ()
         for p, parameter in enumerate(one.law.parameters):
@@ -67,6 +74,12 @@ def _starts(model: Model) -> Iterator[Model]:
         if len(np.unique(one.groups[one.active])) > 1:
             clearest = _clearest(model, k)
             yield model.replacing(k, attrs.evolve(one, values=np.where(one.active, clearest, one.values)))
+
+
+def _moved(model: Model, early: float, late: float) -> Model:
+    """With so much more input and output delay, s, as far as there is."""
+    delays = model.input_delay + early, model.output_delay + late
+    return model.with_delays(*(np.clip(one, 0.0, most) for one, most in zip(delays, LONGEST, strict=True)))
 
 
 def _clearest(model: Model, index: int) -> Array:
