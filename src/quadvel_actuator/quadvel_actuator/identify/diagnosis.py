@@ -40,7 +40,7 @@ _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it."""
-_OF_SHIFTS = 0.4
+_OF_SHIFTS = 0.25
 """So little of it promises a law that looks like a delay, as long as the delays stay where they are without it"""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
