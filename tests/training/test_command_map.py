@@ -27,14 +27,24 @@ def test_the_command_map_finds_a_map_of_its_own_kind():
     assert np.array_equal(command_map(still), still)
 
 
-def test_the_command_map_treats_left_and_right_alike():
+def test_the_command_map_of_a_teacher_treats_left_and_right_alike():
     rng = np.random.default_rng(1)
     wanted = rng.uniform(-1, 1, (500, 3))
-    command_map = CommandMap()
+    command_map = CommandMap(mirrored=True)
     command_map.correct(wanted, rng.normal(0, 0.1, (500, 3)))
     command = np.column_stack([wanted, np.zeros(500)])
     mirror = symmetry.PARTS["command"]
     assert np.allclose(command_map(mirror(command)), mirror(command_map(command)))
+
+
+def test_the_command_map_of_a_robot_takes_out_what_it_does_to_one_side_only():
+    wanted = np.random.default_rng(3).uniform(-1, 1, (2000, 3))
+    x, y, _ = wanted.T
+    missing = np.stack([0.03 * y, 0.02 * x, np.full(2000, 0.01)], axis=1)
+    command_map = CommandMap()
+    command_map.correct(wanted, missing)
+    out = command_map(np.column_stack([wanted, np.zeros(2000)]))
+    assert np.abs(out[:, :3] - wanted - missing).max() < 2e-3
 
 
 class Slipping:

@@ -91,22 +91,27 @@ def features(command: np.ndarray) -> np.ndarray:
 
 
 class CommandMap:
-    """Which command the teacher needs to walk at the wanted one: wanted + polynomial of it, odd under mirroring where due."""
+    """Which command a walker needs to walk at the wanted one: wanted + polynomial of it.
 
-    def __init__(self, weights: np.ndarray | None = None) -> None:
+    mirrored: the polynomial is odd under mirroring where due, as what a mirrored robot shall learn from has to be. Else it
+    takes out, besides, what a robot whose centre of mass is off the middle does to one side only.
+    """
+
+    def __init__(self, weights: np.ndarray | None = None, mirrored: bool = False) -> None:
         self.weights = np.zeros((TERMS, 3)) if weights is None else weights
+        half = slice(0, TERMS // 2), slice(TERMS // 2, None)
+        self._terms = (half[0], half[1], half[1]) if mirrored else (slice(None),) * 3
 
     def correct(self, wanted: np.ndarray, missing: np.ndarray) -> None:
         """Add the ridge regression of what is missing of the wanted velocities, (n, 3) each."""
         a = features(wanted)
-        half = TERMS // 2
-        for axis, columns in ((0, slice(0, half)), (1, slice(half, None)), (2, slice(half, None))):
+        for axis, columns in enumerate(self._terms):
             part = a[:, columns]
-            gram = part.T @ part + RIDGE * len(a) * np.eye(half)
+            gram = part.T @ part + RIDGE * len(a) * np.eye(part.shape[1])
             self.weights[columns, axis] += np.linalg.solve(gram, part.T @ missing[:, axis])
 
     def __call__(self, command: np.ndarray) -> np.ndarray:
-        """(n, 4) wanted -> (n, 4) for the teacher; stance stays as it is."""
+        """(n, 4) wanted -> (n, 4) for the walker; stance stays as it is."""
         given = command.copy()
         moving = command[:, 3] < 0.5
         added = features(command[:, :3]) @ self.weights

@@ -164,7 +164,7 @@ class DistillRun:
         env_config = EnvConfig(n=config.n, seed=config.seed, commands=config.commands)
         actor = load_teacher(teacher_file)
         trial = held_commands(env_config)  # on flat ground
-        own = CommandMap()
+        own = CommandMap(mirrored=True)
         fit_command_map(Teacher(actor, VelocityEnv(trial), own, gain=0.0))
         self.env = VelocityEnv(attrs.evolve(env_config, terrain=config.terrain))
         self.teacher = Teacher(actor, self.env, own, config.correction_gain)

@@ -54,13 +54,13 @@ class KalmanConfig:
     contact_source: what tells the force on a foot, its own sensor or the joint torques, which every robot has
     """
 
-    accelerometer: float = _positive(0.05, 5.8, 50.0)
-    foot_position: float = _positive(1e-4, 0.014, 0.2)
-    foot_velocity: float = _positive(0.01, 0.35, 2.0)
-    foot_walk: float = _positive(1e-4, 0.0028, 0.5)
-    slip_gate: float = _positive(0.1, 0.5, 10.0)
-    contact_force: float = _positive(0.5, 1.6, 60.0)
-    contact_ramp: float = _positive(0.5, 2.2, 150.0)
+    accelerometer: float = _positive(0.05, 16.2, 50.0)
+    foot_position: float = _positive(1e-4, 0.0102, 0.2)
+    foot_velocity: float = _positive(0.01, 0.465, 2.0)
+    foot_walk: float = _positive(1e-4, 0.00296, 0.5)
+    slip_gate: float = _positive(0.1, 0.564, 10.0)
+    contact_force: float = _positive(0.5, 2.42, 60.0)
+    contact_ramp: float = _positive(0.5, 3.34, 150.0)
     contact_source: Literal["foot_force", "torque"] = attrs.field(
         default="torque", validator=attrs.validators.in_(("foot_force", "torque"))
     )
