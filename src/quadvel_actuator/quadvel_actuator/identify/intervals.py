@@ -22,6 +22,8 @@ from .valleys import as_deep
 LEVEL = 0.95
 _CLOCK = 0.25e-3
 """s, by which times may be off besides: the clock of a drive, whose step is up to 1 ms, is in no log"""
+_BENT = 0.01
+"""of a value, by which it may be off besides: a log holds noisy samples of a motion, not the motion"""
 _AS_WELL = 1.003
 """of the error: a shape of a law that leaves no more explains the log as well"""
 
@@ -51,7 +53,8 @@ def intervals(model: Model, judge: Judge, learned: Learned | None = None) -> Int
         random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
         chance = np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
         clock = np.array([[_CLOCK if parameter.unit == "s" else 0.0] for parameter in one.law.parameters])
-        effects.append(chance + _shape_error(model, len(effects), judge) + clock * one.active)
+        systematic = np.maximum(clock, _BENT * np.abs(one.values)) * one.active
+        effects.append(chance + _shape_error(model, len(effects), judge) + systematic)
         first += len(one.law.parameters)
     return Intervals(wide[:2], tuple(effects), wide[-2:] + _CLOCK, _on_bound(model))
 

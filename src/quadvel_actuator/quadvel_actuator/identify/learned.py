@@ -105,7 +105,12 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
         picks.append(_simplest(kept))
         left = _Joint(picks, scene).left
     picks = _pruned(picks, scene, noise)
-    return _fitted_beside(picks, scene) if picks else None
+    if not picks:
+        return None
+    found = _fitted_beside(picks, scene)
+    tau = model.samples.tau
+    paid = judge.compare(tau - model.predict(), tau - found.model.predict() - found.torque)
+    return found if paid.p_any < LEVEL else None  # fitted to all, they may give back what they promised
 
 
 def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
