@@ -25,7 +25,7 @@ LEAD = 0.025  # s, by which soft and late drives lag behind a foot's motion
 HANDOVER, OF_STANCE = 0.04, 0.27
 """s, in which a leg passes from swing to push and back, and the most of its time on the ground that this may take"""
 LEG_WEIGHT = np.tile([[-1.07, 1.07], [0.34, 0.34], [-0.27, -0.27]], 2)  # N m, of a lifted leg
-CENTRING = 30.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
+CENTRING = 60.0  # 1/s^2, pull of the standing trunk to the middle of its feet, and to their heading
 SPEED_WEIGHTS = (1.0, 1.3, 0.24)  # by which steps come quicker for 1 m/s forward, 1 m/s sideways, 1 rad/s
 SLOWEST, QUICKER = 2.2, 0.64  # Hz, and Hz more for each m/s
 QUICKEST = 3.0  # m/s, from which on steps come no quicker
