@@ -54,7 +54,7 @@ class Body:
 
 
 def speed(command: Tensor) -> Tensor:
-    """How fast the feet have to go for a command (..., 3 or more), m/s, (..., 1)."""
+    """How fast a walk a command (..., 3 or more) is to the steps, m/s forward that need as quick ones, (..., 1)."""
     return (command[..., :3] * command.new_tensor(SPEED_WEIGHTS)).norm(dim=-1, keepdim=True)
 
 

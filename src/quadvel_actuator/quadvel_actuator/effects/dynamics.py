@@ -41,6 +41,11 @@ def _evenly(before: Array, x: Array, dt: Any, time: Array) -> Array:
     return x + (x - before) * (1.0 / np.expm1(dt / time) - time / dt)
 
 
+def _row_before(x: Array, s: Any) -> Array:
+    """Of the rows of `x` (..., N, J) each the one before it; the first of a stretch its own."""
+    return np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
+
+
 def lagged(x: Array, s: Any, time: Array) -> Array:
     """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
 
@@ -93,7 +98,7 @@ class FirstOrderLag(MemoryLaw):
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
         """A new command may come in the middle of a step: until then the torque before is followed."""
-        before = np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
+        before = _row_before(x, s)
         late = -np.expm1(-np.minimum(s.age, s.dt) / p["T"]) / -np.expm1(-s.dt / p["T"])
         return lagged(before + late * (x - before), s, p["T"])
 
@@ -121,8 +126,8 @@ class VelocityFilter(MemoryLaw):
         return (x[0], x[1] + u[0] - filtered), (filtered, u[0])
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        before = np.where(s.start, s.dq, np.concatenate([s.dq[:1], s.dq[:-1]]))
-        return x[0], x[1] + s.dq - lagged(_evenly(before, s.dq, s.dt, p["T"]), s, p["T"])
+        even = _evenly(_row_before(s.dq, s), s.dq, s.dt, p["T"])
+        return x[0], x[1] + s.dq - lagged(even, s, p["T"])
 
 
 @attrs.frozen(eq=False)

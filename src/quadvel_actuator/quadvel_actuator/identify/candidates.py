@@ -26,6 +26,11 @@ _LATER = tuple(np.arange(-0.003, 0.0031, 0.0005))
 _JOINT_LEVEL = 0.01  # p-value below which a joint counts as acted on
 
 
+def _may_move(model: Model) -> bool:
+    """Is it worth the time to fit the last effect from other delays, too? With a memory, if it looks like a delay."""
+    return not remembers(model) or model.applied[-1].law.shifts
+
+
 def _best(models: Sequence[Model], rows: Bools, count: int) -> list[Model]:
     """The `count` models with the least errors."""
     return sorted(models, key=lambda one: one.error(rows))[:count]
@@ -69,8 +74,7 @@ class About:
         """The model fitted with its delays to few rows, from these or those without its last effect."""
         there, rows = self.few.of(model)
         here = there.with_delays(self.model.input_delay, self.model.output_delay)
-        cheap = not remembers(model) or model.applied[-1].law.shifts
-        starts = (there, here) if cheap else (there,)
+        starts = (there, here) if _may_move(model) else (there,)
         near = _best([fit_with_delays(fit(one, rows, 2), rows, _STEPS) for one in starts], rows, 1)[0]
         near = attrs.evolve(near, samples=model.samples)
         if model.applied[
@@ -83,8 +87,7 @@ class About:
         """The model fitted from other delays and with other steps of the drive: an effect may have hidden the right ones."""
         some, rows = self.few.of(model)
         windows = [attrs.evolve(some, window=one) for one in sorted({model.window, *WINDOWS})]
-        cheap = not remembers(model) or model.applied[-1].law.shifts
-        near = _LATER if cheap else ()
+        near = _LATER if _may_move(model) else ()
         near_best = [
             found
             for one in windows  # each has its own valleys, so that they are compared at the bottom
