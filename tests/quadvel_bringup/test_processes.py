@@ -142,16 +142,28 @@ def _alone(program: str) -> None:
 
 def test_stop_signals_are_noted_and_not_raised_however_often_they_come() -> None:
     _alone("""
-        former = signal.getsignal(signal.SIGINT)
+        former = signal.getsignal(signal.SIGTERM)
         with StopSignals() as signals:
             assert not signals.wait(0.0)
             for number in (signal.SIGTERM, signal.SIGINT, signal.SIGINT):
                 os.kill(os.getpid(), number)
             assert signals.wait(1.0)
             assert signals.received == signal.SIGTERM
-        assert signal.getsignal(signal.SIGINT) is former
+        assert signal.getsignal(signal.SIGTERM) is former
         os.kill(os.getpid(), signal.SIGINT)  # does not come through to the clean-up that follows
         assert signal.sigtimedwait({signal.SIGINT}, 1.0) is not None
+    """)
+
+
+def test_a_thread_that_began_among_stop_signals_lets_none_through_at_the_end() -> None:
+    _alone("""
+        import threading, time
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        with StopSignals() as signals:
+            threading.Thread(target=time.sleep, args=(0.5,)).start()
+        assert not signals.received
+        os.kill(os.getpid(), signal.SIGINT)  # the thread has not blocked it
+        time.sleep(0.1)
     """)
 
 

@@ -86,8 +86,8 @@ class StopSignals:
     """While entered, SIGINT, SIGTERM and SIGHUP are noted instead of raised, however often they come.
 
     To be entered in the main thread, outside of a `ProcessGroup`, so that a second Ctrl-C does not cut its
-    clean-up short. A SIGINT that was held back before comes now. After the block it is held back again, and in
-    any case once one came: what follows is the end.
+    clean-up short. A SIGINT that was held back before comes now. If it was, and in any case once one came, it is
+    held back again after the block and ignored, also by threads that began in it: what follows is the end.
     """
 
     NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -115,7 +115,10 @@ class StopSignals:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask | INTERRUPT if self.received else self._mask)
+        if self.received or INTERRUPT <= self._mask:
+            self._mask |= INTERRUPT
+            self._former[signal.SIGINT] = signal.SIG_IGN
+        signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)
         for number, handler in self._former.items():
             signal.signal(number, handler)
 
