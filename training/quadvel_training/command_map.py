@@ -94,13 +94,15 @@ class CommandMap:
     """Which command a walker needs to walk at the wanted one: wanted + polynomial of it.
 
     mirrored: the polynomial is odd under mirroring where due, as what a mirrored robot shall learn from has to be. Else it
-    takes out, besides, what a robot whose centre of mass is off the middle does to one side only.
+    takes out, besides, what a robot whose centre of mass is off the middle does to one side only: terms up to second order,
+    since robots enough to tell higher ones from chance there are none at the corners of the range.
     """
 
     def __init__(self, weights: np.ndarray | None = None, mirrored: bool = False) -> None:
         self.weights = np.zeros((TERMS, 3)) if weights is None else weights
-        half = slice(0, TERMS // 2), slice(TERMS // 2, None)
-        self._terms = (half[0], half[1], half[1]) if mirrored else (slice(None),) * 3
+        even = np.arange(TERMS) < len(EVEN)
+        one_sided = not mirrored and EXPONENTS.sum(axis=1) <= 2
+        self._terms = tuple(np.flatnonzero(due | one_sided) for due in (even, ~even, ~even))
 
     def correct(self, wanted: np.ndarray, missing: np.ndarray) -> None:
         """Add the ridge regression of what is missing of the wanted velocities, (n, 3) each."""

@@ -108,7 +108,7 @@ def map_student(
     actor: Recurrent, own: CommandMap, commands: CommandRange, drives: ActuatorParameters
 ) -> tuple[MapFit, VelocityEnv]:
     """Fit a student's command map on the nominal plant with these actuators; and the environment it was measured in."""
-    plain = EnvConfig(n=256, commands=commands, actuator=drives, randomisation=Randomisation.calm())
+    plain = EnvConfig(n=768, commands=commands, actuator=drives, randomisation=Randomisation.calm())
     walker = Student(actor, VelocityEnv(held_commands(plain)), own)
     return fit_command_map(walker), walker.env
 
