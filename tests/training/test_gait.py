@@ -130,6 +130,21 @@ def test_the_feet_feel_height_and_slope_of_a_plane():
     assert np.allclose(known[0], [height - gait.HEIGHT, *slope], atol=1e-3)
 
 
+def test_a_trunk_along_a_hill_feels_its_height_along_the_vertical():
+    steep, off = 0.26, 0.38  # rad, m at right angles to the ground
+    feet = kinematics.foot_positions(robot.NOMINAL_Q).T
+    feet[0] -= 0.1  # they stand behind the trunk
+    feet[2] = robot.FOOT_RADIUS * np.cos(steep) - off
+    up = np.array([np.sin(steep), 0.0, np.cos(steep)])  # its nose is up
+    known = torch.zeros(1, ground.SIZE)
+    for _ in range(2000):
+        known = ground.advance(
+            known, tensor(feet)[None], tensor(up)[None], torch.zeros(1, 3), torch.ones(1, 4) > 0
+        )
+    assert np.isclose(known[0, 0] + gait.HEIGHT, off / np.cos(steep), atol=1e-3)
+    assert np.allclose(known[0, 1:], [-np.tan(steep) / np.cos(steep), 0.0], atol=1e-3)
+
+
 def test_lifted_feet_tell_nothing_of_the_ground_and_a_walk_uphill_keeps_its_height():
     feet = tensor(kinematics.foot_positions(robot.NOMINAL_Q).T)[None]
     up, none = tensor([[0.0, 0.0, 1.0]]), torch.zeros(1, 4, dtype=torch.bool)
