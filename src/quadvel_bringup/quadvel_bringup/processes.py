@@ -115,7 +115,7 @@ class StopSignals:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self.received or INTERRUPT <= self._mask:
+        if self.received or signal.SIGINT in self._mask:
             self._mask |= INTERRUPT
             self._former[signal.SIGINT] = signal.SIG_IGN
         signal.pthread_sigmask(signal.SIG_SETMASK, self._mask)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -22,6 +23,7 @@ from .log import Log, LogError
 from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
+M_MMAP_THRESHOLD, LARGE = -3, 1 << 22  # of glibc's mallopt; bytes
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
 
@@ -118,6 +120,7 @@ def _run(
     messages: Console,
 ) -> None:
     _check_folder(out)
+    _give_memory_back()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
     fitted = read(logs, joints, gains, messages)
     judged = read(holdout, joints, gains, messages, like=fitted[0])
@@ -189,6 +192,12 @@ def say(inspection: Inspection, messages: Console) -> None:
     for finding in inspection.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
+
+
+def _give_memory_back() -> None:
+    """Have glibc return large arrays as soon as they are free: left to itself it keeps ever larger ones, with gaps."""
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+        mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 def _check_folder(out: Path) -> None:

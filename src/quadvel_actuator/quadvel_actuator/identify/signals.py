@@ -38,7 +38,7 @@ STRETCH, FILLING = 0.75, 0.25
 _SLOPES = {"ddq": 0.0, "ddq_smooth": SMOOTH_LATE}
 """Signals that few laws ask for, and how much later they are read, s"""
 
-_CACHED = 6, 64
+_CACHED = 3, 64
 """sets of signals that are kept, at least and at most;"""
 _CACHED_VALUES = 1_000_000
 """as many as have about so many values in each of their signals together"""
@@ -205,6 +205,11 @@ def _double(values: NDArray[np.floating]) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
+def _lean(values: Array) -> Array:
+    """`values` (N, J), as a view of one row where all are the same: long logs have many such signals."""
+    return np.broadcast_to(values[0].copy(), values.shape) if (values == values[0]).all() else values
+
+
 def _or_one(values: Array | None) -> Array:
     return np.ones(1) if values is None else values
 
@@ -348,6 +353,7 @@ class Samples:
                 columns[name] = np.empty(self.tau.shape)
                 for pair, joints in every.items():
                     columns[name][:, joints] = getattr(made[pair], name)
+                columns[name] = _lean(columns[name])
         late = np.array([pair[1] for pair in pairs])
 
         def slope(name: str) -> Array:
@@ -392,7 +398,7 @@ class Samples:
             packets.append((row + first)[:, None])
             ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
             parts.setdefault("t", []).append((at - one.origin)[:, None])
-        signals = {name: np.concatenate(part) for name, part in parts.items()}
+        signals = {name: _lean(np.concatenate(part)) for name, part in parts.items()}
         for name in ("temperature", "voltage"):
             if name not in signals or len(signals[name]) < len(self.t):
                 signals[name] = None  # type: ignore[assignment]  # not in every log
