@@ -34,7 +34,7 @@ TRUTH = {
     "gain_asymmetry": {"a": 0.1},
     "thermal_drift": {"rate": -0.05, "tau_t": 10.0, "of": "time"},
     "supply_sag": {"sag": 0.002, "T": 0.01, "of": "power", "what": "gain"},
-    "cross_coupling": {"a": 0.2, "source": ["FL_hip_joint/q"] * 3},
+    "cross_coupling": {"a": 0.2, "offset": -0.1, "source": ["FL_hip_joint/q"] * 3},
     "command_hold": {"share": 0.1},
 }
 LATE = {"armature"}  # a running model takes the acceleration from the past alone

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import attrs
 import numpy as np
@@ -198,14 +198,16 @@ def _sagging(what: str, x: Array, strain: Array, p: Params) -> Array:
 
 @attrs.frozen(eq=False)
 class CrossCoupling(AddedLaw):
-    """a times q, dq or tau of another joint: `source` names one for each joint, as in FR_thigh_joint/dq
+    """a times q, dq or tau of another joint: `source` names one for each joint, as in FR_thigh_joint/dq; of q, plus an offset
 
     tau is what that joint's drive gives without such effects: a measured one would carry its noise over.
     """
 
     name = "cross_coupling"
-    parameters = (Parameter("a", "N m per unit of the source", -100.0, 100.0, 0.05),)
-    linear = ("a",)
+    parameters: ClassVar[tuple[Parameter, ...]] = (
+        Parameter("a", "N m per unit of the source", -100.0, 100.0, 0.05),
+    )
+    linear: ClassVar[tuple[str, ...]] = ("a",)
     motion = "each joint moved alone while the others hold still"
     source: tuple[str, ...] = ()
     columns: tuple[tuple[str, int], ...] = ()
@@ -220,9 +222,13 @@ class CrossCoupling(AddedLaw):
 
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
-        source = tuple(settings["source"])
+        return cls._of(tuple(settings["source"]), joints, settings.get("at", DRIVE))
+
+    @classmethod
+    def _of(cls, source: tuple[str, ...], joints: Sequence[str], at: str) -> CrossCoupling:
         columns = tuple(cls._column(one, joints) for one in source)
-        return cls(source, columns, at=settings.get("at", DRIVE))
+        kind = _PositionCoupling if any(signal == "q" for signal, _ in columns) else CrossCoupling
+        return kind(source, columns, at=at)
 
     @staticmethod
     def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:
@@ -236,9 +242,8 @@ class CrossCoupling(AddedLaw):
         if len(joints) < 2:
             return ()
         names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
-        found = [names[k] for k in about.strongest_neighbour()]
-        columns = tuple(cls._column(one, joints) for one in found)
-        return tuple(cls(tuple(found), columns, at=at) for at in (DRIVE, JOINT))
+        found = tuple(names[k] for k in about.strongest_neighbour())
+        return tuple(cls._of(found, joints, at) for at in (DRIVE, JOINT))
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]
@@ -247,6 +252,17 @@ class CrossCoupling(AddedLaw):
         lead = x.shape[:-1]
         of = (x[..., k] if name == "tau" else getattr(s, name)[..., k] for name, k in self.columns)
         return p["a"] * np.stack([np.broadcast_to(one, lead) for one in of], axis=-1)
+
+
+@attrs.frozen(eq=False)
+class _PositionCoupling(CrossCoupling):
+    """The same with an offset: where a joint's angle is zero is a convention."""
+
+    parameters = (*CrossCoupling.parameters, Parameter("offset", "N m", -300.0, 300.0, 0.1))
+    linear = ("a", "offset")
+
+    def torque(self, x: Array, s: View, p: Params) -> Array:
+        return super().torque(x, s, p) + p["offset"]
 
 
 LAWS = (GainAsymmetry, ThermalDrift, SupplySag, CrossCoupling)

@@ -40,8 +40,6 @@ _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it."""
-_OF_SHIFTS = 0.25
-"""So little of it promises a law that looks like a delay, as long as the delays stay where they are without it"""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
 _TIE_LEVEL = 0.02
@@ -173,8 +171,10 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         )
     for k, first in enumerate(looked):
         name = first.law.name
-        costly = k >= _FITTED or first.law.remembers
-        if costly and first.promise < (_OF_SHIFTS if first.law.shifts else 1.0) * least:
+        costly = (
+            k >= _FITTED or first.law.remembers
+        ) and not first.law.shifts  # whose promise is for delays not its own
+        if costly and first.promise < least:
             idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
             continue
         tick(f"{what}: {name}, fitted")
