@@ -1,0 +1,20 @@
+"""Hidden effects that the tool once took for another one."""
+
+import pytest
+
+from tests.identification import adapter
+from tests.identification.hidden.cases import make_case
+from tests.identification.judge import judge
+
+
+@pytest.mark.parametrize(
+    ("kind", "index", "seed"),
+    [
+        ("velocity_filter", 0, 17),  # beside delays of 20 ms it promises little as long as these are wrong
+        ("cross_coupling", 0, 17),  # to an angle, whose zero is a convention
+    ],
+)
+def test_it_is_named_now(kind, index, seed, tmp_path):
+    case = make_case(kind, index, seed)
+    logs = [path.rename(tmp_path / path.name) for path in case.save(tmp_path / "truth")]
+    assert judge(adapter.identify(logs[:1], logs[1:]), case.truth)["verdict"] == "right"
