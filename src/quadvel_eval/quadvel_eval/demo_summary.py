@@ -12,7 +12,7 @@ from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
 
 Array = NDArray[np.float64]
 
-GAP = 0.5  # s, a planner that was silent for longer had stopped: so long does the mux hold its command
+GAP = 2.0  # s, a planner that was silent for longer had stopped; less is a stall, and what the robot did in it counts
 SHORTEST = SETTLE + 0.5  # s, of a segment that can be judged
 MAX_TILT = 1.0  # rad
 MIN_HEIGHT = 0.2  # m, of the trunk; it stands at 0.43 and lies at 0.14
