@@ -31,7 +31,7 @@ def demo_command(
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for every node.")
+        bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
 ) -> None:
     """Walk a simulated robot through all directions, in real time, through the nodes.

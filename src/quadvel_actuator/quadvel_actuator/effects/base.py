@@ -297,7 +297,8 @@ class _Pieces:
         return memory
 
 
-_PIECE = 120  # rows that advance one after the other; what takes longer than wide arrays is Python's step from row to row
+_PIECE = 120
+"""Rows that advance one after the other: few, since each is a step of Python, however wide the arrays."""
 _SAME = 1e-9
 
 

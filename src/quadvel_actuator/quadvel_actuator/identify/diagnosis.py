@@ -39,7 +39,8 @@ _AS_WELL = 0.02
 _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
-keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it."""
+keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it. One that
+looks like a delay always is: what it promises is for delays that are not its own."""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
 _TIE_LEVEL = 0.02
@@ -171,10 +172,8 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         )
     for k, first in enumerate(looked):
         name = first.law.name
-        costly = (
-            k >= _FITTED or first.law.remembers
-        ) and not first.law.shifts  # whose promise is for delays not its own
-        if costly and first.promise < least:
+        costly = k >= _FITTED or first.law.remembers
+        if costly and not first.law.shifts and first.promise < least:
             idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
             continue
         tick(f"{what}: {name}, fitted")

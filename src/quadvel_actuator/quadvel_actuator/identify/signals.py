@@ -205,7 +205,7 @@ def _double(values: NDArray[np.floating]) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def _lean(values: Array) -> Array:
+def _one_row(values: Array) -> Array:
     """`values` (N, J), as a view of one row where all are the same: long logs have many such signals."""
     return np.broadcast_to(values[0].copy(), values.shape) if (values == values[0]).all() else values
 
@@ -353,7 +353,7 @@ class Samples:
                 columns[name] = np.empty(self.tau.shape)
                 for pair, joints in every.items():
                     columns[name][:, joints] = getattr(made[pair], name)
-                columns[name] = _lean(columns[name])
+                columns[name] = _one_row(columns[name])
         late = np.array([pair[1] for pair in pairs])
 
         def slope(name: str) -> Array:
@@ -398,7 +398,7 @@ class Samples:
             packets.append((row + first)[:, None])
             ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
             parts.setdefault("t", []).append((at - one.origin)[:, None])
-        signals = {name: _lean(np.concatenate(part)) for name, part in parts.items()}
+        signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
         for name in ("temperature", "voltage"):
             if name not in signals or len(signals[name]) < len(self.t):
                 signals[name] = None  # type: ignore[assignment]  # not in every log
