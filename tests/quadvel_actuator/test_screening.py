@@ -215,6 +215,15 @@ def test_an_effect_leaves_a_joint_that_needs_it_no_more():
     np.testing.assert_allclose(model.applied[0].values[0, 0], -0.009, atol=5e-4)
 
 
+def test_a_supply_that_sags_is_one_for_all_joints():
+    """Friction beside it, on one joint alone, must not pass for another sag there."""
+    sag = Effect("supply_sag", JOINTS, {"of": "power", "what": "gain", "sag": 0.02, "T": 0.01})
+    looked = about(_log(sag, attrs.evolve(FRICTION, joints=JOINTS[:1])), 0.009, 0.003)
+    law = next(one for one in registry()["supply_sag"].variants(looked) if one.what == "gain")
+    late = propose(looked, started(looked, law)).model.applied[-1].values
+    np.testing.assert_array_equal(late[:, 0], late[:, 1])
+
+
 def test_a_drift_with_temperature_counts_from_the_coolest_drive():
     """Drives that start at 32 degrees have the gains that were found for them; those that stay so are not affected."""
     log = _log()

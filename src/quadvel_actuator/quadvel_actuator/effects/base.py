@@ -107,6 +107,8 @@ class EffectLaw(ABC):
     """has to follow what happens between the rows of a log, too"""
     gainlike: ClassVar[bool] = False
     """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
+    common: ClassVar[bool] = False
+    """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
     at: str = attrs.field(default=DRIVE, kw_only=True, validator=attrs.validators.in_((DRIVE, JOINT)))

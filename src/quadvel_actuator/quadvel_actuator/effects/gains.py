@@ -99,6 +99,10 @@ class SupplySag(TorqueLaw):
     full: float = 1.0
 
     @property
+    def common(self) -> bool:  # type: ignore[override]
+        return self.what == "gain"
+
+    @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
         return (Parameter("sag", "1", 0.0, 20.0, 0.3), *_limit(self.what))
 
@@ -139,6 +143,10 @@ class PowerSag(MemoryLaw):
     motion = SupplySag.motion
     inputs = ("dq",)
     what: str = "gain"
+
+    @property
+    def common(self) -> bool:  # type: ignore[override]
+        return self.what == "gain"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

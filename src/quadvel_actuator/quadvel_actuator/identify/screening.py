@@ -13,6 +13,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
 
 from ..effects import AddedLaw, EffectLaw, Parameter
 from ..effects.base import Params, Start, View, smooth_sign
@@ -158,7 +159,8 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     table = np.array(
         [[_within(one.get(p.name, p.scale), p, joints) for p in law.parameters] for one in starts]
     )
-    empty = Applied(law, np.ones(joints, dtype=bool), table[0], np.arange(joints))
+    groups = np.zeros(joints, dtype=np.intp) if law.common else np.arange(joints)
+    empty = Applied(law, np.ones(joints, dtype=bool), table[0], groups)
     best: Model | None = None
     lowest = np.full(joints, np.inf)
     for spot in ground.pairs(law, (*_EXCHANGED, *(_SHORTENED if law.shifts else ()))):
@@ -260,7 +262,7 @@ class _Screen:
         gram, right, square = (np.concatenate(one) for one in zip(*parts, strict=True))
         free = _Quadratic.of(gram, right, square, len(self.bounds))
         joint = np.arange(table.shape[2])
-        chosen = np.argmin(free.alone(), axis=0)
+        chosen = self._least(free.alone())
         outside = np.zeros(free.error.shape, dtype=bool)
         for _ in range(_ROUNDS):
             off = outside[chosen, joint]
@@ -268,11 +270,17 @@ class _Screen:
             gradient = np.where(off[:, None], free.plain[1][chosen, joint], free.gradient[chosen, joint])
             change = self._shared(hessian, gradient)
             error, values, outside = free.at(change, self.bounds)
-            chosen = np.argmin(error, axis=0)
+            chosen = self._least(error)
         found = values[chosen, joint].T
         best = table[chosen, :, joint].T.copy()
         best[self.linear] = found[: len(self.linear)]
         return self._moved_by(change, best, found[len(self.linear) :]), error[chosen, joint]
+
+    def _least(self, error: Array) -> NDArray[np.intp]:
+        """The best guess for each joint (J,) by its error (guesses, J), or the best for all where they have one cause."""
+        if self.tried is not None and self.tried.law.common:
+            return np.full(error.shape[1], np.argmin(error.sum(axis=1)))
+        return np.argmin(error, axis=0)
 
     def _shared(self, hessian: Array, gradient: Array) -> Array:
         """The change (4, J) of gains and delays that lessens the error of all joints most."""
