@@ -15,7 +15,7 @@ from quadvel_actuator.identify.features import Scene
 from quadvel_actuator.identify.floor import noise_floor
 from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.judging import Judge
-from quadvel_actuator.identify.learned import Trial, learn
+from quadvel_actuator.identify.learned import Trial, learn, longest
 from quadvel_actuator.identify.model import Model
 from quadvel_actuator.identify.signals import Samples
 
@@ -63,7 +63,7 @@ def test_delays_that_are_moved_to_their_longest_say_the_same_together_with_the_t
     tau = learned.model.samples.tau
     fitted, late = (
         np.where(judge.fit, tau - model.predict() - learned.torque, 0.0)
-        for model in (learned.model, learned.latest(judge.fit))
+        for model in (learned.model, longest(learned.model, learned, judge.fit))
     )
     assert np.sum(late**2) <= np.sum(fitted**2) * (1.0 + 1e-6)
 

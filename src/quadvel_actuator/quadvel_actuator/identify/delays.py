@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 
 from .eam import LONGEST_INPUT, LONGEST_OUTPUT
-from .model import Model, Slots, gather, jacobian, pack, step, with_slots
+from .model import Model, Slots, fit, gather, jacobian, pack, step, with_slots
 from .signals import Array, Bools
 
 SLOPE = 0.0003
@@ -20,6 +20,10 @@ _DAMPING = (1e-6, 1e-2, 1.0)
 _SETTLED = 2e-5
 _FINE = 5e-5  # s
 _EQUAL = 1e-9  # of the error
+CLOCK = 0.001
+"""s, a step of a drive's clock"""
+_UNTOLD = 3.84
+"""Of the mean squared error: a sum of squares that rises by less than this is no worse at a level of 95 %"""
 LONGEST = (LONGEST_INPUT, LONGEST_OUTPUT)
 """s, input and output delay at most"""
 
@@ -69,6 +73,17 @@ def latest(model: Model, rows: Bools) -> Model:
             break
         found = later
     return found
+
+
+def in_steps(model: Model, rows: Bools) -> Model:
+    """The model with delays in whole steps of a drive's clock, where `rows` (N, J) do not tell these from its own.
+
+    Input and output delay trade against each other and against the gains along a valley that is all but flat. A drive
+    waits for whole steps, so that of delays that say the same those in steps are the likelier ones.
+    """
+    near = [np.round(delay / CLOCK) * CLOCK for delay in (model.input_delay, model.output_delay)]
+    stepped = fit(model.with_delays(*near), rows)
+    return stepped if stepped.error(rows) < model.error(rows) + _UNTOLD * model.mse(rows) else model
 
 
 def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:

@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from ..parameters import ActuatorParameters
-from .delays import fit_with_delays, latest
+from .delays import fit_with_delays, in_steps, latest
 from .diagnosis import Diagnosis, Rejected, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
@@ -22,7 +22,7 @@ from .identification import Identification
 from .inspect import inspect
 from .intervals import intervals
 from .judging import Judge
-from .learned import Learned
+from .learned import Learned, beside, longest
 from .log import Log, LogError
 from .model import Model
 from .motion import STRETCH, Body, Replay, implied, replayed
@@ -80,6 +80,8 @@ def identify(
     samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd, windows)
     findings += remark
     before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
+    if heldout:  # whose rows may lie otherwise between their commands
+        before = latest(before, judge.fit)
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
     diagnosis = diagnosed(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
@@ -89,11 +91,13 @@ def identify(
     def told(chosen_one: Diagnosis, learned: Learned | None) -> Outcome:
         model = chosen_one.model
         named = diagnosis.model if chosen_one.findings else before
-        late = latest(model, judge.fit) if learned is None else learned.latest(judge.fit)
+        final = _whole(model, judge, learned)
         return Outcome(
-            eam, latest(before, judge.fit), attrs.evolve(chosen_one, model=late), learned,
+            eam, latest(before, judge.fit), _told(_whole(before, judge, None), judge, None),
+            attrs.evolve(chosen_one, model=longest(model, learned, judge.fit)),
+            _told(final, judge, learned), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),
-            intervals(model, judge, learned), ideal, noise, judge,
+            intervals(final, judge, learned, model), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
         )  # fmt: skip
 
@@ -108,6 +112,19 @@ def identify(
         found = attrs.evolve(found, report=_with_motion(found.report, motion, body))
     tell(1.0, "done")
     return found
+
+
+def _whole(model: Model, judge: Judge, learned: Learned | None) -> Model:
+    """The model, chosen by the rows that judge, fitted to every row that its values are taken from."""
+    if judge.every is judge.fit:
+        return model
+    return attrs.evolve(fit_with_delays(beside(model, learned), judge.every), samples=model.samples)
+
+
+def _told(model: Model, judge: Judge, learned: Learned | None) -> Model:
+    """A model fitted to every row, with those of the delays that say the same of them which a drive is likely to have."""
+    likely = in_steps(latest(beside(model, learned), judge.every), judge.every)
+    return attrs.evolve(likely, samples=model.samples)
 
 
 def _nothing(before: Model, diagnosis: Diagnosis) -> Diagnosis:
@@ -215,7 +232,8 @@ def _rows(samples: Samples, fitted: int) -> Judge:
                 f"{samples.logs[0].log.name}: valid/{joint}: {int(rows.sum(axis=0).min())} rows to be {word}, "
                 f"expected {_LEAST_ROWS} or more"
             )
-    return Judge.of(samples, samples.judged & first, samples.judged & ~first)
+    every = None if fitted < len(samples.logs) else samples.judged
+    return Judge.of(samples, samples.judged & first, samples.judged & ~first, every)
 
 
 def _plain(samples: Samples, eam: Eam, judge: Judge) -> Model:

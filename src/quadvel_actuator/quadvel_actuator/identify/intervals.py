@@ -14,7 +14,7 @@ from scipy import stats
 
 from .delays import fit_with_delays, jacobian_with_delays
 from .judging import Judge
-from .learned import Learned
+from .learned import Learned, beside
 from .model import Model, gather
 from .signals import Array, Bools
 from .valleys import as_deep
@@ -38,14 +38,20 @@ class Intervals:
     on_bound: tuple[str, ...]
 
 
-def intervals(model: Model, judge: Judge, learned: Learned | None = None) -> Intervals:
-    """Intervals of everything that was fitted to the rows `judge.fit`, the weights of learned terms left free beside it."""
-    model = model if learned is None else learned.beside
-    wide = _half_widths(model, judge, judge.fit, learned)
+def intervals(
+    model: Model, judge: Judge, learned: Learned | None = None, chosen: Model | None = None
+) -> Intervals:
+    """Intervals of everything that was fitted to the rows `judge.every`, the weights of learned terms left free beside it.
+
+    `chosen` is the model as it was fitted to `judge.fit`, where these are others.
+    """
+    part = beside(model if chosen is None else chosen, learned)
+    model = beside(model, learned)
+    wide = _half_widths(model, judge, judge.every, learned)
     here = _everything(model)
-    for other in as_deep(model, judge.fit):
+    for other in as_deep(model, judge.every):
         wide = np.maximum(wide, np.abs(_everything(other) - here))
-    wide = np.maximum(wide, _contradicted(model, judge, wide, learned))
+    wide = np.maximum(wide, _contradicted(part, judge, learned))
     effects: list[Array] = []
     first = 2
     for one in model.applied:
@@ -88,14 +94,15 @@ def _half_widths(model: Model, judge: Judge, rows: Bools, learned: Learned | Non
     return np.where(slots.index >= 0, half[slots.index], 0.0)
 
 
-def _contradicted(model: Model, judge: Judge, wide: Array, learned: Learned | None) -> Array:
+def _contradicted(model: Model, judge: Judge, learned: Learned | None) -> Array:
     """How far off the model fitted to the held-out rows is, (A + 2, J), where the two contradict each other, else 0.
 
     Then neither of the two widths holds: the model lacks something that bends what is fitted on one of them.
     """
     other = fit_with_delays(model, judge.judge)
     apart = np.abs(_everything(other) - _everything(model))
-    return np.where(apart > wide + _half_widths(other, judge, judge.judge, learned), apart, 0.0)
+    wide = _half_widths(model, judge, judge.fit, learned) + _half_widths(other, judge, judge.judge, learned)
+    return np.where(apart > wide, apart, 0.0)
 
 
 def _beside_terms(slopes: Array, learned: Learned, rows: Bools) -> Array:
@@ -117,11 +124,11 @@ def _everything(model: Model) -> Array:
 
 def _shape_error(model: Model, index: int, judge: Judge) -> Array:
     """How far an effect's values (P, J) move where it has another shape that explains the log as well."""
-    one = model.applied[index]
+    one, rows = model.applied[index], judge.every
     moved = np.zeros(one.values.shape)
     for law in one.law.alternatives:
-        tried = fit_with_delays(model.replacing(index, attrs.evolve(one, law=law)), judge.fit)
-        if tried.error(judge.fit) < _AS_WELL * model.error(judge.fit):
+        tried = fit_with_delays(model.replacing(index, attrs.evolve(one, law=law)), rows)
+        if tried.error(rows) < _AS_WELL * model.error(rows):
             moved = np.maximum(moved, np.abs(tried.applied[index].values - one.values))
     return moved
 

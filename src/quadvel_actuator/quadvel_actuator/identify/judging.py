@@ -64,19 +64,23 @@ class Comparison:
 
 @attrs.frozen(eq=False)
 class Judge:
-    """Rows to fit and rows to judge by, (N, J); blocks of consecutive rows begin at the rows `starts`."""
+    """Rows to fit, to judge by, and to take the values from once the model is chosen, (N, J).
+
+    Blocks of consecutive rows begin at the rows `starts`.
+    """
 
     joints: tuple[str, ...]
     fit: Bools
     judge: Bools
+    every: Bools
     starts: NDArray[np.intp]
 
     @classmethod
-    def of(cls, samples: Samples, fit_rows: Bools, judge_rows: Bools) -> Judge:
-        """Blocks of BLOCK s."""
+    def of(cls, samples: Samples, fit_rows: Bools, judge_rows: Bools, every: Bools | None = None) -> Judge:
+        """Blocks of BLOCK s; values from the fitted rows unless `every` says from more."""
         at = np.floor(samples.t / BLOCK).astype(int) + 10**7 * samples.log_of_row
         starts = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
-        return cls(samples.joints, fit_rows, judge_rows, starts)
+        return cls(samples.joints, fit_rows, judge_rows, fit_rows if every is None else every, starts)
 
     def sums(self, values: Array) -> Array:
         """Values (N, ...) summed over each block."""

@@ -56,18 +56,6 @@ class Learned:
     columns: tuple[Array, ...]  # of each joint, what its terms are sums of, (N, K)
 
     @property
-    def beside(self) -> Model:
-        """The model on what was measured less the terms."""
-        samples = copy(self.model.samples)
-        samples.tau, samples._parts = samples.tau - self.torque, {}
-        return attrs.evolve(self.model, samples=samples)
-
-    def latest(self, rows: Bools) -> Model:
-        """The model with the longest delays with which it says the same of `rows`, together with the terms."""
-        late = latest(self.beside, rows)
-        return self.model.with_delays(late.input_delay, late.output_delay)
-
-    @property
     def joints(self) -> Bools:
         """Those on which any term acts."""
         acts: Bools = np.any([term.active for term in self.terms], axis=0)
@@ -78,6 +66,21 @@ class Learned:
         """All signals that the terms depend on, the weightiest first."""
         ranked = sorted(zip(self.gains, self.terms, strict=True), key=lambda pair: -pair[0])
         return list(dict.fromkeys(name for _, term in ranked for name in term.inputs))
+
+
+def beside(model: Model, learned: Learned | None) -> Model:
+    """The model on what was measured less the terms, if there are any."""
+    if learned is None:
+        return model
+    samples = copy(model.samples)
+    samples.tau, samples._parts = samples.tau - learned.torque, {}
+    return attrs.evolve(model, samples=samples)
+
+
+def longest(model: Model, learned: Learned | None, rows: Bools) -> Model:
+    """The model with the longest delays with which it says the same of `rows`, together with the terms."""
+    late = latest(beside(model, learned), rows)
+    return model.with_delays(late.input_delay, late.output_delay)
 
 
 @attrs.frozen(eq=False)

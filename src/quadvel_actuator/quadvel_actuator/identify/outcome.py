@@ -19,7 +19,7 @@ from .findings import Finding as LogFinding
 from .identification import Identification, Shape, Trace
 from .intervals import Intervals
 from .judging import Judge
-from .learned import Learned
+from .learned import Learned, beside
 from .model import Applied, Model
 from .residual import Remainder
 from .signals import Array
@@ -51,7 +51,9 @@ class Outcome:
 
     eam: Eam
     before: Model
+    before_whole: Model  # as `before`, but fitted to every row, held-out ones too: its values are reported
     diagnosis: Diagnosis
+    whole: Model  # as `model`, likewise
     learned: Learned | None
     learned_gain: tuple[float, float]  # held-out gain and p-value of all terms together
     rest: Remainder
@@ -110,10 +112,10 @@ def _report(o: Outcome) -> dict[str, Any]:
         "pd": mses["pd"],
         "before": mses["before"]
         | {
-            "delta_kp": float((o.before.gains[0, 0] - 1.0) * o.kp_ref),
-            "delta_kd": float((o.before.gains[1, 0] - 1.0) * o.kd_ref),
-            "input_delay_ms": 1e3 * float(o.before.input_delay[0]),
-            "output_delay_ms": 1e3 * float(o.before.output_delay[0]),
+            "delta_kp": float((o.before_whole.gains[0, 0] - 1.0) * o.kp_ref),
+            "delta_kd": float((o.before_whole.gains[1, 0] - 1.0) * o.kd_ref),
+            "input_delay_ms": 1e3 * float(o.before_whole.input_delay[0]),
+            "output_delay_ms": 1e3 * float(o.before_whole.output_delay[0]),
         },
         "after": mses["after"] | _gains(o),
         "effects": effects,
@@ -130,7 +132,7 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} sits on its bound: its value and interval are not to be trusted"
             for name in o.widths.on_bound
         ]
-        + _unlike_delays(o.model),
+        + _unlike_delays(o.whole),
         "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
     }
     report["decision"] = _decision(report)
@@ -155,7 +157,7 @@ def _mse(error: Array, rows: Any) -> float:
 
 def _gains(o: Outcome) -> dict[str, Any]:
     """Gain deviations and delays of the corrected model, a number, or one for each joint, with intervals."""
-    model, widths = o.model, o.widths
+    model, widths = o.whole, o.widths
     found: dict[str, Any] = {}
     rows = {
         "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
@@ -183,7 +185,7 @@ def _with_interval(
 def _effects(o: Outcome) -> list[dict[str, Any]]:
     joints = o.model.samples.joints
     found = []
-    for finding, one, half in zip(o.diagnosis.findings, o.model.applied, o.widths.effects, strict=True):
+    for finding, one, half in zip(o.diagnosis.findings, o.whole.applied, o.widths.effects, strict=True):
         found.append(_effect(finding, one, half, joints))
     if o.learned is not None:
         found.append(
@@ -277,11 +279,14 @@ def _decision(report: Mapping[str, Any]) -> str:
 
 
 def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
-    """The corrected model as the stack loads it, or another one of the outcome's."""
-    model = o.model if model is None else model
+    """The corrected model as the stack loads it, or another one of the outcome's: its terms belong to all but the plain one."""
+    model = o.whole if model is None else model
+    learned = None if model is o.before else o.learned
     joints = model.samples.joints
-    mse = _mse(model.samples.tau - (o.after if model is o.model else model.predict()), o.judge.fit)
-    pair = DelayPair(_stepped_delay(o, model), round(float(np.median(model.output_delay)), 7), mse)
+    mse = _mse(model.samples.tau - (o.before.predict() if model is o.before else o.after), o.judge.fit)
+    pair = DelayPair(
+        _stepped_delay(model, learned, o.judge), round(float(np.median(model.output_delay)), 7), mse
+    )
     effects = []
     for one, half in zip(model.applied, o.widths.effects, strict=False):
         values: dict[str, Any] = {}
@@ -293,9 +298,9 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         units = {parameter.name: parameter.unit for parameter in one.law.parameters}
         acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
         effects.append(Effect(one.law.name, acts, values, units, ranges))
-    if model is o.model and o.learned is not None:
-        acts = tuple(name for name, on in zip(joints, o.learned.joints, strict=True) if on)
-        effects.append(Effect(TERMS, acts, {"terms": [one.saved(joints) for one in o.learned.terms]}))
+    if learned is not None:
+        acts = tuple(name for name, on in zip(joints, learned.joints, strict=True) if on)
+        effects.append(Effect(TERMS, acts, {"terms": [one.saved(joints) for one in learned.terms]}))
     deviations: dict[str, Any] = {
         "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
         "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
@@ -317,7 +322,7 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
     )
 
 
-def _stepped_delay(o: Outcome, model: Model) -> float:
+def _stepped_delay(model: Model, learned: Learned | None, judge: Judge) -> float:
     """The input delay (s) with which a model that runs in steps repeats this one.
 
     Such a model gives means over its steps. One fitted to the instant itself needs half a step more, or whatever the
@@ -326,12 +331,11 @@ def _stepped_delay(o: Outcome, model: Model) -> float:
     delay = float(np.median(model.input_delay))
     if model.window > 0.0:
         return round(delay, 7)
-    beside = o.learned.beside if o.learned is not None and model is o.model else model
-    best = 0.5 * STEP
+    alone, best = beside(model, learned), 0.5 * STEP
     for reach in (0.25 * STEP, 0.125 * STEP, 0.0625 * STEP):
         around = [best + k * reach for k in (-2, -1, 0, 1, 2) if best + k * reach >= 0.0]
-        meant = [attrs.evolve(beside, window=STEP, input_delay=model.input_delay + by) for by in around]
-        best = around[int(np.argmin([one.error(o.judge.fit) for one in meant]))]
+        meant = [attrs.evolve(alone, window=STEP, input_delay=model.input_delay + by) for by in around]
+        best = around[int(np.argmin([one.error(judge.fit) for one in meant]))]
     return round(delay + best, 7)
 
 
