@@ -224,6 +224,17 @@ def test_a_supply_that_sags_is_one_for_all_joints():
     np.testing.assert_array_equal(late[:, 0], late[:, 1])
 
 
+def test_a_drift_of_a_few_per_cent_is_looked_at():
+    """Of one joint, on gains that are shared: a guess several times too large takes nothing off the error."""
+    drift = Effect("thermal_drift", JOINTS[:1], {"rate": -0.011, "tau_t": 3.0})
+    looked = about(_log(drift, seconds=8.0), 0.009, 0.003)
+    first = started(looked, registry()["thermal_drift"]("time"))
+    assert first is not None
+    found = propose(looked, first).model.applied[-1]
+    at_the_end = found.values[0, 0] * found.values[1, 0] * np.expm1(-8.0 / found.values[1, 0])
+    np.testing.assert_allclose(at_the_end, 0.011 * 3.0 * -np.expm1(-8.0 / 3.0), atol=0.012)
+
+
 def test_a_drift_with_temperature_counts_from_the_coolest_drive():
     """Drives that start at 32 degrees have the gains that were found for them; those that stay so are not affected."""
     log = _log()

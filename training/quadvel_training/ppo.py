@@ -187,7 +187,8 @@ class Ppo:
 
         seen = ids < self.mirrored(r.reward.shape[1])
         before = r.mirrored_state and select(r.mirrored_state, ids[seen])
-        mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
+        with torch.set_grad_enabled(c.symmetry > 0.0):  # else the term is but watched
+            mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
         symmetry = _mean(gap.sum(-1), mask[:, seen])
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]

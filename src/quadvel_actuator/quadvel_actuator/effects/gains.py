@@ -72,12 +72,14 @@ class ThermalDrift(TorqueLaw):
         return (cls("time"), cls("temperature", float(np.quantile(temperature, 0.01))))
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+        drifts = (-0.15, -0.04, 0.04, 0.15)  # over the log
         if self.of == "temperature":
-            return [{"rate": rate} for rate in (-0.01, 0.01)]
+            warming = max(float(np.max(s.temperature)) - self.cold, 0.5)
+            return [{"rate": drift / warming} for drift in drifts]
         span = float(np.max(s.t))
         return [
-            {"rate": sign * 0.15 / min(share, 1.0) / span, "tau_t": share * span}
-            for sign in (-1, 1)
+            {"rate": drift / min(share, 1.0) / span, "tau_t": share * span}
+            for drift in drifts
             for share in (0.15, 0.5, 3.0)
         ]
 
