@@ -93,9 +93,9 @@ def identify(
         named = diagnosis.model if chosen_one.findings else before
         final = _whole(model, judge, learned)
         return Outcome(
-            eam, latest(before, judge.fit), _told(_whole(before, judge, None), judge, None),
+            eam, latest(before, judge.fit), _likely(_whole(before, judge, None), judge, None),
             attrs.evolve(chosen_one, model=longest(model, learned, judge.fit)),
-            _told(final, judge, learned), learned,
+            _likely(final, judge, learned), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),
             intervals(final, judge, learned, model), ideal, noise, judge,
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
@@ -121,10 +121,10 @@ def _whole(model: Model, judge: Judge, learned: Learned | None) -> Model:
     return attrs.evolve(fit_with_delays(beside(model, learned), judge.every), samples=model.samples)
 
 
-def _told(model: Model, judge: Judge, learned: Learned | None) -> Model:
+def _likely(model: Model, judge: Judge, learned: Learned | None) -> Model:
     """A model fitted to every row, with those of the delays that say the same of them which a drive is likely to have."""
-    likely = in_steps(latest(beside(model, learned), judge.every), judge.every)
-    return attrs.evolve(likely, samples=model.samples)
+    told = in_steps(latest(beside(model, learned), judge.every), judge.every)
+    return attrs.evolve(told, samples=model.samples)
 
 
 def _nothing(before: Model, diagnosis: Diagnosis) -> Diagnosis:
