@@ -16,7 +16,7 @@ from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
 from quadvel_actuator.identify.model import Applied, Model
 from quadvel_actuator.identify.screening import Started
-from quadvel_actuator.identify.signals import Samples
+from quadvel_actuator.identify.signals import Samples, scattered
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)
@@ -47,6 +47,17 @@ def test_signals_of_few_rows_are_those_of_all():
     for name in ("t", "q", "q_des", "ddq", "packet"):
         whole = getattr(samples.at(0.004, 0.001, 0.001), name)
         np.testing.assert_array_equal(getattr(few.at(0.004, 0.001, 0.001), name), whole[rows])
+
+
+@pytest.mark.parametrize("every", [2, 5, 10])
+def test_few_rows_lie_at_all_places_between_two_commands(every):
+    """Commands at 200 Hz, rows at 500 or 1000 Hz: even steps would show few of the places, and hide a wrong delay."""
+    rows = scattered(4000, every)
+    assert len(rows) == pytest.approx(4000 / every, abs=1)
+    assert np.diff(rows).min() > 0
+    counts = np.bincount(rows % 10)
+    assert counts.min() > 0.8 * len(rows) / 10
+    assert counts.max() < 1.2 * len(rows) / 10
 
 
 def test_stretches_lie_where_most_is_left_and_all_over_the_log():

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..parameters import PROBABLE, DelayPair
-from .signals import Array, Bools, Samples
+from .signals import Array, Bools, Samples, scattered
 
 LONGEST_INPUT, LONGEST_OUTPUT = 0.020, 0.006  # s
 WINDOWS = (0.0, 0.001)
@@ -145,7 +145,9 @@ def fit_eam(
     groups = np.zeros(len(samples.joints), dtype=int) if groups is None else groups
     found = []
     for window in windows:
-        thinned = rows & (np.arange(len(rows)) % max(1, len(rows) // _ENOUGH) == 0)[:, None]
+        thinned = np.zeros_like(rows)
+        some = scattered(len(rows), max(1, len(rows) // _ENOUGH))
+        thinned[some] = rows[some]
         totals = np.arange(0.0, LONGEST_INPUT + LONGEST_OUTPUT + 1e-9, 0.001)
         eam = _search(
             samples, thinned, groups, window, totals, np.arange(0.0, LONGEST_OUTPUT + 1e-9, 0.001), 0.0

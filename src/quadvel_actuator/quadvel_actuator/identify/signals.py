@@ -49,6 +49,9 @@ BETWEEN = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
 _OF_JOINTS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
 
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+"""Its multiples' fractions fill the unit interval evenly, in no period."""
+
 Joints = slice | list[int]
 ALL = slice(None)
 
@@ -99,6 +102,13 @@ class Signals:
     def shifted(self, name: str, late: Array) -> Array:
         """A signal of the joints' state `late` s earlier (negative: later); `late` (J,) or (B, 1, J)."""
         return self.elsewhere(name, late)
+
+
+def scattered(count: int, every: int) -> NDArray[np.intp]:
+    """One row of `every` of so many, at changing places: even steps and an even sender's commands would meet alike each time."""
+    first = np.arange(0, count, every)
+    rows: NDArray[np.intp] = first + (every * np.modf(_GOLDEN * np.arange(len(first)))[0]).astype(np.intp)
+    return rows[rows < count]
 
 
 def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
@@ -282,7 +292,7 @@ class Samples:
     def thinned(self, every: int) -> tuple[Samples, NDArray[np.intp]]:
         """One row of `every` of each log, and which these are; `dt` and `start` of the rows are those they had."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
-        rows = np.concatenate([np.arange(a, b, every) for a, b in pairwise(edges)])
+        rows = np.concatenate([a + scattered(b - a, every) for a, b in pairwise(edges)])
         return self._of(rows), rows
 
     def stretches(self, most: int, weight: Array) -> tuple[Samples, NDArray[np.intp], Bools]:
