@@ -89,6 +89,9 @@ class ThermalDrift(TorqueLaw):
         return x * (1.0 - p["rate"] * p["tau_t"] * np.expm1(-np.maximum(s.t, 0.0) / p["tau_t"]))
 
 
+_OF_ONE_SUPPLY: Any = property(lambda law: law.what == "gain")  # a bound is each drive's own
+
+
 @attrs.frozen(eq=False)
 class SupplySag(TorqueLaw):
     """Gain or bound falls with the logged voltage, by 1 - sag (1 - V / `full`), or with the joints' power (`PowerSag`)"""
@@ -97,12 +100,9 @@ class SupplySag(TorqueLaw):
     stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
+    common = _OF_ONE_SUPPLY
     what: str = "gain"
     full: float = 1.0
-
-    @property
-    def common(self) -> bool:  # type: ignore[override]
-        return self.what == "gain"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -143,12 +143,9 @@ class PowerSag(MemoryLaw):
     stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = SupplySag.signal
     motion = SupplySag.motion
+    common = _OF_ONE_SUPPLY
     inputs = ("dq",)
     what: str = "gain"
-
-    @property
-    def common(self) -> bool:  # type: ignore[override]
-        return self.what == "gain"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

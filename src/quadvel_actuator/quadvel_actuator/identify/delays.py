@@ -20,10 +20,10 @@ _DAMPING = (1e-6, 1e-2, 1.0)
 _SETTLED = 2e-5
 _FINE = 5e-5  # s
 _EQUAL = 1e-9  # of the error
-CLOCK = 0.001
+_CLOCK = 0.001
 """s, a step of a drive's clock"""
-_UNTOLD = 3.84
-"""Of the mean squared error: a sum of squares that rises by less than this is no worse at a level of 95 %"""
+CHANCE = 3.84
+"""Of the mean squared error: by so much 95 % of the logs of one truth have a larger sum of squares there than at the best fit"""
 LONGEST = (LONGEST_INPUT, LONGEST_OUTPUT)
 """s, input and output delay at most"""
 
@@ -81,9 +81,9 @@ def in_steps(model: Model, rows: Bools) -> Model:
     Input and output delay trade against each other and against the gains along a valley that is all but flat. A drive
     waits for whole steps, so that of delays that say the same those in steps are the likelier ones.
     """
-    near = [np.round(delay / CLOCK) * CLOCK for delay in (model.input_delay, model.output_delay)]
+    near = [np.round(delay / _CLOCK) * _CLOCK for delay in (model.input_delay, model.output_delay)]
     stepped = fit(model.with_delays(*near), rows)
-    return stepped if stepped.error(rows) < model.error(rows) + _UNTOLD * model.mse(rows) else model
+    return stepped if stepped.error(rows) < model.error(rows) + CHANCE * model.mse(rows) else model
 
 
 def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:

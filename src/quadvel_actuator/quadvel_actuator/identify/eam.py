@@ -143,11 +143,11 @@ def fit_eam(
     later one fits better.
     """
     groups = np.zeros(len(samples.joints), dtype=int) if groups is None else groups
+    thinned = np.zeros_like(rows)
+    some = scattered(len(rows), max(1, len(rows) // _ENOUGH))
+    thinned[some] = rows[some]
     found = []
     for window in windows:
-        thinned = np.zeros_like(rows)
-        some = scattered(len(rows), max(1, len(rows) // _ENOUGH))
-        thinned[some] = rows[some]
         totals = np.arange(0.0, LONGEST_INPUT + LONGEST_OUTPUT + 1e-9, 0.001)
         eam = _search(
             samples, thinned, groups, window, totals, np.arange(0.0, LONGEST_OUTPUT + 1e-9, 0.001), 0.0

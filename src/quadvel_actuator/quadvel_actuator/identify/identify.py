@@ -80,12 +80,14 @@ def identify(
     samples, judge, eam, remark = _clocked(chosen, fitted, kp, kd, windows)
     findings += remark
     before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
+    late = latest(before, judge.fit)
     if heldout:  # whose rows may lie otherwise between their commands
-        before = latest(before, judge.fit)
+        before = late
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
     diagnosis = diagnosed(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
     tell(0.88, "what no effect explains")
+    late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
 
     def told(chosen_one: Diagnosis, learned: Learned | None) -> Outcome:
@@ -93,7 +95,7 @@ def identify(
         named = diagnosis.model if chosen_one.findings else before
         final = _whole(model, judge, learned)
         return Outcome(
-            eam, latest(before, judge.fit), _likely(_whole(before, judge, None), judge, None),
+            eam, late, late_whole,
             attrs.evolve(chosen_one, model=longest(model, learned, judge.fit)),
             _likely(final, judge, learned), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),

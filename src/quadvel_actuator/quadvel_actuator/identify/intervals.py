@@ -48,10 +48,11 @@ def intervals(
     part = beside(model if chosen is None else chosen, learned)
     model = beside(model, learned)
     wide = _half_widths(model, judge, judge.every, learned)
+    fitted = wide if judge.every is judge.fit else _half_widths(part, judge, judge.fit, learned)
     here = _everything(model)
     for other in as_deep(model, judge.every):
         wide = np.maximum(wide, np.abs(_everything(other) - here))
-    wide = np.maximum(wide, _contradicted(part, judge, learned))
+    wide = np.maximum(wide, _contradicted(part, judge, fitted, learned))
     effects: list[Array] = []
     first = 2
     for one in model.applied:
@@ -94,15 +95,14 @@ def _half_widths(model: Model, judge: Judge, rows: Bools, learned: Learned | Non
     return np.where(slots.index >= 0, half[slots.index], 0.0)
 
 
-def _contradicted(model: Model, judge: Judge, learned: Learned | None) -> Array:
+def _contradicted(model: Model, judge: Judge, wide: Array, learned: Learned | None) -> Array:
     """How far off the model fitted to the held-out rows is, (A + 2, J), where the two contradict each other, else 0.
 
     Then neither of the two widths holds: the model lacks something that bends what is fitted on one of them.
     """
     other = fit_with_delays(model, judge.judge)
     apart = np.abs(_everything(other) - _everything(model))
-    wide = _half_widths(model, judge, judge.fit, learned) + _half_widths(other, judge, judge.judge, learned)
-    return np.where(apart > wide, apart, 0.0)
+    return np.where(apart > wide + _half_widths(other, judge, judge.judge, learned), apart, 0.0)
 
 
 def _beside_terms(slopes: Array, learned: Learned, rows: Bools) -> Array:

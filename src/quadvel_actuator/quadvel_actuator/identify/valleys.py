@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 
 from ..effects import AddedLaw
-from .delays import LONGEST, fit_with_delays
+from .delays import CHANCE, LONGEST, fit_with_delays
 from .eam import WINDOWS
 from .few import remembers
 from .model import Model
@@ -29,7 +29,6 @@ _SHARES = (0.98, 0.99, 1.01, 1.02)
 _STEPS = 5
 _DEEPER = 1.0
 """Of the mean squared error: a sum of squares that has to fall by this much to count as less"""
-_AS_DEEP = 3.84  # the same, of what 95 % of the logs of one truth leave between it and the best fit
 
 
 def deepest(model: Model, rows: Bools, rounds: int) -> Model:
@@ -49,7 +48,7 @@ def as_deep(model: Model, rows: Bools) -> list[Model]:
     """
     if remembers(model):
         return []
-    bound = model.error(rows) + _AS_DEEP * model.mse(rows)
+    bound = model.error(rows) + CHANCE * model.mse(rows)
     return [one for one in _neighbours(model, rows) if one.error(rows) < bound]
 
 
