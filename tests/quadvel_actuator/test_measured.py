@@ -26,5 +26,5 @@ def test_a_walk_explains_the_other_with_at_most_half_of_the_error_of_the_eam(wal
     fitted, judged = (walks[k] for k in order)
     report = identify([fitted], [judged], Options(gains=GAINS)).report
     effects = [effect["name"] for effect in report["effects"]]
-    assert effects[0] == "armature"
+    assert "armature" in effects[:2]
     assert report["after"]["heldout_mse"] < 0.5 * report["before"]["heldout_mse"]

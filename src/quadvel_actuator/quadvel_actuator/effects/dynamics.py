@@ -132,7 +132,7 @@ class VelocityFilter(MemoryLaw):
 
 @attrs.frozen(eq=False)
 class Armature(AddedLaw):
-    """-J ddq; `of` says how the acceleration is taken: a short slope of dq, or a smooth one for noisy or sparse logs"""
+    """-J ddq; `of` says how the acceleration is taken: of a short slope of dq, or of a smooth one where dq is noisy"""
 
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)

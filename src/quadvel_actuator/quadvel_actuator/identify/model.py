@@ -72,6 +72,11 @@ class Model:
         """The signals at this model's delays."""
         return self.samples.at(self.input_delay, self.output_delay, self.window)
 
+    @property
+    def _at_joint(self) -> Signals:
+        """The signals for torques that do not come an output delay late."""
+        return self.samples.at_joint(self.input_delay, self.output_delay, self.window)
+
     def predict(self) -> Array:
         """Torque of every row, (N, J), N m."""
         torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.applied])[0]
@@ -120,7 +125,7 @@ class Model:
 
     def added(self, one: Applied, x: Array, value: Array) -> Array:
         """The torque (B, N, J) that a law of the stage ADDED adds to `x`, with a batch of its values (B, P, J)."""
-        seen = self.signals if one.law.at == DRIVE else self.samples.at(0.0, 0.0, self.window)
+        seen = self.signals if one.law.at == DRIVE else self._at_joint
         extra: Array = self._series(one, x, seen, value)
         return extra if one.active.all() else extra * one.active
 

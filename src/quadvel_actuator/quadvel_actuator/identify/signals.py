@@ -18,6 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from .acceleration import HALF_WIDTHS, smooth_part
 from .log import Log
 
 Array = NDArray[np.float64]
@@ -29,19 +30,16 @@ GAP = 3.5
 SETTLING = 0.03
 """Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
 
-SMOOTH, SMOOTH_LATE = 0.006, 0.001
-"""The smooth acceleration is taken over so long to either side, and so much later, s."""
-
 STRETCH, FILLING = 0.75, 0.25
 """Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
-
-_SLOPES = {"ddq": 0.0, "ddq_smooth": SMOOTH_LATE}
-"""Signals that few laws ask for, and how much later they are read, s"""
 
 _CACHED = 3, 64
 """sets of signals that are kept, at least and at most;"""
 _CACHED_VALUES = 1_000_000
 """as many as have about so many values in each of their signals together"""
+
+_KEPT_SLOPES = 4
+"""accelerations that a log keeps: two kinds at a few delays"""
 
 _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 
@@ -86,7 +84,7 @@ class Signals:
 
     @cached_property
     def ddq_smooth(self) -> Array:
-        """rad/s^2, over more rows, and of SMOOTH_LATE before."""
+        """rad/s^2, over more rows."""
         return self.slope("ddq_smooth")
 
     @cached_property
@@ -111,35 +109,12 @@ def scattered(count: int, every: int) -> NDArray[np.intp]:
     return rows[rows < count]
 
 
-def derivative(log: Log, values: Array, half_width: float = 0.002) -> Array:
-    """Slope of `values` (N, J) over `half_width` s to either side, by rows."""
-    n = len(log.t)
-    reach = max(1, round(half_width / log.period))
-    rows = np.arange(n)
-    first, last = np.maximum(rows - reach, 0), np.minimum(rows + reach, n - 1)
-    slope: Array = (values[last] - values[first]) / (log.t[last] - log.t[first])[:, None]
-    return slope
-
-
-def smooth_derivative(log: Log, values: Array) -> Array:
-    """Slope of a parabola through SMOOTH s of `values` (N, J) to either side, by rows."""
-    reach = max(2, round(SMOOTH / log.period))
-    k = np.arange(-reach, reach + 1)
-    weight = (1.0 - (k / (reach + 1.0)) ** 2) * k
-    padded = np.pad(values, ((reach, reach), (0, 0)), mode="edge")
-    slope = sum(w * padded[i : i + len(values)] for i, w in enumerate(weight))
-    result: Array = slope / (float(np.sum(weight * k)) * log.period)
-    return result
-
-
 class _LogSignals:
     """One log, ready to be read at any time."""
 
     def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float) -> None:
         self.log, self.origin = log, origin
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
-        self.states["ddq"] = derivative(log, self.states["dq"])
-        self.states["ddq_smooth"] = smooth_derivative(log, self.states["dq"])
         if log.temperature is not None:
             self.states["temperature"] = _double(log.temperature)
         if log.voltage is not None:
@@ -166,6 +141,7 @@ class _LogSignals:
             for name, values in self.commands.items()
             if values.any()
         }
+        self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
     def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """Of times: the state row before, and how far towards the next, 0 to 1; shape of `at`."""
@@ -177,15 +153,42 @@ class _LogSignals:
         self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
     ) -> Array:
         """A state signal, linear between rows; `found` is `between(at)` where that is known."""
-        row, share = self.between(at) if found is None else found
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        early = values[row]
+        return self._read(values, self.between(at) if found is None else found)
+
+    def _read(self, values: Array, found: tuple[NDArray[np.intp], Array]) -> Array:
+        """Values of the rows (N, J), linear between them."""
+        row, share = found
+        early: Array = values[row]
         late = values[row + 1]
         late -= early
         late *= share[:, None]
         late += early
         return late
+
+    def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
+        """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
+        key = (name, *delays.tolist())
+        if key not in self._smooth:
+            if len(self._smooth) >= _KEPT_SLOPES:
+                self._smooth.pop(next(iter(self._smooth)))
+            t = _double(self.log.t)
+            come = self._acting(t, delays, self._integral)
+            self._smooth[key] = smooth_part(t, self.states["dq"], come, HALF_WIDTHS[name])
+        smooth, answer = self._smooth[key]
+        jumps = self._acting(at, delays, lambda values, _, sent: values[self.log.command_rows(sent + 1e-9)])
+        return self._read(smooth[:, joints], self.between(at)) + jumps @ answer[:, joints]
+
+    def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
+        """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
+        found = np.zeros((len(at), len(delays)))
+        if "q_des" in self.sums:
+            for delay in np.unique(delays):
+                joints = delays == delay
+                values, sums = self.commands["q_des"][:, joints], self.sums["q_des"][:, joints]
+                found[:, joints] = read(values, sums, at - delay)
+        return found
 
     def shifted(self, name: str, at: Array) -> Array:
         """A state signal of every joint at times of its own, (..., N, J)."""
@@ -346,16 +349,30 @@ class Samples:
         pairs = [(round(float(a), 7), round(float(b), 7)) for a, b in zip(*delays, strict=True)]
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
+        return self._cached(
+            key, lambda: self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
+        )
+
+    def at_joint(self, input_delay: Array, output_delay: Array, window: float) -> Signals:
+        """The signals (N, J) of now, for what acts on the joint itself; commands move it with delays (s) of each, (J,)."""
+        delays = np.broadcast_to(input_delay + output_delay, self.tau.shape[1:])
+        slope = partial(self._slope, 0.0, delays - 0.5 * window, ALL)
+        key = ("joint", window, *np.round(delays, 7).tolist())
+        return self._cached(key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
+
+    def _cached(self, key: tuple[Any, ...], make: Callable[[], Signals]) -> Signals:
         if key not in self._cache:
+            made = make()
             if len(self._cache) >= max(_CACHED[0], min(_CACHED[1], _CACHED_VALUES // self.tau.size)):
                 self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
+            self._cache[key] = made
         return self._cache[key]
 
     def _mixed(self, pairs: Sequence[tuple[float, float]], window: float) -> Signals:
         """Each joint's columns at its own delays; times and packets are those of the first one."""
         every = {pair: [j for j, one in enumerate(pairs) if one == pair] for pair in dict.fromkeys(pairs)}
-        made = {pair: self._make(*pair, window, joints) for pair, joints in every.items()}
+        delays = np.array(pairs).sum(axis=1) - 0.5 * window
+        made = {pair: self._make(*pair, window, joints, delays) for pair, joints in every.items()}
         first = made[pairs[0]]
         columns: dict[str, Any] = {}
         for name in _OF_JOINTS:
@@ -389,17 +406,23 @@ class Samples:
         return np.concatenate(parts, axis=-2)
 
     def _make(
-        self, input_delay: float, output_delay: float, window: float, joints: list[int] | None = None
+        self,
+        input_delay: float,
+        output_delay: float,
+        window: float,
+        joints: list[int] | None = None,
+        delays: Array | None = None,
     ) -> Signals:
-        """The signals of `joints`, or of all, at one pair of delays."""
+        """The signals of `joints`, or of all, at one pair of delays; `delays` (J,) after which commands move the joints."""
         parts: dict[str, list[Array]] = {}
         packets, ages = [], []
         chosen = ALL if joints is None else joints
+        if delays is None:
+            delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
             found = one.between(at)
             for name in one.states:
-                if name not in _SLOPES:
-                    parts.setdefault(name, []).append(one.state(name, at, chosen, found))
+                parts.setdefault(name, []).append(one.state(name, at, chosen, found))
             for name in one.commands:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
             row = one.log.command_rows(at - input_delay + 1e-9)
@@ -420,15 +443,14 @@ class Samples:
             row=self.row[:, None],
             sent=self.sent,
             elsewhere=partial(self._elsewhere, output_delay),
-            slope=partial(self._slope, output_delay, chosen),
+            slope=partial(self._slope, output_delay, delays, chosen),
             **signals,
         )
 
-    def _slope(self, output_delay: float, joints: Joints, name: str) -> Array:
-        """One of the accelerations at this output delay."""
-        late = _SLOPES[name]
+    def _slope(self, output_delay: float, delays: Array, joints: Joints, name: str) -> Array:
+        """One of the accelerations (N, J) at this output delay, where commands move the joints after `delays` (J,)."""
         parts = [
-            one.state(name, at - late, joints)
+            one.acceleration(name, at, delays, joints)
             for one, at in zip(self.logs, self._instants(output_delay), strict=False)
         ]
         return np.concatenate(parts)
