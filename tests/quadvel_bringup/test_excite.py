@@ -17,7 +17,7 @@ from quadvel_actuator.identify.excitation import FootLifting
 from quadvel_actuator.identify.read_log import read_log
 from quadvel_bringup.excite import RAMP, MotionError, Player
 from quadvel_description import robot
-from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
 PROGRAM = """
 import typer
@@ -44,6 +44,12 @@ def state(seconds: float, q: np.ndarray = robot.LIE_Q, tilt: float = 0.0) -> Rob
     )
 
 
+def play(player: Player, begin: float, end: float, q: np.ndarray = robot.LIE_Q) -> JointCommand:
+    """The answer at `end`, s, after states of every 20 ms since `begin`."""
+    times = np.linspace(begin, end, round((end - begin) / 0.02) + 1)
+    return [player.answer(state(float(t), q)) for t in times][-1]
+
+
 def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
     excitation = FootLifting(seconds=1.0)
     player, targets = Player(excitation), excitation.targets()
@@ -51,17 +57,24 @@ def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
     np.testing.assert_allclose(first.q, robot.LIE_Q)
     assert (first.mode, first.tick) == (MODE_SERVO, 5000)
     near = robot.NOMINAL_Q
-    np.testing.assert_allclose(player.answer(state(RAMP, near)).q, targets[0], atol=1e-9)
-    np.testing.assert_allclose(player.answer(state(RAMP + 0.25, near)).q, targets[250], atol=1e-9)
+    np.testing.assert_allclose(play(player, 0.0, RAMP, near).q, targets[0], atol=1e-9)
+    np.testing.assert_allclose(play(player, RAMP, RAMP + 0.25, near).q, targets[250], atol=1e-9)
     assert not player.done
-    assert player.answer(state(RAMP + 1.0, near)).mode == MODE_DAMPING
+    assert play(player, RAMP + 0.25, RAMP + 1.0, near).mode == MODE_DAMPING
     assert player.done
+
+
+@pytest.mark.parametrize("then", [1.2, 0.9])
+def test_a_motion_that_would_jump_after_a_silence_or_a_step_of_the_clock_is_ended(then: float) -> None:
+    player = Player(FootLifting(seconds=1.0))
+    play(player, 0.0, 1.0)
+    with pytest.raises(MotionError, match=r"time went by (0.200|-0.100) s, expected 0 to 0.05 s"):
+        player.answer(state(then))
 
 
 def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
     player = Player(FootLifting())
-    player.answer(state(0.0))
-    asked = robot.KP * (player.answer(state(RAMP)).q - robot.LIE_Q)
+    asked = robot.KP * (play(player, 0.0, RAMP).q - robot.LIE_Q)
     assert (np.abs(asked) <= robot.TORQUE_LIMIT).all()
 
 

@@ -94,7 +94,7 @@ def test_in_simulated_time_the_simulator_waits_and_the_others_follow_its_clock()
 def test_beside_a_robot_that_others_serve_nothing_moves_without_an_operator() -> None:
     overrides = Stack(low_level="external").overrides()
     assert "sim_node" not in overrides
-    assert overrides["controller"] == {"require_operator": True}
+    assert overrides["controller"] == {"auto_stand": False, "require_operator": True}
 
 
 def test_another_robot_is_refused_by_name() -> None:

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import pytest
 
 from quadvel_bringup import up
+from quadvel_bringup.alone import NotAlone, look_for_others
 from quadvel_bringup.stack import Stack
 
 NODE = """
@@ -77,3 +80,30 @@ def test_when_a_node_dies_the_others_are_stopped_and_its_exit_code_is_returned(
 def test_a_node_that_ends_by_itself_is_a_fault_even_with_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:
     use_programs(monkeypatch, lambda name: "pass" if name == "sim_node" else NODE)
     assert up.up(Stack()) == 1
+
+
+def test_beside_another_simulator_it_does_not_start(capfd: pytest.CaptureFixture[str]) -> None:
+    program = [
+        sys.executable,
+        "-m",
+        "quadvel_bringup",
+        "run",
+        "sim_node",
+        "--ros-args",
+        "-p",
+        "mode:=lockstep",
+    ]
+    other = subprocess.Popen(program)
+    try:
+        until = time.monotonic() + 30.0
+        while time.monotonic() < until:
+            with suppress(NotAlone):
+                look_for_others()
+                continue
+            break
+        with pytest.raises(NotAlone, match="low_state: somebody publishes it already on ROS domain"):
+            up.up(Stack())
+    finally:
+        other.send_signal(signal.SIGINT)
+        assert other.wait(20.0) == 0
+    assert "starting" not in capfd.readouterr().out

@@ -44,6 +44,15 @@ def test_timer_keeps_its_grid_and_leaves_out_missed_deadlines(ros: Start) -> Non
     assert len(calls) == 5
 
 
+def test_a_timer_goes_on_where_simulated_time_goes_back(ros: Start) -> None:
+    ros("--ros-args", "-p", "use_sim_time:=true")
+    node, calls = Node("control", start_parameter_services=False), []
+    node.create_timer(0.1, lambda: calls.append(node.get_clock().now().nanoseconds / 1e9))
+    for now in (100.0, 100.1, 0.0, 0.1, 0.2):
+        drive_clock(node, now)
+    assert calls == [100.0, 100.1, 0.1, 0.2]
+
+
 def test_simulated_time_comes_from_the_clock_topic(ros: Start, spin_until: SpinUntil) -> None:
     ros()
     node = Node("control", parameter_overrides=[Parameter("use_sim_time", value=True)])

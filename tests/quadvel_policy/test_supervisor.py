@@ -394,6 +394,30 @@ def test_an_action_that_is_not_finite_is_a_fault(rig: Rig) -> None:
     assert "not finite" in rig.supervisor.reason
 
 
+def test_a_standing_robot_that_is_put_elsewhere_at_once_is_a_fault(rig: Rig) -> None:
+    """As a simulator's reset does: targets of the stance would throw it over."""
+    rig.stand()
+    rig.state.q = LIE_Q.copy()
+    answer = rig.tick()
+    assert rig.mode == "fault"
+    assert re.match(r"FR_calf_joint moved by -\d\.\d\d rad in 5 ms, limit 0\.40", rig.supervisor.reason)
+    assert answer.mode == MODE_DAMPING
+
+
+def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
+    rig = Rig(policy, auto_stand=True)
+    rig.supervisor.obstacle = "low_state has 2 publishers"
+    rig.run(0.1)
+    assert rig.mode == "passive"
+    assert rig.supervisor.request("stand_up") == (False, "low_state has 2 publishers")
+    rig.supervisor.obstacle = None
+    rig.run(2.5)
+    assert rig.mode == "stance"
+    rig.supervisor.obstacle = "low_state has 2 publishers"
+    rig.tick()
+    assert (rig.mode, rig.supervisor.reason) == ("fault", "low_state has 2 publishers")
+
+
 def test_a_fault_from_outside_is_latched_and_the_first_reason_stays(rig: Rig) -> None:
     rig.walk()
     rig.supervisor.fail("20 deadlines were missed in a row")

@@ -164,7 +164,7 @@ def test_fast_goes_on_by_itself_and_takes_commands() -> None:
         bench.loop.pause(True)
         bench.loop.submit(command(4.0, bench.samples[-1][0].tick))
         bench.loop.step(10)
-        assert bench.torque() == 4.0
+        wait_for(lambda: bench.torque() == 4.0)
     assert bench.clock.now == 100.0
 
 
@@ -177,10 +177,28 @@ def test_a_pause_stops_time_and_steps_advance_it() -> None:
         tick = bench.loop.tick
         time.sleep(0.03)
         assert bench.loop.tick == tick
+        count = len(bench.samples)
         bench.loop.step(7)
-        assert (bench.loop.tick, bench.samples[-1][0].tick) == (tick + 7, tick + 7)
+        wait_for(lambda: bench.samples[-1][0].tick == tick + 7)
+        time.sleep(0.03)
+        assert [state.tick for state, _ in bench.samples[count:]] == [tick + 5, tick + 7]
         bench.loop.pause(False)
         wait_for(lambda: bench.loop.tick > tick + 7)
+
+
+def test_steps_in_lockstep_wait_for_the_answer_to_each_state() -> None:
+    bench = Bench("lockstep", answer_timeout=10.0)
+    with running(bench.loop):
+        wait_for(lambda: len(bench.samples) == 1)
+        bench.loop.pause(True)
+        bench.loop.step(100)
+        for tick in range(0, 100, 5):
+            bench.loop.submit(command(2.0, tick))
+            wait_for(lambda: bench.samples[-1][0].tick == tick + 5)  # noqa: B023
+            assert not bench.loop.report().braking
+        bench.loop.submit(command(2.0, 100))
+        time.sleep(0.03)
+        assert bench.samples[-1][0].tick == 100
 
 
 def test_after_a_pause_realtime_does_not_catch_up() -> None:
@@ -201,14 +219,18 @@ def test_after_a_pause_realtime_does_not_catch_up() -> None:
 def test_samples_stay_in_order_of_time_however_one_steps_pauses_and_resets() -> None:
     bench = Bench("realtime")
     with running(bench.loop):
-        for order in (
-            lambda: bench.loop.step(500),
-            lambda: bench.loop.reset("lie"),
-            lambda: bench.loop.step(1),
+        for order, steps in (
+            (lambda: bench.loop.step(500), 500),
+            (lambda: bench.loop.reset("lie"), 5),
+            (lambda: bench.loop.step(1), 1),
         ):
             bench.loop.pause(True)
             bench.clock.now += 0.003
+            after = bench.loop.tick + steps
             order()
+            while bench.loop.tick < after:
+                bench.clock.now += 0.001
+                time.sleep(0.001)
             bench.loop.pause(False)
             count = len(bench.samples)
             bench.clock.now += 0.0075

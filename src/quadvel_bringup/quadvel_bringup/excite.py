@@ -26,6 +26,7 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.report import output_folder, replacing
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 
+from .alone import ensure_alone
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 from .stack import PARAMETERS
@@ -37,6 +38,7 @@ MAX_TILT = 0.8  # rad
 JOINT_MARGIN = 0.1  # rad, that a joint may pass its mechanical range by
 PATIENCE = 20.0  # s, for the first state
 MAX_SILENCE = 5.0  # s, without a state
+MAX_GAP = 0.05  # s, between two states: after a longer one the motion would jump
 ANSWER_TIMEOUT = 2.0  # s, after which the simulator asks again
 RECORDED = {"/low_state": "quadvel_msgs/msg/LowState", "/low_cmd": "quadvel_msgs/msg/LowCmd"}
 
@@ -52,6 +54,7 @@ class Player:
         self._targets = excitation.targets()
         self._kp, self._kd = kp, kd
         self._begin: RobotState | None = None
+        self._last = 0.0
         self.total = RAMP + excitation.seconds
         """s, of ramp and motion"""
         self.elapsed = 0.0
@@ -66,7 +69,12 @@ class Player:
         """The command at `state`; damping once the motion is done. Raises MotionError."""
         _check(state)
         if self._begin is None:
-            self._begin = state
+            self._begin, self._last = state, state.time
+        gap, self._last = state.time - self._last, state.time
+        if not 0.0 <= gap <= MAX_GAP:
+            raise MotionError(
+                f"from one state to the next time went by {gap:.3f} s, expected 0 to {MAX_GAP} s"
+            )
         self.elapsed = state.time - self._begin.time
         if self.done:
             return JointCommand.damping(tick=state.tick)
@@ -198,6 +206,8 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
     clock = [Parameter("use_sim_time", value=bool(nodes))]
     node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:
+        if nodes:
+            ensure_alone(node)
         with StopSignals() as signals, bar, replacing(path) as draft, ProcessGroup(say) as group:
             for name, line in nodes.items():
                 group.start(name, line)
@@ -231,12 +241,15 @@ class _Session:
         self._heard: float | None = None  # when the last state came, s
         self._counts: Counter[str] = Counter()
         self._failure: MotionError | None = None
+        self._resting, self._tick = False, 0
         self._publisher = node.create_publisher(LowCmd, "low_cmd", 1)
-        newest = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+        # In lockstep no state may be lost; a robot's driver may send them as best it can.
+        reliability = ReliabilityPolicy.RELIABLE if simulated else ReliabilityPolicy.BEST_EFFORT
+        newest = QoSProfile(depth=1, reliability=reliability)
         node.create_subscription(LowState, "low_state", self._on_state, newest)
 
     def run(self, draft: Path, group: ProcessGroup, signals: StopSignals, bar: Progress) -> None:
-        """Play to the end and record it in `draft`, then let a real robot sink to rest."""
+        """Play to the end and record it in `draft`; then, whatever ended it, let a real robot sink to rest."""
         from rclpy.executors import SingleThreadedExecutor
 
         from .recorder import Recorder
@@ -245,19 +258,28 @@ class _Session:
         playing, recording = SingleThreadedExecutor(), SingleThreadedExecutor()  # neither waits for the other
         playing.add_node(self._node)
         recording.add_node(self._recorder_node)
-        with Recorder(self._recorder_node, draft) as recorder:
-            for topic, kind in RECORDED.items():
-                recorder.record(topic, kind)
-            while not self._player.done:
-                _spin(playing, LOOK)
+        try:
+            with Recorder(self._recorder_node, draft) as recorder:
+                for topic, kind in RECORDED.items():
+                    recorder.record(topic, kind)
+                while not self._player.done:
+                    _spin(playing, LOOK)
+                    recorder.write_waiting(recording)
+                    bar.update(task, completed=min(self._player.elapsed, self._player.total))
+                    self._look(group, signals)
+                time.sleep(LOOK)  # what was sent last is under way
                 recorder.write_waiting(recording)
-                bar.update(task, completed=min(self._player.elapsed, self._player.total))
-                self._look(group, signals)
-            time.sleep(LOOK)  # what was sent last is under way
-            recorder.write_waiting(recording)
-        self._counts = recorder.counts
-        if not self._simulated:
-            _spin(playing, REST)
+            self._counts = recorder.counts
+        finally:
+            if not self._simulated:
+                self._rest(playing)
+
+    def _rest(self, playing: Any) -> None:
+        """Damping, at once and as the answer to all that comes."""
+        self._resting = True
+        if self._heard is not None:
+            self._send(JointCommand.damping(tick=self._tick), self._node.get_clock().now().to_msg())
+        _spin(playing, REST)
 
     def summary(self) -> str:
         """What was recorded."""
@@ -279,19 +301,24 @@ class _Session:
             raise MotionError(f"nothing came on low_state for {patience:g} s")
 
     def _on_state(self, message: Any) -> None:
-        if self._failure:
+        self._heard, self._tick = time.monotonic(), message.tick
+        answer = self._answer(message)
+        if self._simulated and (self._failure or self._player.done):
             return
-        self._heard = time.monotonic()
-        try:
-            if self._player.elapsed == 0.0 and self._node.count_publishers("low_cmd") > 1:
-                raise MotionError("somebody else sends low_cmd too; stop the controller first")
-            answer = self._player.answer(read_low_state(message))
-        except (MessageError, MotionError) as error:
-            self._failure = MotionError(str(error))
-            answer = JointCommand.damping(tick=message.tick)
-        if self._player.done and self._simulated:
-            return
-        stamp = message.stamp if self._simulated else self._node.get_clock().now().to_msg()
+        self._send(answer, message.stamp if self._simulated else self._node.get_clock().now().to_msg())
+
+    def _answer(self, message: Any) -> JointCommand:
+        """The player's answer; damping once something went wrong, or the end has come."""
+        if not (self._failure or self._resting):
+            try:
+                if self._player.elapsed == 0.0 and self._node.count_publishers("low_cmd") > 1:
+                    raise MotionError("somebody else sends low_cmd too; stop the controller first")
+                return self._player.answer(read_low_state(message))
+            except (MessageError, MotionError) as error:
+                self._failure = MotionError(str(error))
+        return JointCommand.damping(tick=message.tick)
+
+    def _send(self, answer: JointCommand, stamp: Any) -> None:
         command = self._message(stamp=stamp)
         write_low_cmd(answer, command)
         self._publisher.publish(command)

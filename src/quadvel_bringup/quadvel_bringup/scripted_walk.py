@@ -13,6 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 import quadvel_dds
 from quadvel_eval.script import SCRIPTS
 
+from .alone import ensure_alone
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 
@@ -56,7 +57,10 @@ class ScriptedWalk:
         self._task = self._bar.add_task("start", total=len(self._steps))
 
     def run(self) -> str:
-        """Run the script to its end; what went wrong, or "". Ctrl-C ends it with a typer.Exit."""
+        """Run the script to its end; what went wrong, or "". Ctrl-C ends it with a typer.Exit.
+
+        Raises NotAlone where a robot is there already.
+        """
         quadvel_dds.install()
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
@@ -72,6 +76,7 @@ class ScriptedWalk:
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         try:
+            ensure_alone(node)
             node.create_subscription(String, "planner/step", self._on_step, 10)
             with StopSignals() as signals, Recorder(node, self._recording) as recorder, self._bar:
                 for topic, kind in RECORDED.items():

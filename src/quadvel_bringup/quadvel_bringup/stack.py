@@ -26,7 +26,7 @@ class LowLevel:
 LOW_LEVELS = {
     "sim": LowLevel(("sim_node",), {"auto_stand": True}),
     # Started by somebody else, and perhaps a real robot: it stands up and walks only on an operator's call.
-    "external": LowLevel((), {"require_operator": True}),
+    "external": LowLevel((), {"auto_stand": False, "require_operator": True}),
 }
 
 
@@ -44,6 +44,11 @@ class Stack:
     terrain: str | None = None
     estimator: str | None = None
     use_sim_time: bool = False
+
+    @property
+    def simulates(self) -> bool:
+        """Whether it brings the robot itself."""
+        return bool(LOW_LEVELS[self.low_level].nodes)
 
     def overrides(self) -> dict[str, Parameters]:
         """For each node to start, by name, the parameters that stand above those of the file."""

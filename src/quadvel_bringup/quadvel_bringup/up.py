@@ -7,6 +7,7 @@ import threading
 from rich.console import Console
 from rich.text import Text
 
+from .alone import look_for_others
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 from .stack import Stack
@@ -33,8 +34,11 @@ def up(stack: Stack) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0).
+    are stopped, and its exit code is ours (1 if that was 0). Raises NotAlone where a robot is there already that
+    nobody asked for.
     """
+    if stack.simulates:
+        look_for_others()
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])
     with StopSignals() as signals, ProcessGroup(say) as group:

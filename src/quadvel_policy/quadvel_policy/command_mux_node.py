@@ -72,8 +72,10 @@ class CommandMuxNode(Node):
         self.create_service(SetBool, "~/stance", self._on_stance)
         self._command = self.create_publisher(VelocityCommand, "command", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(PERIOD, self._update)
-        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where the system's clock is set back
+        simulated = self.get_parameter("use_sim_time").value
+        self.create_timer(PERIOD, self._update, clock=self.get_clock() if simulated else steady)
+        self.create_timer(1.0, self._report, clock=steady)
 
     def _now(self) -> float:
         return float(1e-9 * self.get_clock().now().nanoseconds)

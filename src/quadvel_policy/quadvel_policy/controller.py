@@ -92,13 +92,18 @@ class Controller(Node):
         self._low_cmd = self.create_publisher(LowCmd, "low_cmd", 1)
         self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_subscription(LowState, "low_state", self._on_state, NEWEST)
+        # A robot's driver may send its states as best it can; a simulator in lockstep waits for the answer to each.
+        of_states = (
+            NEWEST if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+        )
+        self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
         self.create_subscription(TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, NEWEST)
         self.create_subscription(VelocityCommand, "command", self._on_command, NEWEST)
         self.create_service(SetMode, "~/set_mode", self._on_set_mode)
         self.create_service(SetBool, "~/enable_walking", self._on_enable_walking)
-        self.create_timer(STATE_PERIOD, self._watch)
-        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where the system's clock is set back
+        self.create_timer(STATE_PERIOD, self._watch, clock=self.get_clock() if self._sim_time else steady)
+        self.create_timer(1.0, self._report, clock=steady)
 
     def _now(self, stamp: float = 0.0) -> float:
         """The clock of the stamps, s. Simulated time may reach this node after what was stamped with it."""
@@ -219,7 +224,8 @@ class Controller(Node):
         return message
 
     def _report(self) -> None:
-        """Once a second: /diagnostics."""
+        """Once a second: /diagnostics, and a look whether the robot is alone."""
+        self._supervisor.obstacle = self._rival()
         level, summary = self._judge()
         values = {
             "mode": self._supervisor.mode,
@@ -235,6 +241,13 @@ class Controller(Node):
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 
+    def _rival(self) -> str | None:
+        """A sentence where more than one robot reports: what the states say then fits neither."""
+        count = self.count_publishers(self._states.topic_name)
+        return (
+            f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
+        )
+
     def _judge(self) -> tuple[bytes, str]:
         """Level and summary of the last second."""
         refused = self._refusals.total - self._refused_before
@@ -245,6 +258,8 @@ class Controller(Node):
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.mode == "fault":
             return DiagnosticStatus.ERROR, status
+        if self._supervisor.obstacle:
+            return DiagnosticStatus.ERROR, self._supervisor.obstacle
         if self._state is None:
             return DiagnosticStatus.WARN, "no message on low_state yet"
         if refused:
@@ -257,8 +272,8 @@ class Controller(Node):
 
 
 def _fresh(stamped: tuple[float, Array] | None, now: float, limit: float) -> Array | None:
-    """The value, unless it is older than `limit` (s)."""
-    return stamped[1] if stamped is not None and now - stamped[0] <= limit else None
+    """The value, unless its time is more than `limit` (s) off, to come where the clock was set back."""
+    return stamped[1] if stamped is not None and abs(now - stamped[0]) <= limit else None
 
 
 def main(args: list[str] | None = None) -> None:

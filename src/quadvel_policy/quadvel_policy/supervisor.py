@@ -72,7 +72,7 @@ class Supervisor:
 
     policy: what drives in walk; its metadata gives limits and the nominal posture. After each tick: `mode`
     (one of MODES), `reason` (one sentence), `command` (4,) in effect, `walk_allowed`, `inference_seconds`
-    (nan where no network ran).
+    (nan where no network ran). `obstacle`: what somebody else found that forbids moving, a sentence, or None.
     """
 
     def __init__(self, policy: Policy, config: SupervisorConfig = SupervisorConfig()) -> None:
@@ -105,6 +105,7 @@ class Supervisor:
         self.mode, self.reason = "passive", "waits for an order"
         self.command = STILL.copy()
         self.inference_seconds = float("nan")
+        self.obstacle: str | None = None
         self._auto_stand = c.auto_stand
         self._enabled = False
         self._last: Tick | None = None
@@ -205,7 +206,7 @@ class Supervisor:
 
     def _check(self, seen: Tick, gap: float) -> None:
         """Latch the first problem of this tick; a short gap only costs the policy its memory."""
-        problem = next(self._problems(seen, gap), None)
+        problem = next(self._problems(seen, gap), None) or self._jump(seen.state, gap)
         if problem:
             self.fail(problem)
         elif gap > self.config.reset_gap:
@@ -214,6 +215,8 @@ class Supervisor:
     def _problems(self, seen: Tick, gap: float = 0.0) -> Iterator[str]:
         """Every reason to go to damping, as sentences. gap: s since the state before."""
         c, state = self.config, seen.state
+        if self.obstacle:
+            yield self.obstacle
         sound = self._is_sound(state)
         if not sound:
             yield from self._not_finite(state)
@@ -230,6 +233,17 @@ class Supervisor:
             yield "there is no fresh velocity estimate"
         if seen.velocity is not None and not _finite(seen.velocity.tolist()):
             yield "the velocity estimate is not finite"
+
+    def _jump(self, state: RobotState, gap: float) -> str | None:
+        """A sentence where joints that a posture holds are elsewhere at once: a robot put back, or an encoder at fault."""
+        if self._last is None or not isinstance(self._modes[self.mode], Posture):
+            return None
+        moved = state.q - self._last.state.q
+        i = int(np.argmax(np.abs(moved)))
+        limit = self.config.max_joint_speed * gap + self.config.joint_margin
+        if abs(moved[i]) <= limit:
+            return None
+        return f"{JOINT_NAMES[i]} moved by {moved[i]:+.2f} rad in {1e3 * gap:.0f} ms, limit {limit:.2f}"
 
     def _is_sound(self, state: RobotState) -> bool:
         """Whether every number is finite and every joint within its limits: all in one look, as it mostly is."""

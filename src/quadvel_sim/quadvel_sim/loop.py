@@ -69,6 +69,7 @@ class SimulationLoop:
         self._inbox: deque[tuple[float, JointCommand]] = deque()
         self._before_reset = 0  # tick of the last reset
         self._answered = self._paused = self._stopped = False
+        self._owed = 0  # ms that a paused simulation was asked for and has not simulated yet
         self._given_up = 0.0
         self._unanswered = 0
         self._anchor()
@@ -100,10 +101,13 @@ class SimulationLoop:
             self._condition.notify_all()
 
     def advance(self) -> None:
-        """Simulate one period and publish the state at its end."""
+        """Simulate one period, or what is left of the steps of a paused simulation, and publish the state at its end."""
         with self._condition:
             self._answered = False
-            self._step(self.period)
+            steps = self._ahead
+            self._step(steps)
+            if self._paused:
+                self._owed -= steps
             self._sample()
 
     def submit(self, command: JointCommand) -> None:
@@ -131,20 +135,20 @@ class SimulationLoop:
     def pause(self, paused: bool) -> None:
         """Let time stand still, or go on."""
         with self._condition:
-            self._paused = paused
+            self._paused, self._owed = paused, 0
             self._anchor()
             self._begin_report()
             self._condition.notify_all()
 
     def step(self, steps: int) -> None:
-        """Advance a paused simulation by `steps` ms and publish. ValueError where it is not paused."""
+        """Let a paused simulation run on for `steps` ms, at its usual pace. ValueError where it is not paused."""
         with self._condition:
             if not self._paused:
                 raise ValueError("the simulation runs; pause it first")
-            self._answered = False
-            self._step(steps)
-            self._anchor()
-            self._sample()
+            if not self._owed:
+                self._anchor()
+            self._owed += steps
+            self._condition.notify_all()
 
     def push(self, body: str, force: ArrayLike, torque: ArrayLike, duration: float) -> None:
         """As `Simulator.push`."""
@@ -166,6 +170,15 @@ class SimulationLoop:
             self._begin_report()
             return report
 
+    @property
+    def _ahead(self) -> int:
+        """How many ms come next: a period, or what is left to a paused simulation."""
+        return min(self.period, self._owed) if self._paused else self.period
+
+    @property
+    def _halted(self) -> bool:
+        return self._ahead == 0
+
     def _begin_report(self) -> None:
         self._report_time, self._report_tick, self._worst_lateness = self._clock(), self.tick, 0.0
 
@@ -179,18 +192,18 @@ class SimulationLoop:
 
     def _ready(self) -> bool:
         """Whether the next period may be simulated; if not, waits a while or until something happens."""
-        if self._paused:
+        if self._halted:
             self._condition.wait()
             return False
         if self.mode == FAST:
             self._condition.wait(_BREATH)
-            return not (self._paused or self._stopped)
+            return not (self._halted or self._stopped)
         if self.mode == LOCKSTEP:
             if not self._answered and not self._condition.wait(self._answer_timeout):
                 self._unanswered += 1
                 self._sample()  # for a controller that has come late
-            return self._answered and not (self._paused or self._stopped)
-        lateness = self._clock() - self._real_time(self.tick + self.period)
+            return self._answered and not (self._halted or self._stopped)
+        lateness = self._clock() - self._real_time(self.tick + self._ahead)
         if lateness < 0.0:
             self._condition.wait(-lateness)
             return False

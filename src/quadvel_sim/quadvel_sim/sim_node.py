@@ -168,7 +168,7 @@ class SimNode(Node):
         return _answer(response, done, self._loop.pause, request.data)
 
     def _on_step(self, request: Any, response: Any) -> Any:
-        return _answer(response, f"advanced by {request.steps} ms", self._loop.step, request.steps)
+        return _answer(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
 
     def _on_push(self, request: Any, response: Any) -> Any:
         force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))

@@ -17,7 +17,7 @@ class Timer:
 
     Deadlines are multiples of the period from the start, on the monotonic clock (on simulated time where the
     clock is driven by /clock), so that lateness does not add up; deadlines missed while a callback ran are
-    left out.
+    left out. Simulated time that goes back starts it anew.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class Timer:
     handle = property(unsupported("Timer.handle"))
 
     def _remaining_ns(self) -> int:
-        if self._simulated != self._clock._is_simulated():
+        if self._simulated != self._clock._is_simulated() or self._now_ns() < self._last_ns:  # set back
             self._restart()
         return self._next_ns - self._now_ns()
 
