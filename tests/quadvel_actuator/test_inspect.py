@@ -46,6 +46,33 @@ def exchanged(values: np.ndarray, a: int = 0, b: int = 4) -> np.ndarray:
     return values[:, order]
 
 
+def of_one(values: np.ndarray, factor: float) -> np.ndarray:
+    """Of the second joint alone."""
+    return values * np.where(np.arange(12) == 1, factor, 1.0)
+
+
+def set_back(t: np.ndarray) -> np.ndarray:
+    """A clock that was set in the middle."""
+    return t + np.where(np.arange(len(t)) >= len(t) // 2, 1.7e9, 0.0)
+
+
+def test_what_is_odd_on_one_joint_is_said_of_it() -> None:
+    noise = np.where(np.arange(12) == 1, np.random.default_rng(0).normal(size=(2000, 12)), fields()["tau"])
+    warnings = said(inspect(log(tau=noise)), "warning")
+    assert any(
+        text.startswith("tau: does not answer the position error on FR_thigh_joint") for text in warnings
+    )
+    copied = fields()["q"].copy()
+    copied[:, 1] = copied[:, 0]
+    warnings = said(inspect(log(q=copied)), "warning")
+    assert any(
+        text.startswith("q: FR_thigh_joint and FR_hip_joint are the same to the bit") for text in warnings
+    )
+    found = inspect(log(kp=of_one(np.full((2000, 12), 30.0), 0.0)))
+    assert said(found, "refusal") == []
+    assert "kp: 0 at times on FR_thigh_joint alone; left out there" in said(found, "warning")
+
+
 def test_of_a_clean_log_only_its_rate_is_said() -> None:
     inspection = inspect(log())
     assert said(inspection, "warning") == []
@@ -80,7 +107,7 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
             {"tau": exchanged(fields()["tau"])},
             "tau: a joint's tau follows another joint's command and motion (FR_",
         ),
-        ({"tau": 1e3 * fields()["tau"]}, "tau: 1e+03 times what kp asks for; expected N m"),
+        ({"tau": 1e3 * fields()["tau"]}, "tau: 1e+03 times what kp asks for on FR_hip_joint"),
         (
             {"tau": np.random.default_rng(0).normal(size=(2000, 12))},
             "tau: does not answer the position error",
@@ -89,6 +116,21 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ({"tau": np.zeros((2000, 12))}, "tau: never changes on any joint"),
         ({"kp": np.zeros((2000, 12))}, "valid: 0.00 s under PD control are left"),
         ({"kp": np.full((2000, 12), -30.0)}, "kp: found -30"),
+        ({"t": fields()["t"] * 1e6, "t_cmd": fields()["t"] * 1e6}, "dq: the slope of q is 1e-06 times dq"),
+        ({"t": set_back(fields()["t"])}, "t: jumps by 1.7e+09 s from row 999 to row 1000"),
+        ({"t_cmd": fields()["t"] + 1e9}, "t_cmd: 1e+09 to 1e+09 s, t: 0 to 3.998 s: nothing in common"),
+        ({"t_cmd": fields()["t"] * 1e3}, "t_cmd: 0 to 3998 s, t: 0 to 3.998 s: 1e+03 times as long"),
+        ({"t_cmd": fields()["t"] + 0.2}, "t_cmd: the torque answers commands 0.20 s before they were sent"),
+        ({"t_cmd": fields()["t"] - 0.2}, "t_cmd: the torque answers commands 0.20 s after they were sent"),
+        ({"dq": of_one(fields()["dq"], 0.0)}, "dq: is 0 on FR_thigh_joint although q moves"),
+        ({"dq": 2.0 * fields()["dq"]}, "dq: the slope of q is 0.5 times dq on FR_hip_joint"),
+        (
+            {"q": of_one(fields()["q"], -1.0), "dq": of_one(fields()["dq"], -1.0)},
+            "q: has the wrong sign on FR_thigh_joint",
+        ),
+        ({"q_des": of_one(fields()["q_des"], -1.0)}, "q_des: has the wrong sign on FR_thigh_joint"),
+        ({"tau": of_one(fields()["tau"], 1e3)}, "tau: 1e+03 times what kp asks for on FR_thigh_joint"),
+        ({"kp": of_one(np.full((2000, 12), 30.0), 100.0)}, "tau: 0.00999 times what kp asks for on FR_thigh"),
     ],
 )
 def test_a_log_that_would_mislead_is_refused(changes: dict[str, Any], sentence: str) -> None:

@@ -203,11 +203,25 @@ def test_an_archive_that_was_cut_off_is_refused(tmp_path: Path) -> None:
         read_log(path)
 
 
+def test_one_column_is_not_taken_for_that_of_every_joint(tmp_path: Path) -> None:
+    with pytest.raises(LogError, match=r"dq: found shape \(2000,\), expected \(2000, 12\)"):
+        read_log(npz(tmp_path / "a.npz", dq=fields()["dq"][:, 0]))
+
+
+def test_what_of_a_file_is_not_used_is_said(tmp_path: Path) -> None:
+    log = read_log(npz(tmp_path / "a.npz", Tau=np.zeros(3), t_cmd=fields()["t"]))
+    assert "Tau: not used, as no log has such fields: Tau" in log.remarks
+    assert "t_cmd: not used, as q_des_cmd is not there; q_des counts on the times t" in log.remarks
+
+
 @pytest.mark.parametrize(
     ("line", "sentence"),
     [
-        ("0.1,1,2,x", "could not convert string 'x'"),
-        ("0.1,1,2", "3 cells|number of columns changed"),
+        ("0.1,1,2,x", "line 22: q_des/a: found 'x', expected a number with a decimal point"),
+        ("0.1,1,2", "line 22: found 3 cells, expected 4"),
+        ("# note", "line 22: found 1 cells, expected 4"),
+        ("0.1,1,2,0.8#x", "line 22: q_des/a: found '0.8#x'"),
+        ("0.1;1;2;3", "line 22: found 1 cells, expected 4"),
     ],
 )
 def test_a_wrong_line_of_a_table_is_refused(tmp_path: Path, line: str, sentence: str) -> None:

@@ -197,6 +197,8 @@ class ActuatorParameters:
         """Read a parameter file; ValueError names file, field, the value found and what was expected."""
         try:
             parameters: ActuatorParameters = _record(cls, yaml.safe_load(Path(path).read_text()))
+        except UnicodeDecodeError:
+            raise ValueError(f"{path}: no text, expected a YAML file of actuator parameters") from None
         except yaml.YAMLError as error:
             raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
         except ValueError as error:

@@ -23,6 +23,11 @@ def main() -> None:
             raise
         print(f"quadvel: {error}", file=sys.stderr)
         sys.exit(2)
+    except MemoryError as error:
+        if os.environ.get("QUADVEL_TRACEBACK"):
+            raise
+        print(f"quadvel: this machine has too little memory for it: {error}", file=sys.stderr)
+        sys.exit(2)
 
 
 if __name__ == "__main__":

@@ -19,6 +19,8 @@ from .pd_control import in_words, out_of_control, stretches, without_position_ga
 
 GAP = 3.5  # times the usual spacing
 PAUSE = 0.1  # s, without a command, where they come regularly
+LONGEST_GAP = 86_400.0  # s; a longer one is no pause, but a clock that was set
+LONGEST_SPAN = 30.0  # times that of the states, of the commands
 LEAST_VALID = 0.5  # s, of states that a model may be judged on
 
 
@@ -37,18 +39,44 @@ class Inspection:
 
 
 def inspect(log: Log) -> Inspection:
-    """All that can be said about the log, check by check."""
+    """All that can be said about the log, check by check, as far as the first refusal."""
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     for check in CHECKS:
         findings += check(log)
+        if _refused(findings):
+            return Inspection(log, tuple(findings))
     answer = log.without_feed_forward()
     valid, why = _explainable(answer)
     findings += why
-    if valid.any():
+    if not _refused(findings):
         answer = attrs.evolve(answer, valid=valid)
-    for check in CHECKS_UNDER_CONTROL:
-        findings += check(answer)
+        for check in CHECKS_UNDER_CONTROL:
+            findings += check(answer)
     return Inspection(attrs.evolve(log, valid=valid), tuple(findings))
+
+
+def _refused(findings: list[Finding]) -> bool:
+    return any(finding.kind == "refusal" for finding in findings)
+
+
+def clocks(log: Log) -> Iterator[Finding]:
+    """Clocks that were set in the middle, and two time bases that have nothing in common."""
+    for field, time in (("t", log.t), ("t_cmd", log.t_cmd)):
+        row = int(np.argmax(np.diff(time)))
+        step = float(time[row + 1] - time[row])
+        if step > max(LONGEST_GAP, 1e3 * float(np.median(np.diff(time)))):
+            text = (
+                f"{field}: jumps by {step:.6g} s from row {row} to row {row + 1}; expected one clock, in seconds: "
+                "was it set while this was recorded?"
+            )
+            yield Finding("refusal", field, (), text)
+    spans = f"t_cmd: {log.t_cmd[0]:.6g} to {log.t_cmd[-1]:.6g} s, t: {log.t[0]:.6g} to {log.t[-1]:.6g} s"
+    ratio = (log.t_cmd[-1] - log.t_cmd[0]) / (log.t[-1] - log.t[0])
+    if log.t_cmd[0] > log.t[-1] or log.t_cmd[-1] < log.t[0]:
+        yield Finding("refusal", "t_cmd", (), f"{spans}: nothing in common, expected one clock for both")
+    elif ratio > LONGEST_SPAN:
+        text = f"{spans}: {ratio:.3g} times as long, expected both in seconds and of the same recording"
+        yield Finding("refusal", "t_cmd", (), text)
 
 
 def rates(log: Log) -> Iterator[Finding]:
@@ -176,11 +204,14 @@ def torque(log: Log) -> Iterator[Finding]:
 
 
 CHECKS: tuple[Callable[[Log], Iterator[Finding]], ...] = (
+    clocks,
     rates,
     repeats,
     still,
+    plausible.copies,
     plausible.units,
     plausible.ranges,
+    plausible.time_bases,
     clipped,
     gains,
     torque,

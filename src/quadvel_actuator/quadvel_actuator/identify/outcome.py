@@ -30,6 +30,8 @@ _REMOVABLE = 0.05
 """Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
 
 _ALIKE = 0.05  # ms
+_OVER = 1.1  # times the limit, that noise and a short peak may reach
+_LESS = 0.9  # of the error before, from which gains and delays of each joint are worth a word
 
 STEP = 0.001
 """s, of the models that run with the parameters"""
@@ -132,7 +134,9 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} sits on its bound: its value and interval are not to be trusted"
             for name in o.widths.on_bound
         ]
-        + _unlike_delays(o.whole),
+        + _unlike_delays(o.whole)
+        + _negative_gains(o.whole)
+        + _beyond_limits(o),
         "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
     }
     report["decision"] = _decision(report)
@@ -147,6 +151,31 @@ def _unlike_delays(model: Model) -> list[str]:
     return [
         f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml holds their median, so a model that runs "
         "with it does worse than the error after says"
+    ]
+
+
+def _negative_gains(model: Model) -> list[str]:
+    """A drive that pushes away from its target does not exist: the log or the model is wrong."""
+    found = []
+    for name, row in zip(("kp", "kd"), model.gains, strict=True):
+        joints = np.array(model.samples.joints)[row < 0.0]
+        if len(joints):
+            text = f"{name} + delta_{name} is negative on {', '.join(joints)}"
+            found.append(
+                f"{text}: look at the signs and stamps of the log before believing anything else here"
+            )
+    return found
+
+
+def _beyond_limits(o: Outcome) -> list[str]:
+    """Torques that were measured and that the corrected model can not give."""
+    joints, most = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
+    limits = np.broadcast_to(_limits(o.base, joints), most.shape)
+    return [
+        f"{joint}: up to {torque:.1f} N m were measured, and torque_limit in actuator.yaml, which is the base's, is "
+        f"{limit:.1f} N m"
+        for joint, torque, limit in zip(joints, most, limits, strict=True)
+        if torque > _OVER * limit
     ]
 
 
@@ -246,6 +275,11 @@ def _settings(one: Applied) -> dict[str, Any]:
 def _decision(report: Mapping[str, Any]) -> str:
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
     effects, rest = report["effects"], report["unexplained"]
+    if not effects and rest["verdict"] == "white" and after < _LESS * before:
+        return (
+            f"Nothing significant beside gains and delays of each joint: with them the EAM explains the torque to {after:.3g} "
+            f"N^2 m^2, with one for all to {before:.3g} (noise floor {report['noise_floor']:.3g}), and no effect is added."
+        )
     if not effects and rest["verdict"] == "white":
         return (
             f"Nothing significant: the plain EAM explains the torque to {before:.3g} N^2 m^2 "

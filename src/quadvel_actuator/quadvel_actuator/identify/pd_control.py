@@ -44,7 +44,8 @@ def stretches(rows: NDArray[Any], t: Array, least: float = 0.0) -> list[tuple[fl
 
 def _unanswered(log: Log) -> Bools:
     """Torque against position error, in short windows over all joints: where is the gain far below its usual size?"""
-    bins = ((log.t - log.t[0]) / BIN).astype(np.intp)
+    steps = np.diff(((log.t - log.t[0]) / BIN).astype(np.intp), prepend=0)
+    bins = np.cumsum(np.minimum(steps, WINDOW))  # a gap is as good as one that no window bridges
     sums = max((_sums(log, bins, lag) for lag in LAGS), key=_explained)
     count, ee, ed, dd, et, dt, _ = (np.convolve(row, np.ones(WINDOW), "same") for row in sums)
     determinant = ee * dd - ed**2

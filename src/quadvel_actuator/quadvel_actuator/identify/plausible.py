@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,10 @@ MOVING = 0.05  # rad/s
 LAGS = (0.0, 0.006, 0.012)  # s, from a command to its torque
 TURNS = 10.0  # rad; a joint of a leg does not reach so far
 REACH = 0.4  # rad beyond the model's range
+DEAD = 2e-4  # of the slope of q, that a speed of 0 may be by its noise
+OFF, ALIKE = 1.4, 0.95  # how far, as a factor, the slope of q may be off dq, where they are alike in shape
+CLOCKS = np.arange(-1.0, 1.01, 0.02)  # s, from a command to its torque, looked at for clocks that differ
+EARLIEST, LATEST = -0.005, 0.1  # s, between which a drive may answer
 UNANSWERED = 0.1  # of the torque that the speed leaves, explained by the position error
 FAR_OFF = 8.0  # times the commanded gain
 ROWS_FOR_A_LAW = 50
@@ -48,8 +52,14 @@ def units(log: Log) -> Iterator[Finding]:
     slope = (log.q[last] - log.q[first]) / (log.t[last] - log.t[first])[:, None]
     speed = log.dq[row].astype(float)
     moving = (np.sqrt(np.mean(speed**2, axis=0)) > MOVING) & (np.ptp(log.q, axis=0) > 1e-3)
+    turning = np.sqrt(np.mean(slope**2, axis=0))
+    dead = _names(log, (turning > MOVING) & (np.sqrt(np.mean(speed**2, axis=0)) < DEAD * turning))
+    if dead:
+        yield Finding("refusal", "dq", dead, f"dq: is 0 on {some(dead)} although q moves; expected rad/s")
+        return
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sum(slope * speed, axis=0) / np.sum(speed**2, axis=0)
+        alike = np.sum(slope * speed, axis=0) / np.sqrt(np.sum(speed**2, axis=0) * np.sum(slope**2, axis=0))
     for factor, mistake in SLOPES:
         hit = moving & (np.abs(np.log(np.maximum(ratio, 1e-12) / factor)) < np.log(1.7))
         if hit.any():
@@ -65,9 +75,17 @@ def units(log: Log) -> Iterator[Finding]:
         yield Finding(
             "refusal", "dq", reversed_, f"dq: has the opposite sign of the slope of q on {some(reversed_)}"
         )
-    odd = _names(log, moving & (ratio > -0.3) & ((ratio < 0.5) | (ratio > 2.0)))
-    if odd:
-        yield Finding("warning", "dq", odd, f"dq: is not the slope of q on {some(odd)}")
+    far = moving & (alike > ALIKE) & (np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(OFF))
+    if far.any():
+        joints, number = _names(log, far), float(np.median(ratio[far]))
+        text = f"dq: the slope of q is {number:.3g} times dq on {some(joints)}; expected q in rad, dq in rad/s, t in s"
+        yield Finding("refusal", "dq", joints, text)
+        return
+    odd = moving & (ratio > -0.3) & ((ratio < 0.5) | (ratio > 2.0))
+    if odd.any():
+        joints, number = _names(log, odd), float(np.median(alike[odd]))
+        text = f"dq: is not the slope of q on {some(joints)}: correlation {number:.2f}, expected some 1"
+        yield Finding("warning", "dq", joints, text)
     yield from _degrees(log, row)
 
 
@@ -77,7 +95,8 @@ def _degrees(log: Log, row: NDArray[np.intp]) -> Iterator[Finding]:
     q_des = log.q_des[log.command_rows(log.t[row])].astype(float)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio = np.sqrt(np.mean(q_des**2) / np.mean(q**2))
-    for field, other, share in (("q_des", "q", ratio), ("q", "q_des", 1.0 / ratio)):
+        shares = (("q_des", "q", ratio), ("q", "q_des", 1.0 / ratio))
+    for field, other, share in shares:
         if 25.0 < share < 130.0:
             text = f"{field}: about {share:.0f} times as large as {other}: degrees? expected rad in both"
             yield Finding("refusal", field, (), text)
@@ -98,6 +117,51 @@ def _gain_in_degrees(log: Log, row: NDArray[np.intp]) -> bool:
     asked = log.kp[command] * (log.q_des[command] - log.q[row])
     share = float(np.sum(asked * log.tau[row]) / max(float(np.sum(asked**2)), 1e-12))
     return 0.5 * DEGREE < share < 2.0 * DEGREE
+
+
+def copies(log: Log) -> Iterator[Finding]:
+    """Two joints whose measurements are the same to the bit."""
+    row = rows_of(log)
+    for field in ("q", "tau"):
+        values = getattr(log, field)
+        if values is None:
+            continue
+        seen: dict[bytes, str] = {}
+        for j, joint in enumerate(log.joints):
+            column = np.ascontiguousarray(values[row, j])
+            other = seen.setdefault(column.tobytes(), joint)
+            if other != joint and np.ptp(column) > 0.0:
+                text = f"{field}: {joint} and {other} are the same to the bit: one measured joint under two names?"
+                yield Finding("warning", field, (other, joint), text)
+                return
+
+
+def time_bases(log: Log) -> Iterator[Finding]:
+    """Torques that answer their commands before these were sent, or long after: by the lag that leaves least."""
+    if log.tau is None:
+        return
+    answer = log.without_feed_forward()
+    row = _some_valid(answer)[::2]
+    row = row[(log.t[row] > log.t_cmd[0] + CLOCKS[-1]) & (log.t[row] < log.t_cmd[-1] + CLOCKS[0])]
+    if len(row) < ROWS_FOR_A_LAW:
+        return
+    assert answer.tau is not None
+    q, dq, tau = (x[row].astype(float) for x in (log.q, log.dq, answer.tau))
+    moves = np.flatnonzero((np.ptp(q, axis=0) > 1e-3) & (np.var(tau, axis=0) > 1e-6))
+    left = np.empty(len(CLOCKS))
+    for k, lag in enumerate(CLOCKS):
+        q_des = log.q_des[log.command_rows(log.t[row] - lag)]
+        shares = [_law(q_des[:, j] - q[:, j], dq[:, j], tau[:, j])[0] / np.var(tau[:, j]) for j in moves]
+        left[k] = np.median(shares) if shares else 1.0
+    allowed = (CLOCKS >= EARLIEST) & (CLOCKS <= LATEST)
+    best = float(CLOCKS[np.argmin(left)])
+    if left.min() < 0.3 * min(left[allowed].min(), 1.0) and not EARLIEST <= best <= LATEST:
+        way = f"{best:.2f} s after" if best > 0.0 else f"{-best:.2f} s before"
+        text = (
+            f"t_cmd: the torque answers commands {way} they were sent (it leaves {100 * left.min():.0f} % of the torque, at "
+            f"no lag {100 * left[allowed].min():.0f} %); expected t and t_cmd on one clock"
+        )
+        yield Finding("refusal", "t_cmd", (), text)
 
 
 def ranges(log: Log) -> Iterator[Finding]:
@@ -140,7 +204,7 @@ def sign_of_torque(log: Log) -> Iterator[Finding]:
 
 
 def answer_of_torque(log: Log) -> Iterator[Finding]:
-    """Torque that has nothing to do with the position error, or only by a law with quite other gains than commanded."""
+    """Torque that has nothing to do with the position error, or only by a law with quite other signs or gains."""
     if log.tau is None:
         return
     row = _some_valid(log)
@@ -148,25 +212,60 @@ def answer_of_torque(log: Log) -> Iterator[Finding]:
         return
     lags = [log.command_rows(log.t[row] - lag) for lag in LAGS]
     left, gain, answer = (np.zeros(len(log.joints)) for _ in range(3))
-    for j in range(len(log.joints)):
+    wrong: dict[str, list[str]] = {}
+    for j, joint in enumerate(log.joints):
         tau, q, dq = (x[row, j].astype(float) for x in (log.tau, log.q, log.dq))
-        fits = (_law(log.q_des[at, j].astype(float) - q, dq, tau) for at in lags)
-        least, gain[j] = min(fits, key=lambda one: one[0])
+        commands = [log.q_des[at, j].astype(float) for at in lags]
+        least, gain[j] = min((_law(q_des - q, dq, tau) for q_des in commands), key=lambda one: one[0])
         left[j] = least / max(float(np.var(tau)), 1e-12)
         answer[j] = 1.0 - least / max(_law(np.zeros(len(row)), dq, tau)[0], 1e-12)
-    if (answer < UNANSWERED).all():
+        if left[j] > 0.5 and (field := _reversed(commands, q, dq, tau)):
+            wrong.setdefault(field, []).append(joint)
+    if wrong:
+        for field, names in wrong.items():
+            text = f"{field}: has the wrong sign on {some(names)}: the torque answers it the other way round"
+            yield Finding("refusal", field, tuple(names), text)
+        return
+    yield from _deaf(log, answer, np.ptp(log.q[row], axis=0) > 1e-3)
+    if log.kp is not None:
+        yield from _off_gain(log, gain, np.median(log.kp[lags[0]], axis=0), left < 0.3)
+
+
+def _deaf(log: Log, answer: Array, moves: NDArray[np.bool_]) -> Iterator[Finding]:
+    """`answer`: share of the torque of each joint that its position error explains."""
+    deaf = answer < UNANSWERED
+    if deaf.all():
         text = (
             f"tau: does not answer the position error on any joint (which explains {100 * answer.max():.0f} % of it at "
             "most); expected q_des, q and tau of the same joints, with the same signs"
         )
         yield Finding("refusal", "tau", log.joints, text)
-    clear = left < 0.3
-    if log.kp is not None and clear.any():
-        asked = np.median(log.kp[lags[0]], axis=0)
-        ratio = float(np.median(gain[clear] / np.maximum(asked[clear], 1e-12)))
-        if ratio > FAR_OFF or ratio < 1.0 / FAR_OFF:
-            text = f"tau: {ratio:.3g} times what kp asks for; expected N m, and kp in N m/rad"
-            yield Finding("refusal", "tau", _names(log, clear), text)
+    elif (deaf & moves).any():
+        joints = _names(log, deaf & moves)
+        text = f"tau: does not answer the position error on {some(joints)}: what is found there is not to be trusted"
+        yield Finding("warning", "tau", joints, text)
+
+
+def _off_gain(log: Log, gain: Array, asked: Array, clear: NDArray[np.bool_]) -> Iterator[Finding]:
+    """The gain that the torque shows, N m/rad, beside the one that was asked for, of each joint."""
+    ratio = np.where(asked > 0.0, gain / np.where(asked > 0.0, asked, 1.0), 1.0)
+    off = clear & (np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(FAR_OFF))
+    if off.any():
+        joints, number = _names(log, off), float(np.median(ratio[off]))
+        text = f"tau: {number:.3g} times what kp asks for on {some(joints)}; expected N m, and kp in N m/rad"
+        yield Finding("refusal", "tau", joints, text)
+
+
+def _reversed(commands: Sequence[Array], q: Array, dq: Array, tau: Array) -> str | None:
+    """The field whose sign, turned round, lets a PD law explain most of a torque that it does not explain as it is."""
+    turned = {
+        "q": [(c + q, -dq, tau) for c in commands],
+        "q_des": [(-c - q, dq, tau) for c in commands],
+        "tau": [(c - q, dq, -tau) for c in commands],
+    }
+    left = {field: min(_law(*one)[0] for one in tries) for field, tries in turned.items()}
+    field = min(left, key=lambda name: left[name])
+    return field if left[field] < 0.2 * float(np.var(tau)) else None
 
 
 def exchanged(log: Log) -> Iterator[Finding]:

@@ -69,6 +69,11 @@ def read_npz(path: Path) -> Log:
             shapes = dict(_headers(path, archive))
             _check_size(path, {name: shape for name, (shape, _) in shapes.items()})
             dtype = precision(sum(int(np.prod(shape)) for shape, _ in shapes.values()))
+            unknown = [
+                name
+                for name in (one.removesuffix(".npy") for one in archive.namelist())
+                if name not in FIELDS
+            ]
             fields = {
                 name: _array(archive, name, None if name in ("t", "t_cmd", "joint_names") else dtype)
                 for name in shapes
@@ -76,7 +81,7 @@ def read_npz(path: Path) -> Log:
     except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError) as error:
         raise LogError(f"{path}: no whole NPZ archive: {error or 'it is cut off'}") from None
     names = fields.pop("joint_names", None)
-    return _log(path, fields, None if names is None else [str(name) for name in np.ravel(names)])
+    return _log(path, fields, None if names is None else [str(name) for name in np.ravel(names)], unknown)
 
 
 def _headers(
@@ -135,13 +140,19 @@ def read_csv(path: Path) -> Log:
         for column in columns:
             if columns.count(column) > 1:
                 raise LogError(f"{path}: {column}: the column stands there twice")
+        if "t" not in columns:
+            raise LogError(
+                f"{path}: t: no such column in the first line ({header.strip()[:60]!r}); expected t, q/FR_hip_joint, ... "
+                "with commas between"
+            )
         known = [k for k, column in enumerate(columns) if column.partition("/")[0] in FIELDS]
         lines = max(1, path.stat().st_size // max(1, 2 * len(columns)))
         dtype = precision(lines * len(known) // 4)  # a number takes about eight characters
         blocks = list(_blocks(path, file, columns, known, dtype))
     if not blocks:
         raise LogError(f"{path}: t: the table has no rows")
-    return _log(path, *_fields(path, [columns[k] for k in known], blocks))
+    unknown = [column for column in columns if column.partition("/")[0] not in FIELDS]
+    return _log(path, *_fields(path, [columns[k] for k in known], blocks), unknown)
 
 
 def _blocks(
@@ -155,16 +166,32 @@ def _blocks(
         if not lines:
             continue
         try:
-            values = np.loadtxt(lines, delimiter=",", ndmin=2)
-        except ValueError as error:
-            raise LogError(f"{path}: rows {rows + 1} to {rows + len(lines)}: {error}") from None
-        if values.shape[1] != len(columns):
-            raise LogError(f"{path}: row {rows + 1}: {values.shape[1]} cells, expected {len(columns)}")
+            values = np.loadtxt(lines, delimiter=",", ndmin=2, comments=None)
+            if values.shape[1] != len(columns):
+                raise ValueError
+        except ValueError:
+            raise LogError(f"{path}: {_odd_cell(lines, columns, rows + 2)}") from None
         rows += len(lines)
         if rows * len(known) > LARGEST:
             raise LogError(f"{path}: more than {LARGEST} values, expected fewer; cut the log")
         time = np.stack([values[:, k] if k >= 0 else np.full(len(lines), np.nan) for k in clocks], 1)
         yield time, values[:, known].astype(dtype)
+
+
+def _odd_cell(lines: list[str], columns: list[str], first: int) -> str:
+    """The first cell that is no number, or the first line with too few or too many; `first` is the number of its line."""
+    for number, line in enumerate(lines, first):
+        cells = line.split(",")
+        if len(cells) != len(columns):
+            return f"line {number}: found {len(cells)} cells, expected {len(columns)} as the header has, with commas between"
+        for column, cell in zip(columns, cells, strict=True):
+            try:
+                float(cell)
+            except ValueError:
+                return (
+                    f"line {number}: {column}: found {cell.strip()!r}, expected a number with a decimal point"
+                )
+    return f"lines {first} to {first + len(lines) - 1}: found what is no table, expected numbers with commas between"
 
 
 def _cells(line: str) -> str:
@@ -206,9 +233,17 @@ def _cut(values: Array) -> Array:
     return values[: there[-1] + 1 if there.size else 0]
 
 
-def _log(path: Path, fields: dict[str, Any], names: list[str] | None) -> Log:
-    """The fields, of whatever file, as a log: shapes made equal, one time base for all that was commanded."""
+def _log(path: Path, fields: dict[str, Any], names: list[str] | None, unknown: list[str]) -> Log:
+    """The fields, of whatever file, as a log: shapes made equal, one time base for all that was commanded.
+
+    `unknown` are the fields of the file that are none of a log.
+    """
     remarks: list[str] = []
+    if unknown:
+        more = f" and {len(unknown) - 4} more" if len(unknown) > 4 else ""
+        remarks.append(f"{unknown[0]}: not used, as no log has such fields: {', '.join(unknown[:4])}{more}")
+    if "t_cmd" in fields and "q_des_cmd" not in fields:
+        remarks.append("t_cmd: not used, as q_des_cmd is not there; q_des counts on the times t")
     _check_size(path, {name: np.shape(values) for name, values in fields.items()})
     t, q = fields["t"], fields["q"]
     if q.ndim == 1 == (1 if names is None else len(names)):
@@ -216,9 +251,10 @@ def _log(path: Path, fields: dict[str, Any], names: list[str] | None) -> Log:
     if t.ndim != 1 or q.ndim != 2 or len(q) != len(t):
         raise LogError(f"{path}: q: found shape {q.shape}, expected ({t.size}, J): a row for each of t")
     joints = _joints(path, names, q.shape[1], remarks)
-    state: dict[str, Any] = {
-        name: _table(fields[name], len(t), len(joints)) for name in STATE_FIELDS if name in fields
-    }
+    state: dict[str, Any] = {name: fields[name] for name in STATE_FIELDS if name in fields}
+    for name in state:
+        if len(joints) == 1 or name == "temperature":  # one number for all joints makes sense of no other
+            state[name] = _table(state[name], len(t), len(joints))
     state["valid"] = _valid(path, fields.get("valid", True), len(t), len(joints))
     if "voltage" in fields:
         state["voltage"] = fields["voltage"]
