@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 from simulated_joints import NAMES, parameters, record
 
-from quadvel_actuator import Effect
+from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_actuator.identify.eam import fit_eam
-from quadvel_actuator.identify.identify import identify
+from quadvel_actuator.identify.identify import Options, identify
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -32,6 +32,21 @@ def test_nothing_is_added_to_a_log_that_the_eam_explains():
     assert report["effects"] == []
     assert report["unexplained"] == {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
     assert report["decision"].startswith("Nothing significant")
+
+
+def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base():
+    def weaker(k, q, dq, tau):
+        return tau * np.array([1.0, 0.6])
+
+    base = attrs.evolve(ActuatorParameters.default(), torque_limit=2.0)
+    report = identify(
+        [record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], options=Options(base=base)
+    ).report
+    assert report["effects"] == []
+    error = f"{report['after']['heldout_mse']:.3g} N^2 m^2, with one for all to {report['before']['heldout_mse']:.3g}"
+    assert error in report["decision"]
+    assert report["warnings"][0].startswith("FR_hip_joint: up to ")
+    assert report["warnings"][0].endswith("torque_limit in actuator.yaml, which is the base's, is 2.0 N m")
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,9 @@ class GainAsymmetry(TorqueLaw):
         return x + p["a"] * np.abs(x)
 
 
+_QUICKEST = 2.0  # s, in which a drive warms up; what settles at once is a gain
+
+
 @attrs.frozen(eq=False)
 class ThermalDrift(TorqueLaw):
     """tau* (1 + drift): with temperature, drift = rate (temperature - `cold`), else rate tau_t (1 - exp(-t / tau_t))
@@ -62,7 +65,7 @@ class ThermalDrift(TorqueLaw):
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
         if self.of == "temperature":
             return (Parameter("rate", "1/K", -0.2, 0.2, 0.005),)
-        return (Parameter("rate", "1/s", -2.0, 2.0, 0.02), Parameter("tau_t", "s", 0.2, 3000.0, 5.0))
+        return (Parameter("rate", "1/s", -2.0, 2.0, 0.02), Parameter("tau_t", "s", _QUICKEST, 3000.0, 5.0))
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[ThermalDrift]:
@@ -78,7 +81,7 @@ class ThermalDrift(TorqueLaw):
             return [{"rate": drift / warming} for drift in drifts]
         span = float(np.max(s.t))
         return [
-            {"rate": drift / min(share, 1.0) / span, "tau_t": share * span}
+            {"rate": drift / min(share, 1.0) / span, "tau_t": max(share * span, _QUICKEST)}
             for drift in drifts
             for share in (0.15, 0.5, 3.0)
         ]
