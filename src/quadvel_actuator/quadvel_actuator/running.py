@@ -47,6 +47,8 @@ class Instant:
         """A running model has only the past to take an acceleration from."""
         return self.ddq
 
+    ddq_sharp = ddq_smooth
+
     def shifted(self, name: str, late: Array) -> Array:
         """q or dq `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
         if name not in _KNOWN:

@@ -120,6 +120,11 @@ class EffectLaw(ABC):
         return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
 
     @property
+    def forms(self) -> tuple[EffectLaw, ...]:
+        """The same law with its signals taken otherwise; which one suits may change with the other effects."""
+        return ()
+
+    @property
     def alternatives(self) -> tuple[EffectLaw, ...]:
         """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""
         return ()

@@ -130,9 +130,12 @@ class VelocityFilter(MemoryLaw):
         return x[0], x[1] + s.dq - lagged(even, s, p["T"])
 
 
+_SLOPES = "ddq", "ddq_sharp", "ddq_smooth"
+
+
 @attrs.frozen(eq=False)
 class Armature(AddedLaw):
-    """-J ddq; `of` says how the acceleration is taken: of a short slope of dq, or of a smooth one where dq is noisy"""
+    """-J ddq; `of` says how the acceleration is taken: a short slope of dq, sharp or not, or a smooth one where dq is noisy"""
 
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)
@@ -144,7 +147,11 @@ class Armature(AddedLaw):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[Armature]:
-        return tuple(cls(of=of, at=at) for of in ("ddq", "ddq_smooth") for at in (DRIVE, JOINT))
+        return tuple(cls(of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
+
+    @property
+    def forms(self) -> tuple[Armature, ...]:
+        return tuple(attrs.evolve(self, of=of) for of in _SLOPES if of != self.of)
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

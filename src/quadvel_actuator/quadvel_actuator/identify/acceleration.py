@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HALF_WIDTHS = {"ddq": 0.002, "ddq_smooth": 0.008}
-"""By signal: the slope is taken over so long to either side, s"""
+HALF_WIDTHS = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
+"""By signal: the slope is taken over so long to either side, s; `ddq` is left smeared, for torques that rise slowly"""
 
 _BEND = 0.002
 """Bends are differences of slopes over so long before and after, s"""
@@ -51,9 +51,11 @@ def _bend(t: Array, values: Array) -> Array:
     return bend
 
 
-def smooth_part(t: Array, dq: Array, come: Array, half_width: float) -> tuple[Array, Array]:
-    """Of ddq (N, J) what is left without B q_des, D dq - B D come, and B (J, J), transposed."""
-    cause, outcome = _bend(t, come), _bend(t, dq)
+def smooth_part(name: str, t: Array, dq: Array, come: Array) -> tuple[Array, Array]:
+    """Of ddq (N, J), as `name` says, what is left without B q_des, D dq - B D come, and B (J, J), transposed."""
+    half_width, cause, outcome = HALF_WIDTHS[name], _bend(t, come), _bend(t, dq)
+    if name == "ddq":
+        return slope(t, dq, half_width), np.zeros((dq.shape[1],) * 2)
     answer: Array = np.asarray(
         np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float
     )

@@ -33,6 +33,9 @@ MOST = 5
 
 _FAR = 0.4
 """Logarithm of a gain over the commanded one that is hard to believe."""
+_BETTER_FORM = 0.99
+"""of the held-out error, that another form of a law has to leave at most"""
+
 _AS_WELL = 0.02
 """Of the noise: what an account with gains that can be believed may lose."""
 
@@ -127,6 +130,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
             break
         best, tied = _choice(candidates, judge, noise)
         found = _deepened(about.fit_anew(best.model.holding(False)), judge, few)
+        found = _reformed(found, judge, few)
         model = _released(_widened(found, judge, noise, few), few)
         ties.append(tied)
     model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
@@ -145,6 +149,17 @@ def _deepened(model: Model, judge: Judge, few: Few) -> Model:
     if remembers(model):
         return fit_with_delays(few.fitted(model, deepest, 1), judge.fit)
     return deepest(model, judge.fit, 4)
+
+
+def _reformed(model: Model, judge: Judge, few: Few) -> Model:
+    """The model with those forms of its laws that suit each other best; the newest law came in the best of its own."""
+    for index, one in enumerate(model.applied[:-1]):
+        for form in one.law.forms:
+            other = model.replacing(index, attrs.evolve(one, law=form))
+            other = few.fitted(other, fit_with_delays, 10)
+            if other.error(judge.judge) < _BETTER_FORM * model.error(judge.judge):
+                model = other
+    return model
 
 
 def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:

@@ -18,7 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .acceleration import HALF_WIDTHS, smooth_part
+from .acceleration import smooth_part
 from .log import Log
 
 Array = NDArray[np.float64]
@@ -83,8 +83,13 @@ class Signals:
         return self.slope("ddq")
 
     @cached_property
+    def ddq_sharp(self) -> Array:
+        """rad/s^2, over a few rows, and not smeared where a command comes in."""
+        return self.slope("ddq_sharp")
+
+    @cached_property
     def ddq_smooth(self) -> Array:
-        """rad/s^2, over more rows."""
+        """rad/s^2, over more rows, and not smeared where a command comes in."""
         return self.slope("ddq_smooth")
 
     @cached_property
@@ -175,7 +180,7 @@ class _LogSignals:
                 self._smooth.pop(next(iter(self._smooth)))
             t = _double(self.log.t)
             come = self._acting(t, delays, self._integral)
-            self._smooth[key] = smooth_part(t, self.states["dq"], come, HALF_WIDTHS[name])
+            self._smooth[key] = smooth_part(name, t, self.states["dq"], come)
         smooth, answer = self._smooth[key]
         jumps = self._acting(at, delays, lambda values, _, sent: values[self.log.command_rows(sent + 1e-9)])
         return self._read(smooth[:, joints], self.between(at)) + jumps @ answer[:, joints]
