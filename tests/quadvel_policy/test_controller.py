@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 import rclpy
 from diagnostic_msgs.msg import DiagnosticStatus
 from geometry_msgs.msg import TwistWithCovarianceStamped
+from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import SetBool
 
 from quadvel_description.recurrent_network import NetworkFileError
@@ -24,7 +26,7 @@ from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
-from quadvel_policy.controller import Controller
+from quadvel_policy.controller import Controller, _fresh
 
 PERIOD = 0.005
 
@@ -313,6 +315,40 @@ def test_set_mode_says_why_it_refuses(robot: Robot) -> None:
     assert (response.success, response.message) == (False, "the robot has not reported yet")
     response = robot.graph.call(SetMode, "controller/set_mode", mode="jump")
     assert response.message.startswith("mode is 'jump', expected one of")
+
+
+def test_a_second_robot_on_the_same_topic_is_a_fault_and_refuses_to_be_stood_up(robot: Robot) -> None:
+    robot.step(2)
+    robot.stand()
+    other = robot.graph.speak(LowState, "low_state")
+    robot.graph.diagnosed("low_state has 2 publishers, expected 1")
+    robot.step(5)
+    assert robot.report("fault").reason.startswith("low_state has 2 publishers")
+    assert robot.graph.call(SetMode, "controller/set_mode", mode="passive").success
+    response = robot.graph.call(SetMode, "controller/set_mode", mode="stand_up")
+    assert (response.success, response.message[:28]) == (False, "low_state has 2 publishers, ")
+    robot.graph.peer.destroy_publisher(other)
+    robot.graph.wait(lambda: robot.graph.call(SetMode, "controller/set_mode", mode="stance").success)
+
+
+def test_in_real_time_a_driver_that_sends_as_best_it_can_is_heard(write_policy: Callable[..., Path]) -> None:
+    rclpy.init(args=["--ros-args", "-p", f"policy:={write_policy()}"])
+    try:
+        controller, driver = Controller(), rclpy.create_node("driver", use_global_arguments=False)
+        states = driver.create_publisher(LowState, "low_state", qos_profile_sensor_data)
+        until = time.monotonic() + 20.0
+        while not states.get_subscription_count() and time.monotonic() < until:
+            time.sleep(0.02)
+        assert states.get_subscription_count() == 1
+        for node in (controller, driver):
+            node.destroy_node()
+    finally:
+        rclpy.shutdown()
+
+
+@pytest.mark.parametrize(("age", "followed"), [(0.1, True), (-0.1, True), (0.6, False), (-60.0, False)])
+def test_a_command_of_another_time_is_not_followed_be_it_old_or_to_come(age: float, followed: bool) -> None:
+    assert (_fresh((100.0 - age, np.ones(4)), 100.0, 0.5) is not None) == followed
 
 
 def start(*parameters: str) -> None:

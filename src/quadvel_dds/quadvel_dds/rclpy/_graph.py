@@ -29,14 +29,13 @@ class GraphAnnouncer:
 
 def _node_info(node: Any) -> Any:
     calls = [entity._endpoint for entity in (*node.clients, *node.services)]
-    readers = [
-        *(subscription._reader for subscription in node.subscriptions),
-        *(call.reader for call in calls),
-    ]
-    writers = [*(publisher._writer for publisher in node.publishers), *(call.writer for call in calls)]
+    readers = [*(one._reader for one in node.subscriptions), *(call.reader for call in calls)]
+    writers = [*(one._writer for one in node.publishers), *(call.writer for call in calls)]
     return NodeEntitiesInfo(
         node_namespace=node.get_namespace(),
         node_name=node.get_name(),
-        reader_gid_seq=[Gid(data=list(reader.gid)) for reader in readers],
-        writer_gid_seq=[Gid(data=list(writer.gid)) for writer in writers],
+        reader_gid_seq=[
+            Gid(data=list(reader.gid)) for reader in readers if reader is not None
+        ],  # None: destroyed
+        writer_gid_seq=[Gid(data=list(writer.gid)) for writer in writers if writer is not None],
     )
