@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,47 +47,52 @@ def rows_of(log: Log) -> NDArray[np.intp]:
 
 def units(log: Log) -> Iterator[Finding]:
     """Degrees and milliseconds: by the slope of q against dq, by q_des against q, by size."""
-    reach = max(1, round(HALF_WIDTH / log.period))
     row = rows_of(log)
+    found = list(_speeds(log, row))
+    yield from found
+    if all(one.kind != "refusal" for one in found):
+        yield from _degrees(log, row)
+
+
+def _speeds(log: Log, row: NDArray[np.intp]) -> Iterator[Finding]:
+    """What dq is beside the slope of q: nothing, a multiple of it, its opposite, or something else."""
+    reach = max(1, round(HALF_WIDTH / log.period))
     first, last = np.maximum(row - reach, 0), np.minimum(row + reach, len(log.t) - 1)
     slope = (log.q[last] - log.q[first]) / (log.t[last] - log.t[first])[:, None]
     speed = log.dq[row].astype(float)
-    moving = (np.sqrt(np.mean(speed**2, axis=0)) > MOVING) & (np.ptp(log.q, axis=0) > 1e-3)
-    turning = np.sqrt(np.mean(slope**2, axis=0))
-    dead = _names(log, (turning > MOVING) & (np.sqrt(np.mean(speed**2, axis=0)) < DEAD * turning))
-    if dead:
-        yield Finding("refusal", "dq", dead, f"dq: is 0 on {some(dead)} although q moves; expected rad/s")
-        return
+    turning, size = (np.sqrt(np.mean(x**2, axis=0)) for x in (slope, speed))
+    moving = (size > MOVING) & (np.ptp(log.q, axis=0) > 1e-3)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.sum(slope * speed, axis=0) / np.sum(speed**2, axis=0)
-        alike = np.sum(slope * speed, axis=0) / np.sqrt(np.sum(speed**2, axis=0) * np.sum(slope**2, axis=0))
+        ratio = np.mean(slope * speed, axis=0) / size**2
+        alike = ratio * size / turning
+        off = np.abs(np.log(np.maximum(ratio, 1e-12)))
+    times = "the slope of q is {number:.3g} times dq on {joints}"
     for factor, mistake in SLOPES:
         hit = moving & (np.abs(np.log(np.maximum(ratio, 1e-12) / factor)) < np.log(1.7))
         if hit.any():
-            joints = _names(log, hit)
-            number = float(np.median(ratio[hit]))
-            text = (
-                f"dq: the slope of q is {number:.3g} times dq on {some(joints)}: {mistake}; expected SI units"
-            )
-            yield Finding("refusal", "dq", joints, text)
+            yield _of_dq("refusal", log, hit, f"{times}: {mistake}; expected SI units", ratio)
             return
-    reversed_ = _names(log, moving & (ratio < -0.3))
-    if reversed_:
-        yield Finding(
-            "refusal", "dq", reversed_, f"dq: has the opposite sign of the slope of q on {some(reversed_)}"
-        )
-    far = moving & (alike > ALIKE) & (np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(OFF))
-    if far.any():
-        joints, number = _names(log, far), float(np.median(ratio[far]))
-        text = f"dq: the slope of q is {number:.3g} times dq on {some(joints)}; expected q in rad, dq in rad/s, t in s"
-        yield Finding("refusal", "dq", joints, text)
-        return
-    odd = moving & (ratio > -0.3) & ((ratio < 0.5) | (ratio > 2.0))
+    for hit, what in (
+        ((turning > MOVING) & (size < DEAD * turning), "is 0 on {joints} although q moves; expected rad/s"),
+        (moving & (ratio < -0.3), "has the opposite sign of the slope of q on {joints}"),
+        (moving & (alike > ALIKE) & (off > np.log(OFF)), f"{times}; expected q in rad, dq in rad/s, t in s"),
+    ):
+        if hit.any():
+            yield _of_dq("refusal", log, hit, what, ratio)
+            return
+    odd = moving & ((ratio < 0.5) | (ratio > 2.0))
     if odd.any():
-        joints, number = _names(log, odd), float(np.median(alike[odd]))
-        text = f"dq: is not the slope of q on {some(joints)}: correlation {number:.2f}, expected some 1"
-        yield Finding("warning", "dq", joints, text)
-    yield from _degrees(log, row)
+        what = "is not the slope of q on {joints}: correlation {number:.2f}, expected some 1"
+        yield _of_dq("warning", log, odd, what, alike)
+
+
+def _of_dq(
+    kind: Literal["warning", "refusal"], log: Log, hit: NDArray[np.bool_], what: str, numbers: Array
+) -> Finding:
+    """What is wrong with dq of some joints, with their `joints` and the median of their `number`."""
+    joints = _names(log, hit)
+    text = what.format(joints=some(joints), number=float(np.median(numbers[hit])))
+    return Finding(kind, "dq", joints, f"dq: {text}")
 
 
 def _degrees(log: Log, row: NDArray[np.intp]) -> Iterator[Finding]:
