@@ -243,7 +243,7 @@ class Controller(Node):
 
     def _rival(self) -> str | None:
         """A sentence where more than one robot reports: what the states say then fits neither."""
-        count = self.count_publishers(self._states.topic_name)
+        count = self._states.get_publisher_count()
         return (
             f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
         )
