@@ -18,15 +18,11 @@ def main() -> None:
 
     try:
         app()
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, MemoryError) as error:
         if os.environ.get("QUADVEL_TRACEBACK"):
             raise
-        print(f"quadvel: {error}", file=sys.stderr)
-        sys.exit(2)
-    except MemoryError as error:
-        if os.environ.get("QUADVEL_TRACEBACK"):
-            raise
-        print(f"quadvel: this machine has too little memory for it: {error}", file=sys.stderr)
+        short = "this machine has too little memory for it: " if isinstance(error, MemoryError) else ""
+        print(f"quadvel: {short}{error}", file=sys.stderr)
         sys.exit(2)
 
 

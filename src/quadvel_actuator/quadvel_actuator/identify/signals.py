@@ -18,7 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .acceleration import smooth_part
+from .acceleration import HALF_WIDTHS, slope, smooth_part
 from .log import Log
 
 Array = NDArray[np.float64]
@@ -174,6 +174,8 @@ class _LogSignals:
 
     def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
         """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
+        if name == "ddq":
+            return self._read(self._smeared[:, joints], self.between(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
             if len(self._smooth) >= _KEPT_SLOPES:
@@ -184,6 +186,11 @@ class _LogSignals:
         smooth, answer = self._smooth[key]
         jumps = self._acting(at, delays, lambda values, _, sent: values[self.log.command_rows(sent + 1e-9)])
         return self._read(smooth[:, joints], self.between(at)) + jumps @ answer[:, joints]
+
+    @cached_property
+    def _smeared(self) -> Array:
+        """rad/s^2 by rows, whatever commands do."""
+        return slope(_double(self.log.t), self.states["dq"], HALF_WIDTHS["ddq"])
 
     def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
         """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
