@@ -90,7 +90,7 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ({name: fields()[name] / SHARE for name in ("q", "dq", "q_des")}, "q: up to "),
         ({"q_des": fields()["q_des"] / SHARE}, "q_des: about 57 times as large as q: degrees?"),
         ({"dq": -fields()["dq"]}, "dq: has the opposite sign"),
-        ({"tau": -fields()["tau"]}, "tau: has the sign against the position error"),
+        ({"tau": -fields()["tau"]}, "tau: has the wrong sign on"),
         (
             {"q_des": exchanged(fields()["q_des"])},
             "q_des: a joint's q follows another joint's command (FR_hip",

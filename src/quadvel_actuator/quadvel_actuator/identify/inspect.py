@@ -217,7 +217,6 @@ CHECKS: tuple[Callable[[Log], Iterator[Finding]], ...] = (
     torque,
 )
 CHECKS_UNDER_CONTROL = (
-    plausible.sign_of_torque,
     plausible.exchanged,
     plausible.answer_of_torque,
     excited.collinear,

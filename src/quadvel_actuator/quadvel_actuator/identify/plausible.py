@@ -192,23 +192,6 @@ def ranges(log: Log) -> Iterator[Finding]:
         yield Finding("warning", "joint_names", tuple(outside), text)
 
 
-def sign_of_torque(log: Log) -> Iterator[Finding]:
-    """Torque that grows against the position error."""
-    if log.tau is None:
-        return
-    row = rows_of(log)
-    command = log.command_rows(log.t[row])
-    error = log.q_des[command].astype(float) - log.q[row]
-    tau = log.tau[row].astype(float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        alike = np.sum(error * tau, axis=0) / np.sqrt(np.sum(error**2, axis=0) * np.sum(tau**2, axis=0))
-    joints = _names(log, alike < -0.7)
-    if joints:
-        yield Finding(
-            "refusal", "tau", joints, f"tau: has the sign against the position error on {some(joints)}"
-        )
-
-
 def answer_of_torque(log: Log) -> Iterator[Finding]:
     """Torque that has nothing to do with the position error, or only by a law with quite other signs or gains."""
     if log.tau is None:
