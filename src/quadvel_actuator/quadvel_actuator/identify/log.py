@@ -85,10 +85,15 @@ class Log:
         return np.maximum(np.searchsorted(self.t_cmd, at, side="right") - 1, 0)
 
     def without_feed_forward(self) -> Log:
-        """The log with the torque alone that answers angles and speeds: less `tau_ff` of the command in force."""
-        if self.tau is None or self.tau_ff is None:
+        """The log with the torque alone that answers angles and speeds: less what `tau_ff` and `dq_des` in force ask for."""
+        if self.tau is None:
             return self
-        return attrs.evolve(self, tau=self.tau - self.tau_ff[self.command_rows(self.t)], tau_ff=None)
+        asked = np.zeros_like(self.q_des) if self.tau_ff is None else self.tau_ff
+        known = self.dq_des is not None and self.kd is not None
+        if self.dq_des is not None and self.kd is not None:
+            asked = asked + self.kd * self.dq_des
+        tau = self.tau - asked[self.command_rows(self.t)]
+        return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=None if known else self.dq_des)
 
     def select(self, joints: Sequence[str]) -> Log:
         """The log with these joints only, in this order. Raises LogError for one that it does not hold."""
