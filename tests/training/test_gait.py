@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
 import pytest
 
@@ -111,6 +112,20 @@ def test_standing_feet_are_led_as_the_trunk_goes_over_them():
     force = gait._stance_forces(cycle, body, Legs(body.q).feet, cycle.load()[..., None, :])
     held = before - (Legs(body.q).torques(force) / robot.KP)[0, :, 0].numpy()
     assert np.allclose(gait.targets(cycle, body)[0, :3].numpy() - held, expected, atol=1e-3)
+
+
+@pytest.mark.parametrize("stands", [1.0, 0.0])
+def test_in_stance_and_only_then_feet_are_led_back_to_where_they_stand(stands):
+    """What is left of the targets of feet that parted, without the forces' share: nominal places, or the feet's own."""
+    parted = robot.NOMINAL_Q + np.array([-0.1, 0.1, -0.2, 0.1, 0.1, -0.2] * 2)
+    cycle, body = standing_legs([0.0, 0.0, 0.0, stands])
+    legs = Legs(columns(tensor(parted))[None])
+    body = attrs.evolve(body, q=columns(tensor(parted))[None])
+    force = gait._stance_forces(cycle, body, legs.feet, cycle.load()[..., None, :])
+    led = gait.targets(cycle, body) + joints(legs.torques(force)) / tensor(robot.KP)
+    at = kinematics.foot_positions(led[0].numpy())
+    expected = kinematics.foot_positions(robot.NOMINAL_Q if stands else parted)
+    assert np.allclose(at[[0, 3], :2], expected[[0, 3], :2], atol=1e-3)
 
 
 def test_every_leg_pushes_wholly_in_stance_and_as_the_first_step_begins():

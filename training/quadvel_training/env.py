@@ -84,10 +84,8 @@ class EnvConfig:
 
 
 def training_model(timestep: float, terrain: Terrain) -> mujoco.MjModel:
-    """The AlienGo as it is trained on: feet and trunk collide, no sensors, few solver iterations."""
-    plant = mjcf.Plant(
-        timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False, iterations=6, ls_iterations=8
-    )
+    """The AlienGo as it is trained on: feet and trunk collide, no sensors."""
+    plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
     spec = mjcf.build_spec(plant)
     terrain.add_to(spec)
     return spec.compile()

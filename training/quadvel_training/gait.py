@@ -105,7 +105,8 @@ def targets(cycle: Cycle, body: Body) -> Tensor:
     """Joint targets (..., 12) rad: swing feet by position, stance feet by force, through the soft gains."""
     legs = Legs(body.q)
     load = cycle.load()[..., None, :]
-    on_ground = legs.feet - LEAD * _over_ground(cycle, legs.feet)
+    astray = cycle.stands[..., None] * _astray(legs.feet, body.slope)
+    on_ground = legs.feet - LEAD * _over_ground(cycle, legs.feet) - astray
     swing, push = angles(torch.stack([_swing_feet(cycle, body), on_ground]))
     swing = swing + body.q.new_tensor(LEG_WEIGHT / robot.KP)
     push = push - legs.torques(_stance_forces(cycle, body, legs.feet, load)) / robot.KP
@@ -196,6 +197,15 @@ def _solved(matrix: Tensor, right: Tensor) -> Tensor:
     adjugate = _cross(after, after[..., [1, 2, 0]])
     determinant = (matrix[..., :1] * adjugate[..., :1]).sum(-2, keepdim=True)
     return adjugate @ right / determinant
+
+
+def _astray(feet: Tensor, slope: Tensor) -> Tensor:
+    """How far feet (..., 3, 4) are from where they stand in the nominal posture, forward and to the left, (..., 3, 4) m.
+
+    Forces alone leave it open where each foot stands: led back by nothing, they part within minutes.
+    """
+    level = feet[..., :2, :] - feet.new_tensor(_STAND[:2]) - HEIGHT * slope[..., None]
+    return torch.cat([level, torch.zeros_like(feet[..., :1, :])], dim=-2)
 
 
 def _standing_place(feet: Tensor, slope: Tensor) -> Tensor:

@@ -28,8 +28,6 @@ class Plant:
     only_feet_and_trunk: bool = False  # leave the legs' own collision shapes out (training: faster)
     sensors: bool = True  # IMU sensors at the IMU site
     hung: bool = False  # the trunk held at HUNG_HEIGHT, as on a stand: the feet are in the air
-    iterations: int = 20  # of the Newton solver
-    ls_iterations: int = 20
 
 
 def _leg(leg: str, plant: Plant) -> str:
@@ -105,8 +103,8 @@ def mjcf(plant: Plant | None = None) -> str:
     heights = [robot.HUNG_HEIGHT] * 2 if plant.hung else [robot.NOMINAL_HEIGHT, robot.LIE_HEIGHT]
     return f"""<mujoco model="aliengo">
   <compiler angle="radian" autolimits="true"/>
-  <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="pyramidal"
-          iterations="{plant.iterations}" ls_iterations="{plant.ls_iterations}" gravity="0 0 {-robot.GRAVITY!r}"/>
+  <option timestep="{plant.timestep!r}" integrator="implicitfast" cone="elliptic" impratio="10"
+          iterations="20" ls_iterations="20" gravity="0 0 {-robot.GRAVITY!r}"/>
   <default>
     <geom contype="0" conaffinity="1" condim="3" solref="0.01 1" friction="{plant.foot_friction!r} 0.02 0.01"/>
     <default class="visual"><geom contype="0" conaffinity="0" group="1" rgba="0.25 0.27 0.3 1"/></default>
