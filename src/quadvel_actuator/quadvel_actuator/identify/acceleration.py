@@ -21,8 +21,8 @@ _BEND = 0.002
 """Bends are differences of slopes over so long before and after, s"""
 
 
-def slope(t: Array, values: Array, half_width: float) -> Array:
-    """Slope of the line through `values` (N, J) at most `half_width` s off, near ones counting more; by rows."""
+def lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
+    """Level at and slope of the line through `values` (N, J) at most `half_width` s off, near ones counting more; by rows."""
     n, period = len(t), float(np.median(np.diff(t)))
     wide = max(half_width, period)
     moments = np.zeros((3, n))
@@ -37,10 +37,13 @@ def slope(t: Array, values: Array, half_width: float) -> Array:
         sums[0, here] += weight[:, None] * change
         sums[1, here] += (weight * late)[:, None] * change
     spread = moments[0] * moments[2] - moments[1] ** 2
-    found: Array = (moments[0, :, None] * sums[1] - moments[1, :, None] * sums[0]) / np.where(
-        spread > 0.0, spread, np.inf
-    )[:, None]
-    return found
+    one, late, square = moments[:, :, None] / np.where(spread > 0.0, spread, np.inf)[:, None]
+    return values + square * sums[0] - late * sums[1], one * sums[1] - late * sums[0]
+
+
+def slope(t: Array, values: Array, half_width: float) -> Array:
+    """The slope of `lines`."""
+    return lines(t, values, half_width)[1]
 
 
 def _bend(t: Array, values: Array) -> Array:

@@ -20,6 +20,15 @@ def noise_floor(samples: Samples, rows: Bools, residual: Array) -> Array:
     return np.minimum(_local(samples.tau, samples, rows), _local(residual, samples, rows))
 
 
+def unseen_noise(samples: Samples, rows: Bools, residual: Array) -> float:
+    """By which share of it the noise of what a model leaves exceeds the torque's own.
+
+    That is noise of q and dq which the drive did not act on: through the gains it is in what the model asks for, not in tau.
+    """
+    own = _local(samples.tau, samples, rows)
+    return float((_local(residual, samples, rows) - own).sum() / max(float(own.sum()), 1e-12))
+
+
 def _local(values: Array, samples: Samples, rows: Bools) -> Array:
     """The least of the variances that differences of several orders show, each without its largest tenth."""
     found = []

@@ -18,7 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .acceleration import HALF_WIDTHS, slope, smooth_part
+from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
 from .log import Log
 
 Array = NDArray[np.float64]
@@ -117,9 +117,11 @@ def scattered(count: int, every: int) -> NDArray[np.intp]:
 class _LogSignals:
     """One log, ready to be read at any time."""
 
-    def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float) -> None:
+    def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float, steady: float) -> None:
         self.log, self.origin = log, origin
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
+        if steady > 0.0:
+            self.states = {k: lines(_double(log.t), values, steady)[0] for k, values in self.states.items()}
         if log.temperature is not None:
             self.states["temperature"] = _double(log.temperature)
         if log.voltage is not None:
@@ -182,7 +184,7 @@ class _LogSignals:
                 self._smooth.pop(next(iter(self._smooth)))
             t = _double(self.log.t)
             come = self._acting(t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, t, self.states["dq"], come)
+            self._smooth[key] = smooth_part(name, t, _double(self.log.dq), come)
         smooth, answer = self._smooth[key]
         jumps = self._acting(at, delays, lambda values, _, sent: values[self.log.command_rows(sent + 1e-9)])
         return self._read(smooth[:, joints], self.between(at)) + jumps @ answer[:, joints]
@@ -190,7 +192,7 @@ class _LogSignals:
     @cached_property
     def _smeared(self) -> Array:
         """rad/s^2 by rows, whatever commands do."""
-        return slope(_double(self.log.t), self.states["dq"], HALF_WIDTHS["ddq"])
+        return slope(_double(self.log.t), _double(self.log.dq), HALF_WIDTHS["ddq"])
 
     def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
         """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
@@ -244,7 +246,7 @@ class Samples:
 
     `kp`, `kd` (J,) stand for logs that hold no gains; without either the gains count as 1, so that what is fitted
     is the gain itself. `origins` (s) are the times that `Signals.t` counts from, by default each log's first row.
-    `judged` (N, J) are the rows that a model has to explain.
+    q and dq are lines through the rows at most `steady` s off. `judged` (N, J) are the rows that a model has to explain.
     """
 
     def __init__(
@@ -253,9 +255,10 @@ class Samples:
         kp: Array | None = None,
         kd: Array | None = None,
         origins: Sequence[float] | None = None,
+        steady: float = 0.0,
     ) -> None:
         origins = [float(log.t[0]) for log in logs] if origins is None else origins
-        self.logs = [_LogSignals(log, kp, kd, at) for log, at in zip(logs, origins, strict=True)]
+        self.logs = [_LogSignals(log, kp, kd, at, steady) for log, at in zip(logs, origins, strict=True)]
         self.joints = logs[0].joints
         self.commanded = all(one.gains_known for one in self.logs)
         """are the gains that were commanded known?"""
