@@ -3,7 +3,7 @@
 import attrs
 import numpy as np
 import pytest
-from simulated_joints import NAMES, parameters, record
+from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_actuator.identify.eam import fit_eam
@@ -32,6 +32,16 @@ def test_nothing_is_added_to_a_log_that_the_eam_explains():
     assert report["effects"] == []
     assert report["unexplained"] == {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
     assert report["decision"].startswith("Nothing significant")
+
+
+def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
+    """A quarter of the torque's noise again, through kd: whatever averages dq would predict better than the truth."""
+    log = record(parameters(joints=3), joints=3, seed=6)
+    log = attrs.evolve(log, dq=log.dq + np.random.default_rng(6).normal(0.0, 0.25, log.dq.shape))
+    report = identify([log]).report
+    assert report["effects"] == []
+    assert report["after"]["delta_kd"] == pytest.approx(TABLE_4["delta_kd"], abs=0.025)  # 5 % of kd
+    assert any("on which the drive did not act" in finding["text"] for finding in report["findings"])
 
 
 def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base():

@@ -17,7 +17,7 @@ from quadvel_actuator.identify.read_log import read_log
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
 
 sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import KP, fields
+from joint_logs import KD, KP, fields, npz
 
 SHARE = np.pi / 180.0
 
@@ -268,3 +268,12 @@ def test_measured_logs_with_commands_are_accepted() -> None:
 def test_measured_logs_of_torque_commands_are_refused(name: str) -> None:
     with pytest.raises(LogError, match=rf"{name}\.npz: q_des: the field is missing"):
         read_log(MEASURED / f"{name}.npz")
+
+
+def test_speeds_that_commands_ask_for_are_no_clock_that_is_off(tmp_path):
+    """kd dq_des leads kp q_des, as a torque before its command would."""
+    log, kd = fields(), 4.0
+    dq_des = np.gradient(log["q_des"], log["t"], axis=0)
+    tau = log["tau"] + kd * (dq_des - log["dq"]) + KD * log["dq"]
+    found = inspect(read_log(npz(tmp_path / "log.npz", dq_des=dq_des, tau=tau, kd=kd)))
+    assert not [one.text for one in found.findings if one.kind == "refusal"]

@@ -3,6 +3,7 @@
 import attrs
 import numpy as np
 import pytest
+from joint_logs import fields, npz
 from simulated_joints import NAMES, parameters, record
 from test_screening import about
 
@@ -10,9 +11,11 @@ from quadvel_actuator.effects import registry
 from quadvel_actuator.identify.candidates import propose, started
 from quadvel_actuator.identify.delays import latest
 from quadvel_actuator.identify.eam import fit_eam
+from quadvel_actuator.identify.excerpts import evened, jitters
 from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.log import Log
 from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_actuator.identify.signals import Samples
 
 
@@ -139,3 +142,16 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     )
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
     assert latest(model, samples.judged).input_delay[0] == pytest.approx(0.007, abs=2e-4)
+
+
+def test_of_commands_that_stand_in_the_rows_the_instants_of_an_even_sender_are_restored(tmp_path):
+    """97 Hz in rows of 500 Hz: a row shows up to 2 ms late what was sent, which lost commands would explain."""
+    rows = fields()
+    sending = np.floor(rows["t"] * 97.0 + 1e-9)
+    rows["q_des"] = rows["q_des"][np.searchsorted(sending, sending)]
+    log = read_log(npz(tmp_path / "log.npz", q_des=rows["q_des"]))
+    assert jitters(log)
+    even = evened(log).t_cmd
+    assert len(even) == len(np.unique(sending))
+    assert np.abs(np.diff(even)[2:-2] - 1.0 / 97.0).max() < 5e-4
+    assert 0.0 < (even - np.unique(sending) / 97.0)[2:-2].mean() < 0.002

@@ -20,6 +20,8 @@ LEAD = 0.1  # s of commands before a piece
 JITTER = 0.03
 """Spacing that varies by more than this share of the usual one counts as jitter."""
 
+_OF_COMMANDS = ("t_cmd", "q_des", "dq_des", "tau_ff", "kp", "kd")
+_FEWEST, _REPEATED = 50, 0.7  # commands, and share of the rows that hold a new one: at least, at most
 _WINDOW = 101, 31  # rows of states, of commands, over which lateness is a drift and not jitter
 _REACH = 200  # rows from which the true period is read
 
@@ -50,8 +52,7 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
     for field in attrs.fields(Log):
         value = getattr(log, field.name)
         if isinstance(value, np.ndarray):
-            of_command = field.name in ("t_cmd", "q_des", "dq_des", "tau_ff", "kp", "kd")
-            taken[field.name] = value[sent if of_command else rows]
+            taken[field.name] = value[sent if field.name in _OF_COMMANDS else rows]
     if len(taken["t"]) < 50 or len(taken["t_cmd"]) < 10:
         return None
     return attrs.evolve(log, **taken)
@@ -59,13 +60,31 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
 
 def jitters(log: Log) -> bool:
     """Do the stamps of states or commands vary more than an even clock's?"""
-    return any(_jitter(time) > JITTER for time in (log.t, log.t_cmd))
+    return any(_jitter(time) > JITTER for time in (log.t, _sent(log).t_cmd))
 
 
 def evened(log: Log) -> Log:
     """The log with the stamps of an even sender; losses and slow drifts stay."""
+    log = _sent(log)
     t, t_cmd = (_even(time, window) for time, window in zip((log.t, log.t_cmd), _WINDOW, strict=True))
     return attrs.evolve(log, t=t, t_cmd=t_cmd)
+
+
+def _sent(log: Log) -> Log:
+    """The log with each command once, where they stand in the rows of states and most rows repeat the one before.
+
+    Then a row is all that is known of when one was sent.
+    """
+    if len(log.t_cmd) != len(log.t) or (log.t_cmd != log.t).any():
+        return log
+    fields = {name: getattr(log, name) for name in _OF_COMMANDS if getattr(log, name) is not None}
+    new = np.any(
+        [(np.diff(fields[name], axis=0) != 0.0).any(axis=1) for name in fields if name != "t_cmd"], axis=0
+    )
+    rows = np.concatenate([[0], 1 + np.flatnonzero(new)])
+    if not _FEWEST <= len(rows) <= _REPEATED * len(log.t):
+        return log
+    return attrs.evolve(log, **{name: values[rows] for name, values in fields.items()})
 
 
 def _jitter(time: NDArray[np.floating]) -> float:

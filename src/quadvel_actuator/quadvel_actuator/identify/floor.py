@@ -20,13 +20,10 @@ def noise_floor(samples: Samples, rows: Bools, residual: Array) -> Array:
     return np.minimum(_local(samples.tau, samples, rows), _local(residual, samples, rows))
 
 
-def unseen_noise(samples: Samples, rows: Bools, residual: Array) -> float:
-    """By which share of it the noise of what a model leaves exceeds the torque's own.
-
-    That is noise of q and dq which the drive did not act on: through the gains it is in what the model asks for, not in tau.
-    """
-    own = _local(samples.tau, samples, rows)
-    return float((_local(residual, samples, rows) - own).sum() / max(float(own.sum()), 1e-12))
+def encoder_noise(samples: Samples, rows: Bools, kp: float, kd: float) -> Array:
+    """Variance of what the noise of the measured q and dq makes of the torque asked for at these gains, (J,), N^2 m^2."""
+    q, dq = (np.concatenate([one.states[name] for one in samples.logs]) for name in ("q", "dq"))
+    return kp**2 * _local(q, samples, rows) + kd**2 * _local(dq, samples, rows)
 
 
 def _local(values: Array, samples: Samples, rows: Bools) -> Array:

@@ -17,7 +17,7 @@ from .diagnosis import Diagnosis, Rejected, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
 from .findings import Finding
-from .floor import noise_floor, unseen_noise
+from .floor import encoder_noise, noise_floor
 from .identification import Identification
 from .inspect import inspect
 from .intervals import intervals
@@ -39,7 +39,7 @@ _BLOCKS = 20  # of a log, at least
 _SHORTEST_BLOCK, _LONGEST_BLOCK = 0.2, 2.0  # s
 _LEAST_ROWS = 30
 _CLEARLY = 0.97  # of the error
-_UNSEEN = 0.01  # of the torque's noise: what encoders' noise may add to it
+_NOISY = 0.01  # of the torque's noise: what encoders' noise may add to it
 _STEADY_ROWS = np.array([1, 2, 4, 8])  # to either side, that q and dq may be averaged over
 _STEADY_TIME = 0.0081  # s, at most
 _STEADIER = 0.005  # of the noise: what each further step has to take off the error
@@ -235,13 +235,15 @@ def _read(
 def _steadied(found: Fit, tried: Callable[[float], Fit]) -> tuple[Fit, float]:
     """The fit with q and dq averaged over so long (s) to either side as it pays; `tried` makes one.
 
-    Only where their noise is in what the EAM leaves and not in the torque: whatever filters would be taken for an effect.
+    Where encoders are noisy and the drive did not act on what they say: whatever filters would be taken for an effect. A
+    drive that did has their noise in its torque, and averages explain that worse.
     """
     samples, judge, eam = found
-    rows, left = judge.fit | judge.judge, samples.tau - _plain(samples, eam, judge).predict()
-    if unseen_noise(samples, rows, left) < _UNSEEN:
+    rows, gains = judge.fit | judge.judge, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
+    noise = noise_floor(samples, rows, samples.tau - _plain(samples, eam, judge).predict()).mean()
+    if encoder_noise(samples, rows, *gains * _reference(samples)).mean() < _NOISY * noise:
         return found, 0.0
-    noise, chosen = float(noise_floor(samples, rows, left).mean()), 0.0
+    chosen = 0.0
     for steady in _STEADY_ROWS * samples.period:
         if steady <= _STEADY_TIME and (other := tried(steady))[2].mse < found[2].mse - _STEADIER * noise:
             found, chosen = other, float(steady)
