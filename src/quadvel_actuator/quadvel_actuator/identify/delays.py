@@ -18,7 +18,7 @@ SLOPE = 0.0003
 
 _DAMPING = (1e-6, 1e-2, 1.0)
 _SETTLED = 2e-5
-_FINE = 5e-5  # s
+_FINE, _COARSE = 5e-5, 2.5e-4  # s
 _EQUAL = 1e-9  # of the error
 _CLOCK = 0.001
 """s, a step of a drive's clock"""
@@ -73,6 +73,16 @@ def latest(model: Model, rows: Bools) -> Model:
             break
         found = later
     return found
+
+
+def plateau(model: Model, rows: Bools) -> float:
+    """By how much (s) the input delays may be shorter and the model says the same of `rows` (N, J): see `latest`."""
+    error, shorter = model.error(rows) * (1.0 + _EQUAL), 0.0
+    while (model.input_delay >= shorter + _COARSE).all():
+        if model.with_delays(model.input_delay - shorter - _COARSE, model.output_delay).error(rows) > error:
+            break
+        shorter += _COARSE
+    return shorter
 
 
 def in_steps(model: Model, rows: Bools) -> Model:

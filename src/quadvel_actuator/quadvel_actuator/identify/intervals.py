@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from scipy import stats
 
-from .delays import fit_with_delays, jacobian_with_delays
+from .delays import LONGEST, fit_with_delays, jacobian_with_delays, plateau
 from .judging import Judge
 from .learned import Learned, beside
 from .model import Model, gather
@@ -63,7 +63,14 @@ def intervals(
         systematic = np.maximum(clock, _BENT * np.abs(one.values)) * one.active
         effects.append(chance + _shape_error(model, len(effects), judge) + systematic)
         first += len(one.law.parameters)
-    return Intervals(wide[:2], tuple(effects), wide[-2:] + _CLOCK, _on_bound(model))
+    gains = np.minimum(
+        wide[:2], np.maximum(1.0, np.abs(model.gains))
+    )  # nothing tells them: anything from 0 on
+    delays = wide[-2:] + _CLOCK
+    if shorter := plateau(model, judge.every):  # where no slope says anything
+        delays[0] = shorter + _CLOCK
+    delays = np.minimum(delays, np.array(LONGEST)[:, None])
+    return Intervals(gains, tuple(effects), delays, _on_bound(model))
 
 
 def _half_widths(model: Model, judge: Judge, rows: Bools, learned: Learned | None) -> Array:
@@ -134,8 +141,11 @@ def _shape_error(model: Model, index: int, judge: Judge) -> Array:
 
 
 def _on_bound(model: Model) -> tuple[str, ...]:
-    """effect.parameter of those that sit on a bound of theirs."""
-    found = []
+    """Delays, and effect.parameter, of those that sit on a bound of theirs."""
+    delays = zip(
+        ("input_delay", "output_delay"), (model.input_delay, model.output_delay), LONGEST, strict=True
+    )
+    found = [name for name, values, most in delays if (values >= most - 1e-9).any()]
     for one in model.applied:
         for parameter, values in zip(one.law.parameters, one.values, strict=True):
             reach = 1e-9 * max(abs(parameter.low), abs(parameter.high))
