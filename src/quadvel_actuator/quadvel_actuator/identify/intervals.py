@@ -22,8 +22,8 @@ from .valleys import as_deep
 LEVEL = 0.95
 _CLOCK = 0.25e-3
 """s, by which times may be off besides: the clock of a drive, whose step is up to 1 ms, is in no log"""
-_BENT = 0.01
-"""of a value, by which it may be off besides: a log holds noisy samples of a motion, not the motion"""
+_BENT, _BENT_GAIN = 0.01, 0.005
+"""of an effect's value, of a gain, by which they may be off besides: a log holds noisy samples of a motion, not the motion"""
 _AS_WELL = 1.003
 """of the error: a shape of a law that leaves no more explains the log as well"""
 
