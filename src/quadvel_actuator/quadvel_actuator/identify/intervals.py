@@ -63,9 +63,8 @@ def intervals(
         systematic = np.maximum(clock, _BENT * np.abs(one.values)) * one.active
         effects.append(chance + _shape_error(model, len(effects), judge) + systematic)
         first += len(one.law.parameters)
-    gains = np.minimum(
-        wide[:2], np.maximum(1.0, np.abs(model.gains))
-    )  # nothing tells them: anything from 0 on
+    size = np.abs(model.gains)
+    gains = np.minimum(wide[:2] + _BENT_GAIN * size, np.maximum(1.0, size))  # or anything from 0 on
     delays = wide[-2:] + _CLOCK
     if shorter := plateau(model, judge.every):  # where no slope says anything
         delays[0] = shorter + _CLOCK

@@ -25,6 +25,7 @@ DEAD = 2e-4  # of the slope of q, that a speed of 0 may be by its noise
 OFF, ALIKE = 1.4, 0.95  # how far, as a factor, the slope of q may be off dq, where they are alike in shape
 CLOCKS = np.arange(-1.0, 1.01, 0.02)  # s, from a command to its torque, looked at for clocks that differ
 EARLIEST, LATEST = -0.005, 0.1  # s, between which a drive may answer
+UNALIGNED = 0.2  # of the torque, left at the best lag that a drive may have: a motion that repeats fits a lag of its period, too
 UNANSWERED = 0.1  # of the torque that the speed leaves, explained by the position error
 FAR_OFF = 8.0  # times the commanded gain
 ROWS_FOR_A_LAW = 50
@@ -161,7 +162,8 @@ def time_bases(log: Log) -> Iterator[Finding]:
         left[k] = np.median(shares) if shares else 1.0
     allowed = (CLOCKS >= EARLIEST) & (CLOCKS <= LATEST)
     best = float(CLOCKS[np.argmin(left)])
-    if left.min() < 0.3 * min(left[allowed].min(), 1.0) and not EARLIEST <= best <= LATEST:
+    aside = left[allowed].min() > UNALIGNED and left.min() < 0.3 * min(left[allowed].min(), 1.0)
+    if aside and not EARLIEST <= best <= LATEST:
         way = f"{best:.2f} s after" if best > 0.0 else f"{-best:.2f} s before"
         text = (
             f"t_cmd: the torque answers commands {way} they were sent (it leaves {100 * left.min():.0f} % of the torque, at "
