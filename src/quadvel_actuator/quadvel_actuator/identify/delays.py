@@ -66,23 +66,25 @@ def latest(model: Model, rows: Bools) -> Model:
     delays. A drive that works on that grid has the longest of them, and so has a model that is to foretell rows that
     lie otherwise; a fit needs the room to either side.
     """
-    found, error = model, model.error(rows) * (1.0 + _EQUAL)
-    while (found.input_delay + _FINE <= LONGEST_INPUT).all():
-        later = model.with_delays(np.round(found.input_delay + _FINE, 7), model.output_delay)
-        if later.error(rows) > error:
-            break
-        found = later
-    return found
+    return _walked(model, rows, _FINE)
 
 
 def plateau(model: Model, rows: Bools) -> float:
     """By how much (s) the input delays may be shorter and the model says the same of `rows` (N, J): see `latest`."""
-    error, shorter = model.error(rows) * (1.0 + _EQUAL), 0.0
-    while (model.input_delay >= shorter + _COARSE).all():
-        if model.with_delays(model.input_delay - shorter - _COARSE, model.output_delay).error(rows) > error:
-            break
-        shorter += _COARSE
-    return shorter
+    return float((model.input_delay - _walked(model, rows, -_COARSE).input_delay).max())
+
+
+def _walked(model: Model, rows: Bools, by: float) -> Model:
+    """The model with input delays as many steps `by` (s) on as it says the same of `rows` (N, J)."""
+    found, error = model, model.error(rows) * (1.0 + _EQUAL)
+    while True:
+        delay = np.round(found.input_delay + by, 7)
+        if (delay < 0.0).any() or (delay > LONGEST_INPUT).any():
+            return found
+        moved = model.with_delays(delay, model.output_delay)
+        if moved.error(rows) > error:
+            return found
+        found = moved
 
 
 def in_steps(model: Model, rows: Bools) -> Model:

@@ -86,14 +86,12 @@ class Log:
 
     def without_feed_forward(self) -> Log:
         """The log with the torque alone that answers angles and speeds: less what `tau_ff` and `dq_des` in force ask for."""
-        if self.tau is None:
+        speed = None if self.kd is None or self.dq_des is None else self.kd * self.dq_des
+        asked = [torque for torque in (self.tau_ff, speed) if torque is not None]
+        if self.tau is None or not asked:
             return self
-        asked = np.zeros_like(self.q_des) if self.tau_ff is None else self.tau_ff
-        known = self.dq_des is not None and self.kd is not None
-        if self.dq_des is not None and self.kd is not None:
-            asked = asked + self.kd * self.dq_des
-        tau = self.tau - asked[self.command_rows(self.t)]
-        return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=None if known else self.dq_des)
+        tau = self.tau - np.sum(asked, axis=0)[self.command_rows(self.t)]
+        return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=self.dq_des if speed is None else None)
 
     def select(self, joints: Sequence[str]) -> Log:
         """The log with these joints only, in this order. Raises LogError for one that it does not hold."""
