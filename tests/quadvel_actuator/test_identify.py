@@ -100,6 +100,27 @@ def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
     ]
 
 
+def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both():
+    three = NAMES[:3]
+    spring = Effect("parallel_spring", three, {"k": 5.0, "q0": 0.1})
+    cogging = Effect("cogging", three, {"a": 0.5, "n": 12.0, "phi": 0.7})
+    truth = attrs.evolve(parameters((spring, cogging)), joints=three)
+    report = identify([record(truth, 3, 5.0, 500, seed=4)]).report
+    assert {one["name"] for one in report["effects"]} == {"parallel_spring", "cogging"}
+    assert report["after"]["heldout_mse"] < 1.05 * 0.066
+
+
+def test_drives_that_are_stronger_one_way_only_are_not_hidden_in_the_gains_of_all():
+    def stronger(k, q, dq, tau):
+        return tau * np.where((tau > 0.0) & (np.arange(4) < 2), 1.15, 1.0)
+
+    truth = attrs.evolve(parameters(), joints=NAMES[:4])
+    report = identify([record(truth, 4, 5.0, 500, seed=6, distort=stronger)]).report
+    assert [(one["name"], one["joints"]) for one in report["effects"]] == [
+        ("gain_asymmetry", list(NAMES[:2]))
+    ]
+
+
 def test_hum_of_the_mains_is_told_as_a_line_in_time():
     def hum(k, q, dq, tau):
         return tau + 0.35 * np.sin(2 * np.pi * 50.0 * k * 0.001)

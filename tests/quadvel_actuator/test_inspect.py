@@ -202,6 +202,19 @@ def test_damping_and_switching_off_show_in_the_torque(gains_known: bool, damping
     assert valid[given["t"] < 2.3].all()
 
 
+def test_a_drive_that_something_pushes_against_is_not_switched_off() -> None:
+    """A spring in part of the range takes the mean of its torque, which goes on to follow the error."""
+    t = np.arange(3000) * 0.002
+    error = (0.1 * np.sin(0.5 * np.pi * t) + 0.01 * np.sin(6.0 * np.pi * t))[:, None]
+    q = 0.4 * np.sin(0.9 * t)[:, None]
+    one = {"t": t, "t_cmd": t, "q": q, "dq": np.gradient(q, t, axis=0), "q_des": q + error}
+    gains = {"valid": np.ones(q.shape, bool), "kp": np.full(q.shape, 30.0), "kd": np.full(q.shape, 0.5)}
+    tau = 30.0 * error - 0.5 * one["dq"]
+    pushed = error[:, 0] > 0.07
+    tau[pushed] -= tau[pushed].mean()
+    assert inspect(Log(name="a.npz", joints=("a",), tau=tau, **one, **gains)).log.valid.all()
+
+
 def test_saturation_and_friction_are_not_taken_for_damping() -> None:
     given = fields()
     tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)

@@ -38,11 +38,26 @@ GROUPS = (
     ("thermal_drift", "gain_asymmetry", "supply_sag"),
 )
 
+CLOSE = (
+    ("parallel_spring", "cogging"),
+    ("torque_offset", "cogging"),
+    ("coulomb_friction", "quadratic_drag"),
+    ("load_dependent_friction", "quadratic_drag"),
+    ("coulomb_friction", "load_dependent_friction"),
+    ("first_order_lag", "armature"),
+    ("first_order_lag", "torque_saturation"),
+    ("deadband", "torque_saturation"),
+    ("gain_asymmetry", "thermal_drift"),
+    ("hysteresis", "quadratic_drag"),
+)
+"""Of one group, and yet not the same."""
+
 GROUP_OF = {
     "table_4": "table 4",
     "none": "none",
     **dict.fromkeys(KNOWN, "alone"),
     "pair": "together",
+    "close_pair": "together",
     "triple": "together",
     **dict.fromkeys(OUTSIDE, "outside"),
 }
@@ -173,6 +188,8 @@ def _setting(kind: str, index: int, seed: tuple[int, ...]) -> Setting:
 
 
 def _effects_of(kind: str, rng: np.random.Generator) -> tuple[str, ...]:
+    if kind == "close_pair":
+        return CLOSE[rng.integers(len(CLOSE))]
     if kind in ("pair", "triple"):
         groups = rng.permutation(len(GROUPS))[: 2 if kind == "pair" else 3]
         return tuple(str(rng.choice(GROUPS[group])) for group in sorted(groups))

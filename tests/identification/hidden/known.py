@@ -254,10 +254,12 @@ def hysteresis(draw: Draw) -> Effect:
 
 
 def gain_asymmetry(draw: Draw) -> Effect:
+    """Half of the drives are as strong as they should be one way: their mean gain is off, too."""
     share = min(draw.strength * draw.uniform(0.04, 0.12), 0.4) * draw.sign()
+    mean = 1.0 / (1.0 - abs(share)) if draw.uniform(0.0, 1.0) < 0.5 else 1.0
 
     def make(state: State, j: int, dt: float) -> Step:
-        return lambda k, u: u * (1 + share) if u > 0 else u * (1 - share)
+        return lambda k, u: mean * (u * (1 + share) if u > 0 else u * (1 - share))
 
     return Effect("gain_asymmetry", draw.joints, {"asymmetry": share}, {"drive": make})
 

@@ -61,6 +61,20 @@ def rubbing_cable(draw: Draw) -> Effect:
     )
 
 
+def soft_stop(draw: Draw) -> Effect:
+    """A rubber stop that is pressed at one end of the range."""
+    stiffness, share, end = draw.strength * draw.uniform(4.0, 12.0), draw.uniform(0.3, 0.6), draw.sign()
+
+    def make(state: State, j: int, dt: float) -> Step:
+        q = state.q
+        low, high = np.quantile(draw.nominal.q[:, j], [0.02, 0.98])
+        edge = float(high - share * (high - low)) if end > 0 else float(low + share * (high - low))
+        return lambda k, u: u - end * stiffness * max(end * (q[j] - edge), 0.0)
+
+    params = {"stiffness": stiffness}
+    return Effect("soft_stop", draw.joints, params, {"joint": make}, signals={"key": ["q"], "all": [["q"]]})
+
+
 def neighbour_ripple(draw: Draw) -> Effect:
     """A torque ripple tied to the angle of another joint."""
     height, phase = draw.strength * draw.uniform(0.3, 0.7), draw.uniform(-math.pi, math.pi)
@@ -288,6 +302,7 @@ OUTSIDE = {
     for make in (
         structural_resonance,
         rubbing_cable,
+        soft_stop,
         neighbour_ripple,
         hardening_stiffness,
         mains_hum,

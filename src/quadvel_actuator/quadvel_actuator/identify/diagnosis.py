@@ -46,6 +46,8 @@ keeps of its promise and so much of what is above the noise; of the best promise
 looks like a delay always is: what it promises is for delays that are not its own."""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
+_NEARLY, _MUCH = 0.9, 0.1
+"""Of the best gain; and of the noise, left beside the best law alone"""
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
@@ -128,7 +130,7 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
             continue
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
-        best, tied = _choice(candidates, judge, noise)
+        best, tied = _choice(_in_order(candidates, judge, noise, few), judge, noise)
         found = _deepened(about.fit_anew(best.model.holding(False)), judge, few)
         found = _reformed(found, judge, few)
         model = _released(_widened(found, judge, noise, few), few)
@@ -230,9 +232,9 @@ def _pays(one: Candidate, noise: Array, tried: int) -> bool:
 def _finer(
     model: Model, candidates: Sequence[Candidate], judge: Judge, noise: Array, few: Few
 ) -> Model | None:
-    """The model with gains or delays shared by fewer joints, if that pays clearly more than any effect does."""
+    """The model with gains or delays shared by fewer joints, if that pays more than any effect does."""
     best = candidates[0].gain if candidates and _pays(candidates[0], noise, len(registry())) else 0.0
-    chosen, most = None, max(best, 0.0) + WORTH * float(noise.mean())
+    chosen, most = None, max(best, WORTH * float(noise.mean()))
     left = model.samples.tau - latest(model, judge.fit).predict()
     for _, tried in regroupings(model, few):
         found = judge.compare(left, tried.samples.tau - latest(tried, judge.fit).predict())
@@ -306,6 +308,28 @@ def _choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tupl
         if size[one.name] < size[chosen.name] and best.gain - one.gain < _SIMPLER_LOSES * float(noise.mean()):
             chosen = one
     return chosen, tuple(one.name for one in equal if one is not chosen)[:_TIES]
+
+
+def _in_order(candidates: Sequence[Candidate], judge: Judge, noise: Array, few: Few) -> Sequence[Candidate]:
+    """The candidates, a simpler law first that is nearly as good as the best one and with that on top says more than it.
+
+    The best one alone may owe its place to parameters that stand for both, and it would not find its own again.
+    """
+    best = candidates[0]
+    few_words = len(best.law.parameters)
+    simpler = [
+        one for one in candidates if len(one.law.parameters) < few_words and one.gain > _NEARLY * best.gain
+    ]
+    left = judge.compare(best.residual, np.zeros_like(best.residual)).gain
+    if not simpler or left < (1.0 + _MUCH) * float(noise.mean()):
+        return candidates
+    first = simpler[0]
+    beside = About(first.model, judge, noise, few)
+    start = started(beside, best.law)
+    both = None if start is None else propose(beside, start)
+    if both is None or judge.compare(best.residual, both.residual).gain < WORTH * float(noise.mean()):
+        return candidates
+    return [first]
 
 
 def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool:

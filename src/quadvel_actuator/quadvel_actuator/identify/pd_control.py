@@ -7,6 +7,7 @@ kp of 0 says it too. What the drive does under PD control is for the identificat
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -46,7 +47,7 @@ def _unanswered(log: Log) -> Bools:
     """Torque against position error, in short windows over all joints: where is the gain far below its usual size?"""
     steps = np.diff(((log.t - log.t[0]) / BIN).astype(np.intp), prepend=0)
     bins = np.cumsum(np.minimum(steps, WINDOW))  # a gap is as good as one that no window bridges
-    sums = max((_sums(log, bins, lag) for lag in LAGS), key=_explained)
+    lag, sums = max(((lag, _sums(log, bins, lag)) for lag in LAGS), key=lambda one: _explained(one[1]))
     count, ee, ed, dd, et, dt, _ = (np.convolve(row, np.ones(WINDOW), "same") for row in sums)
     determinant = ee * dd - ed**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -62,21 +63,46 @@ def _unanswered(log: Log) -> Bools:
         return np.zeros(len(log.t), bool)
     # A window that tells nothing, as the error is small there, is taken to be like the one before.
     last = np.maximum.accumulate(np.where(tells, np.arange(len(gain)), -1))
-    lost = (last >= 0) & (gain[last] < LOST * usual)
-    return _widened(lost[bins], log.t)
+    lost = ((last >= 0) & (gain[last] < LOST * usual))[bins]
+    for first, stop in stretches(lost, log.t, SHORTEST):
+        there = (log.t >= first) & (log.t <= stop)
+        if _follows(log, there, lag) >= LOST * usual:
+            lost &= ~there
+    return _widened(lost, log.t)
+
+
+def _follows(log: Log, rows: Bools, lag: float) -> float:
+    """The gain with which the torque follows changes of the position error within `rows`, whatever its mean.
+
+    What pushes against the drive all the while, a spring in part of the range, takes torque off without switching it off.
+    """
+    squares, products = np.zeros((2, 2)), np.zeros(2)
+    for use, e, d, tau in _answers(log, np.flatnonzero(rows), lag):
+        level = use / max(float(use.sum()), 1.0)
+        x = np.stack([e, d])
+        x = (x - (x @ level)[:, None]) * use
+        squares += x @ x.T
+        products += x @ (tau - tau @ level)
+    found: Array = np.linalg.lstsq(squares, products, rcond=1e-3)[0]
+    return float(found[0])
+
+
+def _answers(log: Log, rows: NDArray[np.intp], lag: float) -> Iterator[tuple[Array, Array, Array, Array]]:
+    """Of each joint in `rows`: 1 where valid, and stiffness times error, -dq and torque there, the first two `lag` s earlier."""
+    row = np.maximum(np.searchsorted(log.t, log.t[rows] - lag, side="right") - 1, 0)
+    command = log.command_rows(log.t[row])
+    assert log.tau is not None
+    for j in range(len(log.joints)):
+        use = log.valid[rows, j].astype(float)
+        stiffness = 1.0 if log.kp is None else np.asarray(log.kp)[command, j]
+        e = use * stiffness * (log.q_des[command, j] - log.q[row, j])
+        yield use, e, -use * log.dq[row, j], use * log.tau[rows, j]
 
 
 def _sums(log: Log, bins: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
     """Sums in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
-    row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
-    command = log.command_rows(log.t[row])
     total = np.zeros((7, bins[-1] + 1))
-    assert log.tau is not None
-    for j in range(len(log.joints)):
-        use = log.valid[:, j].astype(float)
-        stiffness = 1.0 if log.kp is None else np.asarray(log.kp)[command, j]
-        e = use * stiffness * (log.q_des[command, j] - log.q[row, j])
-        d, tau = -use * log.dq[row, j], use * log.tau[:, j]
+    for use, e, d, tau in _answers(log, np.arange(len(log.t)), lag):
         for k, product in enumerate((use, e * e, e * d, d * d, e * tau, d * tau, tau * tau)):
             total[k] += np.bincount(bins, product, len(total[k]))
     return total

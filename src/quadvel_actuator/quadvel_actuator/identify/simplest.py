@@ -27,6 +27,9 @@ _AS_WELL = 0.02
 _TERM = 2
 """A term of signals says as much as so many laws."""
 
+_SHAPED = "q"
+"""The signal whose laws add up to any shape; those of dq, friction and drag, go together by nature."""
+
 
 def account(
     before: Model, diagnosis: Diagnosis, judge: Judge, noise: Array
@@ -40,7 +43,8 @@ def account(
     named = _with(diagnosis, beside)
     if not diagnosis.findings or _enough(before, diagnosis, beside, judge, floor):
         return named, beside
-    alone = learn(before, judge, noise)
+    shape = _one_shape(diagnosis)  # what hid the delays is found then
+    alone = learn(attrs.evolve(diagnosis.model, applied=()) if shape else before, judge, noise)
     if alone is None or not _shorter_or_better(named, beside, alone, judge, floor):
         return named, beside
     reason = "terms of named signals say it better than the named laws together"
@@ -49,11 +53,19 @@ def account(
 
 
 def _enough(before: Model, diagnosis: Diagnosis, beside: Learned | None, judge: Judge, floor: float) -> bool:
-    """Do the laws say nearly everything?"""
+    """Do the laws say nearly everything, and more than that there is a shape?"""
+    if _one_shape(diagnosis):
+        return False
     left = diagnosis.model.mse(judge.judge)
     if len(diagnosis.findings) <= _FEW and left - floor < (1.0 - _MOST) * (before.mse(judge.judge) - floor):
         return True
     return beside is None and left < _AT_FLOOR * floor
+
+
+def _one_shape(diagnosis: Diagnosis) -> bool:
+    """Are they several laws of the angle alone? A spring and cogging together can look like a stop or any other shape."""
+    laws = [one.law for one in diagnosis.model.applied]
+    return len(laws) > 1 and all(law.signal == _SHAPED for law in laws)
 
 
 def _with(diagnosis: Diagnosis, learned: Learned | None) -> Diagnosis:
@@ -71,5 +83,7 @@ def _shorter_or_better(
     found = judge.compare(_left(named.model, beside), _left(alone.model, alone))
     if found.gain > WORTH * floor and found.p_any < LEVEL:
         return True
+    if _one_shape(named) and alone.inputs[0] == _SHAPED:
+        return found.gain > 0.0 and len(alone.terms) <= len(named.findings)
     length = len(named.findings) + _TERM * (len(beside.terms) if beside is not None else 0)
     return found.gain > -_AS_WELL * floor and _TERM * len(alone.terms) < length
