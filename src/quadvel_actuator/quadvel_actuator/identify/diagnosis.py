@@ -47,7 +47,9 @@ looks like a delay always is: what it promises is for delays that are not its ow
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
 _NEARLY, _MUCH = 0.9, 0.1
-"""Of the best gain; and of the noise, left beside the best law alone"""
+"""Of the best gain; and of the noise, what is much beside it"""
+_FEW = 2
+"""Effects that no other account needs to be looked for"""
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
@@ -84,17 +86,19 @@ class Diagnosis:
     rejected: tuple[Rejected, ...]
 
 
-def diagnosed(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
+def diagnosed(
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool]
+) -> Diagnosis:
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
     What a joint swings freely can hide an inertia in lesser gains, and the other effects then come out bent. The account
     with the commanded gains is taken where it predicts as well. Without measured torque the gains set the scale of all.
     """
-    found = diagnose(model, judge, noise, tick)
+    found = diagnose(model, judge, noise, tick, otherwise)
     if model.implied or not model.samples.commanded or not _far(found.model):
         return found
     as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
-    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick)
+    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick, otherwise)
     if not other.findings:
         return found
     tau = model.samples.tau
@@ -114,12 +118,20 @@ def _released(model: Model, few: Few) -> Model:
     return model if _far(free) else free
 
 
-def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
-    """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2."""
+def diagnose(
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool]
+) -> Diagnosis:
+    """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
+
+    Of many that still leave much, `otherwise(count)` says whether there is a shorter account without them.
+    """
     few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
+        count = len(model.applied)
+        if count >= _FEW and _unsaid(model, judge, noise) and otherwise(count):
+            break
         model = model.holding(True)
         about = About(model, judge, noise, few)
         candidates, idle = ranked(about, tick, f"effect {number + 1}")
@@ -131,7 +143,8 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
         best, tied = _choice(_in_order(candidates, judge, noise, few), judge, noise)
-        found = _deepened(about.fit_anew(best.model.holding(False)), judge, few)
+        found = few.fitted(about.fit_anew(best.model.holding(False)), deepest, 1)
+        found = fit_with_delays(found, judge.fit)
         found = _reformed(found, judge, few)
         model = _released(_widened(found, judge, noise, few), few)
         ties.append(tied)
@@ -144,6 +157,11 @@ def diagnose(model: Model, judge: Judge, noise: Array, tick: Tick) -> Diagnosis:
     findings = tuple(_finding(model, k, judge, tied, few) for k, tied in enumerate(ties))
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
+
+
+def _unsaid(model: Model, judge: Judge, noise: Array) -> bool:
+    """Is there much left beside the effects?"""
+    return bool(model.mse(judge.judge) > (1.0 + _MUCH) * float(noise.mean()))
 
 
 def _deepened(model: Model, judge: Judge, few: Few) -> Model:
@@ -320,8 +338,7 @@ def _in_order(candidates: Sequence[Candidate], judge: Judge, noise: Array, few: 
     simpler = [
         one for one in candidates if len(one.law.parameters) < few_words and one.gain > _NEARLY * best.gain
     ]
-    left = judge.compare(best.residual, np.zeros_like(best.residual)).gain
-    if not simpler or left < (1.0 + _MUCH) * float(noise.mean()):
+    if not simpler or not _unsaid(best.model, judge, noise):
         return candidates
     first = simpler[0]
     beside = About(first.model, judge, noise, few)

@@ -29,7 +29,7 @@ from .motion import STRETCH, Body, Replay, implied, replayed
 from .outcome import Outcome, identification, parameters
 from .residual import remainder
 from .signals import Array, Samples
-from .simplest import account
+from .simplest import Alone, account
 
 Progress = Callable[[float, str], None]
 Fit = tuple[Samples, Judge, Eam]
@@ -90,7 +90,12 @@ def identify(
         before = late
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
-    diagnosis = diagnosed(before, judge, noise, lambda text: tell(min(0.1 + 0.008 * next(steps), 0.85), text))
+    alone = Alone(before, judge, noise)
+
+    def tick(text: str) -> None:
+        tell(min(0.1 + 0.008 * next(steps), 0.85), text)
+
+    diagnosis = diagnosed(before, judge, noise, tick, alone.says_all)
     tell(0.88, "what no effect explains")
     late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
@@ -108,7 +113,7 @@ def identify(
             chosen, *_reference(samples), options.base or ActuatorParameters.default(),
         )  # fmt: skip
 
-    outcome = told(*account(before, diagnosis, judge, noise))
+    outcome = told(*account(alone, diagnosis, judge, noise))
     if body is None:
         found = identification(outcome, findings)
     else:

@@ -6,6 +6,8 @@ the wrong signals. So terms are also tried without any law, and held-out rows de
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import attrs
 import numpy as np
 
@@ -31,25 +33,50 @@ _SHAPED = "q"
 """The signal whose laws add up to any shape; those of dq, friction and drag, go together by nature."""
 
 
+class Alone:
+    """Terms of named signals on `before`, the model without effects: what they say without any law."""
+
+    def __init__(self, before: Model, judge: Judge, noise: Array) -> None:
+        self.before, self._judge, self._noise = before, judge, noise
+
+    @cached_property
+    def learned(self) -> Learned | None:
+        return learn(self.before, self._judge, self._noise)
+
+    def says_all(self, laws: int) -> bool:
+        """Do fewer terms than so many laws leave no more than the noise?"""
+        if self.learned is None or len(self.learned.terms) >= laws:
+            return False
+        left = self._judge.compare(
+            _left(self.learned.model, self.learned), np.zeros_like(self.learned.torque)
+        )
+        return left.gain < _AT_FLOOR * _floor(self._judge, self._noise)
+
+
 def account(
-    before: Model, diagnosis: Diagnosis, judge: Judge, noise: Array
+    alone: Alone, diagnosis: Diagnosis, judge: Judge, noise: Array
 ) -> tuple[Diagnosis, Learned | None]:
     """The diagnosis with the terms that it needs beside it, or terms instead of it.
 
-    `before` is the model without effects; the diagnosis that comes back holds the model fitted beside the terms.
+    The diagnosis that comes back holds the model fitted beside the terms.
     """
     beside = learn(diagnosis.model, judge, noise)
-    floor = float(np.average(noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
+    floor = _floor(judge, noise)
     named = _with(diagnosis, beside)
-    if not diagnosis.findings or _enough(before, diagnosis, beside, judge, floor):
+    if not diagnosis.findings or _enough(alone.before, diagnosis, beside, judge, floor):
         return named, beside
-    shape = _one_shape(diagnosis)  # what hid the delays is found then
-    alone = learn(attrs.evolve(diagnosis.model, applied=()) if shape else before, judge, noise)
-    if alone is None or not _shorter_or_better(named, beside, alone, judge, floor):
+    terms = alone.learned
+    if _one_shape(diagnosis):  # what hid the delays is found then
+        terms = learn(attrs.evolve(diagnosis.model, applied=()), judge, noise)
+    if terms is None or not _shorter_or_better(named, beside, terms, judge, floor):
         return named, beside
     reason = "terms of named signals say it better than the named laws together"
     given_up = tuple(Rejected(one.name, one.gain, reason) for one in diagnosis.findings)
-    return Diagnosis(alone.model, (), (*given_up, *diagnosis.rejected)), alone
+    return Diagnosis(terms.model, (), (*given_up, *diagnosis.rejected)), terms
+
+
+def _floor(judge: Judge, noise: Array) -> float:
+    return float(np.average(noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
 
 
 def _enough(before: Model, diagnosis: Diagnosis, beside: Learned | None, judge: Judge, floor: float) -> bool:
