@@ -46,7 +46,7 @@ keeps of its promise and so much of what is above the noise; of the best promise
 looks like a delay always is: what it promises is for delays that are not its own."""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
-_NEARLY, _MUCH = 0.9, 0.1
+_NEARLY, _MUCH = 0.7, 0.1
 """Of the best gain; and of the noise, what is much beside it"""
 _FEW = 2
 """Effects that no other account needs to be looked for"""
