@@ -44,6 +44,8 @@ _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it. One that
 looks like a delay always is: what it promises is for delays that are not its own."""
+_STUCK = 0.7
+"""Of its promise: what keeps less was fitted from delays that are not its own"""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
 _NEARLY, _MUCH = 0.7, 0.1
@@ -190,6 +192,7 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
     idle: dict[str, Rejected] = {}
     best: dict[str, Candidate] = {}
     looked: list[Started] = []
+    stuck: list[tuple[float, Candidate]] = []  # with what they promised, which no other law keeps
     taken = {one.law.name for one in about.model.applied}
     for name, law in registry().items():
         tick(f"{what}: {name}")
@@ -218,14 +221,24 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
         if name not in best or found.gain > best[name].gain:
             best[name] = found
         if found.law.foretold() is found.law:
-            kept = float((np.maximum(found.joint_gain, 0.0) / about.noise * rows).sum())
+            kept = _kept(about, found)
             least = max(least, _PROMISING * kept)
+            if kept < _STUCK * first.promise:
+                stuck.append((first.promise, found))
+    for promise, one in stuck:
+        if promise > max(WORTH * rows.sum(), *(_kept(about, other) for other in best.values())):
+            best[one.name] = max(anew(about, one), best[one.name], key=lambda other: other.gain)
     leader = max(best.values(), key=lambda one: one.gain, default=None)
     less = None if leader is None else simplified(about, leader)
     if less is not None and less.name not in taken:
         best[less.name] = max(less, best.get(less.name, less), key=lambda one: one.gain)
     out = [one for name, one in idle.items() if name not in best]
     return _settled(about, sorted(best.values(), key=lambda one: -one.gain)), out
+
+
+def _kept(about: About, one: Candidate) -> float:
+    """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
+    return float((np.maximum(one.joint_gain, 0.0) / about.noise * about.few.fitted_rows).sum())
 
 
 def _settled(about: About, candidates: list[Candidate]) -> list[Candidate]:
