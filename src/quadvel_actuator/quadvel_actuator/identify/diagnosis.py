@@ -44,8 +44,8 @@ _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it. One that
 looks like a delay always is: what it promises is for delays that are not its own."""
-_STUCK = 0.7
-"""Of its promise: what keeps less was fitted from delays that are not its own"""
+_STUCK, _AGAIN = 0.7, 2
+"""Of its promise: what keeps less was fitted from delays that are not its own; and so many are fitted from others"""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
 _NEARLY, _MUCH = 0.7, 0.1
@@ -225,7 +225,7 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
             least = max(least, _PROMISING * kept)
             if kept < _STUCK * first.promise:
                 stuck.append((first.promise, found))
-    for promise, one in stuck:
+    for promise, one in stuck[:_AGAIN]:
         if promise > max(WORTH * rows.sum(), *(_kept(about, other) for other in best.values())):
             best[one.name] = max(anew(about, one), best[one.name], key=lambda other: other.gain)
     leader = max(best.values(), key=lambda one: one.gain, default=None)
