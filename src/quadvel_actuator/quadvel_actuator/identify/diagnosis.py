@@ -225,15 +225,17 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
             least = max(least, _PROMISING * kept)
             if kept < _STUCK * first.promise:
                 stuck.append((first.promise, found))
+    settled: set[str] = set()
     for promise, one in stuck[:_AGAIN]:
         if promise > max(WORTH * rows.sum(), *(_kept(about, other) for other in best.values())):
             best[one.name] = max(anew(about, one), best[one.name], key=lambda other: other.gain)
+            settled.add(one.name)
     leader = max(best.values(), key=lambda one: one.gain, default=None)
     less = None if leader is None else simplified(about, leader)
     if less is not None and less.name not in taken:
         best[less.name] = max(less, best.get(less.name, less), key=lambda one: one.gain)
     out = [one for name, one in idle.items() if name not in best]
-    return _settled(about, sorted(best.values(), key=lambda one: -one.gain)), out
+    return _settled(about, sorted(best.values(), key=lambda one: -one.gain), settled), out
 
 
 def _kept(about: About, one: Candidate) -> float:
@@ -241,18 +243,18 @@ def _kept(about: About, one: Candidate) -> float:
     return float((np.maximum(one.joint_gain, 0.0) / about.noise * about.few.fitted_rows).sum())
 
 
-def _settled(about: About, candidates: list[Candidate]) -> list[Candidate]:
-    """The candidates, those in the lead that look like a delay fitted from other delays, too.
+def _settled(about: About, candidates: list[Candidate], settled: set[str]) -> list[Candidate]:
+    """The candidates, those in the lead but the `settled` ones fitted from other delays, too, if one looks like a delay.
 
     What they change and what the delays stand for goes together, and each can be stuck at delays that are not its own.
     """
-    if not candidates:
+    most = candidates[0].gain if candidates else 0.0
+    if most <= WORTH * float(about.noise.mean()):
         return candidates
-    most = candidates[0].gain
-    lead = [one for one in candidates[:_LEAD] if one.law.shifts and one.gain > _NEAR * most > 0.0]
-    if not lead or (len(lead) == 1 and lead[0] is candidates[0]):
+    lead = [one for one in candidates[:_LEAD] if one.gain > _NEAR * most]
+    if len(lead) < 2 or not any(one.law.shifts for one in lead):
         return candidates
-    found = [anew(about, one) if one in lead else one for one in candidates]
+    found = [anew(about, one) if one in lead and one.name not in settled else one for one in candidates]
     return sorted(found, key=lambda one: -one.gain)
 
 
