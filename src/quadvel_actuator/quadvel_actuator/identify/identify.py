@@ -42,6 +42,7 @@ _CLEARLY = 0.97  # of the error
 _NOISY = 0.01  # of the torque's noise: what encoders' noise may add to it
 _STEADY_ROWS = np.array([1, 2, 4, 8])  # to either side, that q and dq may be averaged over
 _STEADY_TIME = 0.0081  # s, at most
+_AT_REST = np.array([0.02, 0.06, 0.2])  # rad/s, widths of friction's step
 _STEADIER = 0.005  # of the noise: what each further step has to take off the error
 
 
@@ -246,13 +247,33 @@ def _steadied(found: Fit, tried: Callable[[float], Fit]) -> tuple[Fit, float]:
     samples, judge, eam = found
     rows, gains = judge.fit | judge.judge, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
     noise = noise_floor(samples, rows, samples.tau - _plain(samples, eam, judge).predict()).mean()
-    if encoder_noise(samples, rows, *gains * _reference(samples)).mean() < _NOISY * noise:
-        return found, 0.0
-    chosen = 0.0
-    for steady in _STEADY_ROWS * samples.period:
-        if steady <= _STEADY_TIME and (other := tried(steady))[2].mse < found[2].mse - _STEADIER * noise:
-            found, chosen = other, float(steady)
+    noisy = encoder_noise(samples, rows, *gains * _reference(samples)).mean() >= _NOISY * noise
+
+    def left(fit: Fit) -> float:
+        """Error beside dry friction, or how much more than without where the PD law itself is hardly blurred."""
+        return _beside_friction(fit) - (0.0 if noisy else fit[2].mse)
+
+    chosen, least = 0.0, left(found)
+    for steady in _STEADY_ROWS[_STEADY_ROWS * samples.period <= _STEADY_TIME] * samples.period:
+        other = tried(steady)
+        error = left(other)
+        if error < least - _STEADIER * noise:
+            found, chosen, least = other, float(steady), error
+        elif error > least:
+            break
     return found, chosen
+
+
+def _beside_friction(fit: Fit) -> float:
+    """Mean squared error of the EAM with dry friction, whose steps noisy speeds blur most, on each joint beside it."""
+    samples, judge, eam = fit
+    dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
+    left, total = samples.tau - eam.predict(samples), 0.0
+    for j, rows in enumerate(judge.fit.T):
+        steps = np.tanh(dq[rows, j, None] / _AT_REST)
+        r = left[rows, j] - steps @ np.linalg.lstsq(steps, left[rows, j], rcond=None)[0]
+        total += float(r @ r)
+    return total / int(judge.fit.sum())
 
 
 def _rows(samples: Samples, fitted: int) -> Judge:
