@@ -44,6 +44,15 @@ def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
     assert any("on which the drive did not act" in finding["text"] for finding in report["findings"])
 
 
+def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
+    truth = _truth(Effect("coulomb_friction", JOINTS, {"c": 0.8, "v_0": 0.05}))
+    log = record(truth, 2, 5.0, 1000, seed=3)
+    noise = np.random.default_rng(0).normal(0.0, 0.04, log.dq.shape)
+    report = identify([attrs.evolve(log, dq=log.dq + noise)]).report
+    assert [one["name"] for one in report["effects"]] in (["coulomb_friction"], ["stribeck_friction"])
+    assert any("noise" in one["text"] and "averaged" in one["text"] for one in report["findings"])
+
+
 def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base():
     def weaker(k, q, dq, tau):
         return tau * np.array([1.0, 0.6])
