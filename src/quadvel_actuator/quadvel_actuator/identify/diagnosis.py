@@ -12,21 +12,18 @@ import attrs
 import numpy as np
 
 from ..effects import registry
-from .candidates import About, Candidate, anew, less_said, propose, simplified, started
+from .candidates import About, Candidate, less_said, propose, started
 from .delays import fit_with_delays, latest
 from .few import Few, remembers
 from .judging import Judge
 from .model import Model
-from .screening import Started
+from .ranking import WORTH, Rejected, Tick, ranked
 from .sharing import pooled, regroupings
 from .signals import Array
 from .valleys import deepest
 
 LEVEL = 0.01
 """An effect is named if chance would bring its gain with less than this probability, all candidates counted."""
-
-WORTH = 0.03
-"""Least gain on the joints that the effect acts on, as a share of the noise."""
 
 MOST = 5
 """Effects of one log at most."""
@@ -39,15 +36,6 @@ _BETTER_FORM = 0.99
 _AS_WELL = 0.02
 """Of the noise: what an account with gains that can be believed may lose."""
 
-_FITTED = 5
-_PROMISING, _LITTLE = 0.5, 0.1
-"""A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
-keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it. One that
-looks like a delay always is: what it promises is for delays that are not its own."""
-_STUCK, _AGAIN = 0.7, 2
-"""Of its promise: what keeps less was fitted from delays that are not its own; and so many are fitted from others"""
-_LEAD, _NEAR = 3, 0.8
-"""So many in the lead, and so near the best one's gain"""
 _NEARLY, _MUCH = 0.7, 0.1
 """Of the best gain; and of the noise, what is much beside it"""
 _FEW = 2
@@ -56,8 +44,6 @@ _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
 _SIMPLER_LOSES = 0.01  # of the noise
-
-Tick = Callable[[str], None]
 
 
 @attrs.frozen(eq=False)
@@ -68,15 +54,6 @@ class Finding:
     gain: float  # held-out error without it less that with it, N^2 m^2
     p: float
     indistinguishable: tuple[str, ...] = ()
-
-
-@attrs.frozen(eq=False)
-class Rejected:
-    """A law that did not."""
-
-    name: str
-    gain: float
-    reason: str
 
 
 @attrs.frozen(eq=False)
@@ -182,80 +159,6 @@ def _reformed(model: Model, judge: Judge, few: Few) -> Model:
             if other.error(judge.judge) < _BETTER_FORM * model.error(judge.judge):
                 model = other
     return model
-
-
-def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:
-    """Every law of the registry on top of the model, the best form of each, least held-out error first.
-
-    Second, those that do not come into question.
-    """
-    idle: dict[str, Rejected] = {}
-    best: dict[str, Candidate] = {}
-    looked: list[Started] = []
-    stuck: list[tuple[float, Candidate]] = []  # with what they promised, which no other law keeps
-    taken = {one.law.name for one in about.model.applied}
-    for name, law in registry().items():
-        tick(f"{what}: {name}")
-        if name in taken:
-            continue
-        idle[name] = Rejected(name, 0.0, "takes nothing off the error of the fitted data")
-        looked += [one for one in (started(about, form) for form in law.variants(about)) if one is not None]
-    looked.sort(key=lambda one: -one.promise)
-    rows = about.few.fitted_rows
-    above = float(np.maximum(about.left - rows, 0.0).sum())
-    least = _LITTLE * above
-    if above < _LITTLE * rows.sum():
-        least = _PROMISING * max(
-            (one.promise for one in looked if one.law.foretold() is one.law), default=0.0
-        )
-    for k, first in enumerate(looked):
-        name = first.law.name
-        costly = k >= _FITTED or first.law.remembers
-        if costly and not first.law.shifts and first.promise < least:
-            idle[name] = Rejected(name, 0.0, "takes far less off the error of the fitted data than others do")
-            continue
-        tick(f"{what}: {name}, fitted")
-        found = propose(about, first)
-        if found is None:
-            continue
-        if name not in best or found.gain > best[name].gain:
-            best[name] = found
-        if found.law.foretold() is found.law:
-            kept = _kept(about, found)
-            least = max(least, _PROMISING * kept)
-            if kept < _STUCK * first.promise:
-                stuck.append((first.promise, found))
-    settled: set[str] = set()
-    for promise, one in stuck[:_AGAIN]:
-        if promise > max(WORTH * rows.sum(), *(_kept(about, other) for other in best.values())):
-            best[one.name] = max(anew(about, one), best[one.name], key=lambda other: other.gain)
-            settled.add(one.name)
-    leader = max(best.values(), key=lambda one: one.gain, default=None)
-    less = None if leader is None else simplified(about, leader)
-    if less is not None and less.name not in taken:
-        best[less.name] = max(less, best.get(less.name, less), key=lambda one: one.gain)
-    out = [one for name, one in idle.items() if name not in best]
-    return _settled(about, sorted(best.values(), key=lambda one: -one.gain), settled), out
-
-
-def _kept(about: About, one: Candidate) -> float:
-    """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
-    return float((np.maximum(one.joint_gain, 0.0) / about.noise * about.few.fitted_rows).sum())
-
-
-def _settled(about: About, candidates: list[Candidate], settled: set[str]) -> list[Candidate]:
-    """The candidates, those in the lead but the `settled` ones fitted from other delays, too, if one looks like a delay.
-
-    What they change and what the delays stand for goes together, and each can be stuck at delays that are not its own.
-    """
-    most = candidates[0].gain if candidates else 0.0
-    if most <= WORTH * float(about.noise.mean()):
-        return candidates
-    lead = [one for one in candidates[:_LEAD] if one.gain > _NEAR * most]
-    if len(lead) < 2 or not any(one.law.shifts for one in lead):
-        return candidates
-    found = [anew(about, one) if one in lead and one.name not in settled else one for one in candidates]
-    return sorted(found, key=lambda one: -one.gain)
 
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:

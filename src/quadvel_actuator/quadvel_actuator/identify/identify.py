@@ -13,7 +13,7 @@ import numpy as np
 
 from ..parameters import ActuatorParameters
 from .delays import fit_with_delays, in_steps, latest
-from .diagnosis import Diagnosis, Rejected, diagnosed
+from .diagnosis import Diagnosis, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
 from .excerpts import Piece, evened, jitters, pieces
 from .findings import Finding
@@ -27,6 +27,7 @@ from .log import Log, LogError
 from .model import Model
 from .motion import STRETCH, Body, Replay, implied, replayed
 from .outcome import Outcome, identification, parameters
+from .ranking import Rejected
 from .residual import remainder
 from .signals import Array, Samples
 from .simplest import Alone, account

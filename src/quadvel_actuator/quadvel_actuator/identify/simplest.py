@@ -11,10 +11,11 @@ from functools import cached_property
 import attrs
 import numpy as np
 
-from .diagnosis import Diagnosis, Rejected
+from .diagnosis import Diagnosis
 from .judging import Judge
 from .learned import LEVEL, WORTH, Learned, learn
 from .model import Model
+from .ranking import Rejected
 from .signals import Array
 
 _AT_FLOOR = 1.05
