@@ -298,11 +298,9 @@ def _decision(report: Mapping[str, Any]) -> str:
         else f"rises by {-cut:.0f} %, as it holds what the fitted data do not show"
     )
     text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
-    more = (
-        f"; what was learned beyond them depends on {', '.join(rest['depends_on'])}"
-        if rest["depends_on"]
-        else ""
-    )
+    learned = any(one["name"] == TERMS for one in effects)
+    beyond = "what was learned beyond them" if learned else "what is left"
+    more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
     for one in effects:
         if "samples_hit" in one:
             more += (
