@@ -44,6 +44,7 @@ _NOISY = 0.01  # of the torque's noise: what encoders' noise may add to it
 _STEADY_ROWS = np.array([1, 2, 4, 8])  # to either side, that q and dq may be averaged over
 _STEADY_TIME = 0.0081  # s, at most
 _AT_REST = np.array([0.02, 0.06, 0.2])  # rad/s, widths of friction's step
+_BLURRED_TIME = 0.0021  # s, at most where only friction shows it: bristles and play act on as slow a scale as the longer ones
 _STEADIER = 0.005  # of the noise: what each further step has to take off the error
 
 
@@ -255,7 +256,8 @@ def _steadied(found: Fit, tried: Callable[[float], Fit]) -> tuple[Fit, float]:
         return _beside_friction(fit) - (0.0 if noisy else fit[2].mse)
 
     chosen, least = 0.0, left(found)
-    for steady in _STEADY_ROWS[_STEADY_ROWS * samples.period <= _STEADY_TIME] * samples.period:
+    widths = _STEADY_ROWS * samples.period
+    for steady in widths[widths <= (_STEADY_TIME if noisy else _BLURRED_TIME)]:
         other = tried(steady)
         error = left(other)
         if error < least - _STEADIER * noise:
