@@ -33,8 +33,7 @@ def another(monkeypatch):
             parallel.join("cpu")
             yield process
         finally:
-            if torch.distributed.is_initialized():
-                torch.distributed.destroy_process_group()
+            parallel.leave()
             process.kill()
 
 
@@ -45,6 +44,6 @@ def test_two_processes_with_half_of_the_robots_each_take_the_step_of_one_with_al
     together = update(slice(0, 4))
     assert parallel.from_first("first") == "first"
     assert another.wait(30) == 0
-    torch.distributed.destroy_process_group()
+    parallel.leave()
     for name, expected in update(slice(0, 8)).items():
         assert torch.allclose(together[name], expected, atol=1e-6), name

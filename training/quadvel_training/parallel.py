@@ -5,6 +5,7 @@ Each process has environments of its own. A single process, started without torc
 
 from __future__ import annotations
 
+import atexit
 import os
 from typing import Any
 
@@ -18,8 +19,15 @@ def join(device: str) -> torch.device:
         return torch.device(device)
     if not dist.is_initialized():
         dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+        atexit.register(leave)
     local = int(os.environ["LOCAL_RANK"])
     return torch.device(device, local) if device == "cuda" else torch.device(device)
+
+
+def leave() -> None:
+    """Be one of several no more: a process that ends with threads of its group at work can abort."""
+    if dist.is_initialized():
+        dist.destroy_process_group()
 
 
 def rank() -> int:
