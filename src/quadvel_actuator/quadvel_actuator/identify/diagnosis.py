@@ -121,7 +121,7 @@ def diagnose(
             continue
         if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
             break
-        best, tied = _choice(_in_order(candidates, judge, noise, few), judge, noise)
+        best, tied = _choice(_simpler_first(candidates, judge, noise, few), judge, noise)
         found = few.fitted(about.fit_anew(best.model.holding(False)), deepest, 1)
         found = fit_with_delays(found, judge.fit)
         found = _reformed(found, judge, few)
@@ -246,7 +246,9 @@ def _choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tupl
     return chosen, tuple(one.name for one in equal if one is not chosen)[:_TIES]
 
 
-def _in_order(candidates: Sequence[Candidate], judge: Judge, noise: Array, few: Few) -> Sequence[Candidate]:
+def _simpler_first(
+    candidates: Sequence[Candidate], judge: Judge, noise: Array, few: Few
+) -> Sequence[Candidate]:
     """The candidates, a simpler law first that is nearly as good as the best one and with that on top says more than it.
 
     The best one alone may owe its place to parameters that stand for both, and it would not find its own again.

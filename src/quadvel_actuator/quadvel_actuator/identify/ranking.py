@@ -31,7 +31,7 @@ Tick = Callable[[str], None]
 
 @attrs.frozen(eq=False)
 class Rejected:
-    """A law that did not."""
+    """A law that was turned down, and why."""
 
     name: str
     gain: float
