@@ -92,13 +92,11 @@ class SlewLimit(MemoryLaw):
 
 def _chasing(given: Array, target: Array, slope: Array, time: Array, rate: Array) -> Array:
     """Where `given` comes in `time` at `rate` at most after a target that moves evenly, by `slope`."""
-    side = np.sign(given - target)
-    nearing = rate + side * slope
-    apart = np.abs(given - target)
-    met = np.where(nearing > 0.0, apart / np.maximum(nearing, 1e-12), np.inf)
-    left = np.maximum(time - met, 0.0)
-    chased = np.minimum(met, time)
-    return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * left
+    ahead = given - target
+    side = np.sign(ahead)
+    nearing = np.maximum(rate + side * slope, 1e-12)
+    chased = np.minimum(np.abs(ahead) / nearing, time)
+    return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * (time - chased)
 
 
 LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)

@@ -23,6 +23,8 @@ from .log import Log, LogError
 from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
+CORES = 4
+"""More have little to do: each round of effects waits for its last"""
 M_MMAP_THRESHOLD, LARGE = -3, 1 << 22  # of glibc's mallopt; bytes
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
@@ -78,6 +80,12 @@ def identify(
     joints: Annotated[
         list[str] | None, typer.Option(metavar="NAME...", help="Use these joints only.", show_default="all")
     ] = None,
+    cores: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="How many share the work.", show_default=f"those there are, {CORES} at most"
+        ),
+    ] = None,
 ) -> None:
     """Find what the actuator model lacks, from measured logs of joints.
 
@@ -104,10 +112,14 @@ def identify(
     """
     messages = Console(stderr=True)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, messages)
+        _run(logs, holdout or [], out, base, gains, joints, cores or _cores(), messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
+
+
+def _cores() -> int:
+    return min(CORES, len(os.sched_getaffinity(0)))
 
 
 def _run(
@@ -117,6 +129,7 @@ def _run(
     base: Path | None,
     gains: tuple[float, float] | None,
     joints: Sequence[str] | None,
+    cores: int,
     messages: Console,
 ) -> None:
     _check_folder(out)
@@ -133,7 +146,7 @@ def _run(
         found = identify(
             fitted,
             judged,
-            Options(gains=gains, base=parameters),
+            Options(gains=gains, base=parameters, cores=cores),
             lambda share, text: bar.update(task, completed=share, description=text),
         )
     write(found, out)

@@ -66,18 +66,18 @@ class Diagnosis:
 
 
 def diagnosed(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool]
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool], cores: int
 ) -> Diagnosis:
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
     What a joint swings freely can hide an inertia in lesser gains, and the other effects then come out bent. The account
     with the commanded gains is taken where it predicts as well. Without measured torque the gains set the scale of all.
     """
-    found = diagnose(model, judge, noise, tick, otherwise)
+    found = diagnose(model, judge, noise, tick, otherwise, cores)
     if model.implied or not model.samples.commanded or not _far(found.model):
         return found
     as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
-    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick, otherwise)
+    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick, otherwise, cores)
     if not other.findings:
         return found
     tau = model.samples.tau
@@ -98,7 +98,7 @@ def _released(model: Model, few: Few) -> Model:
 
 
 def diagnose(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool]
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool], cores: int
 ) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
 
@@ -113,7 +113,7 @@ def diagnose(
             break
         model = model.holding(True)
         about = About(model, judge, noise, few)
-        candidates, idle = ranked(about, tick, f"effect {number + 1}")
+        candidates, idle = ranked(about, tick, f"effect {number + 1}", cores)
         rejected = [*(_reason(one, noise, len(registry())) for one in candidates), *idle]
         finer = _finer(model, candidates, judge, noise, few)
         if finer is not None:

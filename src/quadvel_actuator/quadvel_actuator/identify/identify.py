@@ -58,6 +58,8 @@ class Options:
     """its torque limits go into the corrected model"""
     values: int = 144_000
     """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
+    cores: int = 1
+    """that work side by side; the report is the same"""
 
 
 def identify(
@@ -98,7 +100,7 @@ def identify(
     def tick(text: str) -> None:
         tell(min(0.1 + 0.008 * next(steps), 0.85), text)
 
-    diagnosis = diagnosed(before, judge, noise, tick, alone.says_all)
+    diagnosis = diagnosed(before, judge, noise, tick, alone.says_all, options.cores)
     tell(0.88, "what no effect explains")
     late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)

@@ -155,7 +155,11 @@ class Model:
         """What a law makes of `x`; with a memory, the latest are kept, as a fit of other parameters asks for them again."""
         law, p = one.law, one.part(value)
         if isinstance(law, ErrorLaw):
-            return law.errors(x, s, p)
+            if x[0].ndim > 2:
+                return law.errors(x, s, p)
+            some, which = _distinct(value)
+            after = law.errors(x, s, one.part(some))
+            return tuple(part[which] if part.ndim > 2 else part for part in after)
         if not isinstance(law, MemoryLaw):
             return law.torque(x, s, p)  # type: ignore[attr-defined]
         if len(_lean(value)) > 1:
@@ -205,6 +209,13 @@ class Model:
 def _lean(batch: Array) -> Array:
     """A batch of equal values as one."""
     return batch[:1] if len(batch) > 1 and (batch == batch[0]).all() else batch
+
+
+def _distinct(batch: Array) -> tuple[Array, NDArray[np.intp]]:
+    """The different ones of a batch, and which of them each is: where slopes are taken, most are the same."""
+    first: dict[bytes, int] = {}
+    which = np.array([first.setdefault(one.tobytes(), len(first)) for one in batch])
+    return batch[np.unique(which, return_index=True)[1]], which
 
 
 def _where(active: Bools, new: Array, old: Array) -> Array:

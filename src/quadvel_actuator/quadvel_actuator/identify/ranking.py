@@ -10,7 +10,8 @@ from collections.abc import Callable
 import attrs
 import numpy as np
 
-from ..effects import registry
+from ..effects import EffectLaw, registry
+from .ahead import Ahead, R
 from .candidates import About, Candidate, anew, propose, simplified, started
 from .screening import Started
 
@@ -38,12 +39,12 @@ class Rejected:
     reason: str
 
 
-def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:
+def ranked(about: About, tick: Tick, what: str, cores: int = 1) -> tuple[list[Candidate], list[Rejected]]:
     """Every law of the registry on top of the model, the best form of each, least held-out error first.
 
-    Second, those that do not come into question.
+    Second, those that do not come into question. `cores` share the work.
     """
-    race = _Race(about)
+    race = _Race(about, cores)
     looked = race.looked(lambda name: tick(f"{what}: {name}"))
     race.fit(looked, lambda name: tick(f"{what}: {name}, fitted"))
     race.fit_stuck_ones_again()
@@ -55,8 +56,8 @@ def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[R
 class _Race:
     """The best candidate of each law so far."""
 
-    def __init__(self, about: About) -> None:
-        self.about = about
+    def __init__(self, about: About, cores: int) -> None:
+        self.about, self.cores = about, cores
         self.taken = {one.law.name for one in about.model.applied}
         self.best: dict[str, Candidate] = {}
         self.idle: dict[str, Rejected] = {}
@@ -65,36 +66,48 @@ class _Race:
 
     def looked(self, tick: Tick) -> list[Started]:
         """Where to fit each form of each law from, the most promising first."""
-        found: list[Started] = []
+        forms: list[EffectLaw] = []
         for name, law in registry().items():
-            tick(name)
             if name not in self.taken:
                 reason = "takes nothing off the error of the fitted data"
                 self.idle[name] = Rejected(name, 0.0, reason)
-                starts = (started(self.about, form) for form in law.variants(self.about))
-                found += [one for one in starts if one is not None]
+                forms += law.variants(self.about)
+        found: list[Started] = []
+        with self._ahead(lambda k: started(self.about, forms[k])) as ahead:
+            for k, form in enumerate(forms):
+                tick(form.name)
+                one = ahead.take(k, range(k + 1, len(forms)))
+                found += [one] if one is not None else []
         return sorted(found, key=lambda one: -one.promise)
 
     def fit(self, looked: list[Started], tick: Tick) -> None:
         """All that are quick to fit, or promise enough."""
         least = self._least_promise(looked)
-        for k, first in enumerate(looked):
-            name = first.law.name
-            costly = k >= _FITTED or first.law.remembers
-            if costly and not first.law.shifts and first.promise < least:
-                reason = "takes far less off the error of the fitted data than others do"
-                self.idle[name] = Rejected(name, 0.0, reason)
-                continue
-            tick(name)
-            found = propose(self.about, first)
-            if found is None:
-                continue
-            self._take(found)
-            if found.law.foretold() is found.law:
-                kept = self._kept(found)
-                least = max(least, _PROMISING * kept)
-                if kept < _STUCK * first.promise:
-                    self._stuck.append((first.promise, found))
+
+        def counts(k: int) -> bool:
+            law = looked[k].law
+            return (k < _FITTED and not law.remembers) or law.shifts or looked[k].promise >= least
+
+        with self._ahead(lambda k: propose(self.about, looked[k])) as ahead:
+            for k, first in enumerate(looked):
+                name = first.law.name
+                if not counts(k):
+                    reason = "takes far less off the error of the fitted data than others do"
+                    self.idle[name] = Rejected(name, 0.0, reason)
+                    continue
+                tick(name)
+                found = ahead.take(k, filter(counts, range(k + 1, len(looked))))
+                if found is None:
+                    continue
+                self._take(found)
+                if found.law.foretold() is found.law:
+                    kept = self._kept(found)
+                    least = max(least, _PROMISING * kept)
+                    if kept < _STUCK * first.promise:
+                        self._stuck.append((first.promise, found))
+
+    def _ahead(self, work: Callable[[int], R]) -> Ahead[R]:
+        return Ahead(work, self.cores, self.about.samples)
 
     def _least_promise(self, looked: list[Started]) -> float:
         rows = self.about.few.fitted_rows

@@ -207,7 +207,9 @@ class _LogSignals:
     def shifted(self, name: str, at: Array) -> Array:
         """A state signal of every joint at times of its own, (..., N, J)."""
         values = self.states[name]
-        row, share = self.between(at)
+        row, share = (
+            one.swapaxes(-1, -2) for one in self.between(at.swapaxes(-1, -2))
+        )  # each joint's in order of time
         joint = np.arange(values.shape[1])
         early: Array = values[row, joint]
         return early + share * (values[row + 1, joint] - early)
