@@ -29,6 +29,8 @@ QUADVEL = ("quadvel_bringup", "quadvel")
 STATE = ("controller/state", "quadvel_msgs/msg/ControllerState", "mode_name")
 FORWARD = ("ground_truth/odom", "nav_msgs/msg/Odometry", "twist.twist.linear.x")
 TRUTH_RATE = 200
+LOOKING = ("--no-daemon", "--spin-time", "5")
+"""A command that asks a node looks for it so long (s); Fast DDS takes some seconds where lo has no multicast."""
 RESET = ("/sim_node/reset", "quadvel_msgs/srv/ResetSim", "{keyframe: stand}")
 
 RESET_FROM_EMBEDDED = """
@@ -103,16 +105,16 @@ def test_parameters_come_from_yaml_and_are_told_but_fixed(ros: Any, tmp_path: Pa
     file.write_text("estimator:\n  ros__parameters:\n    kind: kalman\n    reset_gap: 0.25\n")
     ros.node("estimator", "--params-file", str(file), "-p", "reset_gap:=0.5", embedded=embedded)
     ros.wait_for_nodes("/estimator")
-    listed = ros.call("ros2", "param", "list", "/estimator", "--no-daemon").split()
+    listed = ros.call("ros2", "param", "list", "/estimator", *LOOKING).split()
     assert {"kind", "reset_gap", "use_sim_time"} <= {*listed}
-    assert "kalman" in ros.call("ros2", "param", "get", "/estimator", "kind", "--no-daemon")
-    assert "0.5" in ros.call("ros2", "param", "get", "/estimator", "reset_gap", "--no-daemon")
-    described = ros.call("ros2", "param", "describe", "/estimator", "reset_gap", "--no-daemon")
+    assert "kalman" in ros.call("ros2", "param", "get", "/estimator", "kind", *LOOKING)
+    assert "0.5" in ros.call("ros2", "param", "get", "/estimator", "reset_gap", *LOOKING)
+    described = ros.call("ros2", "param", "describe", "/estimator", "reset_gap", *LOOKING)
     assert "Read only: true" in described
-    refused = ros.start("ros2", "param", "set", "/estimator", "reset_gap", "0.1", "--no-daemon")
+    refused = ros.start("ros2", "param", "set", "/estimator", "reset_gap", "0.1", *LOOKING)
     refused.wait(60.0)
     assert "read-only" in refused.text, refused.text
-    assert "0.5" in ros.call("ros2", "param", "get", "/estimator", "reset_gap", "--no-daemon")
+    assert "0.5" in ros.call("ros2", "param", "get", "/estimator", "reset_gap", *LOOKING)
 
 
 @pytest.mark.parametrize(
@@ -156,13 +158,13 @@ def test_ros2_sees_embedded_nodes_their_endpoints_and_their_types(ros: Any) -> N
     for name in NODES:
         ros.node(name, embedded=True)
     ros.wait_for_nodes(*(f"/{name}" for name in NODES))
-    info = ros.call("ros2", "node", "info", "/controller", "--no-daemon", "--spin-time", "2")
+    info = ros.call("ros2", "node", "info", "/controller", "--no-daemon", "--spin-time", "5")
     assert "/low_cmd: quadvel_msgs/msg/LowCmd" in info
     assert "/low_state: quadvel_msgs/msg/LowState" in info
     assert "/controller/set_mode: quadvel_msgs/srv/SetMode" in info
     ros.node("estimator", "-r", "__node:=other")  # its reader's type hash comes from ROS 2's own generator
     ros.wait_for_nodes("/other")
-    verbose = ros.call("ros2", "topic", "info", "/low_cmd", "--verbose", "--no-daemon", "--spin-time", "2")
+    verbose = ros.call("ros2", "topic", "info", "/low_cmd", "--verbose", "--no-daemon", "--spin-time", "5")
     hashes = re.findall(r"Topic type hash: (\S+)", verbose)
     assert len(hashes) >= 3, verbose
     assert len({*hashes}) == 1, verbose
