@@ -23,8 +23,8 @@ from .log import Log, LogError
 from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
-CORES = 4
-"""More have little to do: each round of effects waits for its last"""
+CORES = 2
+"""Unless more are asked for: each takes some 200 MB"""
 M_MMAP_THRESHOLD, LARGE = -3, 1 << 22  # of glibc's mallopt; bytes
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
