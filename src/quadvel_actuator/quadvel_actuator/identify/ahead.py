@@ -20,6 +20,7 @@ from .signals import Samples
 
 R = TypeVar("R")
 PR_SET_PDEATHSIG = 1
+INTERRUPT = {signal.SIGINT}
 
 
 class Ahead(Generic[R]):
@@ -38,6 +39,9 @@ class Ahead(Generic[R]):
             copies = multiprocessing.get_context("fork")
             task = (self._work, self._samples)
             self._pool = ProcessPoolExecutor(self._cores, copies, initializer=_learn, initargs=task)
+            signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)  # until the copies end without a word
+            self._pool.submit(int)  # which makes them
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
         return self
 
     def __exit__(self, *error: object) -> None:
@@ -64,6 +68,7 @@ def _learn(work: Callable[[int], Any], samples: Samples) -> None:
     global _task
     _task = work, samples
     signal.signal(signal.SIGINT, signal.SIG_DFL)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
     sys.stdout = sys.stderr = None  # their locks may have been copied while held
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # what it waits for would never come
 
