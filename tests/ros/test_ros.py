@@ -158,13 +158,13 @@ def test_ros2_sees_embedded_nodes_their_endpoints_and_their_types(ros: Any) -> N
     for name in NODES:
         ros.node(name, embedded=True)
     ros.wait_for_nodes(*(f"/{name}" for name in NODES))
-    info = ros.call("ros2", "node", "info", "/controller", "--no-daemon", "--spin-time", "5")
+    info = ros.call("ros2", "node", "info", "/controller", *LOOKING)
     assert "/low_cmd: quadvel_msgs/msg/LowCmd" in info
     assert "/low_state: quadvel_msgs/msg/LowState" in info
     assert "/controller/set_mode: quadvel_msgs/srv/SetMode" in info
     ros.node("estimator", "-r", "__node:=other")  # its reader's type hash comes from ROS 2's own generator
     ros.wait_for_nodes("/other")
-    verbose = ros.call("ros2", "topic", "info", "/low_cmd", "--verbose", "--no-daemon", "--spin-time", "5")
+    verbose = ros.call("ros2", "topic", "info", "/low_cmd", "--verbose", *LOOKING)
     hashes = re.findall(r"Topic type hash: (\S+)", verbose)
     assert len(hashes) >= 3, verbose
     assert len({*hashes}) == 1, verbose

@@ -207,9 +207,8 @@ class _LogSignals:
     def shifted(self, name: str, at: Array) -> Array:
         """A state signal of every joint at times of its own, (..., N, J)."""
         values = self.states[name]
-        row, share = (
-            one.swapaxes(-1, -2) for one in self.between(at.swapaxes(-1, -2))
-        )  # each joint's in order of time
+        in_order = at.swapaxes(-1, -2)  # each joint's times, which is quicker to look up
+        row, share = (one.swapaxes(-1, -2) for one in self.between(in_order))
         joint = np.arange(values.shape[1])
         early: Array = values[row, joint]
         return early + share * (values[row + 1, joint] - early)
