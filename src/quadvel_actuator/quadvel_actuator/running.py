@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.effects import DRIVE, JOINT, EffectLaw, MemoryLaw, Stage, registry
 from quadvel_actuator.effects.terms import NAME as TERMS
-from quadvel_actuator.effects.terms import RunningTerms
+from quadvel_actuator.effects.terms import RunningTerms, Term, all_loaded
 from quadvel_actuator.parameters import Effect
 
 Array = NDArray[np.float64]
@@ -191,10 +191,10 @@ def _range(
     return low, high
 
 
-def _terms(effect: Effect, joints: Sequence[str], dt: float) -> RunningTerms:
+def _terms(effect: Effect, joints: Sequence[str]) -> list[Term]:
     """The terms that an effect of the name `learned_residual` holds."""
     try:
-        return RunningTerms(effect.parameters.get("terms"), joints, dt)
+        return all_loaded(effect.parameters.get("terms"), joints)
     except ValueError as error:
         raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
 
@@ -213,7 +213,10 @@ class RunningEffects:
         added = [one for one in self._all if one.law.stage == Stage.ADDED]
         self._added = [one for one in added if one.law.at == DRIVE]
         self._at_joint = [one for one in added if one.law.at == JOINT]
-        self._terms = [_terms(one, joints, dt) for one in effects if one.name == TERMS]
+        terms = [term for one in effects if one.name == TERMS for term in _terms(one, joints)]
+        self._terms, self._terms_at_joint = (
+            RunningTerms([one for one in terms if one.at == at], joints, dt) for at in (DRIVE, JOINT)
+        )
         self._now = Instant(shape, dt)
         self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
 
@@ -249,16 +252,14 @@ class RunningEffects:
         total = torque
         for one in self._added:
             total = total + one.act(torque, now, new)
-        for terms in self._terms:
-            total = total + terms.act(total, now, new)
-        return total
+        return total + self._terms.act(total, now, new)
 
     def at_joint(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
         """What the joints get, now, of the drives' `torque`, which comes an output delay after it was asked for."""
         total = torque
         for one in self._at_joint:
             total = total + one.act(torque, self._now, new)
-        return total
+        return total + self._terms_at_joint.act(total, self._now, new)
 
     def _observe(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> Instant:
         now = self._now
@@ -275,7 +276,7 @@ class RunningEffects:
 
     @property
     def _memories(self) -> list[_Running | RunningTerms]:
-        return [*self._all, *self._terms]
+        return [*self._all, self._terms, self._terms_at_joint]
 
     def remember(self) -> Any:
         """Everything that a step changes, for `recall`."""

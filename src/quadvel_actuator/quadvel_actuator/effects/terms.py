@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from .base import Array, Memory, View, smooth_sign
+from .base import DRIVE, JOINT, Array, Memory, View, smooth_sign
 
 NAME = "learned_residual"
 """Under which terms stand in reports and parameter files."""
@@ -291,6 +291,8 @@ class Term:
     active: NDArray[np.bool_]  # (J,)
     weights: Array  # (K, J)
     bound: Array  # (J,), N m
+    at: str = DRIVE
+    """where it is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -321,6 +323,7 @@ class Term:
             "kind": shape.kind,
             "signal": self.signal,
             "times": self.times,
+            "at": self.at,
             "joints": [joints[int(j)] for j in on],
             **{k: np.asarray(v).tolist() for k, v in attrs.asdict(shape, recurse=False).items()},
             "weights": self.weights[:, on].T.tolist(),
@@ -333,10 +336,11 @@ def loaded(entry: Any, joints: Sequence[str]) -> Term:
     if not isinstance(entry, Mapping):
         raise ValueError(f"found {entry!r}, expected a mapping")
     rest = dict(entry)
-    kind, signal, times = (_word(rest, name) for name in ("kind", "signal", "times"))
+    rest.setdefault("at", DRIVE)
+    kind, signal, times, at = (_word(rest, name) for name in ("kind", "signal", "times", "at"))
     owner, _, plain = signal.rpartition("/")
     for field, value, known in (
-        ("kind", kind, SHAPES), ("times", times, TIMES), ("signal", plain, SIGNALS),
+        ("kind", kind, SHAPES), ("times", times, TIMES), ("at", at, (DRIVE, JOINT)), ("signal", plain, SIGNALS),
         ("signal", owner, ("", *joints)),
     ):  # fmt: skip
         if value not in known:
@@ -367,7 +371,20 @@ def loaded(entry: Any, joints: Sequence[str]) -> Term:
         )
     every = np.zeros((shape.count, len(joints))), np.zeros(len(joints))
     every[0][:, on], every[1][on] = weights.T, bound
-    return Term(signal, times, shape, np.isin(np.arange(len(joints)), on), *every)
+    return Term(signal, times, shape, np.isin(np.arange(len(joints)), on), *every, at)
+
+
+def all_loaded(entries: Any, joints: Sequence[str]) -> list[Term]:
+    """Terms from their entries; ValueError says what is wrong with which."""
+    if not isinstance(entries, (list, tuple)):
+        raise ValueError(f"terms: found {entries!r}, expected a list")
+    terms = []
+    for number, entry in enumerate(entries):
+        try:
+            terms.append(loaded(entry, joints))
+        except ValueError as error:
+            raise ValueError(f"terms[{number}]/{error}") from None
+    return terms
 
 
 def _word(entry: dict[str, Any], name: str) -> str:
@@ -389,22 +406,16 @@ def _numbers(value: Any, name: str) -> Any:
 
 
 class RunningTerms:
-    """All terms of a model at work, step by step, on top of its torque."""
+    """Terms of a model at work, step by step, on top of its torque."""
 
-    def __init__(self, entries: Any, joints: Sequence[str], dt: float) -> None:
-        if not isinstance(entries, (list, tuple)):
-            raise ValueError(f"terms: found {entries!r}, expected a list")
-        self.terms = []
-        for number, entry in enumerate(entries):
-            try:
-                self.terms.append(loaded(entry, joints))
-            except ValueError as error:
-                raise ValueError(f"terms[{number}]/{error}") from None
-        self._joints, self._dt = joints, dt
+    def __init__(self, terms: Sequence[Term], joints: Sequence[str], dt: float) -> None:
+        self.terms, self._joints, self._dt = terms, joints, dt
         self.memory: tuple[Memory, ...] = ()
 
-    def act(self, tau: Array, now: View, new: NDArray[np.bool_] | None) -> Array:
+    def act(self, tau: Array, now: View, new: NDArray[np.bool_] | None) -> Array | float:
         """The torque to add to `tau` (..., J); environments that are `new` start from rest."""
+        if not self.terms:
+            return 0.0
         if new is not None:
             rest = tuple(one.rest(now, tau, self._joints, self._dt) for one in self.terms)
             whole = not self.memory or bool(new.all())

@@ -28,8 +28,6 @@ LEVEL = 0.01
 MOST = 5
 """Effects of one log at most."""
 
-_FAR = 0.4
-"""Logarithm of a gain over the commanded one that is hard to believe."""
 _BETTER_FORM = 0.99
 """of the held-out error, that another form of a law has to leave at most"""
 
@@ -74,7 +72,7 @@ def diagnosed(
     with the commanded gains is taken where it predicts as well. Without measured torque the gains set the scale of all.
     """
     found = diagnose(model, judge, noise, tick, otherwise, cores)
-    if model.implied or not model.samples.commanded or not _far(found.model):
+    if model.implied or not model.samples.commanded or found.model.believable:
         return found
     as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
     other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick, otherwise, cores)
@@ -85,16 +83,12 @@ def diagnosed(
     return other if lost < _AS_WELL * float(noise.mean()) else found
 
 
-def _far(model: Model) -> bool:
-    return bool((np.abs(np.log(np.maximum(model.gains[0], 1e-3))) > _FAR).any())
-
-
 def _released(model: Model, few: Few) -> Model:
     """With gains that are held left free, if they then stay near those commanded."""
     if not model.gains_held:
         return model
     free = few.fitted(attrs.evolve(model, gains_held=False), fit_with_delays, 10)
-    return model if _far(free) else free
+    return free if free.believable else model
 
 
 def diagnose(

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 import attrs
 import numpy as np
 
+from ..effects import DRIVE, JOINT
 from ..effects.terms import Curve, Filter, Lag, Resonance, Shape, Wave, factor, inputs, read
 from ..running import SLOPE
 from .delays import jacobian_with_delays
@@ -22,20 +23,38 @@ _DAMPING = (0.02, 0.07, 0.2)
 _LAGS = np.geomspace(0.01, 1.0, 8)  # s
 _RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
 _COARSE, _MIDDLE, _FINE, _FINEST = 3, 6, 25, 70  # pieces of a curve
+_COMMANDED = "q_des", "error", "tau"
 
 
 @attrs.frozen(eq=False)
 class Feature:
-    """A shape of a signal, times something."""
+    """A shape of a signal, times something; what commands move is first looked for in the drive, all else at the joint."""
 
     signal: str
     times: str
     shape: Shape
+    at: str = attrs.field()
+    """where its torque is added, DRIVE or JOINT"""
+
+    @at.default
+    def _usual_place(self) -> str:
+        return DRIVE if self.signal in _COMMANDED or self.times in _COMMANDED else JOINT
+
+    @property
+    def movable(self) -> bool:
+        """Can it act at the other place, too? At the joint nothing of commands is known but the torque that they made."""
+        return self.signal not in ("q_des", "error", "t")
 
     @property
     def key(self) -> tuple[str, ...]:
         """Features with the same one stand for each other: the best of them comes into question."""
         return inputs(self.signal, self.times, self.shape)
+
+    @property
+    def family(self) -> tuple[str, str, str, int] | None:
+        """The same of other neighbours; None of what is the joint's own."""
+        owner, _, plain = self.signal.rpartition("/")
+        return (plain, self.times, self.shape.kind, self.shape.count) if owner else None
 
     @property
     def size(self) -> tuple[int, int]:
@@ -54,7 +73,7 @@ class Scene:
         self.residual = np.where(self.rows, model.samples.tau - self.asked, 0.0)
         self.dt = model.samples.period
         self.start = model.samples.start
-        self.view = _past_only(model.signals, self.dt)
+        self.views = {at: _past_only(model.seen(at), self.dt) for at in (DRIVE, JOINT)}
         self._taken: dict[Feature, dict[int, Array]] = {}
 
     def taken(self, feature: Feature, joints: Bools) -> dict[int, Array]:
@@ -69,12 +88,13 @@ class Scene:
 
     def columns(self, feature: Feature, rows: slice = EVERY) -> Array:
         """What the feature is a sum of, (N, K, J), at some rows."""
-        u = read(feature.signal, self.view, self.asked, self.joints)
+        view = self.views[feature.at]
+        u = read(feature.signal, view, self.asked, self.joints)
         if feature.shape.history:
             columns = feature.shape.columns(u, self.start, self.dt)[rows]
         else:
             columns = feature.shape.columns(u[rows], self.start[rows], self.dt)
-        by = factor(feature.times, self.view, self.asked)
+        by = factor(feature.times, view, self.asked)
         return columns if isinstance(by, float) else columns * by[rows, None]
 
 
@@ -98,7 +118,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
     for times in ("", "direction", "dq"):
         yield curve("q", times, _FINE)
     yield from (curve(name, times, _FINE) for name, times in (("dq", ""), ("t", ""), ("q", "tau")))
-    yield from (curve("q", times, _FINEST) for times in ("", "direction"))
+    yield from (curve(name, times, _FINEST) for name, times in (("q", ""), ("q", "direction"), ("dq", "")))
     rows = max(round(_HISTORY / scene.dt), 4)
     edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
     for name in ("tau", "q_des", "q", "dq"):
@@ -113,6 +133,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
             yield curve(f"{joint}/{name}", "", _MIDDLE)
             yield from (curve(f"{joint}/{name}", times, _COARSE) for times in ("direction", "tau", "dq"))
         yield curve(f"{joint}/q", "", _FINE)
+        yield curve(f"{joint}/tau", "direction", _FINE)
         yield from (Feature(f"{joint}/{name}", "", Filter(edges)) for name in ("q", "tau"))
         yield from _ripples(scene, left, f"{joint}/q")
     yield from lines(scene, left)
@@ -127,7 +148,7 @@ class _Curves:
 
     def __call__(self, signal: str, times: str, pieces: int) -> Feature:
         if signal not in self._ranges:
-            u = read(signal, self._scene.view, self._scene.asked, self._scene.joints)
+            u = read(signal, self._scene.views[DRIVE], self._scene.asked, self._scene.joints)
             low, high = np.quantile(u, (0.005, 0.995), axis=0)
             self._ranges[signal] = low, np.maximum(high, low + 1e-9)
         return Feature(signal, times, Curve(*self._ranges[signal], pieces))
@@ -135,7 +156,7 @@ class _Curves:
 
 def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
     """A wave along the angle of another joint: the rate with which most of what is left goes."""
-    u = read(signal, scene.view, scene.asked, scene.joints)
+    u = read(signal, scene.views[JOINT], scene.asked, scene.joints)
     least = 2.0 * np.pi / max(float(np.ptp(u)), 1e-3)
     rates = _RATES[1.5 * least < _RATES]
     if rates.size:
@@ -145,7 +166,7 @@ def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:
 
 def lines(scene: Scene, left: Array) -> Iterator[Feature]:
     """The strongest lines of the spectrum in time of what is left, each alone and with two overtones."""
-    t = scene.view.t[:, 0]
+    t = scene.views[JOINT].t[:, 0]
     span, period = float(np.ptp(t)), scene.dt
     grid = np.arange(max(2.0, 3.0 / span), 0.45 / period, 0.5 / span)
     even = np.arange(t.min(), t.max(), period)

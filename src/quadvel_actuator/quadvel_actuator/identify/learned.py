@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
+from functools import cached_property
+from typing import Any
 
 import attrs
 import numpy as np
 
+from ..effects import DRIVE, JOINT
 from ..effects.terms import Lag, Resonance, Shape, Term
 from .delays import latest
 from .features import Feature, Scene, library, lines
@@ -31,6 +34,8 @@ MOST = 8
 
 _TRIED = 100  # features a joint that count as independent trials
 _KEPT = 12  # features that come into question after a look at all of them
+_FITTED = 4  # of these that the model is fitted beside
+_MOST_JOINTS = 0.5  # on more of them a feature is tried on all
 _AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
 _RIDGE = 1e-6
 _FREEDOM = 1e-3  # the same of the model's parameters, in shares of what they do to the joints that move most
@@ -89,37 +94,115 @@ class _Pick:
 
     feature: Feature
     joints: Bools
-    gain: float
+    gain: float  # all joints together
+    each: Array  # (J,), the joint's share of it, 0 where it is not at work
+
+
+_Picks = tuple[_Pick, ...]
+"""What is taken at once: one feature, or one for each joint of a neighbour of its own"""
 
 
 def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
-    """Terms for what `model` leaves; None where nothing pays."""
-    scene = Scene(model, judge)
-    picks: list[_Pick] = []
-    kept: list[_Pick] = []
-    left = scene.residual
-    while len(picks) < MOST:
-        fresh = [one for one in kept if one.feature.signal != "t"]
-        kept = _paying(_again(fresh, scene, left), picks, scene, noise) if fresh else []
-        if not kept:
-            kept = _paying(library(scene, left), picks, scene, noise)
-        if not kept:
+    """Terms for what `model` leaves; None where nothing pays.
+
+    Gains that are held are left free as soon as terms let them stay near those commanded.
+    """
+    state = _State((), Scene(model, judge))
+    kept: list[_Picks] = []
+    for _ in range(MOST):
+        kept = _promising(state, kept, noise)
+        grown = [one for picks in kept[:_FITTED] for one in state.grown(picks)]
+        better = [one for one in grown if one.left < state.left]
+        if not better:
             break
-        picks.append(_simplest(kept))
-        left = _Joint(picks, scene).left
-    picks = _pruned(picks, scene, noise)
-    if not picks:
+        state = _simplest(better, state.left).released()
+    state = _narrowed(_pruned(state, noise), noise)
+    if not state.picks:
         return None
-    found = _fitted_beside(picks, scene)
+    found = _as_terms(state)
     tau = model.samples.tau
     paid = judge.compare(tau - model.predict(), tau - found.model.predict() - found.torque)
     return found if paid.p_any < LEVEL else None  # fitted to all, they may give back what they promised
 
 
+@attrs.frozen(eq=False)
+class _State:
+    """Picks, and the scene of the model fitted beside them."""
+
+    picks: tuple[_Pick, ...]
+    scene: Scene
+
+    @cached_property
+    def beside(self) -> _Joint:
+        """The picks as they are fitted to what the scene leaves, its model staying as it is."""
+        return _Joint(self.picks, self.scene, free=False)
+
+    @property
+    def left(self) -> float:
+        """Mean squared error of the rows that judge, N^2 m^2."""
+        rows = self.scene.judge.judge
+        return float(np.sum((self.beside.left * rows) ** 2) / max(int(rows.sum()), 1))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """How much the latest pick says."""
+        return self.picks[-1].feature.size
+
+    def grown(self, picks: _Picks) -> Iterator[_State]:
+        """With more picks, the model fitted anew, and with these on all joints."""
+        yield _State((*self.picks, *picks), self.scene).settled()
+        if (wider := _wider(picks)) is not None:
+            yield _State((*self.picks, wider), self.scene).settled()
+
+    def released(self) -> _State:
+        """With gains that are held left free, if they then stay near those commanded."""
+        model = self.scene.model
+        if not model.gains_held:
+            return self
+        free = attrs.evolve(model, gains_held=False)
+        found = _State(self.picks, Scene(free, self.scene.judge)).settled()
+        return found if found.scene.model.believable else self
+
+    def settled(self) -> _State:
+        """With the model fitted beside the picks, and both together."""
+        judge, best = self.scene.judge, self
+        least = best.beside.error
+        for _ in range(_STEPS):
+            joint, model = _Joint(self.picks, best.scene), best.scene.model
+            theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
+            error = least
+            for damping in _DAMPINGS:
+                after = step(best.scene.slots, theta, joint.hessian, joint.gradient, damping)
+                moved = with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
+                tried = _State(self.picks, Scene(moved, judge))
+                if tried.beside.error < least:
+                    least, best = tried.beside.error, tried
+                    break
+            if least > error * (1.0 - _SETTLED):
+                break
+        return best
+
+
+def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Picks]:
+    """What pays beside the picks of a state, best first: of what did before, or of everything where that does no more."""
+    left = _Joint(state.picks, state.scene).left if state.picks else state.scene.residual
+    fresh = [one for picks in kept for one in picks if one.feature.signal != "t"]
+    found = _paying(_again(fresh, state.scene, left), state, noise) if fresh else []
+    return found or _paying(library(state.scene, left), state, noise)
+
+
+def _wider(picks: _Picks) -> _Pick | None:
+    """On all joints, what is on most of them: on the others, gains that it bends may stand for it."""
+    one = picks[0]
+    if len(picks) > 1 or one.joints.all() or one.feature.family is not None or one.joints.mean() < _MOST_JOINTS:
+        return None
+    return attrs.evolve(one, joints=np.ones_like(one.joints))
+
+
 def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
     """The signals that what `model` leaves goes with most clearly, whether or not a term of them would pay."""
     scene = Scene(model, judge)
-    trial, every = Trial([], scene), np.ones(len(scene.joints), dtype=bool)
+    trial, every = Trial((), scene), np.ones(len(scene.joints), dtype=bool)
     best: tuple[str, ...] = ()
     least = 1.0
     for feature in library(scene, scene.residual):
@@ -134,18 +217,36 @@ def _again(kept: Sequence[_Pick], scene: Scene, left: Array) -> Iterator[Feature
     yield from lines(scene, left)
 
 
-def _paying(features: Iterable[Feature], picks: Sequence[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
-    """Those that pay beside the picks, of the same signals the best one, best first."""
-    trial = Trial(picks, scene)
+def _paying(features: Iterable[Feature], state: _State, noise: Array) -> list[_Picks]:
+    """Those that pay beside the picks of a state, of the same signals the best one, and sets of neighbours; best first."""
+    trial = Trial(state.picks, state.scene)
     best: dict[tuple[str, ...], _Pick] = {}
+    neighbours: dict[Any, list[_Pick]] = {}
     for feature in features:
         pick = _pick(feature, trial, noise)
+        if pick is None:
+            continue
         before = best.get(feature.key)
-        if pick is not None and (before is None or pick.gain > before.gain):
-            ranked = sorted([*(best | {feature.key: pick}).values()], key=lambda one: -one.gain)[:_KEPT]
-            best = {one.feature.key: one for one in ranked}
-    found = [_tuned(one, trial, noise) for one in best.values()]
-    return sorted(found, key=lambda one: -one.gain)
+        if before is None or pick.gain > before.gain:
+            best[feature.key] = pick
+        if feature.family is not None:
+            neighbours.setdefault(feature.family, []).append(pick)
+    most = sorted(best.values(), key=lambda one: -one.gain)[:_KEPT]
+    found = [(_tuned(one, trial, noise),) for one in most]
+    sets = [each for picks in neighbours.values() if len(each := _own_neighbours(picks)) > 1]
+    return sorted([*found, *sets], key=lambda one: -sum(pick.gain for pick in one))
+
+
+def _own_neighbours(picks: Sequence[_Pick]) -> _Picks:
+    """Every joint with the neighbour of its own that says most of it."""
+    owner = np.argmax([one.each for one in picks], axis=0)
+    found = []
+    for k, one in enumerate(picks):
+        mine = one.joints & (owner == k)
+        if mine.any():
+            each = one.each * mine
+            found.append(attrs.evolve(one, joints=mine, gain=float(each.sum()), each=each))
+    return tuple(found)
 
 
 def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
@@ -158,23 +259,27 @@ def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
     taken = (found.p_joints * _TRIED * len(noise) < LEVEL) & (found.joint_gain > WORTH * noise)
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
-    gain = float((found.fall * taken).sum() / max(found.rows.sum(), 1))
-    return _Pick(feature, taken, gain) if taken.any() else None
+    each = found.fall.sum(axis=0) * taken / max(found.rows.sum(), 1)
+    return _Pick(feature, taken, float(each.sum()), each) if taken.any() else None
 
 
 def _tuned(pick: _Pick, trial: Trial, noise: Array) -> _Pick:
-    """The pick with the time constant, frequency or damping with which it says most of the fitted rows."""
-    shape = pick.feature.shape
-    if not _near(shape, _TUNING[0]):
-        return pick
-    least = trial.error(pick.feature, trial.scene.columns(pick.feature), pick.joints)
+    """The pick at the place and with the time constant, frequency or damping with which it says most of the fitted rows."""
+
+    def error(feature: Feature) -> float:
+        return trial.error(feature, trial.scene.columns(feature), pick.joints)
+
+    best, least = pick.feature, error(pick.feature)
+    if best.movable:
+        moved = attrs.evolve(best, at=DRIVE if best.at == JOINT else JOINT)
+        if (other := error(moved)) < least:
+            best, least = moved, other
     for size in _TUNING:
-        for moved in _near(shape, size):
-            tried = attrs.evolve(pick.feature, shape=moved)
-            error = trial.error(tried, trial.scene.columns(tried), pick.joints)
-            if error < least:
-                least, shape = error, moved
-    found = _pick(attrs.evolve(pick.feature, shape=shape), trial, noise)
+        for shape in _near(best.shape, size):
+            tried = attrs.evolve(best, shape=shape)
+            if (other := error(tried)) < least:
+                best, least = tried, other
+    found = _pick(best, trial, noise)
     return pick if found is None or found.gain < pick.gain else found
 
 
@@ -332,16 +437,20 @@ class _Joint:
                 self.parts[k][:, j] = columns[j][:, first:last] @ solution[first:last]
                 first = last
         self.left = np.where(scene.rows, left - sum(self.parts, start=np.zeros_like(left)), 0.0)
+        self.error = float(np.sum((self.left * fit) ** 2))
+        """sum of squares of the fitted rows"""
 
 
-def _simplest(kept: Sequence[_Pick]) -> _Pick:
-    """Of those that are as good as the best one, the one that says least."""
-    good = [one for one in kept if one.gain >= _AS_GOOD * kept[0].gain]
-    return min(good, key=lambda one: (*one.feature.size, -one.gain))
+def _simplest(states: Sequence[_State], before: float) -> _State:
+    """Of those that are as good as the best one, the one whose latest pick says least."""
+    most = before - min(one.left for one in states)
+    good = [one for one in states if before - one.left >= _AS_GOOD * most]
+    return min(good, key=lambda one: (*one.size, one.left))
 
 
-def _pruned(picks: list[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
-    """Without those that the others made needless."""
+def _pruned(state: _State, noise: Array) -> _State:
+    """Without the picks that the others made needless."""
+    picks, scene = state.picks, state.scene
     while len(picks) > 1:
         whole = _Joint(picks, scene).left
         losses = []
@@ -355,38 +464,31 @@ def _pruned(picks: list[_Pick], scene: Scene, noise: Array) -> list[_Pick]:
         if worst > WORTH:
             break
         picks = picks[:k] + picks[k + 1 :]
-    return picks
+    return state if len(picks) == len(state.picks) else _State(picks, scene).settled()
 
 
-def _fitted_beside(picks: Sequence[_Pick], scene: Scene) -> Learned:
-    """The model fitted beside the terms, and the terms beside it."""
-    judge = scene.judge
-    best, least = scene, float(np.sum((_Joint(picks, scene, free=False).left * judge.fit) ** 2))
-    for _ in range(_STEPS):
-        joint = _Joint(picks, best)
-        theta = np.concatenate(
-            [pack(best.model), best.model.input_delay[None], best.model.output_delay[None]]
-        )
-        error = least
-        for damping in _DAMPINGS:
-            after = step(best.slots, theta, joint.hessian, joint.gradient, damping)
-            moved = with_slots(best.model, after[:-2]).with_delays(*np.round(after[-2:], 7))
-            tried = Scene(moved, judge)
-            left = float(np.sum((_Joint(picks, tried, free=False).left * judge.fit) ** 2))
-            if left < least:
-                least, best = left, tried
-                break
-        if least > error * (1.0 - _SETTLED):
-            break
-    return _as_terms(picks, best)
+def _narrowed(state: _State, noise: Array) -> _State:
+    """Without the picks on joints that do without them, the model staying as it is."""
+    picks = []
+    for k, one in enumerate(state.picks):
+        less = _Joint(state.picks[:k] + state.picks[k + 1 :], state.scene, free=False).left
+        found = state.scene.judge.compare(less, state.beside.left)
+        needed = one.joints & (found.joint_gain > WORTH * noise)
+        if needed.any():
+            picks.append(attrs.evolve(one, joints=needed))
+    before = [one.joints.sum() for one in state.picks]
+    same = [one.joints.sum() for one in picks] == before
+    return state if same else _State(tuple(picks), state.scene).settled()
 
 
-def _as_terms(picks: Sequence[_Pick], scene: Scene) -> Learned:
-    joint, terms, parts = _Joint(picks, scene, free=False), [], []
-    for pick, weights, torque in zip(picks, joint.weights, joint.parts, strict=True):
+def _as_terms(state: _State) -> Learned:
+    scene, joint, terms, parts = state.scene, state.beside, [], []
+    for pick, weights, torque in zip(state.picks, joint.weights, joint.parts, strict=True):
         bound = np.max(np.abs(torque) * scene.judge.fit, axis=0)
         feature = pick.feature
-        terms.append(Term(feature.signal, feature.times, feature.shape, pick.joints, weights, bound))
+        terms.append(
+            Term(feature.signal, feature.times, feature.shape, pick.joints, weights, bound, feature.at)
+        )
         parts.append(np.clip(torque, -bound, bound))
     total: Array = np.sum(parts, axis=0)
     left = scene.residual - total

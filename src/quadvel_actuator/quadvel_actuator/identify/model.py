@@ -21,6 +21,8 @@ Groups = NDArray[np.intp]
 _DAMPING = (1e-7, 1e-2, 1.0)
 _SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
 _GAIN_SLOPE = 0.01
+_FAR = 0.4
+"""Logarithm of a gain over the commanded one that is hard to believe."""
 _KEPT = 8  # results of laws with memory
 _SETTLED = 1e-5  # relative fall of the error below which a fit has converged
 
@@ -72,10 +74,16 @@ class Model:
         """The signals at this model's delays."""
         return self.samples.at(self.input_delay, self.output_delay, self.window)
 
-    @property
-    def _at_joint(self) -> Signals:
-        """The signals for torques that do not come an output delay late."""
+    def seen(self, at: str) -> Signals:
+        """The signals for torques that are added by the drive, or at the joint: these do not come an output delay late."""
+        if at == DRIVE:
+            return self.signals
         return self.samples.at_joint(self.input_delay, self.output_delay, self.window)
+
+    @property
+    def believable(self) -> bool:
+        """Are its proportional gains near those that were commanded?"""
+        return bool((np.abs(np.log(np.maximum(self.gains[0], 1e-3))) <= _FAR).all())
 
     def predict(self) -> Array:
         """Torque of every row, (N, J), N m."""
@@ -125,8 +133,7 @@ class Model:
 
     def added(self, one: Applied, x: Array, value: Array) -> Array:
         """The torque (B, N, J) that a law of the stage ADDED adds to `x`, with a batch of its values (B, P, J)."""
-        seen = self.signals if one.law.at == DRIVE else self._at_joint
-        extra: Array = self._series(one, x, seen, value)
+        extra: Array = self._series(one, x, self.seen(one.law.at), value)
         return extra if one.active.all() else extra * one.active
 
     def driven(self) -> Array:

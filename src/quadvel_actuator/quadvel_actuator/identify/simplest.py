@@ -11,7 +11,9 @@ from functools import cached_property
 import attrs
 import numpy as np
 
+from .as_sent import as_sent
 from .diagnosis import Diagnosis
+from .few import Few
 from .judging import Judge
 from .learned import LEVEL, WORTH, Learned, learn
 from .model import Model
@@ -42,15 +44,26 @@ class Alone:
 
     @cached_property
     def learned(self) -> Learned | None:
-        return learn(self.before, self._judge, self._noise)
+        """From the gains as they were fitted, or from those commanded, if that leaves much or they stray far."""
+        before, judge, noise = self.before, self._judge, self._noise
+        found = learn(before, judge, noise)
+        if before.implied or not before.samples.commanded:
+            return found
+        if found is not None and found.model.believable and self._at_floor(found):
+            return found
+        few = Few(before.samples, judge, (before.samples.tau - before.predict()) / np.sqrt(noise))
+        other = learn(as_sent(before, few), judge, noise)
+        if found is None or other is None:
+            return found or other
+        lost = judge.compare(_left(other.model, other), _left(found.model, found)).gain
+        return other if lost < (0.0 if found.model.believable else _AS_WELL * _floor(judge, noise)) else found
 
     def says_all(self, laws: int) -> bool:
         """Do fewer terms than so many laws leave no more than the noise?"""
-        if self.learned is None or len(self.learned.terms) >= laws:
-            return False
-        left = self._judge.compare(
-            _left(self.learned.model, self.learned), np.zeros_like(self.learned.torque)
-        )
+        return self.learned is not None and len(self.learned.terms) < laws and self._at_floor(self.learned)
+
+    def _at_floor(self, learned: Learned) -> bool:
+        left = self._judge.compare(_left(learned.model, learned), np.zeros_like(learned.torque))
         return left.gain < _AT_FLOOR * _floor(self._judge, self._noise)
 
 
