@@ -64,7 +64,7 @@ class Diagnosis:
 
 
 def diagnosed(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool], cores: int
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[Model], bool], cores: int
 ) -> Diagnosis:
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
@@ -92,18 +92,17 @@ def _released(model: Model, few: Few) -> Model:
 
 
 def diagnose(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[int], bool], cores: int
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[Model], bool], cores: int
 ) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
 
-    Of many that still leave much, `otherwise(count)` says whether there is a shorter account without them.
+    Of several that still leave much, `otherwise(model)` says whether there is a better account without them.
     """
     few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
-        count = len(model.applied)
-        if count >= _FEW and _unsaid(model, judge, noise) and otherwise(count):
+        if len(model.applied) >= _FEW and _unsaid(model, judge, noise) and otherwise(model):
             break
         model = model.holding(True)
         about = About(model, judge, noise, few)

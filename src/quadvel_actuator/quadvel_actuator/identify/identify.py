@@ -100,7 +100,7 @@ def identify(
     def tick(text: str) -> None:
         tell(min(0.1 + 0.008 * next(steps), 0.85), text)
 
-    diagnosis = diagnosed(before, judge, noise, tick, alone.says_all, options.cores)
+    diagnosis = diagnosed(before, judge, noise, tick, alone.says_more, options.cores)
     tell(0.88, "what no effect explains")
     late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)

@@ -162,7 +162,7 @@ class Model:
         """What a law makes of `x`; with a memory, the latest are kept, as a fit of other parameters asks for them again."""
         law, p = one.law, one.part(value)
         if isinstance(law, ErrorLaw):
-            if x[0].ndim > 2:
+            if max(part.ndim for part in x) > 2:
                 return law.errors(x, s, p)
             some, which = _distinct(value)
             after = law.errors(x, s, one.part(some))

@@ -23,8 +23,9 @@ from .signals import Array
 _AT_FLOOR = 1.05
 """Of the noise: laws that leave no more than this need no other account."""
 
-_FEW, _MOST = 2, 0.8
-"""So few laws that take so much of what is above the noise are the account, whatever is left beside them."""
+_MOST, _HALF = 0.8, 0.5
+"""Of what is above the noise: a law that takes so much is the account, whatever is left beside it; and what terms may
+leave of what several laws do"""
 
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
@@ -58,13 +59,20 @@ class Alone:
         lost = judge.compare(_left(other.model, other), _left(found.model, found)).gain
         return other if lost < (0.0 if found.model.believable else _AS_WELL * _floor(judge, noise)) else found
 
-    def says_all(self, laws: int) -> bool:
-        """Do fewer terms than so many laws leave no more than the noise?"""
-        return self.learned is not None and len(self.learned.terms) < laws and self._at_floor(self.learned)
+    def says_more(self, laws: Model) -> bool:
+        """Do terms that say no more than the laws of this model leave no more than the noise, or half of what these do?"""
+        if self.learned is None or _words(None, self.learned) > _words(laws, None):
+            return False
+        above = laws.mse(self._judge.judge) - _floor(self._judge, self._noise)
+        return self._at_floor(self.learned) or self._above(self.learned) < _HALF * above
 
     def _at_floor(self, learned: Learned) -> bool:
+        return self._above(learned) < (_AT_FLOOR - 1.0) * _floor(self._judge, self._noise)
+
+    def _above(self, learned: Learned) -> float:
+        """What they leave above the noise, N^2 m^2."""
         left = self._judge.compare(_left(learned.model, learned), np.zeros_like(learned.torque))
-        return left.gain < _AT_FLOOR * _floor(self._judge, self._noise)
+        return left.gain - _floor(self._judge, self._noise)
 
 
 def account(
@@ -98,7 +106,7 @@ def _enough(before: Model, diagnosis: Diagnosis, beside: Learned | None, judge: 
     if _one_shape(diagnosis):
         return False
     left = diagnosis.model.mse(judge.judge)
-    if len(diagnosis.findings) <= _FEW and left - floor < (1.0 - _MOST) * (before.mse(judge.judge) - floor):
+    if len(diagnosis.findings) == 1 and left - floor < (1.0 - _MOST) * (before.mse(judge.judge) - floor):
         return True
     return beside is None and left < _AT_FLOOR * floor
 
@@ -126,5 +134,11 @@ def _shorter_or_better(
         return True
     if _one_shape(named) and alone.inputs[0] == _SHAPED:
         return found.gain > 0.0 and len(alone.terms) <= len(named.findings)
-    length = len(named.findings) + _TERM * (len(beside.terms) if beside is not None else 0)
-    return found.gain > -_AS_WELL * floor and _TERM * len(alone.terms) < length
+    return found.gain > -_AS_WELL * floor and _words(None, alone) < _words(named.model, beside)
+
+
+def _words(laws: Model | None, terms: Learned | None) -> int:
+    """How much an account says of the joint that it says most of."""
+    named = [one.active.astype(int) for one in laws.applied] if laws is not None else []
+    learned = [_TERM * one.active.astype(int) for one in terms.terms] if terms is not None else []
+    return int(np.max(sum([*named, *learned]), initial=0))
