@@ -14,7 +14,7 @@ from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
 from quadvel_actuator.identify.judging import Judge
-from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.model import Applied, Model, Slots, jacobian
 from quadvel_actuator.identify.screening import Started
 from quadvel_actuator.identify.signals import Samples, scattered
 
@@ -90,6 +90,21 @@ def test_each_joint_reads_the_signals_at_its_own_delays():
         for name in ("q", "dq", "q_des", "kp"):
             own = getattr(samples.at(*pair, 0.001), name)[:, joint]
             np.testing.assert_array_equal(getattr(mixed, name)[:, joint], own)
+
+
+def test_slopes_of_two_laws_on_the_errors_are_those_that_either_has_when_the_other_stays():
+    """Both act on the velocity alone: one leaves a batch of speeds to the other, and the positions as they were."""
+    model = about(_log(), input_delay=0.009, output_delay=0.003).model
+    late = {"velocity_filter": (0.004, 0.005), "timestamp_skew": (0.002, 0.003)}
+    for name, values in late.items():
+        model = model.plus(Applied(registry()[name](), np.ones(2, dtype=bool), np.array([values]), np.arange(2)))
+    slots = Slots.of(model)
+    predicted, slopes = jacobian(model, slots)
+    np.testing.assert_allclose(predicted, model.predict(), atol=1e-12)
+    for k, (one, step) in enumerate(zip(model.applied, slots.step[2:], strict=True)):
+        moved = model.replacing(k, attrs.evolve(one, values=one.values + step))
+        expected = (moved.predict() - model.predict()) / step
+        np.testing.assert_allclose(slopes[:, 2 + k], expected.T, atol=1e-6 * np.abs(expected).max())
 
 
 def test_friction_is_found_from_delays_that_it_has_bent():

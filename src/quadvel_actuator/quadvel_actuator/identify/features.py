@@ -28,7 +28,11 @@ _COMMANDED = "q_des", "error", "tau"
 
 @attrs.frozen(eq=False)
 class Feature:
-    """A shape of a signal, times something; what commands move is first looked for in the drive, all else at the joint."""
+    """A shape of a signal, times something; what commands move is first looked for in the drive, all else at the joint.
+
+    A filter of what is the joint's own stays in the drive: beside gains that see the signal an output delay earlier, it
+    would be a slope of it.
+    """
 
     signal: str
     times: str
@@ -38,12 +42,13 @@ class Feature:
 
     @at.default
     def _usual_place(self) -> str:
-        return DRIVE if self.signal in _COMMANDED or self.times in _COMMANDED else JOINT
+        fixed = not self.movable and self.signal != "t"
+        return DRIVE if fixed or self.signal in _COMMANDED or self.times in _COMMANDED else JOINT
 
     @property
     def movable(self) -> bool:
         """Can it act at the other place, too? At the joint nothing of commands is known but the torque that they made."""
-        return self.signal not in ("q_des", "error", "t")
+        return self.signal not in ("q_des", "error", "t") and not isinstance(self.shape, Filter)
 
     @property
     def key(self) -> tuple[str, ...]:

@@ -35,7 +35,8 @@ MOST = 8
 _TRIED = 100  # features a joint that count as independent trials
 _KEPT = 12  # features that come into question after a look at all of them
 _FITTED = 4  # of these that the model is fitted beside
-_MOST_JOINTS = 0.5  # on more of them a feature is tried on all
+_MOST_JOINTS, _FAR_LESS = 0.5, 0.6
+"""On more of the joints than that a feature is tried on all, and stays there if it leaves less than that of the error"""
 _AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
 _RIDGE = 1e-6
 _FREEDOM = 1e-3  # the same of the model's parameters, in shares of what they do to the joints that move most
@@ -111,7 +112,7 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     kept: list[_Picks] = []
     for _ in range(MOST):
         kept = _promising(state, kept, noise)
-        grown = [one for picks in kept[:_FITTED] for one in state.grown(picks)]
+        grown = [state.plus(picks) for picks in kept[:_FITTED]]
         better = [one for one in grown if one.left < state.left]
         if not better:
             break
@@ -148,11 +149,13 @@ class _State:
         """How much the latest pick says."""
         return self.picks[-1].feature.size
 
-    def grown(self, picks: _Picks) -> Iterator[_State]:
-        """With more picks, the model fitted anew, and with these on all joints."""
-        yield _State((*self.picks, *picks), self.scene).settled()
-        if (wider := _wider(picks)) is not None:
-            yield _State((*self.picks, wider), self.scene).settled()
+    def plus(self, picks: _Picks) -> _State:
+        """With more picks, the model fitted anew; with these on all joints, where that says far more."""
+        found = _State((*self.picks, *picks), self.scene).settled()
+        if (wider := _wider(picks)) is None:
+            return found
+        wide = _State((*self.picks, wider), self.scene).settled()
+        return wide if wide.left < _FAR_LESS * found.left else found
 
     def released(self) -> _State:
         """With gains that are held left free, if they then stay near those commanded."""
