@@ -171,12 +171,8 @@ class _State:
         judge, best = self.scene.judge, self
         least = best.beside.error
         for _ in range(_STEPS):
-            joint, model = _Joint(self.picks, best.scene), best.scene.model
-            theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
             error = least
-            for damping in _DAMPINGS:
-                after = step(best.scene.slots, theta, joint.hessian, joint.gradient, damping)
-                moved = with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
+            for moved in best._steps():
                 tried = _State(self.picks, Scene(moved, judge))
                 if tried.beside.error < least:
                     least, best = tried.beside.error, tried
@@ -184,6 +180,18 @@ class _State:
             if least > error * (1.0 - _SETTLED):
                 break
         return best
+
+
+    def _steps(self) -> Iterator[Model]:
+        """The model after steps of less and less courage, the last one with its delays as they are."""
+        joint, model, slots = _Joint(self.picks, self.scene), self.scene.model, self.scene.slots
+        theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
+        held = np.isin(np.arange(slots.count), slots.index[-2:])
+        still = np.where(held | held[:, None], np.diag(np.diagonal(joint.hessian)), joint.hessian)
+        tries = [(joint.hessian, joint.gradient, damping) for damping in _DAMPINGS]
+        for hessian, gradient, damping in (*tries, (still, np.where(held, 0.0, joint.gradient), _DAMPINGS[0])):
+            after = step(slots, theta, hessian, gradient, damping)
+            yield with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
 
 
 def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Picks]:
