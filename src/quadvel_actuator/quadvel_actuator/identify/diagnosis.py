@@ -38,6 +38,7 @@ _NEARLY, _MUCH = 0.7, 0.1
 """Of the best gain; and of the noise, what is much beside it"""
 _FEW = 2
 """Effects that no other account needs to be looked for"""
+BETTER_SAID = "terms of named signals say it better than the named laws together"
 _TIE_LEVEL = 0.02
 _TIE_SHARE = 0.03  # of the noise
 _TIES = 3  # names beside the first one's
@@ -96,14 +97,15 @@ def diagnose(
 ) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
 
-    Of several that still leave much, `otherwise(model)` says whether there is a better account without them.
+    Several that still leave much are given up where `otherwise(model)` says that there is a better account without them.
     """
+    bare, given_up = model, []
     few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
         if len(model.applied) >= _FEW and _unsaid(model, judge, noise) and otherwise(model):
-            break
+            return Diagnosis(bare, (), (*given_up, *rejected))
         model = model.holding(True)
         about = About(model, judge, noise, few)
         candidates, idle = ranked(about, tick, f"effect {number + 1}", cores)
@@ -120,6 +122,7 @@ def diagnose(
         found = _reformed(found, judge, few)
         model = _released(_widened(found, judge, noise, few), few)
         ties.append(tied)
+        given_up.append(Rejected(best.name, best.gain, BETTER_SAID))
     model, ties = _pruned(attrs.evolve(model.holding(False), gains_held=False), ties, judge, noise, few)
     model, ties = _simplest(model, ties, judge, noise)
     model = _narrowed(model, judge, noise, few)

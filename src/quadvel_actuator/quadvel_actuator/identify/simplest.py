@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 
 from .as_sent import as_sent
-from .diagnosis import Diagnosis
+from .diagnosis import BETTER_SAID, Diagnosis
 from .few import Few
 from .judging import Judge
 from .learned import LEVEL, WORTH, Learned, learn
@@ -48,31 +48,34 @@ class Alone:
         """From the gains as they were fitted, or from those commanded, if that leaves much or they stray far."""
         before, judge, noise = self.before, self._judge, self._noise
         found = learn(before, judge, noise)
+        model = before if found is None else found.model
         if before.implied or not before.samples.commanded:
             return found
-        if found is not None and found.model.believable and self._at_floor(found):
+        if model.believable and self._at_floor(model, found):
             return found
         few = Few(before.samples, judge, (before.samples.tau - before.predict()) / np.sqrt(noise))
         other = learn(as_sent(before, few), judge, noise)
-        if found is None or other is None:
-            return found or other
-        lost = judge.compare(_left(other.model, other), _left(found.model, found)).gain
-        return other if lost < (0.0 if found.model.believable else _AS_WELL * _floor(judge, noise)) else found
+        if other is None:
+            return found
+        least = WORTH if found is None else 0.0 if model.believable else -_AS_WELL
+        gain = self._above(model, found) - self._above(other.model, other)
+        return other if gain > least * _floor(judge, noise) else found
 
     def says_more(self, laws: Model) -> bool:
         """Do terms that say no more than the laws of this model leave no more than the noise, or half of what these do?"""
-        if self.learned is None or _words(None, self.learned) > _words(laws, None):
+        terms = self.learned
+        if terms is None or _words(None, terms) > _words(laws, None):
             return False
-        above = laws.mse(self._judge.judge) - _floor(self._judge, self._noise)
-        return self._at_floor(self.learned) or self._above(self.learned) < _HALF * above
+        half = self._above(terms.model, terms) < _HALF * self._above(laws, None)
+        return half or self._at_floor(terms.model, terms)
 
-    def _at_floor(self, learned: Learned) -> bool:
-        return self._above(learned) < (_AT_FLOOR - 1.0) * _floor(self._judge, self._noise)
+    def _at_floor(self, model: Model, terms: Learned | None) -> bool:
+        return self._above(model, terms) < (_AT_FLOOR - 1.0) * _floor(self._judge, self._noise)
 
-    def _above(self, learned: Learned) -> float:
+    def _above(self, model: Model, terms: Learned | None) -> float:
         """What they leave above the noise, N^2 m^2."""
-        left = self._judge.compare(_left(learned.model, learned), np.zeros_like(learned.torque))
-        return left.gain - _floor(self._judge, self._noise)
+        left = _left(model, terms)
+        return self._judge.compare(left, np.zeros_like(left)).gain - _floor(self._judge, self._noise)
 
 
 def account(
@@ -82,18 +85,19 @@ def account(
 
     The diagnosis that comes back holds the model fitted beside the terms.
     """
+    if not diagnosis.findings:
+        return _with(diagnosis, alone.learned), alone.learned
     beside = learn(diagnosis.model, judge, noise)
     floor = _floor(judge, noise)
     named = _with(diagnosis, beside)
-    if not diagnosis.findings or _enough(alone.before, diagnosis, beside, judge, floor):
+    if _enough(alone.before, diagnosis, beside, judge, floor):
         return named, beside
     terms = alone.learned
     if _one_shape(diagnosis):  # what hid the delays is found then
         terms = learn(attrs.evolve(diagnosis.model, applied=()), judge, noise)
     if terms is None or not _shorter_or_better(named, beside, terms, judge, floor):
         return named, beside
-    reason = "terms of named signals say it better than the named laws together"
-    given_up = tuple(Rejected(one.name, one.gain, reason) for one in diagnosis.findings)
+    given_up = tuple(Rejected(one.name, one.gain, BETTER_SAID) for one in diagnosis.findings)
     return Diagnosis(terms.model, (), (*given_up, *diagnosis.rejected)), terms
 
 
