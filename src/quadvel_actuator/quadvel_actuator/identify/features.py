@@ -126,6 +126,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
     yield from (curve(name, times, _FINEST) for name, times in (("q", ""), ("q", "direction"), ("dq", "")))
     rows = max(round(_HISTORY / scene.dt), 4)
     edges = tuple(scene.dt * np.unique(np.round(np.geomspace(1, rows, 7))))
+    long = tuple(scene.dt * np.unique(np.round(np.linspace(1, 3 * rows, 12))))
     for name in ("tau", "q_des", "q", "dq"):
         yield Feature(name, "", Filter(edges))
     for name in ("tau", "q"):  # a lag of dq is what q has more than a lag of its own
@@ -140,6 +141,7 @@ def library(scene: Scene, left: Array) -> Iterator[Feature]:
         yield curve(f"{joint}/q", "", _FINE)
         yield curve(f"{joint}/tau", "direction", _FINE)
         yield from (Feature(f"{joint}/{name}", "", Filter(edges)) for name in ("q", "tau"))
+        yield Feature(f"{joint}/tau", "", Filter(long))
         yield from _ripples(scene, left, f"{joint}/q")
     yield from lines(scene, left)
 

@@ -35,7 +35,7 @@ MOST = 8
 _TRIED = 100  # features a joint that count as independent trials
 _KEPT = 12  # features that come into question after a look at all of them
 _FITTED = 4  # of these that the model is fitted beside
-_MOST_JOINTS, _FAR_LESS = 0.5, 0.6
+_MOST_JOINTS, _FAR_LESS = 0.5, 0.7
 """On more of the joints than that a feature is tried on all, and stays there if it leaves less than that of the error"""
 _AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
 _RIDGE = 1e-6

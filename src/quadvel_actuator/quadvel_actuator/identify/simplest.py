@@ -30,6 +30,9 @@ leave of what several laws do"""
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
 
+_LITTLE = 0.03
+"""Of what terms take off the error: terms that say less may take so much less."""
+
 _TERM = 2
 """A term of signals says as much as so many laws."""
 
@@ -57,9 +60,18 @@ class Alone:
         other = learn(as_sent(before, few), judge, noise)
         if other is None:
             return found
-        least = WORTH if found is None else 0.0 if model.believable else -_AS_WELL
-        gain = self._above(model, found) - self._above(other.model, other)
-        return other if gain > least * _floor(judge, noise) else found
+        if found is None:
+            gain = self._above(before, None) - self._above(other.model, other)
+            return other if gain > WORTH * _floor(judge, noise) else None
+        return self._better(found, other)
+
+    def _better(self, one: Learned, other: Learned) -> Learned:
+        """Of those whose gains can be believed, if there are any, the shorter one, or the better one where it says more."""
+        believable = [terms for terms in (one, other) if terms.model.believable] or [one, other]
+        left = {id(terms): self._above(terms.model, terms) for terms in believable}
+        most = self._above(self.before, None) - min(left.values())
+        good = [terms for terms in believable if left[id(terms)] - min(left.values()) < _LITTLE * most]
+        return min(good, key=lambda terms: (_words(None, terms), left[id(terms)]))
 
     def says_more(self, laws: Model) -> bool:
         """Do terms that say no more than the laws of this model leave no more than the noise, or half of what these do?"""
@@ -85,12 +97,10 @@ def account(
 
     The diagnosis that comes back holds the model fitted beside the terms.
     """
-    if not diagnosis.findings:
-        return _with(diagnosis, alone.learned), alone.learned
-    beside = learn(diagnosis.model, judge, noise)
+    beside = alone.learned if diagnosis.model is alone.before else learn(diagnosis.model, judge, noise)
     floor = _floor(judge, noise)
     named = _with(diagnosis, beside)
-    if _enough(alone.before, diagnosis, beside, judge, floor):
+    if not diagnosis.findings or _enough(alone.before, diagnosis, beside, judge, floor):
         return named, beside
     terms = alone.learned
     if _one_shape(diagnosis):  # what hid the delays is found then
@@ -142,7 +152,7 @@ def _shorter_or_better(
 
 
 def _words(laws: Model | None, terms: Learned | None) -> int:
-    """How much an account says of the joint that it says most of."""
-    named = [one.active.astype(int) for one in laws.applied] if laws is not None else []
-    learned = [_TERM * one.active.astype(int) for one in terms.terms] if terms is not None else []
-    return int(np.max(sum([*named, *learned]), initial=0))
+    """How much an account says: every law, and of the terms those of the joint that has most of them."""
+    named = len(laws.applied) if laws is not None else 0
+    learned = int(np.sum([one.active for one in terms.terms], axis=0).max()) if terms is not None else 0
+    return named + _TERM * learned
