@@ -37,7 +37,8 @@ _KEPT = 12  # features that come into question after a look at all of them
 _FITTED = 4  # of these that the model is fitted beside
 _MOST_JOINTS, _FAR_LESS = 0.5, 0.7
 """On more of the joints than that a feature is tried on all, and stays there if it leaves less than that of the error"""
-_AS_GOOD = 0.9  # of the best one's gain: among these the simplest is taken
+_AS_GOOD, _NEARLY = 0.9, 1.02
+"""Of the best one's gain: of these that of fewest signals is taken; and of its error: of these that of fewest numbers"""
 _RIDGE = 1e-6
 _FREEDOM = 1e-3  # the same of the model's parameters, in shares of what they do to the joints that move most
 _STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model and terms together
@@ -453,10 +454,13 @@ class _Joint:
 
 
 def _simplest(states: Sequence[_State], before: float) -> _State:
-    """Of those that are as good as the best one, the one whose latest pick says least."""
+    """Of those that gain nearly as much as the best one those of fewest signals; of these, as good, that of fewest numbers."""
     most = before - min(one.left for one in states)
     good = [one for one in states if before - one.left >= _AS_GOOD * most]
-    return min(good, key=lambda one: (*one.size, one.left))
+    fewest = min(one.size[0] for one in good)
+    alike = [one for one in good if one.size[0] == fewest]
+    least = min(one.left for one in alike)
+    return min((one for one in alike if one.left <= _NEARLY * least), key=lambda one: (one.size, one.left))
 
 
 def _pruned(state: _State, noise: Array) -> _State:

@@ -230,6 +230,7 @@ def _effects(o: Outcome) -> list[dict[str, Any]]:
                     {
                         "kind": term.shape.kind,
                         "inputs": list(term.inputs),
+                        "at": term.at,
                         "joints": [name for name, acts in zip(joints, term.active, strict=True) if acts],
                         "heldout_gain": gain,
                     }

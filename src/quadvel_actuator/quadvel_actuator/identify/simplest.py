@@ -74,9 +74,12 @@ class Alone:
         return min(good, key=lambda terms: (_words(None, terms), left[id(terms)]))
 
     def says_more(self, laws: Model) -> bool:
-        """Do terms that say no more than the laws of this model leave no more than the noise, or half of what these do?"""
+        """Do terms that say little more than the laws of this model leave no more than the noise, or half of what these do?
+
+        Where much is left, one more law at least would follow.
+        """
         terms = self.learned
-        if terms is None or _words(None, terms) > _words(laws, None):
+        if terms is None or _words(None, terms) > _words(laws, None) + 1:
             return False
         half = self._above(terms.model, terms) < _HALF * self._above(laws, None)
         return half or self._at_floor(terms.model, terms)
@@ -151,8 +154,10 @@ def _shorter_or_better(
     return found.gain > -_AS_WELL * floor and _words(None, alone) < _words(named.model, beside)
 
 
-def _words(laws: Model | None, terms: Learned | None) -> int:
-    """How much an account says: every law, and of the terms those of the joint that has most of them."""
+def _words(laws: Model | None, terms: Learned | None) -> float:
+    """How much an account says: every law, and of the terms as many as a joint has on average, of those that have any."""
     named = len(laws.applied) if laws is not None else 0
-    learned = int(np.sum([one.active for one in terms.terms], axis=0).max()) if terms is not None else 0
-    return named + _TERM * learned
+    if terms is None:
+        return named
+    acting = np.sum([one.active for one in terms.terms], axis=0)
+    return named + _TERM * float(acting[acting > 0].mean())
