@@ -97,7 +97,9 @@ def test_slopes_of_two_laws_on_the_errors_are_those_that_either_has_when_the_oth
     model = about(_log(), input_delay=0.009, output_delay=0.003).model
     late = {"velocity_filter": (0.004, 0.005), "timestamp_skew": (0.002, 0.003)}
     for name, values in late.items():
-        model = model.plus(Applied(registry()[name](), np.ones(2, dtype=bool), np.array([values]), np.arange(2)))
+        model = model.plus(
+            Applied(registry()[name](), np.ones(2, dtype=bool), np.array([values]), np.arange(2))
+        )
     slots = Slots.of(model)
     predicted, slopes = jacobian(model, slots)
     np.testing.assert_allclose(predicted, model.predict(), atol=1e-12)

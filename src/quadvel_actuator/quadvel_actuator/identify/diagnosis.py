@@ -99,7 +99,8 @@ def diagnose(
 
     Several that still leave much are given up where `otherwise(model)` says that there is a better account without them.
     """
-    bare, given_up = model, []
+    bare = model
+    given_up: list[Rejected] = []
     few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []

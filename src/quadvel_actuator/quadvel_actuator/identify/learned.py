@@ -182,7 +182,6 @@ class _State:
                 break
         return best
 
-
     def _steps(self) -> Iterator[Model]:
         """The model after steps of less and less courage, the last one with its delays as they are."""
         joint, model, slots = _Joint(self.picks, self.scene), self.scene.model, self.scene.slots
@@ -190,7 +189,10 @@ class _State:
         held = np.isin(np.arange(slots.count), slots.index[-2:])
         still = np.where(held | held[:, None], np.diag(np.diagonal(joint.hessian)), joint.hessian)
         tries = [(joint.hessian, joint.gradient, damping) for damping in _DAMPINGS]
-        for hessian, gradient, damping in (*tries, (still, np.where(held, 0.0, joint.gradient), _DAMPINGS[0])):
+        for hessian, gradient, damping in (
+            *tries,
+            (still, np.where(held, 0.0, joint.gradient), _DAMPINGS[0]),
+        ):
             after = step(slots, theta, hessian, gradient, damping)
             yield with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
 
@@ -206,7 +208,12 @@ def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Pic
 def _wider(picks: _Picks) -> _Pick | None:
     """On all joints, what is on most of them: on the others, gains that it bends may stand for it."""
     one = picks[0]
-    if len(picks) > 1 or one.joints.all() or one.feature.family is not None or one.joints.mean() < _MOST_JOINTS:
+    if (
+        len(picks) > 1
+        or one.joints.all()
+        or one.feature.family is not None
+        or one.joints.mean() < _MOST_JOINTS
+    ):
         return None
     return attrs.evolve(one, joints=np.ones_like(one.joints))
 
