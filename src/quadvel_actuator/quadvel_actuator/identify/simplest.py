@@ -58,7 +58,7 @@ class Alone:
             return found
         few = Few(before.samples, judge, (before.samples.tau - before.predict()) / np.sqrt(noise))
         other = learn(as_sent(before, few), judge, noise)
-        if other is None:
+        if other is None or other.model.gains_held:  # left free, they stray: nothing can be said of them
             return found
         if found is None:
             gain = self._above(before, None) - self._above(other.model, other)
