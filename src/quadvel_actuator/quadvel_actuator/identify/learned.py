@@ -113,11 +113,11 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     kept: list[_Picks] = []
     for _ in range(MOST):
         kept = _promising(state, kept, noise)
-        grown = [state.plus(picks) for picks in kept[:_FITTED]]
+        grown = [state.plus(picks).outline for picks in kept[:_FITTED]]
         better = [one for one in grown if one.left < state.left]
         if not better:
             break
-        state = _simplest(better, state.left).released()
+        state = _simplest(better, state.left).state(judge).released()
     state = _narrowed(_pruned(state, noise), noise)
     if not state.picks:
         return None
@@ -146,9 +146,9 @@ class _State:
         return float(np.sum((self.beside.left * rows) ** 2) / max(int(rows.sum()), 1))
 
     @property
-    def size(self) -> tuple[int, int]:
-        """How much the latest pick says."""
-        return self.picks[-1].feature.size
+    def outline(self) -> _Outline:
+        """All that is needed to make it again."""
+        return _Outline(self.picks, self.scene.model, self.left)
 
     def plus(self, picks: _Picks) -> _State:
         """With more picks, the model fitted anew; with these on all joints, where that says far more."""
@@ -195,6 +195,24 @@ class _State:
         ):
             after = step(slots, theta, hessian, gradient, damping)
             yield with_slots(model, after[:-2]).with_delays(*np.round(after[-2:], 7))
+
+
+@attrs.frozen(eq=False)
+class _Outline:
+    """A state without its scene, which is large."""
+
+    picks: tuple[_Pick, ...]
+    model: Model
+    left: float
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """How much the latest pick says."""
+        return self.picks[-1].feature.size
+
+    def state(self, judge: Judge) -> _State:
+        """The state again."""
+        return _State(self.picks, Scene(self.model, judge))
 
 
 def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Picks]:
@@ -413,16 +431,7 @@ class _Joint:
         joints = range(len(scene.joints))
         fit, slots = scene.judge.fit, scene.slots
         mine = [[k for k, pick in enumerate(picks) if pick.joints[j]] for j in joints]
-        columns = [
-            np.concatenate(
-                [
-                    np.zeros((len(fit), 0)),
-                    *(scene.taken(picks[k].feature, picks[k].joints)[j] for k in mine[j]),
-                ],
-                axis=1,
-            )
-            for j in joints
-        ]
+        columns = _columns(picks, scene)
         inverse = [
             _inverse(columns[j][fit[:, j]], [picks[k].feature.shape.penalty for k in mine[j]]) for j in joints
         ]
@@ -445,7 +454,6 @@ class _Joint:
             moved = np.linalg.solve(self.hessian + np.diag(size), self.gradient)
             change = np.where(slots.index >= 0, moved[slots.index], 0.0)  # (A, J)
             left -= np.einsum("jan,aj->nj", scene.slopes, change)
-        self.columns = tuple(columns)
         self.weights = [np.zeros((pick.feature.shape.count, len(joints))) for pick in picks]
         self.parts = [np.zeros_like(left) for _ in picks]
         for j in joints:
@@ -460,7 +468,21 @@ class _Joint:
         """sum of squares of the fitted rows"""
 
 
-def _simplest(states: Sequence[_State], before: float) -> _State:
+def _columns(picks: Sequence[_Pick], scene: Scene) -> tuple[Array, ...]:
+    """Of each joint, what the picks on it are sums of, (N, K)."""
+
+    def of(j: int) -> Array:
+        parts = [scene.taken(one.feature, one.joints)[j] for one in picks if one.joints[j]]
+        return (
+            np.concatenate([np.zeros((len(scene.residual), 0)), *parts], axis=1)
+            if len(parts) != 1
+            else parts[0]
+        )
+
+    return tuple(of(j) for j in range(len(scene.joints)))
+
+
+def _simplest(states: Sequence[_Outline], before: float) -> _Outline:
     """Of those that gain nearly as much as the best one those of fewest signals; of these, as good, that of fewest numbers."""
     most = before - min(one.left for one in states)
     good = [one for one in states if before - one.left >= _AS_GOOD * most]
@@ -515,4 +537,4 @@ def _as_terms(state: _State) -> Learned:
     total: Array = np.sum(parts, axis=0)
     left = scene.residual - total
     gains = [scene.judge.compare(left + part, left).gain for part in parts]
-    return Learned(scene.model, tuple(terms), total, tuple(gains), joint.columns)
+    return Learned(scene.model, tuple(terms), total, tuple(gains), _columns(state.picks, scene))
