@@ -80,6 +80,12 @@ class Curve(Shape):
     high: Array = attrs.field(converter=_array)
     pieces: int
 
+    @classmethod
+    def over(cls, u: Array, pieces: int) -> Curve:
+        """Over the range that a signal (N, C) had, but for a few outliers."""
+        low, high = np.quantile(u, (0.005, 0.995), axis=0)
+        return cls(low, np.maximum(high, low + 1e-9), pieces)
+
     @property
     def count(self) -> int:
         return self.pieces + 3

@@ -13,7 +13,7 @@ import numpy as np
 from ..effects.terms import Curve
 from .few import Few
 from .model import Model
-from .signals import Array, Bools
+from .signals import Bools
 
 _TOTALS = np.arange(0.0015, 0.0261, 0.0015)
 """s, sums of both delays"""
@@ -24,7 +24,7 @@ _PIECES, _RIDGE = 6, 1e-4
 
 def as_sent(model: Model, few: Few) -> Model:
     """The model with its gains held as commanded."""
-    some, rows = few.of(attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True))
+    some, rows = few.of(model.as_commanded())
     pairs = [(total - out, out) for total in _TOTALS for out in _OUTPUTS if 0.0 < total - out < _LONGEST]
     joints = rows.shape[1]
     tried = [some.with_delays(*(np.full(joints, round(one, 7)) for one in pair)) for pair in pairs]
@@ -34,7 +34,9 @@ def as_sent(model: Model, few: Few) -> Model:
 def _left(model: Model, rows: Bools) -> float:
     """Sum of squares that curves of q and dq leave of each joint's torque."""
     left, seen = model.residual(rows), model.signals
-    curves = np.concatenate([_columns(seen.q), _columns(seen.dq)], axis=1)
+    start = np.zeros(len(rows), dtype=bool)
+    shapes = [Curve.over(u, _PIECES).columns(u, start, model.samples.period) for u in (seen.q, seen.dq)]
+    curves = np.concatenate(shapes, axis=1)
     total = 0.0
     for j, mine in enumerate(rows.T):
         x, y = curves[mine, :, j], left[mine, j]
@@ -43,9 +45,3 @@ def _left(model: Model, rows: Bools) -> float:
         y = y - x @ np.linalg.solve(gram, x.T @ y)
         total += float(y @ y)
     return total
-
-
-def _columns(u: Array) -> Array:
-    low, high = np.quantile(u, (0.005, 0.995), axis=0)
-    curve = Curve(low, np.maximum(high, low + 1e-9), _PIECES)
-    return curve.columns(u, np.zeros(len(u), dtype=bool), 0.0)

@@ -75,8 +75,7 @@ def diagnosed(
     found = diagnose(model, judge, noise, tick, otherwise, cores)
     if model.implied or not model.samples.commanded or found.model.believable:
         return found
-    as_sent = attrs.evolve(model, gains=np.ones_like(model.gains), gains_held=True)
-    other = diagnose(fit_with_delays(as_sent, judge.fit), judge, noise, tick, otherwise, cores)
+    other = diagnose(fit_with_delays(model.as_commanded(), judge.fit), judge, noise, tick, otherwise, cores)
     if not other.findings:
         return found
     tau = model.samples.tau

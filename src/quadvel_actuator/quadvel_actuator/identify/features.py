@@ -151,14 +151,13 @@ class _Curves:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        self._ranges: dict[str, tuple[Array, Array]] = {}
+        self._ranges: dict[str, Curve] = {}
 
     def __call__(self, signal: str, times: str, pieces: int) -> Feature:
         if signal not in self._ranges:
             u = read(signal, self._scene.views[DRIVE], self._scene.asked, self._scene.joints)
-            low, high = np.quantile(u, (0.005, 0.995), axis=0)
-            self._ranges[signal] = low, np.maximum(high, low + 1e-9)
-        return Feature(signal, times, Curve(*self._ranges[signal], pieces))
+            self._ranges[signal] = Curve.over(u, pieces)
+        return Feature(signal, times, attrs.evolve(self._ranges[signal], pieces=pieces))
 
 
 def _ripples(scene: Scene, left: Array, signal: str) -> Iterator[Feature]:

@@ -96,8 +96,12 @@ class _Pick:
 
     feature: Feature
     joints: Bools
-    gain: float  # all joints together
-    each: Array  # (J,), the joint's share of it, 0 where it is not at work
+    each: Array  # (J,), the joint's share of the gain, 0 where it is not at work
+
+    @property
+    def gain(self) -> float:
+        """Of all joints together."""
+        return float(self.each.sum())
 
 
 _Picks = tuple[_Pick, ...]
@@ -138,6 +142,11 @@ class _State:
     def beside(self) -> _Joint:
         """The picks as they are fitted to what the scene leaves, its model staying as it is."""
         return _Joint(self.picks, self.scene, free=False)
+
+    @cached_property
+    def freed(self) -> _Joint:
+        """The picks fitted together with the model, along its slopes."""
+        return _Joint(self.picks, self.scene)
 
     @property
     def left(self) -> float:
@@ -184,7 +193,7 @@ class _State:
 
     def _steps(self) -> Iterator[Model]:
         """The model after steps of less and less courage, the last one with its delays as they are."""
-        joint, model, slots = _Joint(self.picks, self.scene), self.scene.model, self.scene.slots
+        joint, model, slots = self.freed, self.scene.model, self.scene.slots
         theta = np.concatenate([pack(model), model.input_delay[None], model.output_delay[None]])
         held = np.isin(np.arange(slots.count), slots.index[-2:])
         still = np.where(held | held[:, None], np.diag(np.diagonal(joint.hessian)), joint.hessian)
@@ -217,7 +226,7 @@ class _Outline:
 
 def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Picks]:
     """What pays beside the picks of a state, best first: of what did before, or of everything where that does no more."""
-    left = _Joint(state.picks, state.scene).left if state.picks else state.scene.residual
+    left = state.freed.left if state.picks else state.scene.residual
     fresh = [one for picks in kept for one in picks if one.feature.signal != "t"]
     found = _paying(_again(fresh, state.scene, left), state, noise) if fresh else []
     return found or _paying(library(state.scene, left), state, noise)
@@ -281,8 +290,7 @@ def _own_neighbours(picks: Sequence[_Pick]) -> _Picks:
     for k, one in enumerate(picks):
         mine = one.joints & (owner == k)
         if mine.any():
-            each = one.each * mine
-            found.append(attrs.evolve(one, joints=mine, gain=float(each.sum()), each=each))
+            found.append(attrs.evolve(one, joints=mine, each=one.each * mine))
     return tuple(found)
 
 
@@ -297,7 +305,7 @@ def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
     each = found.fall.sum(axis=0) * taken / max(found.rows.sum(), 1)
-    return _Pick(feature, taken, float(each.sum()), each) if taken.any() else None
+    return _Pick(feature, taken, each) if taken.any() else None
 
 
 def _tuned(pick: _Pick, trial: Trial, noise: Array) -> _Pick:

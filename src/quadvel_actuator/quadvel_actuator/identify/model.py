@@ -85,6 +85,10 @@ class Model:
         """Are its proportional gains near those that were commanded?"""
         return bool((np.abs(np.log(np.maximum(self.gains[0], 1e-3))) <= _FAR).all())
 
+    def as_commanded(self) -> Model:
+        """With its gains held as they were commanded."""
+        return attrs.evolve(self, gains=np.ones_like(self.gains), gains_held=True)
+
     def predict(self) -> Array:
         """Torque of every row, (N, J), N m."""
         torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.applied])[0]
