@@ -7,6 +7,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from scipy.linalg.blas import dtbsv
 
 from .base import (
     DRIVE,
@@ -26,9 +27,6 @@ from .base import (
 
 _FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
 _TIME = Parameter("T", "s", 0.0002, 0.1, 0.004)
-_ROWS = 16  # summed at once
-_FADED = 40.0
-"""time constants after which nothing is left; exp of as many for every row of a piece is a number"""
 
 
 def lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
@@ -49,31 +47,17 @@ def _row_before(x: Array, s: Any) -> Array:
 def lagged(x: Array, s: Any, time: Array) -> Array:
     """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
 
-    y[k] = d[k] y[k-1] + (1 - d[k]) x[k] is summed over pieces of a few rows, all pieces at once: with D the product of
-    the d since the piece began, y / D grows by (1 - d) x / D at each row. Then the pieces are joined, one by one.
+    y[k] = d[k] y[k-1] + (1 - d[k]) x[k], with d = 0 where a stretch begins, is a triangular system of two bands; all
+    joints and the whole batch are solved as one.
     """
-    rate = np.minimum(s.dt, _FADED * time) / time  # (..., N, J)
-    rate = np.where(s.start, _FADED, rate)
-    rows, joints = x.shape[-2:]
-    lead = np.broadcast_shapes(x.shape[:-2], rate.shape[:-2])
-    pieces = -(-rows // _ROWS)
-
-    def pieced(values: Array) -> Array:
-        wide = np.pad(values, [(0, 0)] * (values.ndim - 2) + [(0, pieces * _ROWS - rows), (0, 0)])
-        return wide.reshape(*values.shape[:-2], pieces, _ROWS, values.shape[-1])
-
-    faded = pieced(rate).cumsum(axis=-2)
-    left = np.exp(-faded)
-    added = left * np.cumsum(pieced(-np.expm1(-rate) * x) / left, axis=-2)
-    added = np.broadcast_to(added, (*lead, *added.shape[-3:]))
-    carried = np.empty((*lead, pieces, 1, joints))
-    before = np.broadcast_to(x[..., 0, :], (*lead, joints))
-    last = left[..., -1, :]
-    for k in range(pieces):
-        carried[..., k, 0, :] = before
-        before = added[..., k, -1, :] + last[..., k, :] * before
-    out: Array = (added + left * carried).reshape(*lead, pieces * _ROWS, joints)[..., :rows, :]
-    return out
+    gone = np.where(s.start, -1.0, np.expm1(-s.dt / time))  # d - 1
+    gone[..., 0, :] = -1.0
+    gone, x = (one.swapaxes(-1, -2) for one in np.broadcast_arrays(gone, x))  # (..., J, N)
+    band = np.ones((2, gone.size), order="F")
+    band[1, :-1] = -1.0 - gone.reshape(-1)[1:]
+    given = (-gone * x).reshape(-1)
+    out: Array = dtbsv(1, band, given, lower=1, diag=1, overwrite_x=1).reshape(gone.shape)
+    return out.swapaxes(-1, -2)
 
 
 class FirstOrderLag(MemoryLaw):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 import attrs
 import numpy as np
@@ -12,7 +13,7 @@ from ..effects.terms import Curve, Filter, Lag, Resonance, Shape, Wave, factor, 
 from ..running import SLOPE
 from .delays import jacobian_with_delays
 from .judging import Judge
-from .model import Model
+from .model import Model, Slots
 from .signals import Array, Bools, Signals
 
 EVERY = slice(None)
@@ -74,12 +75,26 @@ class Scene:
         self.model, self.judge = model, judge
         self.joints: Sequence[str] = model.samples.joints
         self.rows = judge.fit | judge.judge
-        self.asked, self.slopes, self.slots = jacobian_with_delays(model)  # (N, J), (J, A, N)
+        self.asked = model.predict()  # (N, J)
         self.residual = np.where(self.rows, model.samples.tau - self.asked, 0.0)
         self.dt = model.samples.period
         self.start = model.samples.start
         self.views = {at: _past_only(model.seen(at), self.dt) for at in (DRIVE, JOINT)}
         self._taken: dict[Feature, dict[int, Array]] = {}
+
+    @cached_property
+    def _jacobian(self) -> tuple[Array, Slots]:
+        return jacobian_with_delays(self.model)[1:]
+
+    @property
+    def slopes(self) -> Array:
+        """Of the prediction along every slot and the delays, (J, A, N)."""
+        return self._jacobian[0]
+
+    @property
+    def slots(self) -> Slots:
+        """The unknowns that the slopes go along."""
+        return self._jacobian[1]
 
     def taken(self, feature: Feature, joints: Bools) -> dict[int, Array]:
         """The same of each of these joints, (N, K); kept, as few features are taken and these are asked for often."""

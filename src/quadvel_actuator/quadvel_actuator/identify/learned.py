@@ -437,7 +437,7 @@ class _Joint:
 
     def __init__(self, picks: Sequence[_Pick], scene: Scene, free: bool = True) -> None:
         joints = range(len(scene.joints))
-        fit, slots = scene.judge.fit, scene.slots
+        fit = scene.judge.fit
         mine = [[k for k, pick in enumerate(picks) if pick.joints[j]] for j in joints]
         columns = _columns(picks, scene)
         inverse = [
@@ -451,8 +451,8 @@ class _Joint:
             return weights
 
         left = scene.residual.copy()
-        self.hessian, self.gradient = np.zeros((slots.count, slots.count)), np.zeros(slots.count)
         if free:
+            slots = scene.slots
             slopes = np.stack([scene.slopes[j] - (columns[j] @ onto(j, scene.slopes[j].T)).T for j in joints])
             slopes *= fit.T[:, None]
             rest = np.stack([left[:, j] - columns[j] @ onto(j, left[:, j]) for j in joints], axis=1)
