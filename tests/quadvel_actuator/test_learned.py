@@ -15,8 +15,9 @@ from quadvel_actuator.identify.features import Scene
 from quadvel_actuator.identify.floor import noise_floor
 from quadvel_actuator.identify.identify import identify
 from quadvel_actuator.identify.judging import Judge
-from quadvel_actuator.identify.learned import Trial, learn, longest
+from quadvel_actuator.identify.learned import learn, longest
 from quadvel_actuator.identify.model import Model
+from quadvel_actuator.identify.picks import Trial
 from quadvel_actuator.identify.signals import Samples
 from quadvel_actuator.identify.simplest import Alone
 

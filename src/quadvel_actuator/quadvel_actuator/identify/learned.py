@@ -19,15 +19,13 @@ from ..effects import DRIVE, JOINT
 from ..effects.terms import Lag, Resonance, Shape, Term
 from .delays import latest
 from .features import Feature, Scene, library, lines
-from .judging import Comparison, Judge
-from .model import Model, gather, pack, step, with_slots
+from .judging import Judge
+from .model import Model, pack, step, with_slots
+from .picks import WORTH, Pick, Picks, Together, Trial, columns_of
 from .signals import Array, Bools
 
 LEVEL = 0.01
 """A term is taken if chance would bring its gain with less than this probability, all that were tried counted."""
-
-WORTH = 0.03
-"""Least gain on a joint, as a share of its noise."""
 
 MOST = 8
 """Terms at most."""
@@ -39,17 +37,9 @@ _MOST_JOINTS, _FAR_LESS = 0.5, 0.7
 """On more of the joints than that a feature is tried on all, and stays there if it leaves less than that of the error"""
 _AS_GOOD, _NEARLY = 0.9, 1.02
 """Of the best one's gain: of these that of fewest signals is taken; and of its error: of these that of fewest numbers"""
-_RIDGE = 1e-6
-_FREEDOM = 1e-3  # the same of the model's parameters, in shares of what they do to the joints that move most
 _STEPS, _DAMPINGS, _SETTLED = 4, (1e-6, 1e-2, 1.0), 1e-3  # of the fit of model and terms together
 _MOST_DAMPED = 0.7
-_ENOUGH = 1500  # rows for a first look
-_TUNING = (
-    1.06,
-    1.03,
-    1.015,
-    1.007,
-)  # steps of a frequency; of dampings and time constants to the fourth power
+_TUNING = 1.06, 1.03, 1.015, 1.007  # steps of a frequency; of dampings and time constants to the fourth power
 
 
 @attrs.frozen(eq=False)
@@ -90,31 +80,13 @@ def longest(model: Model, learned: Learned | None, rows: Bools) -> Model:
     return model.with_delays(late.input_delay, late.output_delay)
 
 
-@attrs.frozen(eq=False)
-class _Pick:
-    """A feature at work on the joints where it pays."""
-
-    feature: Feature
-    joints: Bools
-    each: Array  # (J,), the joint's share of the gain, 0 where it is not at work
-
-    @property
-    def gain(self) -> float:
-        """Of all joints together."""
-        return float(self.each.sum())
-
-
-_Picks = tuple[_Pick, ...]
-"""What is taken at once: one feature, or one for each joint of a neighbour of its own"""
-
-
 def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
     """Terms for what `model` leaves; None where nothing pays.
 
     Gains that are held are left free as soon as terms let them stay near those commanded.
     """
     state = _State((), Scene(model, judge))
-    kept: list[_Picks] = []
+    kept: list[Picks] = []
     for _ in range(MOST):
         kept = _promising(state, kept, noise)
         grown = [state.plus(picks).outline for picks in kept[:_FITTED]]
@@ -135,18 +107,18 @@ def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
 class _State:
     """Picks, and the scene of the model fitted beside them."""
 
-    picks: tuple[_Pick, ...]
+    picks: tuple[Pick, ...]
     scene: Scene
 
     @cached_property
-    def beside(self) -> _Joint:
+    def beside(self) -> Together:
         """The picks as they are fitted to what the scene leaves, its model staying as it is."""
-        return _Joint(self.picks, self.scene, free=False)
+        return Together(self.picks, self.scene, free=False)
 
     @cached_property
-    def freed(self) -> _Joint:
+    def freed(self) -> Together:
         """The picks fitted together with the model, along its slopes."""
-        return _Joint(self.picks, self.scene)
+        return Together(self.picks, self.scene)
 
     @property
     def left(self) -> float:
@@ -159,7 +131,7 @@ class _State:
         """All that is needed to make it again."""
         return _Outline(self.picks, self.scene.model, self.left)
 
-    def plus(self, picks: _Picks) -> _State:
+    def plus(self, picks: Picks) -> _State:
         """With more picks, the model fitted anew; with these on all joints, where that says far more."""
         found = _State((*self.picks, *picks), self.scene).settled()
         if (wider := _wider(picks)) is None:
@@ -210,7 +182,7 @@ class _State:
 class _Outline:
     """A state without its scene, which is large."""
 
-    picks: tuple[_Pick, ...]
+    picks: tuple[Pick, ...]
     model: Model
     left: float
 
@@ -224,7 +196,7 @@ class _Outline:
         return _State(self.picks, Scene(self.model, judge))
 
 
-def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Picks]:
+def _promising(state: _State, kept: Sequence[Picks], noise: Array) -> list[Picks]:
     """What pays beside the picks of a state, best first: of what did before, or of everything where that does no more."""
     left = state.freed.left if state.picks else state.scene.residual
     fresh = [one for picks in kept for one in picks if one.feature.signal != "t"]
@@ -232,7 +204,7 @@ def _promising(state: _State, kept: Sequence[_Picks], noise: Array) -> list[_Pic
     return found or _paying(library(state.scene, left), state, noise)
 
 
-def _wider(picks: _Picks) -> _Pick | None:
+def _wider(picks: Picks) -> Pick | None:
     """On all joints, what is on most of them: on the others, gains that it bends may stand for it."""
     one = picks[0]
     if (
@@ -258,16 +230,16 @@ def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
     return best
 
 
-def _again(kept: Sequence[_Pick], scene: Scene, left: Array) -> Iterator[Feature]:
+def _again(kept: Sequence[Pick], scene: Scene, left: Array) -> Iterator[Feature]:
     yield from (one.feature for one in kept)
     yield from lines(scene, left)
 
 
-def _paying(features: Iterable[Feature], state: _State, noise: Array) -> list[_Picks]:
+def _paying(features: Iterable[Feature], state: _State, noise: Array) -> list[Picks]:
     """Those that pay beside the picks of a state, of the same signals the best one, and sets of neighbours; best first."""
     trial = Trial(state.picks, state.scene)
-    best: dict[tuple[str, ...], _Pick] = {}
-    neighbours: dict[Any, list[_Pick]] = {}
+    best: dict[tuple[str, ...], Pick] = {}
+    neighbours: dict[Any, list[Pick]] = {}
     for feature in features:
         pick = _pick(feature, trial, noise)
         if pick is None:
@@ -283,7 +255,7 @@ def _paying(features: Iterable[Feature], state: _State, noise: Array) -> list[_P
     return sorted([*found, *sets], key=lambda one: -sum(pick.gain for pick in one))
 
 
-def _own_neighbours(picks: Sequence[_Pick]) -> _Picks:
+def _own_neighbours(picks: Sequence[Pick]) -> Picks:
     """Every joint with the neighbour of its own that says most of it."""
     owner = np.argmax([one.each for one in picks], axis=0)
     found = []
@@ -294,7 +266,7 @@ def _own_neighbours(picks: Sequence[_Pick]) -> _Picks:
     return tuple(found)
 
 
-def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
+def _pick(feature: Feature, trial: Trial, noise: Array) -> Pick | None:
     """The feature on the joints where it pays; None where there are none."""
     promising = trial.promising(feature, noise)
     if not promising.any():
@@ -305,10 +277,10 @@ def _pick(feature: Feature, trial: Trial, noise: Array) -> _Pick | None:
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
     each = found.fall.sum(axis=0) * taken / max(found.rows.sum(), 1)
-    return _Pick(feature, taken, each) if taken.any() else None
+    return Pick(feature, taken, each) if taken.any() else None
 
 
-def _tuned(pick: _Pick, trial: Trial, noise: Array) -> _Pick:
+def _tuned(pick: Pick, trial: Trial, noise: Array) -> Pick:
     """The pick at the place and with the time constant, frequency or damping with which it says most of the fitted rows."""
 
     def error(feature: Feature) -> float:
@@ -341,155 +313,6 @@ def _near(shape: Shape, size: float) -> list[Shape]:
     return []
 
 
-class Trial:
-    """What a feature would add to the picks: each joint's torque on the feature, the model and the picks left free."""
-
-    def __init__(self, picks: Sequence[_Pick], scene: Scene) -> None:
-        self.scene = scene
-        parts = _Joint(picks, scene).parts
-        sizes, rows = _sizes(scene), int(scene.judge.fit.sum(axis=0).max())
-        self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows; slopes over those of all joints
-        self.inverse = []
-        self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
-        self.onto = []  # of each joint: (X, n), weights of the columns that come closest on few of the fitted rows
-        self.bare = np.empty_like(scene.residual)
-        for j in range(len(scene.joints)):
-            keep = scene.judge.fit[:, j]
-            taken = np.column_stack([np.zeros((len(keep), 0)), *(part[:, j] for part in parts)])
-            taken = taken / (np.sqrt(np.mean(taken[keep] ** 2, axis=0)) + 1e-12)
-            x = np.hstack([scene.slopes[j].T / sizes, taken])
-            ridge = np.repeat([_FREEDOM, _RIDGE], [len(sizes), len(parts)])
-            gram = x[keep].T @ x[keep] + np.diag(ridge * rows)
-            self.others.append(x)
-            self.inverse.append(np.linalg.inv(gram))
-            some = x[self.few][keep[self.few]]
-            share = ridge * rows * len(some) / max(int(keep.sum()), 1)
-            self.onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
-            self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
-
-    def _without(self, j: int, values: Array) -> Array:
-        """What the other columns do not explain of `values` (N, K)."""
-        x, keep = self.others[j], self.scene.judge.fit[:, j]
-        left: Array = values - x @ (self.inverse[j] @ (x[keep].T @ values[keep]))
-        return left
-
-    def promising(self, feature: Feature, noise: Array) -> Bools:
-        """The joints where the feature fitted to some of the rows gains more than chance would."""
-        few = self.few
-        columns, fit = self.scene.columns(feature, few), self.scene.judge.fit[few]
-        found = np.zeros(len(noise), dtype=bool)
-        for j, x in enumerate(self.others):
-            keep = fit[:, j]
-            left = self.bare[few, j][keep]
-            b, x = columns[keep, :, min(j, columns.shape[2] - 1)], x[few][keep]
-            b = b - x @ (self.onto[j] @ b)
-            onto = b.T @ left
-            gain = (onto @ _inverse(b, [feature.shape.penalty]) @ onto) / len(left)
-            chance = float(np.mean(left * left)) * feature.shape.count / len(left)
-            found[j] = gain - chance > 0.5 * WORTH * noise[j]
-        return found
-
-    def compare(self, feature: Feature, columns: Array, joints: Bools) -> Comparison:
-        """Held-out residuals without the feature, and with it on these joints."""
-        return self.scene.judge.compare(self.bare, self._after(feature, columns, joints))
-
-    def error(self, feature: Feature, columns: Array, joints: Bools) -> float:
-        """Sum of squares that the feature leaves of the fitted rows of these joints."""
-        left = (self._after(feature, columns, joints) * self.scene.judge.fit)[:, joints]
-        return float(np.sum(left * left))
-
-    def _after(self, feature: Feature, columns: Array, joints: Bools) -> Array:
-        """Residual (N, J) with the feature fitted to each of these joints."""
-        after = self.bare.copy()
-        for j in np.flatnonzero(joints).tolist():
-            own = self._without(j, columns[:, :, min(j, columns.shape[2] - 1)])
-            keep = self.scene.judge.fit[:, j]
-            inverse = _inverse(own[keep], [feature.shape.penalty])
-            after[:, j] -= own @ (inverse @ (own[keep].T @ self.bare[keep, j]))
-        return after
-
-
-def _sizes(scene: Scene) -> Array:
-    """What each of the model's parameters does, root mean square over the fitted rows of the joint that shows it most.
-
-    (A,). A joint that hardly moves while the model is fitted says nothing of them; it must not be free to make them up.
-    """
-    square = np.einsum("jan,nj->ja", scene.slopes**2, scene.judge.fit.astype(float))
-    rows = np.maximum(scene.judge.fit.sum(axis=0), 1)
-    sizes: Array = np.sqrt((square / rows[:, None]).max(axis=0)) + 1e-12
-    return sizes
-
-
-def _inverse(x: Array, penalties: Sequence[Array]) -> Array:
-    """Of the second moments of x (N, K), each block of columns with its penalty, in shares of its mean square."""
-    gram: Array = x.T @ x
-    first = 0
-    for penalty in penalties:
-        last = first + len(penalty)
-        size = float(np.trace(gram[first:last, first:last])) / len(penalty)
-        gram[first:last, first:last] += size * penalty + 1e-12 * np.eye(len(penalty))
-        first = last
-    return np.asarray(np.linalg.inv(gram), dtype=np.float64)
-
-
-class _Joint:
-    """Picks fitted together to what the scene leaves; with `free` the model's parameters move, too, shared as they are."""
-
-    def __init__(self, picks: Sequence[_Pick], scene: Scene, free: bool = True) -> None:
-        joints = range(len(scene.joints))
-        fit = scene.judge.fit
-        mine = [[k for k, pick in enumerate(picks) if pick.joints[j]] for j in joints]
-        columns = _columns(picks, scene)
-        inverse = [
-            _inverse(columns[j][fit[:, j]], [picks[k].feature.shape.penalty for k in mine[j]]) for j in joints
-        ]
-
-        def onto(j: int, values: Array) -> Array:
-            """Weights of the joint's columns that come closest to `values` (N, ...)."""
-            keep = fit[:, j]
-            weights: Array = inverse[j] @ (columns[j][keep].T @ values[keep])
-            return weights
-
-        left = scene.residual.copy()
-        if free:
-            slots = scene.slots
-            slopes = np.stack([scene.slopes[j] - (columns[j] @ onto(j, scene.slopes[j].T)).T for j in joints])
-            slopes *= fit.T[:, None]
-            rest = np.stack([left[:, j] - columns[j] @ onto(j, left[:, j]) for j in joints], axis=1)
-            self.hessian = gather(slots, slopes @ slopes.transpose(0, 2, 1))
-            self.gradient = gather(slots, np.einsum("jan,nj->ja", slopes, rest))
-            size = np.diagonal(self.hessian) * _RIDGE + 1e-9
-            moved = np.linalg.solve(self.hessian + np.diag(size), self.gradient)
-            change = np.where(slots.index >= 0, moved[slots.index], 0.0)  # (A, J)
-            left -= np.einsum("jan,aj->nj", scene.slopes, change)
-        self.weights = [np.zeros((pick.feature.shape.count, len(joints))) for pick in picks]
-        self.parts = [np.zeros_like(left) for _ in picks]
-        for j in joints:
-            solution, first = onto(j, left[:, j]), 0
-            for k in mine[j]:
-                last = first + picks[k].feature.shape.count
-                self.weights[k][:, j] = solution[first:last]
-                self.parts[k][:, j] = columns[j][:, first:last] @ solution[first:last]
-                first = last
-        self.left = np.where(scene.rows, left - sum(self.parts, start=np.zeros_like(left)), 0.0)
-        self.error = float(np.sum((self.left * fit) ** 2))
-        """sum of squares of the fitted rows"""
-
-
-def _columns(picks: Sequence[_Pick], scene: Scene) -> tuple[Array, ...]:
-    """Of each joint, what the picks on it are sums of, (N, K)."""
-
-    def of(j: int) -> Array:
-        parts = [scene.taken(one.feature, one.joints)[j] for one in picks if one.joints[j]]
-        return (
-            np.concatenate([np.zeros((len(scene.residual), 0)), *parts], axis=1)
-            if len(parts) != 1
-            else parts[0]
-        )
-
-    return tuple(of(j) for j in range(len(scene.joints)))
-
-
 def _simplest(states: Sequence[_Outline], before: float) -> _Outline:
     """Of those that gain nearly as much as the best one those of fewest signals; of these, as good, that of fewest numbers."""
     most = before - min(one.left for one in states)
@@ -504,10 +327,10 @@ def _pruned(state: _State, noise: Array) -> _State:
     """Without the picks that the others made needless."""
     picks, scene = state.picks, state.scene
     while len(picks) > 1:
-        whole = _Joint(picks, scene).left
+        whole = Together(picks, scene).left
         losses = []
         for k in range(len(picks)):
-            less = _Joint(picks[:k] + picks[k + 1 :], scene).left
+            less = Together(picks[:k] + picks[k + 1 :], scene).left
             found = scene.judge.compare(less, whole)
             on = picks[k].joints
             worth = float(np.max(np.where(on, found.joint_gain / noise, 0.0)))
@@ -523,7 +346,7 @@ def _narrowed(state: _State, noise: Array) -> _State:
     """Without the picks on joints that do without them, the model staying as it is."""
     picks = []
     for k, one in enumerate(state.picks):
-        less = _Joint(state.picks[:k] + state.picks[k + 1 :], state.scene, free=False).left
+        less = Together(state.picks[:k] + state.picks[k + 1 :], state.scene, free=False).left
         found = state.scene.judge.compare(less, state.beside.left)
         needed = one.joints & (found.joint_gain > WORTH * noise)
         if needed.any():
@@ -545,4 +368,4 @@ def _as_terms(state: _State) -> Learned:
     total: Array = np.sum(parts, axis=0)
     left = scene.residual - total
     gains = [scene.judge.compare(left + part, left).gain for part in parts]
-    return Learned(scene.model, tuple(terms), total, tuple(gains), _columns(state.picks, scene))
+    return Learned(scene.model, tuple(terms), total, tuple(gains), columns_of(state.picks, scene))

@@ -15,8 +15,9 @@ from .as_sent import as_sent
 from .diagnosis import BETTER_SAID, Diagnosis
 from .few import Few
 from .judging import Judge
-from .learned import LEVEL, WORTH, Learned, learn
+from .learned import LEVEL, Learned, learn
 from .model import Model
+from .picks import WORTH
 from .ranking import Rejected
 from .signals import Array
 
