@@ -27,12 +27,12 @@ class Stage(enum.IntEnum):
 
     ERRORS = 0
     """on the errors of position and velocity that the PD law is given"""
-    GAIN = 1
-    """on the asked torque, as a gain"""
-    LIMIT = 2
+    LIMIT = 1
     """on the asked torque, as a bound"""
-    FLOW = 3
+    FLOW = 2
     """on how fast the torque follows"""
+    GAIN = 3
+    """on what the drive's current gives, as a gain: the motor's constant and the gear come after bounds and lags"""
     ADDED = 4
     """a torque beside it: friction, springs, coupling"""
 

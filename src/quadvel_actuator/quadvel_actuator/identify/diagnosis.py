@@ -96,7 +96,8 @@ def diagnose(
 ) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
 
-    Several that still leave much are given up where `otherwise(model)` says that there is a better account without them.
+    Several that still leave much, even with the next, are given up where `otherwise(model)` says that there is a better
+    account without them.
     """
     bare = model
     given_up: list[Rejected] = []
@@ -104,8 +105,6 @@ def diagnose(
     ties: list[tuple[str, ...]] = []
     rejected: list[Rejected] = []
     for number in range(MOST + 1):
-        if len(model.applied) >= _FEW and _unsaid(model, judge, noise) and otherwise(model):
-            return Diagnosis(bare, (), (*given_up, *rejected))
         model = model.holding(True)
         about = About(model, judge, noise, few)
         candidates, idle = ranked(about, tick, f"effect {number + 1}", cores)
@@ -114,7 +113,11 @@ def diagnose(
         if finer is not None:
             model = finer
             continue
-        if not candidates or not _pays(candidates[0], noise, len(registry())) or number == MOST:
+        more = bool(candidates) and _pays(candidates[0], noise, len(registry())) and number < MOST
+        foreseen = candidates[0].model if more else model
+        if len(model.applied) >= _FEW and _unsaid(foreseen, judge, noise) and otherwise(foreseen):
+            return Diagnosis(bare, (), (*given_up, *rejected))
+        if not more:
             break
         best, tied = _choice(_simpler_first(candidates, judge, noise, few), judge, noise)
         found = few.fitted(about.fit_anew(best.model.holding(False)), deepest, 1)

@@ -75,12 +75,9 @@ class Alone:
         return min(good, key=lambda terms: (_words(None, terms), left[id(terms)]))
 
     def says_more(self, laws: Model) -> bool:
-        """Do terms that say little more than the laws of this model leave no more than the noise, or half of what these do?
-
-        Where much is left, one more law at least would follow.
-        """
+        """Do terms of no more words than the laws of this model leave no more than the noise, or half of what these do?"""
         terms = self.learned
-        if terms is None or _words(None, terms) > _words(laws, None) + 1:
+        if terms is None or _words(None, terms) > _words(laws, None):
             return False
         half = self._above(terms.model, terms) < _HALF * self._above(laws, None)
         return half or self._at_floor(terms.model, terms)
