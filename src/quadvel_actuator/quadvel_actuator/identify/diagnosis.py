@@ -70,7 +70,8 @@ def diagnosed(
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
     What a joint swings freely can hide an inertia in lesser gains, and the other effects then come out bent. The account
-    with the commanded gains is taken where it predicts as well. Without measured torque the gains set the scale of all.
+    with the commanded gains is taken where it predicts as well; if they stray there, too, where it predicts better.
+    Without measured torque the gains set the scale of all.
     """
     found = diagnose(model, judge, noise, tick, otherwise, cores)
     if model.implied or not model.samples.commanded or found.model.believable:
@@ -80,7 +81,8 @@ def diagnosed(
         return found
     tau = model.samples.tau
     lost = judge.compare(tau - other.model.predict(), tau - found.model.predict()).gain
-    return other if lost < _AS_WELL * float(noise.mean()) else found
+    may_lose = _AS_WELL * float(noise.mean()) if other.model.believable else 0.0
+    return other if lost < may_lose else found
 
 
 def _released(model: Model, few: Few) -> Model:
