@@ -6,6 +6,7 @@ Each process has environments of its own. A single process, started without torc
 from __future__ import annotations
 
 import atexit
+import importlib
 import os
 from typing import Any
 
@@ -18,6 +19,7 @@ def join(device: str) -> torch.device:
     if "LOCAL_RANK" not in os.environ:
         return torch.device(device)
     if not dist.is_initialized():
+        importlib.import_module("torch._dynamo")  # imported later, by an optimiser, it keeps the group
         dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
         atexit.register(leave)
     local = int(os.environ["LOCAL_RANK"])
