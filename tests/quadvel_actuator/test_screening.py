@@ -8,8 +8,10 @@ from simulated_joints import NAMES, parameters, record
 from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
-from quadvel_actuator.identify import backlog, candidates, diagnosis
+from quadvel_actuator.identify import backlog, candidates, ranking
 from quadvel_actuator.identify.candidates import About, propose, simplified, started
+from quadvel_actuator.identify.company import Company, Said
+from quadvel_actuator.identify.delays import fit_with_delays
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
@@ -38,6 +40,10 @@ def about(log, input_delay, output_delay):
     model = Model(samples, 0.001, np.ones((2, joints)), np.array([one, one]), *delays, one)
     few = Few(model.samples, judge, np.zeros((len(samples.t), joints)))
     return About(model, judge, np.full(joints, 0.066), few)
+
+
+def company(looked):
+    return Company(looked.judge, looked.noise, looked.few)
 
 
 def test_signals_of_few_rows_are_those_of_all():
@@ -155,10 +161,28 @@ def test_a_constant_that_passed_for_a_weak_spring_far_away_is_called_one_in_the_
         Applied(friction, np.ones(2, dtype=bool), np.array([[0.5, 0.5], [0.05, 0.05]]), np.arange(2)),
     )
     model = attrs.evolve(looked.model, applied=both)
-    found, ties = diagnosis._simplest(model, [("cogging",), ()], looked.judge, looked.noise)
+    found, said = company(looked).simplest(model, [Said(("cogging",)), Said()])
     assert [one.law.name for one in found.applied] == ["torque_offset", "coulomb_friction"]
-    assert ties == [("parallel_spring", "cogging"), ()]
+    assert [one.ties for one in said] == [("parallel_spring", "cogging"), ()]
     np.testing.assert_allclose(found.applied[0].values[0], 0.25, atol=0.03)
+
+
+SPRING = Effect("parallel_spring", JOINTS, {"k": 1.5, "q0": -0.2})
+OFFSET = Effect("torque_offset", JOINTS, {"offset": 0.25})
+
+
+@pytest.mark.parametrize(("truth", "named"), [(SPRING, "parallel_spring"), (OFFSET, "torque_offset")])
+def test_a_law_gives_way_to_a_rival_that_says_more_beside_what_came_later(truth, named):
+    looked = about(_log(FRICTION, truth), 0.009, 0.003)
+    offset = Applied(
+        registry()["torque_offset"](), np.ones(2, dtype=bool), np.full((1, 2), 0.25), np.arange(2)
+    )
+    friction = registry()["coulomb_friction"](at=JOINT)
+    later = Applied(friction, np.ones(2, dtype=bool), np.array([[0.5, 0.5], [0.05, 0.05]]), np.arange(2))
+    model = fit_with_delays(looked.model.plus(offset).plus(later), looked.judge.fit)
+    found, said = company(looked).exchanged(model, [Said(("cogging",), ("parallel_spring", "cogging"))])
+    assert [one.law.name for one in found.applied] == [named, "coulomb_friction"]
+    assert ("parallel_spring" in said[0].rivals) == (truth is OFFSET)
 
 
 def test_a_law_that_takes_nothing_off_the_error_is_not_tried():
@@ -179,7 +203,7 @@ def test_a_law_that_reads_the_torque_keeps_no_other_from_being_fitted(monkeypatc
     odds = np.full((*looked.samples.tau.shape, 3), [0.9, 0.1, 0.0])
     monkeypatch.setattr(About, "lost_commands", lambda about, most: [(odds, odds[0, 0])])
     few = {name: registry()[name] for name in ("first_order_lag", "command_hold")}
-    monkeypatch.setattr(diagnosis, "registry", lambda: few)
+    monkeypatch.setattr(ranking, "registry", lambda: few)
 
     def loud(about, law):
         found = started(about, law)
@@ -188,8 +212,8 @@ def test_a_law_that_reads_the_torque_keeps_no_other_from_being_fitted(monkeypatc
         lost = Applied(law, np.ones(2, dtype=bool), np.full((1, 2), 0.1), np.arange(2))
         return Started(law, looked.model.plus(lost), 1e9)
 
-    monkeypatch.setattr(diagnosis, "started", loud)
-    found, _ = diagnosis.ranked(looked, lambda text: None, "")
+    monkeypatch.setattr(ranking, "started", loud)
+    found, _ = ranking.ranked(looked, lambda text: None, "")
     assert found[0].name == "first_order_lag"
 
 
@@ -223,7 +247,7 @@ def test_an_effect_comes_to_a_joint_that_shows_it_later():
     first = Applied(friction, np.array([True, False]), np.array([[0.5, 0.0], [0.05, 0.05]]), np.arange(2))
     spring = registry()["torque_offset"]()
     last = Applied(spring, np.ones(2, dtype=bool), np.zeros((1, 2)), np.arange(2))
-    model = diagnosis._widened(looked.model.plus(first).plus(last), looked.judge, looked.noise, looked.few)
+    model = company(looked).widened(looked.model.plus(first).plus(last))
     assert model.applied[0].active.all()
     np.testing.assert_allclose(model.applied[0].values[0], 0.5, atol=0.04)
 
@@ -238,7 +262,7 @@ def test_an_effect_leaves_a_joint_that_needs_it_no_more():
     both = Applied(skew, np.ones(2, dtype=bool), np.array([[-0.006, 0.003]]), np.arange(2))
     delays = np.full(2, 0.012), np.full(2, 0.0)
     bent = looked.model.plus(both).with_delays(*delays)
-    model = diagnosis._narrowed(bent, looked.judge, looked.noise, looked.few)
+    model = company(looked).narrowed(bent)
     assert model.applied[0].active.tolist() == [True, False]
     np.testing.assert_allclose(model.applied[0].values[0, 0], -0.009, atol=5e-4)
 
@@ -280,7 +304,7 @@ def test_a_drift_with_temperature_counts_from_the_coolest_drive():
 def test_gains_that_are_held_are_left_free_where_they_stay_near_the_commanded_ones(kp, held):
     log = _log()
     looked = about(attrs.evolve(log, kp=np.full_like(log.kp, kp)), 0.009, 0.003)
-    model = diagnosis._released(attrs.evolve(looked.model, gains_held=True), looked.few)
+    model = company(looked).released(attrs.evolve(looked.model, gains_held=True))
     assert model.gains_held == held
     np.testing.assert_allclose(model.gains[0], 1.0 if held else 29.294 / 30.0, atol=0.02)
 

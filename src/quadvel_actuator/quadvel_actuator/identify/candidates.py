@@ -155,18 +155,18 @@ def propose(about: About, started: Started) -> Candidate | None:
             return None
         grown = fewer
     grown = about.fit(grown)
-    everywhere = _judged(about, law, grown)
+    everywhere = judged(about, law, grown)
     chosen = _acted_on(about, everywhere)
     if chosen.all() or not chosen.any():
         return everywhere
     some = attrs.evolve(grown.applied[-1], active=chosen)
-    few = _judged(about, law, about.fit(attrs.evolve(grown, applied=(*grown.applied[:-1], some))))
+    few = judged(about, law, about.fit(attrs.evolve(grown, applied=(*grown.applied[:-1], some))))
     return few if few.gain >= 0.98 * everywhere.gain else everywhere
 
 
 def anew(about: About, one: Candidate) -> Candidate:
     """The candidate fitted from other delays, too."""
-    found = _judged(about, one.law, about.fit_anew(one.model))
+    found = judged(about, one.law, about.fit_anew(one.model))
     return found if found.gain > one.gain else one
 
 
@@ -176,7 +176,7 @@ def simplified(about: About, one: Candidate) -> Candidate | None:
     if less is None:
         return None
     model = attrs.evolve(one.model, applied=(*one.model.applied[:-1], less))
-    return _judged(about, less.law, about.fit(model))
+    return judged(about, less.law, about.fit(model))
 
 
 def less_said(applied: Applied) -> Applied | None:
@@ -197,7 +197,14 @@ def _without_weakest(model: Model) -> Model | None:
     return attrs.evolve(model, applied=(*model.applied[:-1], attrs.evolve(last, active=active)))
 
 
-def _judged(about: About, law: EffectLaw, model: Model) -> Candidate:
+def best_form(about: About, law: type[EffectLaw]) -> Candidate | None:
+    """The most promising form of a law of the registry, fitted; None where none takes anything off the error."""
+    forms = [one for form in law.variants(about) if (one := started(about, form)) is not None]
+    return propose(about, max(forms, key=lambda one: one.promise)) if forms else None
+
+
+def judged(about: About, law: EffectLaw, model: Model) -> Candidate:
+    """The law, last in the model, with what it is worth."""
     residual = about.samples.tau - model.predict()
     found = about.judge.compare(about.residual, residual)
     return Candidate(law, model, residual, found.gain, found.p_any, found.joint_gain)

@@ -5,7 +5,7 @@ What a law promises is found by least squares at many starts; those that promise
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import attrs
 import numpy as np
@@ -13,10 +13,15 @@ import numpy as np
 from ..effects import EffectLaw, registry
 from .ahead import Ahead, R
 from .candidates import About, Candidate, anew, propose, simplified, started
+from .judging import Judge
 from .screening import Started
+from .signals import Array
 
 WORTH = 0.03
 """Least gain on the joints that the effect acts on, as a share of the noise."""
+
+LEVEL = 0.01
+"""An effect is named if chance would bring its gain with less than this probability, all candidates counted."""
 
 _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
@@ -27,6 +32,11 @@ _STUCK, _AGAIN = 0.7, 2
 """Of its promise: what keeps less was fitted from delays that are not its own; and so many are fitted from others"""
 _LEAD, _NEAR = 3, 0.8
 """So many in the lead, and so near the best one's gain"""
+SIMPLER_LOSES = 0.01
+"""Of the noise: what a simpler law may lose"""
+TIES = 3
+"""Names beside the first one's"""
+_TIE_LEVEL, _TIE_SHARE = 0.02, 0.03  # of the noise
 Tick = Callable[[str], None]
 
 
@@ -157,3 +167,25 @@ class _Race:
         """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
         fall = np.maximum(one.joint_gain, 0.0) / self.about.noise
         return float((fall * self.about.few.fitted_rows).sum())
+
+
+def choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tuple[Candidate, tuple[str, ...]]:
+    """The best candidate, or the simplest one that predicts as well; and the names of the others that do."""
+    best = candidates[0]
+    equal = [best, *(one for one in candidates[1:] if _ties(best, one, judge, noise))]
+    size = {one.name: len(one.law.parameters) for one in equal}
+    chosen = best
+    for one in equal[1:]:
+        if size[one.name] < size[chosen.name] and best.gain - one.gain < SIMPLER_LOSES * float(noise.mean()):
+            chosen = one
+    return chosen, tuple(one.name for one in equal if one is not chosen)[:TIES]
+
+
+def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool:
+    """Is the other's held-out error the same within the noise?"""
+    if other.gain <= 0.5 * best.gain:
+        return False
+    found = judge.compare(other.residual, best.residual)
+    return found.gain < 0.005 * float(noise.mean()) or (
+        found.p_any > _TIE_LEVEL and found.gain < _TIE_SHARE * float(noise.mean())
+    )
