@@ -82,9 +82,11 @@ class Company:
         now = judged(beside, one.law, less.plus(one))
         found = [now, *filter(None, (best_form(beside, law) for law in named))]
         best, ties = choice(sorted(found, key=lambda each: -each.gain), self.judge, self.noise)
-        clear = self.judge.compare(now.residual, best.residual).p_any * len(found) < LEVEL
-        simpler = len(best.law.parameters) < len(one.law.parameters)
-        return (beside, best, ties) if best is not now and (clear or simpler) else None
+        more = len(best.law.parameters) - len(one.law.parameters)
+        found_better = self.judge.compare(now.residual, best.residual)
+        clear = found_better.p_any * len(found) < LEVEL
+        pays = found_better.gain > more * SIMPLER_LOSES * float(self.noise.mean())
+        return (beside, best, ties) if best is not now and (more < 0 or (clear and pays)) else None
 
     def _reformed(self, model: Model) -> Model:
         """With those forms of its laws that suit each other best; the newest law came in the best of its own."""
