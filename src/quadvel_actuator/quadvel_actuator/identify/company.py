@@ -13,7 +13,7 @@ import numpy as np
 from ..effects import registry
 from .candidates import About, Candidate, best_form, judged, less_said
 from .delays import fit_with_delays
-from .few import Few
+from .few import Few, remembers
 from .judging import Comparison, Judge
 from .model import Model
 from .ranking import LEVEL, SIMPLER_LOSES, TIES, WORTH, choice
@@ -45,7 +45,9 @@ class Company:
 
     def taken(self, about: About, best: Candidate) -> Model:
         """The candidate's model fitted from other delays, all laws in the forms and on the joints that suit each other."""
-        found = self.few.fitted(about.fit_anew(best.model.holding(False)), deepest, 1)
+        found = about.fit_anew(best.model.holding(False))
+        if not remembers(found):  # whose fits take long: in the end, once
+            found = self.few.fitted(found, deepest, 1)
         found = self._reformed(fit_with_delays(found, self.judge.fit))
         return self.released(self.widened(found))
 
@@ -89,8 +91,8 @@ class Company:
         return (beside, best, ties) if best is not now and (more < 0 or (clear and pays)) else None
 
     def _reformed(self, model: Model) -> Model:
-        """With those forms of its laws that suit each other best; the newest law came in the best of its own."""
-        for index, one in enumerate(model.applied[:-1]):
+        """With those forms of its laws that suit each other best."""
+        for index, one in enumerate(model.applied):
             for form in one.law.forms:
                 other = self._fitted(model.replacing(index, attrs.evolve(one, law=form)), 10)
                 if other.error(self.judge.judge) < _BETTER_FORM * model.error(self.judge.judge):

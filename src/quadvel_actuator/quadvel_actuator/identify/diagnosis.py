@@ -31,8 +31,6 @@ _AS_WELL = 0.02
 
 _NEARLY, _MUCH = 0.7, 0.1
 """Of the best gain; and of the noise, what is much beside it"""
-_FEW = 2
-"""Effects that no other account needs to be looked for"""
 BETTER_SAID = "terms of named signals say it better than the named laws together"
 
 
@@ -101,7 +99,7 @@ def diagnose(
             continue
         more = bool(candidates) and _pays(candidates[0], noise, len(registry())) and len(said) < MOST
         foreseen = candidates[0].model if more else model
-        if len(said) >= _FEW and _unsaid(foreseen, judge, noise) and otherwise(foreseen):
+        if said and _unsaid(foreseen, judge, noise) and otherwise(foreseen):
             return Diagnosis(bare, (), (*given_up, *rejected))
         if not more:
             break

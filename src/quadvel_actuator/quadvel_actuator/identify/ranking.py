@@ -27,7 +27,7 @@ _FITTED = 5
 _PROMISING, _LITTLE = 0.5, 0.1
 """A law is fitted further that is among the first few and quick, or that promises so much of what the best one so far
 keeps of its promise and so much of what is above the noise; of the best promise, where nothing much is above it. One that
-looks like a delay always is: what it promises is for delays that are not its own."""
+looks like a delay always is, in one of its forms at least: what it promises is for delays that are not its own."""
 _STUCK, _AGAIN = 0.7, 2
 """Of its promise: what keeps less was fitted from delays that are not its own; and so many are fitted from others"""
 _LEAD, _NEAR = 3, 0.8
@@ -92,11 +92,12 @@ class _Race:
 
     def fit(self, looked: list[Started], tick: Tick) -> None:
         """All that are quick to fit, or promise enough."""
-        least = self._least_promise(looked)
+        least, firsts = self._least_promise(looked), _firsts([one.law for one in looked])
 
         def counts(k: int) -> bool:
             law = looked[k].law
-            return (k < _FITTED and not law.remembers) or law.shifts or looked[k].promise >= least
+            quick = k < _FITTED and not law.remembers
+            return quick or looked[k].promise >= least or (law.shifts and k in firsts)
 
         with self._ahead(lambda k: propose(self.about, looked[k])) as ahead:
             for k, first in enumerate(looked):
@@ -167,6 +168,17 @@ class _Race:
         """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
         fall = np.maximum(one.joint_gain, 0.0) / self.about.noise
         return float((fall * self.about.few.fitted_rows).sum())
+
+
+def _firsts(laws: Sequence[EffectLaw]) -> set[int]:
+    """Indices of the laws that are no other form of one before them: that one can still take it on."""
+    met: set[tuple[str, str]] = set()
+    firsts = set()
+    for k, law in enumerate(laws):
+        if (law.name, str(law.settings)) not in met:
+            firsts.add(k)
+        met |= {(form.name, str(form.settings)) for form in law.forms}
+    return firsts
 
 
 def choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tuple[Candidate, tuple[str, ...]]:
