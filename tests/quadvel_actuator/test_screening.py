@@ -167,6 +167,17 @@ def test_a_constant_that_passed_for_a_weak_spring_far_away_is_called_one_in_the_
     np.testing.assert_allclose(found.applied[0].values[0], 0.25, atol=0.03)
 
 
+def test_of_a_law_that_looks_like_a_delay_one_form_at_a_place_is_fitted_if_it_promises_little(monkeypatch):
+    looked = about(_log(FRICTION), 0.009, 0.003)
+    fitted = []
+    monkeypatch.setattr(ranking, "propose", lambda about, one: fitted.append(one.law) or propose(about, one))
+    ranking.ranked(looked, lambda text: None, "")
+    places = [law.at for law in fitted if law.name == "armature"]
+    assert len(registry()["armature"].variants(looked)) > 2
+    assert sorted(places) == sorted(set(places))
+    assert places
+
+
 SPRING = Effect("parallel_spring", JOINTS, {"k": 1.5, "q0": -0.2})
 OFFSET = Effect("torque_offset", JOINTS, {"offset": 0.25})
 
