@@ -24,9 +24,12 @@ from .signals import Array
 _AT_FLOOR = 1.05
 """Of the noise: laws that leave no more than this need no other account."""
 
-_MOST, _HALF = 0.8, 0.5
-"""Of what is above the noise: a law that takes so much is the account, whatever is left beside it; and what terms may
-leave of what several laws do"""
+_MOST = 0.8
+"""Of what is above the noise: a law that takes so much is the account, whatever is left beside it."""
+
+_LEAVES = {2: 0.25}
+_MANY_LEAVE = 0.5
+"""Of what so many laws, or more, leave above the noise: what terms may leave. To two a third may come."""
 
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
@@ -75,12 +78,13 @@ class Alone:
         return min(good, key=lambda terms: (_words(None, terms), left[id(terms)]))
 
     def says_more(self, laws: Model) -> bool:
-        """Do terms of no more words than the laws of this model leave no more than the noise, or half of what these do?"""
+        """Do terms of no more words than the laws of this model leave no more than the noise, or far less than these do?"""
         terms = self.learned
         if terms is None or _words(None, terms) > _words(laws, None):
             return False
-        half = self._above(terms.model, terms) < _HALF * self._above(laws, None)
-        return half or self._at_floor(terms.model, terms)
+        share = _LEAVES.get(len(laws.applied), _MANY_LEAVE)
+        far_less = self._above(terms.model, terms) < share * self._above(laws, None)
+        return far_less or self._at_floor(terms.model, terms)
 
     def _at_floor(self, model: Model, terms: Learned | None) -> bool:
         return self._above(model, terms) < (_AT_FLOOR - 1.0) * _floor(self._judge, self._noise)
