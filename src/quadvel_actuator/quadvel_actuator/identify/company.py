@@ -59,7 +59,7 @@ class Company:
         said = list(said)
         k = 0
         while k < len(said):
-            change = self._exchange(model, k, said[k].rivals) if len(model.applied) > 1 else None
+            change = self._exchange(model, k, said[k].rivals)
             if change is None:
                 k += 1
                 continue
@@ -78,16 +78,16 @@ class Company:
         one, less = model.applied[index], model.without(index)
         taken = {other.law.name for other in model.applied}
         named = [law for name, law in registry().items() if name in rivals and name not in taken]
-        if not named:
+        if not named or not less.applied:
             return None
         beside = About(self._fitted(less, 5), self.judge, self.noise, self.few)
         now = judged(beside, one.law, less.plus(one))
         found = [now, *filter(None, (best_form(beside, law) for law in named))]
         best, ties = choice(sorted(found, key=lambda each: -each.gain), self.judge, self.noise)
         more = len(best.law.parameters) - len(one.law.parameters)
-        found_better = self.judge.compare(now.residual, best.residual)
-        clear = found_better.p_any * len(found) < LEVEL
-        pays = found_better.gain > more * SIMPLER_LOSES * float(self.noise.mean())
+        gained = self.judge.compare(now.residual, best.residual)
+        clear = gained.p_any * len(found) < LEVEL
+        pays = gained.gain > more * SIMPLER_LOSES * float(self.noise.mean())
         return (beside, best, ties) if best is not now and (more < 0 or (clear and pays)) else None
 
     def _reformed(self, model: Model) -> Model:
@@ -171,6 +171,12 @@ class Company:
                     break
                 model = tried
         return model
+
+    def deepened(self, model: Model) -> Model:
+        """At the bottom of its deepest valley; with a memory, as few rows show it, since all would take long."""
+        if remembers(model):
+            return fit_with_delays(self.few.fitted(model, deepest, 1), self.judge.fit)
+        return deepest(model, self.judge.fit, 4)
 
     def loss(self, model: Model, index: int) -> tuple[float, float, Model]:
         """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""

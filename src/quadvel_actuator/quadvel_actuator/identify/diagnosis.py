@@ -1,4 +1,4 @@
-"""Which effects a log shows: one is added at a time while held-out rows say that it pays, and then pruned.
+"""Which effects a log shows: one is added at a time while held-out rows say that it pays, and put right beside the others.
 
 Every law of the registry is fitted on top of the model so far, together with gains and, where it looks like one, the
 delays. The law with the least held-out error is taken; laws that predict as well within the noise are named with it.
@@ -15,13 +15,12 @@ from ..effects import registry
 from .candidates import About, Candidate, propose, started
 from .company import Company, Said
 from .delays import fit_with_delays, latest
-from .few import Few, remembers
+from .few import Few
 from .judging import Judge
 from .model import Model
 from .ranking import LEVEL, WORTH, Rejected, Tick, choice, ranked
 from .sharing import pooled, regroupings
 from .signals import Array
-from .valleys import deepest
 
 MOST = 5
 """Effects of one log at most."""
@@ -113,7 +112,7 @@ def diagnose(
     model, said = company.simplest(model, said)
     model = pooled(company.narrowed(model), judge, noise)
     if model.applied:
-        model = _deepened(model, judge, few)
+        model = company.deepened(model)
     findings = tuple(
         Finding(one.law.name, *company.loss(model, k)[:2], of_it.ties)
         for k, (one, of_it) in enumerate(zip(model.applied, said, strict=True))
@@ -125,13 +124,6 @@ def diagnose(
 def _unsaid(model: Model, judge: Judge, noise: Array) -> bool:
     """Is there much left beside the effects?"""
     return bool(model.mse(judge.judge) > (1.0 + _MUCH) * float(noise.mean()))
-
-
-def _deepened(model: Model, judge: Judge, few: Few) -> Model:
-    """The model at the bottom of its deepest valley; with a memory, as few rows show it, since all would take long."""
-    if remembers(model):
-        return fit_with_delays(few.fitted(model, deepest, 1), judge.fit)
-    return deepest(model, judge.fit, 4)
 
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:

@@ -27,9 +27,8 @@ _AT_FLOOR = 1.05
 _MOST = 0.8
 """Of what is above the noise: a law that takes so much is the account, whatever is left beside it."""
 
-_LEAVES = {2: 0.25}
-_MANY_LEAVE = 0.5
-"""Of what so many laws, or more, leave above the noise: what terms may leave. To two a third may come."""
+_OF_TWO, _OF_MORE = 0.25, 0.5
+"""Of what two laws leave above the noise, to which a third may come, and of what more do: what terms may leave"""
 
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
@@ -82,7 +81,7 @@ class Alone:
         terms = self.learned
         if terms is None or _words(None, terms) > _words(laws, None):
             return False
-        share = _LEAVES.get(len(laws.applied), _MANY_LEAVE)
+        share = _OF_TWO if len(laws.applied) == 2 else _OF_MORE
         far_less = self._above(terms.model, terms) < share * self._above(laws, None)
         return far_less or self._at_floor(terms.model, terms)
 
