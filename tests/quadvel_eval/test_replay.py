@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+import attrs
 import numpy as np
 import pytest
 from mcap.writer import Writer
@@ -113,6 +114,17 @@ def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
     true, ideal = ActuatorParameters.default(), ActuatorParameters.ideal()
     assert torque_error(true, joints, 0.2, SECONDS) == pytest.approx(true.torque_noise, rel=0.05)
     assert torque_error(ideal, joints, 0.2, SECONDS) > 2 * true.torque_noise
+
+
+def test_noise_of_encoders_on_which_the_drives_did_not_act_hardly_counts(
+    run: tuple[Joints, Callable[[float], Truth]],
+) -> None:
+    joints, _ = run
+    true, rng = ActuatorParameters.default(), np.random.default_rng(0)
+    noisy = attrs.evolve(joints, dq=joints.dq + rng.normal(0.0, 0.3, joints.dq.shape))
+    through = (robot.KD * 0.3) ** 2
+    assert through > 0.3 * true.torque_noise
+    assert torque_error(true, noisy, 0.2, SECONDS) < true.torque_noise + 0.3 * through
 
 
 def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(

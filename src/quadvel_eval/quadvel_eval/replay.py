@@ -14,6 +14,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import interp1d
+from scipy.signal import savgol_filter
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_dds.recordings import read_messages
@@ -33,6 +34,7 @@ Array = NDArray[np.float64]
 
 STRETCH = 0.2  # s, of one replay
 STRIDE = 0.35  # s, from one to the next: no multiple of a step of the gait
+STEADY = 2  # ms to either side, over which the noise of encoders is averaged out
 PAST = 60  # ms, that the drives live through before
 GROWTH = 10  # ms, from one point to the next of how an error grows
 COMMAND = ("q", "dq", "tau", "kp", "kd")  # of a command, 12 numbers each
@@ -107,13 +109,17 @@ def _held(commands: Mapping[int, Any], ticks: Array) -> Array:
 
 
 def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end: float) -> float:
-    """Mean square of measured minus modelled torque, N^2 m^2, on the recorded motion between `start` and `end`."""
+    """Mean square of measured minus modelled torque, N^2 m^2, on the recorded motion between `start` and `end`.
+
+    The drives acted on the motion itself, so that what encoders add to it is averaged out.
+    """
+    q, dq = (savgol_filter(values, 2 * STEADY + 1, 1, axis=0) for values in (joints.q, joints.dq))
     model = ActuatorModel(attrs.evolve(actuator, torque_noise=0.0), dt=DT)
     begin, stop = np.searchsorted(joints.time, [start, end])
     squares = []
     for row in range(max(begin - PAST, 0), stop):
         c = _command(joints, row)
-        torque = model.step(joints.q[row], joints.dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
+        torque = model.step(q[row], dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
         if row >= begin and joints.whole(row - PAST, row + 1):
             squares.append(np.mean((joints.tau[row] - torque) ** 2))
     if not squares:

@@ -12,6 +12,9 @@ from .signals import Array, Bools, Samples
 BLOCK = 0.1
 """s: what residuals add up to over so long counts as independent"""
 
+STILL = 0.02
+"""rad: while no joint has moved so far, a robot says but once what it says"""
+
 
 @attrs.frozen(eq=False)
 class Comparison:
@@ -77,9 +80,10 @@ class Judge:
 
     @classmethod
     def of(cls, samples: Samples, fit_rows: Bools, judge_rows: Bools, every: Bools | None = None) -> Judge:
-        """Blocks of BLOCK s; values from the fitted rows unless `every` says from more."""
+        """Blocks of BLOCK s, longer where nothing moves; values from the fitted rows unless `every` says from more."""
         at = np.floor(samples.t / BLOCK).astype(int) + 10**7 * samples.log_of_row
         starts = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
+        starts = _moved(starts, samples)
         return cls(samples.joints, fit_rows, judge_rows, fit_rows if every is None else every, starts)
 
     def sums(self, values: Array) -> Array:
@@ -97,3 +101,17 @@ class Judge:
             self.sums(e1 * d),
             self.sums(self.judge.astype(float)),
         )
+
+
+def _moved(starts: NDArray[np.intp], samples: Samples) -> NDArray[np.intp]:
+    """Those of the blocks that a log begins with, or in which a joint moves away from where it was in the last of them."""
+    q = samples.at(0.0, 0.0, 0.0).q
+    log = samples.log_of_row[starts]
+    lowest, highest = np.minimum.reduceat(q, starts, axis=0), np.maximum.reduceat(q, starts, axis=0)
+    kept = [0]
+    for k in range(1, len(starts)):
+        last = kept[-1]
+        away = np.maximum(highest[k] - lowest[last], highest[last] - lowest[k]).max()
+        if log[k] != log[last] or away > STILL:
+            kept.append(k)
+    return starts[kept]
