@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_actuator.effects import base, registry
+from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.identify.log import Log
 from quadvel_actuator.identify.model import Applied, Model
 from quadvel_actuator.identify.signals import Samples
@@ -52,8 +52,7 @@ def _motion(steps=800, dt=0.001):
 
 
 @pytest.mark.parametrize("name", sorted(set(registry()) - UNLIKE))
-def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name, monkeypatch):
-    monkeypatch.setattr(base, "_PIECE", 150)  # several pieces side by side
+def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     t, q, dq, q_des = _motion()
     joints = (*JOINTS, NAMES[3])
     effect = Effect(name, JOINTS, TRUTH[name])
@@ -82,6 +81,23 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name, monkey
     plain = 30.0 * (q_des - q) - 0.5 * dq
     assert np.abs(steps[:, :3] - plain[:, :3]).max() > 0.05, "the law does something"
     np.testing.assert_allclose(steps[:, 3], plain[:, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["slew_limit", "velocity_filter", "backlash", "hysteresis"])
+def test_a_law_of_another_package_needs_its_step_alone_to_be_run_over_a_series(name):
+    """Whatever the stretches and the guesses; a law's own series is but a faster way."""
+    t, q, dq, q_des = _motion(200)
+    samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
+    s = samples.at(0.0, 0.0, 0.0)
+    s = attrs.evolve(s, start=s.start | (np.arange(200) % 70 == 0)[:, None])
+    settings = {"on": "error"} if name == "backlash" else {}
+    law = registry()[name].configured(settings, NAMES[:4])
+    guesses = np.array([0.7, 1.0, 1.6])[:, None, None]
+    p = {parameter: TRUTH[name][parameter] * guesses + np.zeros(4) for parameter in law.names}
+    x = (s.q_des - s.q, s.dq_des - s.dq) if law.stage == Stage.ERRORS else s.pull
+    own, simple = law.series(x, s, p), MemoryLaw.series(law, x, s, p)
+    for one, other in zip(own, simple, strict=True) if isinstance(x, tuple) else [(own, simple)]:
+        np.testing.assert_allclose(*np.broadcast_arrays(one, other), atol=1e-12)
 
 
 def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over():

@@ -229,99 +229,20 @@ class MemoryLaw(EffectLaw):
         """The value instead of `x` after `dt` (s), and the new memory."""
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """All rows of a series, memory starting anew with every stretch.
-
-        Pieces of the series advance side by side, at first each from rest, then from what the piece before it ended
-        with, until that changes nothing any more: memories fade, so that few pieces have to run again.
-        """
-        return _Pieces(self, x, s, p).out
-
-
-class _Pieces:
-    """A series of a law with a memory, cut to pieces that advance side by side, (row of the piece, ..., piece, J)."""
-
-    def __init__(self, law: MemoryLaw, x: Any, s: Any, p: Params) -> None:
-        self.law, self.p, self.pair = law, p, isinstance(x, tuple)
-        given = x if self.pair else (x,)
-        lead = np.broadcast_shapes(*(np.shape(one)[:-2] for one in (*given, *p.values())))
-        self.rows, joints = given[0].shape[-2:]
-        self.xs = [_side_by_side(one) for one in given]
-        self.us = [
-            _side_by_side(np.broadcast_to(getattr(s, name), (self.rows, joints))) for name in law.inputs
-        ]
-        self.dt, self.start = _side_by_side(s.dt), _side_by_side(s.start)
-        self.count = self.dt.shape[-2]
-        self.shape = (*lead, self.count, joints)
-        self.made = [np.empty((len(self.dt), *self.shape)) for _ in given]
-        self._settle()
-
-    @property
-    def out(self) -> Any:
-        """The whole series of what the law gives."""
-        back = tuple(_one_after_the_other(one, self.rows) for one in self.made)
-        return back if self.pair else back[0]
-
-    def _given(self, xs: Sequence[Array], k: int) -> Any:
-        return tuple(one[k] for one in xs) if self.pair else xs[0][k]
-
-    def _settle(self) -> None:
-        """All pieces from rest, then again those that the piece before them leaves with another memory."""
-        rest = self.law.rest(self._given(self.xs, 0), [one[0] for one in self.us], self.p)
-        begin = tuple(np.array(np.broadcast_to(one, self.shape)) for one in rest)
-        ended = tuple(one.copy() for one in begin)
-        which = every = np.arange(self.count)
-        while len(which):
-            last = self._run(tuple(one[..., which, :] for one in begin), which)
-            for one, value in zip(ended, last, strict=True):
-                one[..., which, :] = value
-            after = tuple(
-                np.concatenate([b[..., :1, :], e[..., :-1, :]], axis=-2)
-                for b, e in zip(begin, ended, strict=True)
-            )
-            moved = [np.abs(a - b) > _SAME * (1.0 + np.abs(b)) for a, b in zip(after, begin, strict=True)]
-            changed = np.any([one.any(axis=(*range(one.ndim - 2), -1)) for one in moved], axis=0)
-            which, begin = every[changed & ~self.start[0][:, 0]], after
-
-    def _run(self, memory: Memory, which: NDArray[np.intp]) -> Memory:
-        """These pieces, from this memory to the one that they end with."""
-        whole = len(which) == self.count
-        xs, us, (dt,), (start,) = (
-            [one if whole else one[..., which, :] for one in group]
-            for group in (self.xs, self.us, [self.dt], [self.start])
-        )
-        resets: list[bool] = np.any(start, axis=(1, 2)).tolist()
-        for k, reset in enumerate(resets):
-            here, u = self._given(xs, k), [one[k] for one in us]
-            if reset:
-                rest = self.law.rest(here, u, self.p)
-                memory = tuple(np.where(start[k], r, m) for r, m in zip(rest, memory, strict=True))
-            now, memory = self.law.advance(here, u, dt[k], self.p, memory)
-            for one, value in zip(self.made, now if self.pair else (now,), strict=True):
-                if whole:
-                    one[k] = value
-                else:
-                    one[k][..., which, :] = value
-        return memory
-
-
-_PIECE = 120
-"""Rows that advance one after the other: few, since each is a step of Python, however wide the arrays."""
-_SAME = 1e-9
-
-
-def _side_by_side(values: Array) -> Array:
-    """Rows (..., N, C) as (row of the piece, ..., piece, C); the last piece is filled with its last row."""
-    pieces = -(-values.shape[-2] // _PIECE)
-    short = min(pieces * _PIECE, -(-values.shape[-2] // pieces) * pieces) - values.shape[-2]
-    wide = np.concatenate([values, np.repeat(values[..., -1:, :], short, axis=-2)], axis=-2)
-    cut = wide.reshape(*values.shape[:-2], pieces, -1, values.shape[-1])
-    return np.ascontiguousarray(np.moveaxis(cut, -2, 0))
-
-
-def _one_after_the_other(values: Array, rows: int) -> Array:
-    """The first `rows` of what was put side by side."""
-    cut = np.moveaxis(values, 0, -2)
-    return cut.reshape(*cut.shape[:-3], -1, cut.shape[-1])[..., :rows, :]
+        """All rows of a series, one step after the other, memory starting anew with every stretch: give a faster one."""
+        pair = isinstance(x, tuple)
+        xs = [np.moveaxis(one, -2, 0) for one in (x if pair else (x,))]
+        us = [np.moveaxis(getattr(s, name), -2, 0) for name in self.inputs]
+        p = {name: value[..., 0, :] if np.ndim(value) > 1 else value for name, value in p.items()}
+        memory: Memory = ()
+        made = []
+        for k, (dt, start) in enumerate(zip(s.dt, s.start, strict=True)):
+            here, u = (tuple(one[k] for one in xs) if pair else xs[0][k]), [one[k] for one in us]
+            memory = self.rest(here, u, p) if k == 0 or start.any() else memory
+            now, memory = self.advance(here, u, dt, p, memory)
+            made.append(now if pair else (now,))
+        series = tuple(np.stack(np.broadcast_arrays(*one), axis=-2) for one in zip(*made, strict=True))
+        return series if pair else series[0]
 
 
 def smooth_sign(v: Array, width: Array) -> Array:

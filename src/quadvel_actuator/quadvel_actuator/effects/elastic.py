@@ -8,6 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
+from . import recurrence
 from .base import (
     AddedLaw,
     Array,
@@ -177,16 +178,20 @@ class Backlash(MemoryLaw):
         seen: Array = x if self.on == "torque" else x[0]
         return seen
 
+    def _given(self, x: Any, u: Sequence[Array], follows: Array) -> Any:
+        if self.on == "torque":
+            return follows
+        return (follows if self.on == "error" else x[0] + u[0] - follows), x[1]
+
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return (self._seen(x, u) + 0.0 * p["gap"],)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        seen = self._seen(x, u)
-        follows = np.minimum(np.maximum(memory[0], seen - p["gap"]), seen + p["gap"])
-        if self.on == "torque":
-            return follows, (follows,)
-        error = follows if self.on == "error" else x[0] + seen - follows
-        return (error, x[1]), (follows,)
+        follows = recurrence.play(memory[0], self._seen(x, u), p["gap"])
+        return self._given(x, u, follows), (follows,)
+
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        return self._given(x, (s.q,), recurrence.played(self._seen(x, (s.q,)), s.start, p["gap"]))
 
 
 class Hysteresis(MemoryLaw):
@@ -200,7 +205,7 @@ class Hysteresis(MemoryLaw):
         Parameter("reach", "rad", 0.001, 1.0, 0.03),
         Parameter("beta", "1", 0.0, 1.0, 0.3),
     )
-    inputs = ("q", "dq")
+    inputs = ("q",)
     signal = "q@history"
     motion = _STILL
 
@@ -209,26 +214,21 @@ class Hysteresis(MemoryLaw):
             {"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)
         ]
 
-    def series(self, x: Any, s: Any, p: Params) -> Any:
-        """In proportion to F, and whatever the torque: computed once for all guesses with the same curve."""
-        unit = {"F": np.ones(1), "reach": p["reach"], "beta": p["beta"]}
-        if max(np.ndim(one) for one in unit.values()) == 1:
-            return p["F"] * super().series(s.q, s, unit)
-        reach, beta = np.broadcast_arrays(p["reach"], p["beta"])
-        curves, which = np.unique(np.concatenate([reach, beta], axis=-1), axis=0, return_inverse=True)
-        unit["reach"], unit["beta"] = np.split(curves, 2, axis=-1)
-        return p["F"] * super().series(s.q, s, unit)[which.ravel()]
-
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return 0.0 * (u[0] + p["reach"]), u[0]
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         z, before = memory
-        way = (u[0] - before) / p["reach"]
-        bend = np.where(z * way < 0.0, 2.0 * p["beta"] - 1.0, 1.0)
-        z = z + way * (1.0 - bend * np.abs(z))
-        z = np.minimum(np.maximum(z, -1.0), 1.0)
+        z = recurrence.bend(z, (u[0] - before) / p["reach"], p["beta"])
         return -p["F"] * z, (z, u[0])
+
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        """In proportion to F: computed once for all guesses with the same curve."""
+        reach, beta = np.broadcast_arrays(p["reach"], p["beta"])
+        if reach.ndim == 1:
+            return -p["F"] * recurrence.bent(s.q, s.start, reach, beta)
+        curves, which = np.unique(np.concatenate([reach, beta], axis=-1), axis=0, return_inverse=True)
+        return -p["F"] * recurrence.bent(s.q, s.start, *np.split(curves, 2, axis=-1))[which.ravel()]
 
 
 LAWS = (TorqueOffset, ParallelSpring, Cogging, Deadband, Backlash, Hysteresis)

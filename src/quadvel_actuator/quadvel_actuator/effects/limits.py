@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from . import recurrence
 from .base import Array, EffectLaw, Memory, MemoryLaw, Parameter, Params, Stage, Start, TorqueLaw, View
 
 _HARD = "fast and large steps that ask for more torque than the drive gives"
@@ -83,20 +84,11 @@ class SlewLimit(MemoryLaw):
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         given, before, slope = memory
-        new = np.minimum(u[0], dt)
-        slope = np.where(new < dt, slope, (x - before) / dt)
-        given = _chasing(given, before, slope, dt - new, p["rate"])
-        given = _chasing(given, x - slope * new, slope, new, p["rate"])
+        given, slope = recurrence.chase(given, before, slope, x, u[0], dt, p["rate"])
         return given, (given, x, slope)
 
-
-def _chasing(given: Array, target: Array, slope: Array, time: Array, rate: Array) -> Array:
-    """Where `given` comes in `time` at `rate` at most after a target that moves evenly, by `slope`."""
-    ahead = given - target
-    side = np.sign(ahead)
-    nearing = np.maximum(rate + side * slope, 1e-12)
-    chased = np.minimum(np.abs(ahead) / nearing, time)
-    return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * (time - chased)
+    def series(self, x: Any, s: Any, p: Params) -> Any:
+        return recurrence.chased(x, s.age, s.dt, s.start, p["rate"])
 
 
 LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)
