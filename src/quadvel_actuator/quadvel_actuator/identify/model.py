@@ -23,7 +23,6 @@ _SLOPE = 0.01  # step of the numerical slopes, in a parameter's usual size
 _GAIN_SLOPE = 0.01
 _FAR = 0.4
 """Logarithm of a gain over the commanded one that is hard to believe."""
-_KEPT = 8  # results of laws with memory
 _SETTLED = 1e-5  # relative fall of the error below which a fit has converged
 
 
@@ -163,7 +162,7 @@ class Model:
         return new, speed
 
     def _series(self, one: Applied, x: Any, s: Signals, value: Array) -> Any:
-        """What a law makes of `x`; with a memory, the latest are kept, as a fit of other parameters asks for them again."""
+        """What a law makes of `x`."""
         law, p = one.law, one.part(value)
         if isinstance(law, ErrorLaw):
             if max(part.ndim for part in x) > 2:
@@ -171,19 +170,9 @@ class Model:
             some, which = _distinct(value)
             after = law.errors(x, s, one.part(some))
             return tuple(part[which] if part.ndim > 2 else part for part in after)
-        if not isinstance(law, MemoryLaw):
-            return law.torque(x, s, p)  # type: ignore[attr-defined]
-        if len(_lean(value)) > 1:
+        if isinstance(law, MemoryLaw):
             return law.series(x, s, p)
-        given = () if law.stage == Stage.ADDED else x if isinstance(x, tuple) else (x,)
-        seen = (*given, s.age, *(getattr(s, name) for name in law.inputs))
-        kept = self.samples.kept
-        key = (id(law), value[0].tobytes(), *(hash(part.tobytes()) for part in seen))
-        if key not in kept:
-            if len(kept) >= _KEPT:
-                kept.pop(next(iter(kept)))
-            kept[key] = law, law.series(x, s, p)
-        return kept[key][-1]
+        return law.torque(x, s, p)  # type: ignore[attr-defined]
 
     def reaching(self, rows: Bools) -> tuple[Model, Bools]:
         """The model and `rows` (N, J) of it without the logs at the end that hold none of them."""

@@ -33,9 +33,9 @@ SETTLING = 0.03
 STRETCH, FILLING = 0.75, 0.25
 """Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
 
-_CACHED = 3, 64
+_CACHED = 2, 64
 """sets of signals that are kept, at least and at most;"""
-_CACHED_VALUES = 1_000_000
+_CACHED_VALUES = 400_000
 """as many as have about so many values in each of their signals together"""
 
 _KEPT_SLOPES = 4
@@ -282,7 +282,6 @@ class Samples:
         self._first_row = np.cumsum([0, *lengths])
         self._cache: dict[tuple[Any, ...], Signals] = {}
         self._parts: dict[int, Samples] = {}
-        self.kept: dict[Any, Any] = {}  # what models computed from these rows and may ask for again
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
         """Of each row: does a stretch begin there, the spacing to the row before, is the past known."""
@@ -306,7 +305,7 @@ class Samples:
             for name in _OF_ROWS:
                 setattr(part, name, getattr(self, name)[:stop])
             part.sent = self.sent[: self._first_packet[count]]
-            part._cache, part.kept, part._parts, part._finer = {}, {}, {}, None
+            part._cache, part._parts, part._finer = {}, {}, None
             self._parts[count] = part
         return self._parts[count]
 
@@ -358,7 +357,7 @@ class Samples:
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._cache, part.kept, part._parts, part._finer = {}, {}, {}, None
+        part._cache, part._parts, part._finer = {}, {}, None
         return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
