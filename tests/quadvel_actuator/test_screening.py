@@ -387,3 +387,15 @@ def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
     share = (np.abs(s.q_des - s.q) < widths[:, None]).mean(axis=1)
     assert np.diff(share, axis=0).max() < 0.05
     assert (share[-1] > 0.95).all()
+
+
+def test_the_signals_of_a_part_are_those_of_its_rows_whatever_logs_its_stretches_reach_over():
+    logs = [record(parameters(), joints=2, seconds=1.5, seed=k) for k in range(4)]
+    whole = Samples(logs)
+    every = whole.at(0.004, 0.001, 0.0)
+    weight = np.zeros(len(whole.t))
+    weight[1300:1800], weight[1800:2050] = 2.0, 1.0  # two stretches that reach over the end of the first log
+    part, rows, counts = whole.stretches(3000, weight)
+    assert len(rows) == len(counts) == len(part.t) < len(whole.t)
+    assert counts[np.isin(rows, np.flatnonzero(weight))].any()
+    np.testing.assert_array_equal(part.at(0.004, 0.001, 0.0).q, every.q[rows])

@@ -15,7 +15,7 @@ from scipy.ndimage import median_filter
 
 from .log import Array, Log
 
-PIECE = 1.5  # s
+PIECE = 0.75  # s: many short pieces of a long log show more of what it does than few long ones
 LEAD = 0.1  # s of commands before a piece
 JITTER = 0.03
 """Spacing that varies by more than this share of the usual one counts as jitter."""

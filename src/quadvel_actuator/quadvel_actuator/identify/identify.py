@@ -56,7 +56,7 @@ class Options:
     """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
     base: ActuatorParameters | None = None
     """its torque limits go into the corrected model"""
-    values: int = 120_000
+    values: int = 144_000
     """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
     cores: int = 1
     """that work side by side; the report is the same"""

@@ -337,6 +337,8 @@ class Samples:
         first = np.array(sorted(starts))
         place = np.tile(np.arange(long), count)
         rows = np.repeat(first, long) + place
+        in_order = np.argsort(self.log_of_row[rows], kind="stable")  # where stretches overlap at a log's end
+        rows, place = rows[in_order], place[in_order]
         part = self._of(rows)
         part.start = part.start | (place == 0)
         return part, rows, place * self.period >= FILLING
