@@ -67,6 +67,12 @@ def test_a_recording_is_read_by_rosbags_as_it_was_sent(node: Node, tmp_path: Pat
     assert found[0].q == pytest.approx([0.1 * i for i in range(12)])
 
 
+def test_three_seconds_of_a_fast_topic_wait_until_other_work_is_done(node: Node, tmp_path: Path) -> None:
+    record_low_states(node, tmp_path / "walk.mcap", 3000)
+    with (tmp_path / "walk.mcap").open("rb") as stream:
+        assert sum(1 for _ in make_reader(stream).iter_messages()) == 3000
+
+
 def test_a_recording_follows_the_ros2_profile_of_mcap(node: Node, tmp_path: Path) -> None:
     started = time.time_ns()
     record_low_states(node, tmp_path / "walk.mcap", 1)

@@ -20,8 +20,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from quadvel_dds.messages import STORE
 
-ANY_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Hears every publisher, a reliable one too."""
+ANY_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Hears every publisher, a reliable one too; of the fastest topic it holds seconds, for where other work keeps us from writing."""
 LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 LATCHED = ("/tf_static", "/robot_description")
 """Topics that are published once and kept for those who come later."""
