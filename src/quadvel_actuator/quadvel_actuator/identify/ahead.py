@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ProcessPoolExecutor
 from typing import Any, Generic, TypeVar
 
+from .memory import give_gaps_back
 from .signals import Samples
 
 R = TypeVar("R")
@@ -36,6 +37,7 @@ class Ahead(Generic[R]):
 
     def __enter__(self) -> Ahead[R]:
         if self._cores > 1:
+            give_gaps_back()
             copies = multiprocessing.get_context("fork")
             task = (self._work, self._samples)
             self._pool = ProcessPoolExecutor(self._cores, copies, initializer=_learn, initargs=task)

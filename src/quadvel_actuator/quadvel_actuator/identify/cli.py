@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import sys
 from collections.abc import Iterable, Sequence
@@ -20,12 +19,12 @@ from typer.core import TyperCommand
 from ..parameters import ActuatorParameters
 from .inspect import Inspection, inspect
 from .log import Log, LogError
+from .memory import give_large_arrays_back
 from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
 """Unless more are asked for: each takes some 200 MB"""
-M_MMAP_THRESHOLD, LARGE = -3, 1 << 22  # of glibc's mallopt; bytes
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
 
@@ -133,7 +132,7 @@ def _run(
     messages: Console,
 ) -> None:
     _check_folder(out)
-    _give_memory_back()
+    give_large_arrays_back()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
     fitted = read(logs, joints, gains, messages)
     judged = read(holdout, joints, gains, messages, like=fitted[0])
@@ -205,12 +204,6 @@ def say(inspection: Inspection, messages: Console) -> None:
     for finding in inspection.findings:
         line = f"  {finding.kind:8} {finding.text}"
         messages.print(escape(line), style=STYLE[finding.kind], soft_wrap=True, highlight=False)
-
-
-def _give_memory_back() -> None:
-    """Have glibc return large arrays as soon as they are free: left to itself it keeps ever larger ones, with gaps."""
-    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
-        mallopt(M_MMAP_THRESHOLD, LARGE)
 
 
 def _check_folder(out: Path) -> None:
