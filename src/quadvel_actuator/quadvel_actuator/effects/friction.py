@@ -100,7 +100,7 @@ class QuadraticDrag(AddedLaw):
     """-c dq |dq|"""
 
     name = "quadratic_drag"
-    parameters = (Parameter("c", "N m s^2/rad^2", 0.0, 2.0, 0.02),)
+    parameters = (Parameter("c", "N m s^2/rad^2", 0.0, 50.0, 0.02),)
     linear = ("c",)
     signal = "dq"
     motion = "fast sweeps, up to the joint's top speed"
