@@ -10,13 +10,13 @@ from collections.abc import Sequence
 import attrs
 import numpy as np
 
-from ..effects import registry
+from ..effects import EffectLaw, registry
 from .candidates import About, Candidate, best_form, judged, less_said
 from .delays import fit_with_delays
 from .few import Few, remembers
 from .judging import Comparison, Judge
 from .model import Model
-from .ranking import LEVEL, SIMPLER_LOSES, TIES, WORTH, choice
+from .ranking import LEVEL, SIMPLER_LOSES, TIES, WORTH, choice, worth
 from .signals import Array
 from .valleys import deepest
 
@@ -30,6 +30,22 @@ class Said:
 
     ties: tuple[str, ...] = ()
     rivals: tuple[str, ...] = ()
+
+
+def with_kin(model: Model, said: Sequence[Said]) -> list[Said]:
+    """With rivals that may not have come near at the time: laws of the same signal, or that look like a delay, too.
+
+    Several laws may have come one after the other for one that was hidden.
+    """
+
+    def kin(law: EffectLaw) -> tuple[str, ...]:
+        near = {n for n, o in registry().items() if o.signal == law.signal or (o.shifts and law.shifts)}
+        return tuple(near - {law.name})
+
+    return [
+        attrs.evolve(of_it, rivals=(*of_it.rivals, *kin(one.law)))
+        for one, of_it in zip(model.applied, said, strict=True)
+    ]
 
 
 @attrs.frozen(eq=False)
@@ -128,11 +144,10 @@ class Company:
         said = list(said)
         while model.applied:
             losses = [self.loss(model, k) for k in range(len(model.applied))]
-            worst = int(np.argmin([loss for loss, _, _ in losses]))
-            loss, p, less = losses[worst]
-            active = model.applied[worst].active
-            least = WORTH * float(self.noise[active].mean()) * float(active.mean())
-            if p * len(registry()) < LEVEL and loss > least:
+            worst = int(np.argmin([loss.gain for loss, _ in losses]))
+            loss, less = losses[worst]
+            share = worth(loss.joint_gain, model.applied[worst].active, self.noise)
+            if loss.p_any * len(registry()) < LEVEL and share > WORTH:
                 break
             model = less
             del said[worst]
@@ -178,11 +193,10 @@ class Company:
             return fit_with_delays(self.few.fitted(model, deepest, 1), self.judge.fit)
         return deepest(model, self.judge.fit, 4)
 
-    def loss(self, model: Model, index: int) -> tuple[float, float, Model]:
-        """What leaving an effect out costs on held-out rows, its p-value, and the model without it."""
+    def loss(self, model: Model, index: int) -> tuple[Comparison, Model]:
+        """What leaving an effect out costs on held-out rows, and the model without it."""
         less = self._fitted(model.without(index), 5)
-        found = self._compared(less, model)
-        return found.gain, found.p_any, less
+        return self._compared(less, model), less
 
     def _fitted(self, model: Model, steps: int) -> Model:
         return self.few.fitted(model, fit_with_delays, steps)

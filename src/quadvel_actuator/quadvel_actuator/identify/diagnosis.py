@@ -13,12 +13,12 @@ import numpy as np
 
 from ..effects import registry
 from .candidates import About, Candidate, propose, started
-from .company import Company, Said
+from .company import Company, Said, with_kin
 from .delays import fit_with_delays, latest
 from .few import Few
 from .judging import Judge
 from .model import Model
-from .ranking import LEVEL, WORTH, Rejected, Tick, choice, ranked
+from .ranking import LEVEL, WORTH, Rejected, Tick, choice, ranked, worth
 from .sharing import pooled, regroupings
 from .signals import Array
 
@@ -96,26 +96,27 @@ def diagnose(
         if finer is not None:
             model = finer
             continue
-        more = bool(candidates) and _pays(candidates[0], noise, len(registry())) and len(said) < MOST
-        foreseen = candidates[0].model if more else model
-        if said and _unsaid(foreseen, judge, noise) and otherwise(foreseen):
-            return Diagnosis(bare, (), (*given_up, *rejected))
-        if not more:
+        if not candidates or not _pays(candidates[0], noise, len(registry())) or len(said) == MOST:
+            if said and _unsaid(model, judge, noise) and otherwise(model):
+                return Diagnosis(bare, (), (*given_up, *rejected))
             break
         best, ties = choice(_simpler_first(candidates, judge, noise, few), judge, noise)
+        model, before = company.exchanged(company.taken(about, best), said)
+        if said and _unsaid(model, judge, noise) and otherwise(model):
+            return Diagnosis(bare, (), (*given_up, *rejected))
         near = tuple(one.name for one in candidates if one.gain > _NEARLY * candidates[0].gain)
         given_up.append(Rejected(best.name, best.gain, BETTER_SAID))
-        model, said = company.exchanged(company.taken(about, best), said)
-        said.append(Said(ties, near))
+        said = [*before, Said(ties, near)]
     model, said = company.pruned(attrs.evolve(model.holding(False), gains_held=False), said)
-    model, said = company.exchanged(model, said)
+    model, said = company.pruned(*company.exchanged(model, with_kin(model, said)))
     model, said = company.simplest(model, said)
     model = pooled(company.narrowed(model), judge, noise)
     if model.applied:
         model = company.deepened(model)
+    losses = [company.loss(model, k)[0] for k in range(len(model.applied))]
     findings = tuple(
-        Finding(one.law.name, *company.loss(model, k)[:2], of_it.ties)
-        for k, (one, of_it) in enumerate(zip(model.applied, said, strict=True))
+        Finding(one.law.name, loss.gain, loss.p_any, of_it.ties)
+        for one, loss, of_it in zip(model.applied, losses, said, strict=True)
     )
     known = {one.name for one in findings} | {name for one in findings for name in one.indistinguishable}
     return Diagnosis(model, findings, tuple(one for one in rejected if one.name not in known))
@@ -127,7 +128,7 @@ def _unsaid(model: Model, judge: Judge, noise: Array) -> bool:
 
 
 def _pays(one: Candidate, noise: Array, tried: int) -> bool:
-    return one.p * tried < LEVEL and bool(one.gain > 0.0) and _worth(one, noise) > WORTH
+    return one.p * tried < LEVEL and bool(one.gain > 0.0) and worth(one.joint_gain, one.joints, noise) > WORTH
 
 
 def _finer(
@@ -144,19 +145,13 @@ def _finer(
     return chosen
 
 
-def _worth(one: Candidate, noise: Array) -> float:
-    """Gain as a share of the noise, on the joints that it acts on or on all, as it can set free what they share."""
-    on = one.joints
-    return float(max(one.joint_gain[on].sum() / noise[on].sum(), one.joint_gain.sum() / noise.sum()))
-
-
 def _reason(one: Candidate, noise: Array, tried: int) -> Rejected:
     if one.p * tried >= LEVEL:
         reason = (
             f"not significant on held-out data (p = {min(one.p * tried, 1.0):.2g} after {tried} candidates)"
         )
-    elif _worth(one, noise) <= WORTH:
-        reason = f"worth {100 * _worth(one, noise):.1f} % of the noise floor, below {100 * WORTH:.0f} %"
+    elif (share := worth(one.joint_gain, one.joints, noise)) <= WORTH:
+        reason = f"worth {100 * share:.1f} % of the noise floor, below {100 * WORTH:.0f} %"
     else:
         reason = "nothing left for it once the named effects are in"
     return Rejected(one.name, one.gain, reason)

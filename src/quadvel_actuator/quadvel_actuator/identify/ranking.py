@@ -15,10 +15,10 @@ from .ahead import Ahead, R
 from .candidates import About, Candidate, anew, propose, simplified, started
 from .judging import Judge
 from .screening import Started
-from .signals import Array
+from .signals import Array, Bools
 
 WORTH = 0.03
-"""Least gain on the joints that the effect acts on, as a share of the noise."""
+"""Least gain of an effect, as a share of the noise: see `worth`."""
 
 LEVEL = 0.01
 """An effect is named if chance would bring its gain with less than this probability, all candidates counted."""
@@ -181,6 +181,14 @@ def _firsts(laws: Sequence[EffectLaw]) -> set[int]:
     return firsts
 
 
+def worth(joint_gain: Array, on: Bools, noise: Array) -> float:
+    """Gain (J,) as a share of the noise: on the joint that shows an effect best, or on all, as it can set free what they share.
+
+    What a law says of a joint is held against what a term would say of it; how little others show it is no matter.
+    """
+    return float(max((joint_gain / noise)[on].max(), joint_gain.sum() / noise.sum()))
+
+
 def choice(candidates: Sequence[Candidate], judge: Judge, noise: Array) -> tuple[Candidate, tuple[str, ...]]:
     """The best candidate, or the simplest one that predicts as well; and the names of the others that do."""
     best = candidates[0]
@@ -198,6 +206,6 @@ def _ties(best: Candidate, other: Candidate, judge: Judge, noise: Array) -> bool
     if other.gain <= 0.5 * best.gain:
         return False
     found = judge.compare(other.residual, best.residual)
-    return found.gain < 0.005 * float(noise.mean()) or (
+    return found.gain < SIMPLER_LOSES * float(noise.mean()) or (
         found.p_any > _TIE_LEVEL and found.gain < _TIE_SHARE * float(noise.mean())
     )
