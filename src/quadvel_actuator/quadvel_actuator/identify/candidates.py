@@ -70,6 +70,11 @@ class About:
         self.seen, self.torque = start.signals, start.predict()
         self.fitted = np.where(judge.fit, self.samples.tau - self.torque, 0.0)
 
+    def kept(self, one: Candidate) -> float:
+        """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
+        fall = np.maximum(one.joint_gain, 0.0) / self.noise
+        return float((fall * self.few.fitted_rows).sum())
+
     def fit(self, model: Model) -> Model:
         """The model fitted with its delays to few rows, from these or those without its last effect."""
         there, rows = self.few.of(model)
@@ -197,10 +202,11 @@ def _without_weakest(model: Model) -> Model | None:
     return attrs.evolve(model, applied=(*model.applied[:-1], attrs.evolve(last, active=active)))
 
 
-def best_form(about: About, law: type[EffectLaw]) -> Candidate | None:
-    """The most promising form of a law of the registry, fitted; None where none takes anything off the error."""
+def best_form(about: About, law: type[EffectLaw], least: float) -> Candidate | None:
+    """The most promising form of a law of the registry, fitted; None where none promises so much."""
     forms = [one for form in law.variants(about) if (one := started(about, form)) is not None]
-    return propose(about, max(forms, key=lambda one: one.promise)) if forms else None
+    best = max(forms, key=lambda one: one.promise, default=None)
+    return None if best is None or best.promise < least else propose(about, best)
 
 
 def judged(about: About, law: EffectLaw, model: Model) -> Candidate:

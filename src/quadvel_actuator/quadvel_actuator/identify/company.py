@@ -23,6 +23,9 @@ from .valleys import deepest
 _BETTER_FORM = 0.99
 """of the held-out error, that another form of a law has to leave at most"""
 
+_PROMISING = 0.25
+"""Of what a law takes off the error: a rival that promises less is not fitted."""
+
 
 @attrs.frozen
 class Said:
@@ -98,7 +101,8 @@ class Company:
             return None
         beside = About(self._fitted(less, 5), self.judge, self.noise, self.few)
         now = judged(beside, one.law, less.plus(one))
-        found = [now, *filter(None, (best_form(beside, law) for law in named))]
+        least = _PROMISING * beside.kept(now)
+        found = [now, *filter(None, (best_form(beside, law, least) for law in named))]
         best, ties = choice(sorted(found, key=lambda each: -each.gain), self.judge, self.noise)
         more = len(best.law.parameters) - len(one.law.parameters)
         gained = self.judge.compare(now.residual, best.residual)

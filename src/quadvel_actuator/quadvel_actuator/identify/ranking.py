@@ -112,7 +112,7 @@ class _Race:
                     continue
                 self._take(found)
                 if found.law.foretold() is found.law:
-                    kept = self._kept(found)
+                    kept = self.about.kept(found)
                     least = max(least, _PROMISING * kept)
                     if kept < _STUCK * first.promise:
                         self._stuck.append((first.promise, found))
@@ -130,7 +130,7 @@ class _Race:
     def fit_stuck_ones_again(self) -> None:
         """Those that keep far less than they promise while no other keeps as much, from other delays."""
         for promise, one in self._stuck[:_AGAIN]:
-            most = max(self._kept(other) for other in self.best.values())
+            most = max(self.about.kept(other) for other in self.best.values())
             if promise > max(WORTH * self.about.few.fitted_rows.sum(), most):
                 self._take(anew(self.about, one))
                 self._again.add(one.name)
@@ -163,11 +163,6 @@ class _Race:
     def _take(self, one: Candidate) -> None:
         if one.name not in self.best or one.gain > self.best[one.name].gain:
             self.best[one.name] = one
-
-    def _kept(self, one: Candidate) -> float:
-        """What a candidate takes off the squared error, in units of the noise, as a promise counts it."""
-        fall = np.maximum(one.joint_gain, 0.0) / self.about.noise
-        return float((fall * self.about.few.fitted_rows).sum())
 
 
 def _firsts(laws: Sequence[EffectLaw]) -> set[int]:
