@@ -24,6 +24,8 @@ _CLOCK = 0.001
 """s, a step of a drive's clock"""
 CHANCE = 3.84
 """Of the mean squared error: by so much 95 % of the logs of one truth have a larger sum of squares there than at the best fit"""
+_CHANCE_OF_TWO = 9.21
+"""The same of 99 % of the logs, and of two delays that are off: it is rare that a drive does not wait for whole steps"""
 LONGEST = (LONGEST_INPUT, LONGEST_OUTPUT)
 """s, input and output delay at most"""
 
@@ -95,7 +97,7 @@ def in_steps(model: Model, rows: Bools) -> Model:
     """
     near = [np.round(delay / _CLOCK) * _CLOCK for delay in (model.input_delay, model.output_delay)]
     stepped = fit(model.with_delays(*near), rows)
-    return stepped if stepped.error(rows) < model.error(rows) + CHANCE * model.mse(rows) else model
+    return stepped if stepped.error(rows) < model.error(rows) + _CHANCE_OF_TWO * model.mse(rows) else model
 
 
 def fit_with_delays(model: Model, rows: Bools, iterations: int = 5) -> Model:
