@@ -96,14 +96,14 @@ def diagnose(
         if finer is not None:
             model = finer
             continue
-        if not candidates or not _pays(candidates[0], noise, len(registry())) or len(said) == MOST:
-            if said and _unsaid(model, judge, noise) and otherwise(model):
-                return Diagnosis(bare, (), (*given_up, *rejected))
-            break
-        best, ties = choice(_simpler_first(candidates, judge, noise, few), judge, noise)
-        model, before = company.exchanged(company.taken(about, best), said)
+        more = bool(candidates) and _pays(candidates[0], noise, len(registry())) and len(said) < MOST
+        if more:
+            best, ties = choice(_simpler_first(candidates, judge, noise, few), judge, noise)
+            model, before = company.exchanged(company.taken(about, best), said)
         if said and _unsaid(model, judge, noise) and otherwise(model):
             return Diagnosis(bare, (), (*given_up, *rejected))
+        if not more:
+            break
         near = tuple(one.name for one in candidates if one.gain > _NEARLY * candidates[0].gain)
         given_up.append(Rejected(best.name, best.gain, BETTER_SAID))
         said = [*before, Said(ties, near)]
