@@ -34,6 +34,21 @@ def test_nothing_is_added_to_a_log_that_the_eam_explains():
     assert report["decision"].startswith("Nothing significant")
 
 
+def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
+    """A bound that the fitted log never reaches."""
+    fitted, held_out = (record(_truth(), 2, 3.0, 500, seed=seed) for seed in (4, 5))
+    bound = 0.6 * np.abs(held_out.tau).max()
+    clipped = attrs.evolve(held_out, tau=held_out.tau.clip(-bound, bound))
+    report = identify([fitted], [clipped]).report
+    assert report["effects"] == []
+    left = (report["after"][data] for data in ("heldout_mse", "train_mse"))
+    assert "The held-out data leave {:.3g} N^2 m^2 where the fitted ones leave {:.3g}".format(*left) in (
+        report["decision"]
+    )
+    plain = identify([fitted], [held_out]).report
+    assert "held-out data leave" not in plain["decision"]
+
+
 def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
     """A quarter of the torque's noise again, through kd: whatever averages dq would predict better than the truth."""
     log = record(parameters(joints=3), joints=3, seed=6)

@@ -136,6 +136,8 @@ class About:
         every = np.ones(len(self.noise), dtype=bool)
         lost = Applied(CommandHold(*found), every, np.full((1, len(every)), 0.05), np.arange(len(every)))
         better = fit_with_delays(self.model.plus(lost), self.judge.fit, 2)
+        if better.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(self.judge.fit):
+            return []
         return [self._backlog(better.without(len(better.applied) - 1), most)]
 
     def _backlog(self, model: Model, most: int) -> tuple[Array, Array]:
@@ -144,6 +146,11 @@ class About:
 
 
 _LOST_SHARE = 0.003
+"""Of the rows: commands are not looked at as lost where fewer lag behind."""
+
+_FORETOLD = 1.25
+"""Times the error of the model without: losses at random leave, all alike, about what a longer delay left in their place.
+Where much more is left than that, what was read off the torque as losses was something else."""
 
 
 def started(about: About, law: EffectLaw) -> Started | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import attrs
@@ -12,6 +12,7 @@ from quadvel_description.robot import JOINT_NAMES
 
 from ..effects.terms import NAME as TERMS
 from ..parameters import ActuatorParameters, DelayPair, Effect
+from .decision import decision
 from .diagnosis import Diagnosis, Finding
 from .eam import Eam
 from .excerpts import Piece
@@ -31,7 +32,6 @@ _REMOVABLE = 0.05
 
 _ALIKE = 0.05  # ms
 _OVER = 1.1  # times the limit, that noise and a short peak may reach
-_LESS = 0.9  # of the error before, from which gains and delays of each joint are worth a word
 
 STEP = 0.001
 """s, of the models that run with the parameters"""
@@ -139,7 +139,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         + _beyond_limits(o),
         "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
     }
-    report["decision"] = _decision(report)
+    report["decision"] = decision(report)
     return report
 
 
@@ -271,44 +271,6 @@ def _settings(one: Applied) -> dict[str, Any]:
         else value
         for name, value in one.law.settings.items()
     }
-
-
-def _decision(report: Mapping[str, Any]) -> str:
-    before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
-    effects, rest = report["effects"], report["unexplained"]
-    if not effects and rest["verdict"] == "white" and after < _LESS * before:
-        return (
-            f"Nothing significant beside gains and delays of each joint: with them the EAM explains the torque to {after:.3g} "
-            f"N^2 m^2, with one for all to {before:.3g} (noise floor {report['noise_floor']:.3g}), and no effect is added."
-        )
-    if not effects and rest["verdict"] == "white":
-        return (
-            f"Nothing significant: the plain EAM explains the torque to {before:.3g} N^2 m^2 "
-            f"(noise floor {report['noise_floor']:.3g}), and no effect is added."
-        )
-    if not effects:
-        return (
-            f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on "
-            f"{', '.join(rest['depends_on'])}."
-        )
-    named = ", ".join(dict.fromkeys(one["name"] for one in effects))
-    cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
-    way = (
-        f"falls by {cut:.0f} %"
-        if cut >= 0.0
-        else f"rises by {-cut:.0f} %, as it holds what the fitted data do not show"
-    )
-    text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
-    learned = any(one["name"] == TERMS for one in effects)
-    beyond = "what was learned beyond them" if learned else "what is left"
-    more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
-    for one in effects:
-        if "samples_hit" in one:
-            more += (
-                f"; {one['name']} hits {100.0 * one['samples_hit']:.2g} % of the samples at random, which the error after "
-                "holds, as no model foretells them"
-            )
-    return f"{text} (noise floor {report['noise_floor']:.3g}){more}."
 
 
 def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
