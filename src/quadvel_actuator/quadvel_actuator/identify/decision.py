@@ -21,7 +21,8 @@ def decision(report: Mapping[str, Any]) -> str:
 
 
 def _nothing_added(report: Mapping[str, Any]) -> str:
-    before, after, rest = report["before"]["heldout_mse"], report["after"]["heldout_mse"], report["unexplained"]
+    before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
+    rest = report["unexplained"]
     if rest["verdict"] != "white":
         return (
             f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on "
