@@ -201,6 +201,8 @@ class AddedLaw(EffectLaw):
 
     stage = Stage.ADDED
     linear: ClassVar[tuple[str, ...]]
+    of_drive: ClassVar[bool] = True
+    """depends on what the drive gives; a law that says that it does not is fitted more quickly"""
 
     @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:

@@ -124,6 +124,7 @@ class Armature(AddedLaw):
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)
     linear = ("J",)
+    of_drive = False
     signal = "ddq"
     shifts = True
     motion = _FAST

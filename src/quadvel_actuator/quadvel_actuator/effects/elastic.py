@@ -36,6 +36,7 @@ class TorqueOffset(AddedLaw):
     name = "torque_offset"
     parameters = (Parameter("offset", "N m", -20.0, 20.0, 0.3),)
     linear = ("offset",)
+    of_drive = False
     signal = "q"
     motion = (
         "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
@@ -58,6 +59,7 @@ class ParallelSpring(AddedLaw):
     name = "parallel_spring"
     parameters = (Parameter("k", "N m/rad", -200.0, 200.0, 1.0), Parameter("q0", "rad", -30.0, 30.0, 0.3))
     linear = ("k",)
+    of_drive = False
     signal = "q"
     motion = "slow sweeps over the whole range of every joint"
 
@@ -86,6 +88,7 @@ class Cogging(AddedLaw):
         Parameter("phi", "rad", -20.0, 20.0, 0.3),
     )
     linear = ("a",)
+    of_drive = False
     signal = "q"
     motion = "slow sweeps over the whole range of every joint"
 

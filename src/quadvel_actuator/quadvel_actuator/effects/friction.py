@@ -21,6 +21,7 @@ _SLOW = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/
 class _Rubbing(AddedLaw):
     """Friction with a sign that turns as the hyperbolic tangent does, or slower, as the arctangent."""
 
+    of_drive = False
     turn: str = attrs.field(default="tanh", kw_only=True, validator=attrs.validators.in_(("tanh", "arctan")))
 
     @property
@@ -57,6 +58,7 @@ class ViscousFriction(AddedLaw):
     name = "viscous_friction"
     parameters = (Parameter("b", "N m s/rad", 0.0, 10.0, 0.05),)
     linear = ("b",)
+    of_drive = False
     gainlike = True
     signal = "dq"
     motion = _SLOW
@@ -102,6 +104,7 @@ class QuadraticDrag(AddedLaw):
     name = "quadratic_drag"
     parameters = (Parameter("c", "N m s^2/rad^2", 0.0, 50.0, 0.02),)
     linear = ("c",)
+    of_drive = False
     signal = "dq"
     motion = "fast sweeps, up to the joint's top speed"
 
@@ -118,6 +121,7 @@ class LoadDependentFriction(_Rubbing):
     name = "load_dependent_friction"
     parameters = (Parameter("mu", "1", 0.0, 0.9, 0.05), _WIDTH)
     linear = ("mu",)
+    of_drive = True
     signal = "dq"
     motion = "slow reversals under different loads: hung in the air, standing, with a payload"
 

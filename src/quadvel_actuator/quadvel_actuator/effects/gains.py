@@ -223,6 +223,10 @@ class CrossCoupling(AddedLaw):
     columns: tuple[tuple[str, int], ...] = ()
 
     @property
+    def of_drive(self) -> bool:  # type: ignore[override]
+        return any(name == "tau" for name, _ in self.columns)
+
+    @property
     def signal(self) -> str:  # type: ignore[override]
         return self.source[0] if self.source else "dq"
 
@@ -259,9 +263,8 @@ class CrossCoupling(AddedLaw):
         return [{}]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        lead = x.shape[:-1]
-        of = (x[..., k] if name == "tau" else getattr(s, name)[..., k] for name, k in self.columns)
-        return p["a"] * np.stack([np.broadcast_to(one, lead) for one in of], axis=-1)
+        of = [x[..., k] if name == "tau" else getattr(s, name)[..., k] for name, k in self.columns]
+        return p["a"] * np.stack(np.broadcast_arrays(*of), axis=-1)
 
 
 @attrs.frozen(eq=False)

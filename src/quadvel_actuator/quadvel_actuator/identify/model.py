@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ..effects import DRIVE, EffectLaw, ErrorLaw, MemoryLaw, Stage
+from ..effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from .signals import BETWEEN, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
@@ -288,14 +288,35 @@ def jacobian(model: Model, slots: Slots) -> tuple[Array, Array]:
     """Prediction (N, J) and its slopes (J, A, N) along every slot."""
     theta = pack(model)
     steps = np.where(theta + slots.step[:, None] > slots.high, -slots.step[:, None], slots.step[:, None])
-    free = np.flatnonzero((slots.index >= 0).any(axis=1))
-    batch = np.repeat(theta[None], len(free) + 1, axis=0)
-    for k, a in enumerate(free):
-        batch[k + 1, a] += steps[a]
-    torque = model.evaluate(*unpack(model, batch))
-    slopes = np.zeros((theta.shape[1], len(theta), len(torque[0])))
-    slopes[:, free] = ((torque[1:] - torque[0]) / steps[free, None, :]).transpose(2, 0, 1)
+    free: Bools = np.any(slots.index >= 0, axis=1)
+    alone = np.zeros(len(theta), dtype=bool)
+    slopes = np.zeros((theta.shape[1], len(theta), len(model.samples.t)))
+    first = 2
+    for one in model.applied:
+        mine = first + np.arange(len(one.values))
+        first += len(mine)
+        if isinstance(one.law, AddedLaw) and not one.law.of_drive:
+            alone[mine] = True
+            some = mine[free[mine]]
+            values = _stepped(theta[mine], steps[mine], some - mine[0])
+            slopes[:, some] = _slopes(model.added(one, model.signals.q, values), steps[some])
+    rest = np.flatnonzero(free & ~alone)
+    torque = model.evaluate(*unpack(model, _stepped(theta, steps, rest)))
+    slopes[:, rest] = _slopes(torque, steps[rest])
     return torque[0], slopes
+
+
+def _stepped(values: Array, steps: Array, which: Groups) -> Array:
+    """A batch of `values` (A, J): as they are, and with a step along each of the rows `which`."""
+    batch = np.repeat(values[None], len(which) + 1, axis=0)
+    batch[1 + np.arange(len(which)), which] += steps[which]
+    return batch
+
+
+def _slopes(torque: Array, steps: Array) -> Array:
+    """Slopes (J, A, N) of torques (1 + A, N, J), the first one without a step of `steps` (A, J)."""
+    slopes: Array = ((torque[1:] - torque[0]) / steps[:, None, :]).transpose(2, 0, 1)
+    return slopes
 
 
 def gather(slots: Slots, local: Array) -> Array:

@@ -77,8 +77,8 @@ class Ground:
         grid = [
             (np.full(joints, total - out), np.full(joints, out)) for total in _TOTALS for out in _OUTPUTS[::2]
         ]
-        spots = [_Spot(one) for one in _possible(model, grid)]
-        tried = [_Screen(spot, at.applied[-1], rows).best(nothing) for spot in spots]
+        spots = [_Spot(one, rows) for one in _possible(model, grid)]
+        tried = [_Screen(spot, at.applied[-1]).best(nothing) for spot in spots]
         best = min(tried, key=lambda one: float(one[1].sum()))[0]
         apart = best.input_delay + best.output_delay - model.input_delay - model.output_delay
         if np.abs(apart).max() < _APART:
@@ -89,9 +89,8 @@ class Ground:
         """Squared error (J,) of the model without the law on the rows that suit it, at its best delays."""
         key = law.remembers
         if key not in self._bare:
-            rows = self.few.of(self.model, law)[1]
             every = self.pairs(law, _EXCHANGED)
-            tried = [_Screen(spot, None, rows).best(np.zeros((1, 0, rows.shape[1])))[1] for spot in every]
+            tried = [_Screen(spot, None).best(np.zeros((1, 0, len(self.left))))[1] for spot in every]
             self._bare[key] = min(tried, key=lambda error: float(error.sum()))
         return self._bare[key]
 
@@ -100,7 +99,8 @@ class Ground:
         rowwise = law.remembers or remembers(self.model)
         key = moves if rowwise else None
         if key not in self._spots:
-            self._spots[key] = [_Spot(at) for base in self.bases for at in self._around(base, law, key)]
+            rows = self.few.of(self.model, law)[1]
+            self._spots[key] = [_Spot(at, rows) for base in self.bases for at in self._around(base, law, key)]
         return self._spots[key]
 
     def _around(
@@ -154,8 +154,7 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     """The law at the best of `starts`, chosen for each joint; None where that takes nothing off the error."""
     if not starts:
         return None
-    rows = ground.few.of(ground.model, law)[1]
-    joints = rows.shape[1]
+    joints = len(ground.left)
     table = np.array(
         [[_within(one.get(p.name, p.scale), p, joints) for p in law.parameters] for one in starts]
     )
@@ -164,7 +163,7 @@ def start(ground: Ground, law: EffectLaw, starts: Sequence[Start]) -> Started | 
     best: Model | None = None
     lowest = np.full(joints, np.inf)
     for spot in ground.pairs(law, (*_EXCHANGED, *(_SHORTENED if law.shifts else ()))):
-        found, error = _Screen(spot, empty, rows).best(table)
+        found, error = _Screen(spot, empty).best(table)
         if error.sum() < lowest.sum():
             lowest, best = error, found
     bare = ground.bare(law)
@@ -181,8 +180,9 @@ def _within(value: Array | float, parameter: Parameter, joints: int) -> Array:
 class _Spot:
     """A model at one pair of delays, and what every law that is looked at there needs of it."""
 
-    def __init__(self, model: Model) -> None:
-        self.model = model
+    def __init__(self, model: Model, rows: Bools) -> None:
+        """rows: those that are fitted, (N, J)."""
+        self.model, self.rows = model, rows
         self.moved = np.repeat(model.gains[None], 3, axis=0)
         """gains as they are, and with either a little more"""
         self.moved[1, 0] += _GAIN_STEP
@@ -202,6 +202,33 @@ class _Spot:
         """Torque (3, N, J) with the moved gains."""
         values = [np.repeat(one.values[None], 3, axis=0) for one in self.model.applied]
         return self.model.evaluate(self.moved, values)
+
+    @cached_property
+    def still(self) -> Array:
+        """Columns (J, K + 2, N) that are the same whatever law is tried: of `freed`, and of the delays."""
+        return self.wide([*self.columns, *(one[None] for one in self.slopes)])[0]
+
+    @cached_property
+    def plain(self) -> Array:
+        """Columns (J, K + 5, N) without a law that is tried: of `freed`, of gains and delays, and the target."""
+        *gains, left = self.wide(self.of(self.torque))[0].swapaxes(0, 1)
+        own, delays = self.still[:, :-2], self.still[:, -2:]
+        return np.concatenate([own, np.stack(gains, axis=1), delays, left[:, None]], axis=1)
+
+    def of(self, torque: Array) -> list[Array]:
+        """Of torques (3 B, N, J) with the moved gains: slopes along either gain, and what is left to explain, (B, N, J)."""
+        base = torque[::3]
+        step = np.inf if self.model.gains_held else _GAIN_STEP
+        return [*((torque[k::3] - base) / step for k in (1, 2)), self.model.samples.tau - base]
+
+    def wide(self, columns: Sequence[Array]) -> Array:
+        """Columns (B or 1, N, J) each, on the rows that are fitted, as (B, J, M, N)."""
+        count = max((len(one) for one in columns), default=1)
+        rows, joints = self.rows.shape
+        found = np.empty((count, joints, len(columns), rows))
+        for k, one in enumerate(columns):
+            np.multiply(one.swapaxes(-1, -2), self.rows.T, out=found[:, :, k])
+        return found
 
     @cached_property
     def driven(self) -> Array:
@@ -230,6 +257,17 @@ class _Spot:
         ]
 
 
+def _gram(first: Array, last: Array) -> Array:
+    """Products of all columns, first (B, J, L, N) and last (J, M, N), of which those of the last ones are all the same."""
+    count, joints, mine = first.shape[:3]
+    gram = np.empty((count, joints, mine + last.shape[1], mine + last.shape[1]))
+    gram[..., :mine, :mine] = first @ first.swapaxes(-1, -2)
+    gram[..., :mine, mine:] = first @ last.swapaxes(-1, -2)
+    gram[..., mine:, :mine] = gram[..., :mine, mine:].swapaxes(-1, -2)
+    gram[..., mine:, mine:] = last @ last.swapaxes(-1, -2)
+    return gram
+
+
 def _unit(spot: _Spot, applied: Applied, values: Array, one: int) -> Array:
     """What a unit of a law's linear parameter adds, the others being as in `values` (B, P, J): (B or 1, N, J)."""
     unit = values.copy()
@@ -246,8 +284,8 @@ class _Screen:
     shared as the model shares them.
     """
 
-    def __init__(self, spot: _Spot, tried: Applied | None, rows: Bools) -> None:
-        self.spot, self.tried, self.rows = spot, tried, rows
+    def __init__(self, spot: _Spot, tried: Applied | None) -> None:
+        self.spot, self.tried = spot, tried
         law, model = None if tried is None else tried.law, spot.model
         self.linear = [law.names.index(name) for name in getattr(law, "linear", ())] if law else []
         bounds = [(law.parameters[k].low, law.parameters[k].high) for k in self.linear] if law else []
@@ -315,20 +353,15 @@ class _Screen:
 
     def _products(self, values: Array) -> tuple[Array, Array, Array]:
         """Of each guess (B, P, J) and joint: products of the columns (B, J, M, M), with the target, and of the target."""
-        plain = self.tried is None or bool(self.linear)  # without its linear parameters the law does nothing
-        torque = self.spot.torque if plain else self._run(values)
-        base = torque[::3]
-        step = np.inf if self.spot.model.gains_held else _GAIN_STEP
-        gains = [(torque[k::3] - base) / step for k in (1, 2)]
-        columns = [_unit(self.spot, self.tried, values, one) for one in self.linear] if self.tried else []
-        columns += self.spot.columns
-        found = []
-        for b in range(len(values)):
-            every = [one[min(b, len(one) - 1)] for one in (*columns, *gains)] + self.spot.slopes
-            every.append(self.spot.model.samples.tau - base[min(b, len(base) - 1)])
-            wide = np.ascontiguousarray((np.stack(every) * self.rows).transpose(2, 0, 1))  # (J, M + 1, N)
-            found.append(wide @ wide.transpose(0, 2, 1))
-        gram = np.stack(found)
+        if self.tried is None or self.linear:  # without its linear parameters the law does nothing
+            own = [_unit(self.spot, self.tried, values, one) for one in self.linear] if self.tried else []
+            gram = _gram(self.spot.wide(own), self.spot.plain)
+        else:  # the columns that differ with the guess come between others
+            found = _gram(self.spot.wide(self.spot.of(self._run(values))), self.spot.still)
+            own_count = self.spot.still.shape[1] - 2
+            order = np.array([*range(3, 3 + own_count), 0, 1, 3 + own_count, 4 + own_count, 2])
+            gram = found[..., order[:, None], order]
+        gram = np.broadcast_to(gram, (len(values), *gram.shape[1:]))
         return gram[..., :-1, :-1], gram[..., :-1, -1], gram[..., -1, -1]
 
     def _run(self, values: Array) -> Array:

@@ -8,11 +8,11 @@ that step, 0 for the instant itself. Rows are never resampled, so errors are tho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import attrs
 import numpy as np
@@ -23,6 +23,7 @@ from .log import Log
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Made = TypeVar("Made")
 
 GAP = 3.5
 """A spacing above this many times the usual one begins a new stretch: memories start anew there."""
@@ -148,6 +149,7 @@ class _LogSignals:
             for name, values in self.commands.items()
             if values.any()
         }
+        self.all: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
     def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
@@ -240,6 +242,19 @@ def _one_row(values: Array) -> Array:
     return np.broadcast_to(values[0].copy(), values.shape) if same else values
 
 
+def _steady(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+    """The signals, of those of all `logs`, that are the same in every row, as that row."""
+    rows = {name: values[0] for name, values in logs[0].items()}
+    return {
+        name: row.copy()
+        for name, row in rows.items()
+        if all(
+            name in one and _one_row(one[name]).strides[0] == 0 and (one[name][0] == row).all()
+            for one in logs
+        )
+    }
+
+
 def _or_one(values: Array | None) -> Array:
     return np.ones(1) if values is None else values
 
@@ -280,7 +295,9 @@ class Samples:
         self._finer: Samples | None = None
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._first_row = np.cumsum([0, *lengths])
+        self._steady = _steady([one.all for one in self.logs])
         self._cache: dict[tuple[Any, ...], Signals] = {}
+        self._states: dict[tuple[Any, ...], dict[str, Array]] = {}
         self._parts: dict[int, Samples] = {}
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
@@ -305,7 +322,7 @@ class Samples:
             for name in _OF_ROWS:
                 setattr(part, name, getattr(self, name)[:stop])
             part.sent = self.sent[: self._first_packet[count]]
-            part._cache, part._parts, part._finer = {}, {}, None
+            part._cache, part._states, part._parts, part._finer = {}, {}, {}, None
             self._parts[count] = part
         return self._parts[count]
 
@@ -359,7 +376,7 @@ class Samples:
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._cache, part._parts, part._finer = {}, {}, None
+        part._cache, part._states, part._parts, part._finer = {}, {}, {}, None
         return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
@@ -368,8 +385,8 @@ class Samples:
         pairs = [(round(float(a), 7), round(float(b), 7)) for a, b in zip(*delays, strict=True)]
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
-        return self._cached(
-            key, lambda: self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
+        return self._kept(
+            self._cache, key, lambda: self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
         )
 
     def at_joint(self, input_delay: Array, output_delay: Array, window: float) -> Signals:
@@ -377,15 +394,18 @@ class Samples:
         delays = np.broadcast_to(input_delay + output_delay, self.tau.shape[1:])
         slope = partial(self._slope, 0.0, delays - 0.5 * window, ALL)
         key = ("joint", window, *np.round(delays, 7).tolist())
-        return self._cached(key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
+        return self._kept(self._cache, key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
 
-    def _cached(self, key: tuple[Any, ...], make: Callable[[], Signals]) -> Signals:
-        if key not in self._cache:
+    def _kept(
+        self, cache: dict[tuple[Any, ...], Made], key: tuple[Any, ...], make: Callable[[], Made]
+    ) -> Made:
+        """What `make` gives, made but once while few others are asked for."""
+        if key not in cache:
             made = make()
-            if len(self._cache) >= max(_CACHED[0], min(_CACHED[1], _CACHED_VALUES // self.tau.size)):
-                self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = made
-        return self._cache[key]
+            if len(cache) >= max(_CACHED[0], min(_CACHED[1], _CACHED_VALUES // self.tau.size)):
+                cache.pop(next(iter(cache)))
+            cache[key] = made
+        return cache[key]
 
     def _mixed(self, pairs: Sequence[tuple[float, float]], window: float) -> Signals:
         """Each joint's columns at its own delays; times and packets are those of the first one."""
@@ -433,24 +453,25 @@ class Samples:
         delays: Array | None = None,
     ) -> Signals:
         """The signals of `joints`, or of all, at one pair of delays; `delays` (J,) after which commands move the joints."""
+        chosen = ALL if joints is None else joints
+        steady = self._steady
         parts: dict[str, list[Array]] = {}
         packets, ages = [], []
-        chosen = ALL if joints is None else joints
         if delays is None:
             delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
-            found = one.between(at)
-            for name in one.states:
-                parts.setdefault(name, []).append(one.state(name, at, chosen, found))
-            for name in one.commands:
+            for name in one.commands.keys() - steady:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
             row = one.log.command_rows(at - input_delay + 1e-9)
-            for name, values in one.gains.items():
-                parts.setdefault(name, []).append(values[:, chosen][row])
+            for name in one.gains.keys() - steady:
+                parts.setdefault(name, []).append(one.gains[name][:, chosen][row])
             packets.append((row + first)[:, None])
             ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
-            parts.setdefault("t", []).append((at - one.origin)[:, None])
         signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
+        signals |= self._state(output_delay, joints)
+        for name, value in steady.items():
+            value = value if value.size == 1 else value[chosen]
+            signals[name] = np.broadcast_to(value, (len(self.t), value.size))
         for name in ("temperature", "voltage"):
             if name not in signals or len(signals[name]) < len(self.t):
                 signals[name] = None  # type: ignore[assignment]  # not in every log
@@ -465,6 +486,23 @@ class Samples:
             slope=partial(self._slope, output_delay, delays, chosen),
             **signals,
         )
+
+    def _state(self, output_delay: float, joints: list[int] | None) -> dict[str, Array]:
+        """The part of the signals that goes with the output delay alone, by name."""
+
+        def make() -> dict[str, Array]:
+            parts: dict[str, list[Array]] = {}
+            for one, at in zip(self.logs, self._instants(output_delay), strict=False):
+                found = one.between(at)
+                for name in one.states.keys() - self._steady:
+                    parts.setdefault(name, []).append(
+                        one.state(name, at, ALL if joints is None else joints, found)
+                    )
+                parts.setdefault("t", []).append((at - one.origin)[:, None])
+            return {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
+
+        key = (output_delay, *(joints or ()))
+        return self._kept(self._states, key, make)
 
     def _slope(self, output_delay: float, delays: Array, joints: Joints, name: str) -> Array:
         """One of the accelerations (N, J) at this output delay, where commands move the joints after `delays` (J,)."""
