@@ -62,6 +62,12 @@ class Ahead(Generic[R]):
         return answer
 
 
+def side_by_side(work: Callable[[int], R], count: int, cores: int, samples: Samples) -> list[R]:
+    """What the work gives for each of the numbers below `count`."""
+    with Ahead(work, cores if count > 1 else 1, samples) as ahead:
+        return [ahead.take(k, range(k + 1, count)) for k in range(count)]
+
+
 _task: tuple[Callable[[int], Any], Samples]
 """of a worker"""
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from ..effects import EffectLaw
 from ..effects.commands import CommandHold
+from .ahead import side_by_side
 from .backlog import backlog, suspicious
 from .delays import fit_with_delays
 from .eam import WINDOWS
@@ -59,8 +60,8 @@ class Candidate:
 class About:
     """What a law may ask of the model that it is to be added to."""
 
-    def __init__(self, model: Model, judge: Judge, noise: Array, few: Few) -> None:
-        self.model, self.judge, self.noise, self.few = model, judge, noise, few
+    def __init__(self, model: Model, judge: Judge, noise: Array, few: Few, cores: int = 1) -> None:
+        self.model, self.judge, self.noise, self.few, self.cores = model, judge, noise, few, cores
         self.samples, self.signals = model.samples, model.signals
         self.residual = np.where(judge.fit | judge.judge, self.samples.tau - model.predict(), 0.0)
         self.left = np.sum(np.where(judge.fit, self.residual, 0.0) ** 2, axis=0) / noise
@@ -93,12 +94,15 @@ class About:
         some, rows = self.few.of(model)
         windows = [attrs.evolve(some, window=one) for one in sorted({model.window, *WINDOWS})]
         near = _LATER if _may_move(model) else ()
-        near_best = [
-            found
-            for one in windows  # each has its own valleys, so that they are compared at the bottom
-            for found in _best([fit(at, rows, 2) for at in (*divided(one), *later(one, near))], rows, 2)
-        ]
-        best = _best([fit_with_delays(one, rows, 2 * _STEPS) for one in near_best], rows, 2)
+
+        def settled(k: int) -> list[Model]:
+            """Of one window: each has its own valleys, so that they are compared at the bottom."""
+            starts = (*divided(windows[k]), *later(windows[k], near))
+            best = _best([fit(at, rows, 2) for at in starts], rows, 2)
+            return [fit_with_delays(one, rows, 2 * _STEPS) for one in best]
+
+        of_each = side_by_side(settled, len(windows), self.cores, some.samples)
+        best = _best([one for found in of_each for one in found], rows, 2)
         whole = [attrs.evolve(one, samples=model.samples) for one in best]
         return _best([fit_with_delays(one, self.judge.fit, _LAST_STEPS) for one in whole], self.judge.fit, 1)[
             0

@@ -11,13 +11,14 @@ import attrs
 import numpy as np
 
 from ..effects import EffectLaw, registry
+from .ahead import side_by_side
 from .candidates import About, Candidate, best_form, judged, less_said
 from .delays import fit_with_delays
 from .few import Few, remembers
 from .judging import Comparison, Judge
 from .model import Model
 from .ranking import LEVEL, SIMPLER_LOSES, TIES, WORTH, choice, worth
-from .signals import Array
+from .signals import Array, Bools
 from .valleys import deepest
 
 _BETTER_FORM = 0.99
@@ -55,18 +56,21 @@ def with_kin(model: Model, said: Sequence[Said]) -> list[Said]:
 class Company:
     """Puts the laws of a model right; `noise` (J,) is the floor of each joint, N^2 m^2, `few` the rows to fit to.
 
+    `cores` share the work.
+
     What was said of the laws goes with a model, in their order.
     """
 
     judge: Judge
     noise: Array
     few: Few
+    cores: int = 1
 
     def taken(self, about: About, best: Candidate) -> Model:
         """The candidate's model fitted from other delays, all laws in the forms and on the joints that suit each other."""
         found = about.fit_anew(best.model.holding(False))
         if not remembers(found):  # whose fits take long: in the end, once
-            found = self.few.fitted(found, deepest, 1)
+            found = self.few.fitted(found, self._deepest, 1)
         found = self._reformed(fit_with_delays(found, self.judge.fit))
         return self.released(self.widened(found))
 
@@ -99,10 +103,13 @@ class Company:
         named = [law for name, law in registry().items() if name in rivals and name not in taken]
         if not named or not less.applied:
             return None
-        beside = About(self._fitted(less, 5), self.judge, self.noise, self.few)
+        beside = About(self._fitted(less, 5), self.judge, self.noise, self.few, self.cores)
         now = judged(beside, one.law, less.plus(one))
         least = _PROMISING * beside.kept(now)
-        found = [now, *filter(None, (best_form(beside, law, least) for law in named))]
+        others = side_by_side(
+            lambda k: best_form(beside, named[k], least), len(named), self.cores, beside.samples
+        )
+        found = [now, *filter(None, others)]
         best, ties = choice(sorted(found, key=lambda each: -each.gain), self.judge, self.noise)
         more = len(best.law.parameters) - len(one.law.parameters)
         gained = self.judge.compare(now.residual, best.residual)
@@ -194,8 +201,11 @@ class Company:
     def deepened(self, model: Model) -> Model:
         """At the bottom of its deepest valley; with a memory, as few rows show it, since all would take long."""
         if remembers(model):
-            return fit_with_delays(self.few.fitted(model, deepest, 1), self.judge.fit)
-        return deepest(model, self.judge.fit, 4)
+            return fit_with_delays(self.few.fitted(model, self._deepest, 1), self.judge.fit)
+        return self._deepest(model, self.judge.fit, 4)
+
+    def _deepest(self, model: Model, rows: Bools, rounds: int) -> Model:
+        return deepest(model, rows, rounds, self.cores)
 
     def loss(self, model: Model, index: int) -> tuple[Comparison, Model]:
         """What leaving an effect out costs on held-out rows, and the model without it."""

@@ -84,13 +84,13 @@ def diagnose(
     bare = model
     given_up: list[Rejected] = []
     few = Few(model.samples, judge, (model.samples.tau - model.predict()) / np.sqrt(noise))
-    company = Company(judge, noise, few)
+    company = Company(judge, noise, few, cores)
     said: list[Said] = []
     rejected: list[Rejected] = []
     while True:
         model = model.holding(True)
-        about = About(model, judge, noise, few)
-        candidates, idle = ranked(about, tick, f"effect {len(said) + 1}", cores)
+        about = About(model, judge, noise, few, cores)
+        candidates, idle = ranked(about, tick, f"effect {len(said) + 1}")
         rejected = [*(_reason(one, noise, len(registry())) for one in candidates), *idle]
         finer = _finer(model, candidates, judge, noise, few)
         if finer is not None:

@@ -95,7 +95,7 @@ def identify(
         before = late
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
-    alone = Alone(before, judge, noise)
+    alone = Alone(before, judge, noise, options.cores)
 
     def tick(text: str) -> None:
         tell(min(0.1 + 0.008 * next(steps), 0.85), text)

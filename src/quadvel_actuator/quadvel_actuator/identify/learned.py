@@ -17,6 +17,7 @@ import numpy as np
 
 from ..effects import DRIVE, JOINT
 from ..effects.terms import Lag, Resonance, Shape, Term
+from .ahead import side_by_side
 from .delays import latest
 from .features import Feature, Scene, library, lines
 from .judging import Judge
@@ -30,6 +31,8 @@ LEVEL = 0.01
 MOST = 8
 """Terms at most."""
 
+_PART = 50
+"""Features that one core looks at before it is given others"""
 _TRIED = 100  # features a joint that count as independent trials
 _KEPT = 12  # features that come into question after a look at all of them
 _FITTED = 4  # of these that the model is fitted beside
@@ -80,15 +83,15 @@ def longest(model: Model, learned: Learned | None, rows: Bools) -> Model:
     return model.with_delays(late.input_delay, late.output_delay)
 
 
-def learn(model: Model, judge: Judge, noise: Array) -> Learned | None:
-    """Terms for what `model` leaves; None where nothing pays.
+def learn(model: Model, judge: Judge, noise: Array, cores: int = 1) -> Learned | None:
+    """Terms for what `model` leaves; None where nothing pays. `cores` share the work.
 
     Gains that are held are left free as soon as terms let them stay near those commanded.
     """
     state = _State((), Scene(model, judge))
     kept: list[Picks] = []
     for _ in range(MOST):
-        kept = _promising(state, kept, noise)
+        kept = _promising(state, kept, noise, cores)
         grown = [state.plus(picks).outline for picks in kept[:_FITTED]]
         better = [one for one in grown if one.left < state.left]
         if not better:
@@ -196,12 +199,12 @@ class _Outline:
         return _State(self.picks, Scene(self.model, judge))
 
 
-def _promising(state: _State, kept: Sequence[Picks], noise: Array) -> list[Picks]:
+def _promising(state: _State, kept: Sequence[Picks], noise: Array, cores: int) -> list[Picks]:
     """What pays beside the picks of a state, best first: of what did before, or of everything where that does no more."""
     left = state.freed.left if state.picks else state.scene.residual
     fresh = [one for picks in kept for one in picks if one.feature.signal != "t"]
     found = _paying(_again(fresh, state.scene, left), state, noise) if fresh else []
-    return found or _paying(library(state.scene, left), state, noise)
+    return found or _paying(library(state.scene, left), state, noise, cores)
 
 
 def _wider(picks: Picks) -> Pick | None:
@@ -235,15 +238,19 @@ def _again(kept: Sequence[Pick], scene: Scene, left: Array) -> Iterator[Feature]
     yield from lines(scene, left)
 
 
-def _paying(features: Iterable[Feature], state: _State, noise: Array) -> list[Picks]:
+def _paying(features: Iterable[Feature], state: _State, noise: Array, cores: int = 1) -> list[Picks]:
     """Those that pay beside the picks of a state, of the same signals the best one, and sets of neighbours; best first."""
-    trial = Trial(state.picks, state.scene)
+    trial, every = Trial(state.picks, state.scene), list(features)
     best: dict[tuple[str, ...], Pick] = {}
     neighbours: dict[Any, list[Pick]] = {}
-    for feature in features:
-        pick = _pick(feature, trial, noise)
-        if pick is None:
-            continue
+    parts = side_by_side(
+        lambda k: [_pick(one, trial, noise) for one in every[k * _PART : (k + 1) * _PART]],
+        -(-len(every) // _PART),
+        cores,
+        state.scene.model.samples,
+    )
+    for pick in (one for part in parts for one in part if one is not None):
+        feature = pick.feature
         before = best.get(feature.key)
         if before is None or pick.gain > before.gain:
             best[feature.key] = pick

@@ -49,12 +49,12 @@ class Rejected:
     reason: str
 
 
-def ranked(about: About, tick: Tick, what: str, cores: int = 1) -> tuple[list[Candidate], list[Rejected]]:
+def ranked(about: About, tick: Tick, what: str) -> tuple[list[Candidate], list[Rejected]]:
     """Every law of the registry on top of the model, the best form of each, least held-out error first.
 
-    Second, those that do not come into question. `cores` share the work.
+    Second, those that do not come into question.
     """
-    race = _Race(about, cores)
+    race = _Race(about)
     looked = race.looked(lambda name: tick(f"{what}: {name}"))
     race.fit(looked, lambda name: tick(f"{what}: {name}, fitted"))
     race.fit_stuck_ones_again()
@@ -66,8 +66,8 @@ def ranked(about: About, tick: Tick, what: str, cores: int = 1) -> tuple[list[Ca
 class _Race:
     """The best candidate of each law so far."""
 
-    def __init__(self, about: About, cores: int) -> None:
-        self.about, self.cores = about, cores
+    def __init__(self, about: About) -> None:
+        self.about = about
         self.taken = {one.law.name for one in about.model.applied}
         self.best: dict[str, Candidate] = {}
         self.idle: dict[str, Rejected] = {}
@@ -118,7 +118,7 @@ class _Race:
                         self._stuck.append((first.promise, found))
 
     def _ahead(self, work: Callable[[int], R]) -> Ahead[R]:
-        return Ahead(work, self.cores, self.about.samples)
+        return Ahead(work, self.about.cores, self.about.samples)
 
     def _least_promise(self, looked: list[Started]) -> float:
         rows = self.about.few.fitted_rows

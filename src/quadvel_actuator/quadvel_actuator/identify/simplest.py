@@ -46,21 +46,22 @@ _SHAPED = "q"
 class Alone:
     """Terms of named signals on `before`, the model without effects: what they say without any law."""
 
-    def __init__(self, before: Model, judge: Judge, noise: Array) -> None:
-        self.before, self._judge, self._noise = before, judge, noise
+    def __init__(self, before: Model, judge: Judge, noise: Array, cores: int = 1) -> None:
+        """`cores` share the work."""
+        self.before, self._judge, self._noise, self.cores = before, judge, noise, cores
 
     @cached_property
     def learned(self) -> Learned | None:
         """From the gains as they were fitted, or from those commanded, if that leaves much or they stray far."""
         before, judge, noise = self.before, self._judge, self._noise
-        found = learn(before, judge, noise)
+        found = learn(before, judge, noise, self.cores)
         model = before if found is None else found.model
         if before.implied or not before.samples.commanded:
             return found
         if model.believable and self._at_floor(model, found):
             return found
         few = Few(before.samples, judge, (before.samples.tau - before.predict()) / np.sqrt(noise))
-        other = learn(as_sent(before, few), judge, noise)
+        other = learn(as_sent(before, few), judge, noise, self.cores)
         if other is None or other.model.gains_held:  # left free, they stray: nothing can be said of them
             return found
         if found is None:
@@ -101,14 +102,15 @@ def account(
 
     The diagnosis that comes back holds the model fitted beside the terms.
     """
-    beside = alone.learned if diagnosis.model is alone.before else learn(diagnosis.model, judge, noise)
+    unsaid = diagnosis.model is alone.before
+    beside = alone.learned if unsaid else learn(diagnosis.model, judge, noise, alone.cores)
     floor = _floor(judge, noise)
     named = _with(diagnosis, beside)
     if not diagnosis.findings or _enough(alone.before, diagnosis, beside, judge, floor):
         return named, beside
     terms = alone.learned
     if _one_shape(diagnosis):  # what hid the delays is found then
-        terms = learn(attrs.evolve(diagnosis.model, applied=()), judge, noise)
+        terms = learn(attrs.evolve(diagnosis.model, applied=()), judge, noise, alone.cores)
     if terms is None or not _shorter_or_better(named, beside, terms, judge, floor):
         return named, beside
     given_up = tuple(Rejected(one.name, one.gain, BETTER_SAID) for one in diagnosis.findings)

@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 
 from ..effects import AddedLaw
+from .ahead import side_by_side
 from .delays import CHANCE, LONGEST, fit_with_delays
 from .eam import WINDOWS
 from .few import remembers
@@ -31,10 +32,13 @@ _DEEPER = 1.0
 """Of the mean squared error: a sum of squares that has to fall by this much to count as less"""
 
 
-def deepest(model: Model, rows: Bools, rounds: int) -> Model:
-    """The model fitted to `rows` (N, J) from either side of where it is, at most so often, while that says more."""
+def deepest(model: Model, rows: Bools, rounds: int, cores: int = 1) -> Model:
+    """The model fitted to `rows` (N, J) from either side of where it is, at most so often, while that says more.
+
+    `cores` share the work.
+    """
     for _ in range(rounds):
-        best = min(_neighbours(model, rows), key=lambda one: one.error(rows))
+        best = min(_neighbours(model, rows, cores), key=lambda one: one.error(rows))
         if model.error(rows) - best.error(rows) < _DEEPER * model.mse(rows):
             break
         model = best
@@ -52,9 +56,9 @@ def as_deep(model: Model, rows: Bools) -> list[Model]:
     return [one for one in _neighbours(model, rows) if one.error(rows) < bound]
 
 
-def _neighbours(model: Model, rows: Bools) -> Iterator[Model]:
-    for start in _starts(model):
-        yield fit_with_delays(start, rows, _STEPS)
+def _neighbours(model: Model, rows: Bools, cores: int = 1) -> list[Model]:
+    starts = list(_starts(model))
+    return side_by_side(lambda k: fit_with_delays(starts[k], rows, _STEPS), len(starts), cores, model.samples)
 
 
 def _starts(model: Model) -> Iterator[Model]:
