@@ -8,7 +8,7 @@ from simulated_joints import NAMES, parameters
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.identify.log import Log
-from quadvel_actuator.identify.model import Applied, Model
+from quadvel_actuator.identify.model import Applied, Model, Slots, jacobian, pack, with_slots
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:3]
@@ -114,6 +114,30 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
             Model(Samples([log]), 0.0, *gains, np.zeros(4), np.zeros(4), zero, (coupled,)).predict()
         )
     np.testing.assert_array_equal(*torques)
+
+
+@pytest.mark.parametrize("source", ["q", "tau"])
+@pytest.mark.parametrize("name", [name for name, law in registry().items() if law.stage == Stage.ADDED])
+def test_slopes_of_a_fit_are_those_of_the_torque(name, source):
+    """Whether the law depends on the torque of the drive, which changes with the gains, or says that it does not."""
+    t, q, dq, q_des = _motion(300)
+    settings = {"source": [f"{NAMES[1]}/{source}"] * 4} if name == "cross_coupling" else {}
+    law = registry()[name].configured(settings, NAMES[:4])
+    values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in law.names])
+    every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
+    samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
+    model = Model(
+        samples, 0.0, np.ones((2, 4)), np.array([zero, zero]), np.full(4, 0.004), np.full(4, 0.002), zero,
+        (Applied(law, every, values, np.arange(4)),),
+    )  # fmt: skip
+    slots = Slots.of(model)
+    torque, slopes = jacobian(model, slots)
+    np.testing.assert_array_equal(torque, model.predict())
+    for k, step in enumerate(slots.step):
+        moved = pack(model)
+        moved[k] += step
+        slope = (with_slots(model, moved).predict() - torque) / step
+        np.testing.assert_allclose(slopes[:, k].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
 
 
 @pytest.mark.parametrize("name", ["coulomb_friction", "hysteresis", "load_dependent_friction"])
