@@ -242,7 +242,7 @@ def _one_row(values: Array) -> Array:
     return np.broadcast_to(values[0].copy(), values.shape) if same else values
 
 
-def _steady(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+def _constant(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """The signals, of those of all `logs`, that are the same in every row, as that row."""
     rows = {name: values[0] for name, values in logs[0].items()}
     return {
@@ -295,7 +295,7 @@ class Samples:
         self._finer: Samples | None = None
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._first_row = np.cumsum([0, *lengths])
-        self._steady = _steady([one.all for one in self.logs])
+        self._constant = _constant([one.all for one in self.logs])
         self._cache: dict[tuple[Any, ...], Signals] = {}
         self._states: dict[tuple[Any, ...], dict[str, Array]] = {}
         self._parts: dict[int, Samples] = {}
@@ -454,22 +454,22 @@ class Samples:
     ) -> Signals:
         """The signals of `joints`, or of all, at one pair of delays; `delays` (J,) after which commands move the joints."""
         chosen = ALL if joints is None else joints
-        steady = self._steady
+        constant = self._constant
         parts: dict[str, list[Array]] = {}
         packets, ages = [], []
         if delays is None:
             delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
-            for name in one.commands.keys() - steady:
+            for name in one.commands.keys() - constant:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
             row = one.log.command_rows(at - input_delay + 1e-9)
-            for name in one.gains.keys() - steady:
+            for name in one.gains.keys() - constant:
                 parts.setdefault(name, []).append(one.gains[name][:, chosen][row])
             packets.append((row + first)[:, None])
             ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
         signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
         signals |= self._state(output_delay, joints)
-        for name, value in steady.items():
+        for name, value in constant.items():
             value = value if value.size == 1 else value[chosen]
             signals[name] = np.broadcast_to(value, (len(self.t), value.size))
         for name in ("temperature", "voltage"):
@@ -494,7 +494,7 @@ class Samples:
             parts: dict[str, list[Array]] = {}
             for one, at in zip(self.logs, self._instants(output_delay), strict=False):
                 found = one.between(at)
-                for name in one.states.keys() - self._steady:
+                for name in one.states.keys() - self._constant:
                     parts.setdefault(name, []).append(
                         one.state(name, at, ALL if joints is None else joints, found)
                     )
