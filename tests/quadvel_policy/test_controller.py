@@ -196,6 +196,24 @@ def test_a_simulated_robot_waits_for_the_estimator_but_not_for_ever(robot: Robot
     assert robot.report("walk").overruns == 0
 
 
+def test_a_simulated_robot_waits_for_its_commands_but_not_for_ever(robot: Robot) -> None:
+    walk(robot)
+    robot.order(0.5)
+    robot.step(50)
+    robot.graph.pass_time(PERIOD)
+    robot.state.tick += 5
+    robot.send(robot.message())
+    robot.estimate()
+    assert not robot.graph.holds(robot.answered, 0.2)  # it is about to outrun the mux
+    robot.order(0.5)
+    robot.graph.wait(robot.answered)
+    robot.answers.clear()
+    robot.step(49)
+    assert len(robot.answers) == 49
+    robot.step(15)  # each of the first ones is answered when it is sent again
+    assert not robot.report("walk").stance
+
+
 def test_states_that_stop_are_a_fault(robot: Robot) -> None:
     robot.stand()
     answers = len(robot.answers)

@@ -3,8 +3,8 @@
 It is locked to the phase of the states: a tick runs when the state that is due arrives, so that the latency
 is small and constant. What is due lies on an absolute grid in the states' own time (`TickGrid`), so that
 states may come faster than 200 Hz; the deadline of a tick is one period after its state held. When states
-stop, a timer notices. With simulated time the same holds on that time. What a tick decides is the
-supervisor's matter.
+stop, a timer notices. With simulated time the same holds on that time, and the answer waits until estimator
+and mux have kept up, so that no node is outrun. What a tick decides is the supervisor's matter.
 
 All times but that of the clock are the robot's own (`RobotTime`): a stall of the whole machine, simulator
 included, is no gap in them.
@@ -46,6 +46,12 @@ PERIOD = 1.0 / RATE_HZ
 STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
 
+HELD_UP = 10
+"""Simulated states that wait for a command, one after the other, where none comes any more"""
+
+Stamped = tuple[float, Array]
+"""Time (s) and value"""
+
 
 @attrs.frozen(kw_only=True)
 class ControllerParameters(SupervisorConfig, Scheduling):
@@ -74,10 +80,10 @@ class Controller(Node):
         self._refused_before = self._overruns_before = self._pauses_before = 0
         self._grid = TickGrid(PERIOD)
         self._state: RobotState | None = None
-        self._waiting: RobotState | None = None  # for the velocity estimate, on simulated time
+        self._waiting: RobotState | None = None  # for the estimator or the mux, on simulated time
         self._answer, self._message = JointCommand.damping(), LowCmd()
-        self._velocity: tuple[float, Array] | None = None  # time and value
-        self._command: tuple[float, Array] | None = None
+        self._velocity: Stamped | None = None
+        self._command: Stamped | None = None
         self._checks = {
             "low_state": StampCheck(self._settings.max_state_age),
             "velocity_estimate": StampCheck(self._settings.max_velocity_age),
@@ -129,16 +135,24 @@ class Controller(Node):
         state.time = self._robot_time.follow(state.time, state.tick, longest)
         self._pauses.heard()
         sent_again = self._waiting is not None and self._waiting.time == state.time
-        if self._awaits_velocity(state) and not sent_again:
+        if self._outruns_others(state) and not sent_again:
             self._waiting = state
         else:
             self._take(state, now, start)
 
-    def _awaits_velocity(self, state: RobotState) -> bool:
-        """Whether a simulator shall wait until the estimator has kept up, as it does by itself in real time."""
-        if not self._sim_time or self._velocity is None:
+    def _outruns_others(self, state: RobotState) -> bool:
+        """Whether a simulator shall wait until estimator and mux have kept up, as they do by themselves in real time.
+
+        Not for long: each state is sent again, and those that come after a while are no longer held up.
+        """
+        if not self._sim_time:
             return False
-        return 1.5 * PERIOD < state.time - self._velocity[0] <= self._settings.max_velocity_age
+        late = 0.5 * self._settings.command_timeout
+        held_up = (
+            (self._velocity, 1.5 * PERIOD, self._settings.max_velocity_age),
+            (self._command, late, late + HELD_UP * PERIOD),
+        )
+        return any(last is not None and least < state.time - last[0] <= most for last, least, most in held_up)
 
     def _take(self, state: RobotState, now: float, start: float) -> None:
         """Answer the state if it is due. now, start: when that began, s, on the clock and on the steady clock."""
@@ -178,17 +192,23 @@ class Controller(Node):
         except MessageError as error:
             self._refusals.add("velocity_estimate", error)
             return
-        if self._waiting is not None and not self._awaits_velocity(self._waiting):
-            self._take(self._waiting, now, time.perf_counter())
+        self._resume(now)
 
     def _on_command(self, message: Any) -> None:
         try:
             stamp = seconds(message.stamp)
-            self._accept("command", stamp)
+            now = self._accept("command", stamp)
             command = np.append(planar_velocity(message.twist), float(message.stance))
             self._command = stamp - self._robot_time.stalled, command
         except MessageError as error:
             self._refusals.add("command", error)
+            return
+        self._resume(now)
+
+    def _resume(self, now: float) -> None:
+        """Answer the state that waited, if nothing is behind any more."""
+        if self._waiting is not None and not self._outruns_others(self._waiting):
+            self._take(self._waiting, now, time.perf_counter())
 
     def _on_set_mode(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.request(request.mode)
@@ -271,7 +291,7 @@ class Controller(Node):
         return DiagnosticStatus.OK, status
 
 
-def _fresh(stamped: tuple[float, Array] | None, now: float, limit: float) -> Array | None:
+def _fresh(stamped: Stamped | None, now: float, limit: float) -> Array | None:
     """The value, unless its time is more than `limit` (s) off, to come where the clock was set back."""
     return stamped[1] if stamped is not None and abs(now - stamped[0]) <= limit else None
 
