@@ -138,6 +138,11 @@ class Armature(AddedLaw):
     def forms(self) -> tuple[Armature, ...]:
         return tuple(attrs.evolve(self, of=of) for of in _SLOPES if of != self.of)
 
+    @property
+    def alternatives(self) -> tuple[Armature, ...]:
+        every = (attrs.evolve(self, of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
+        return tuple(one for one in every if (one.of, one.at) != (self.of, self.at))
+
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]
 

@@ -13,9 +13,11 @@ import numpy as np
 from scipy import stats
 
 from .delays import LONGEST, fit_with_delays, jacobian_with_delays, plateau
+from .few import remembers
 from .judging import Judge
 from .learned import Learned, beside
 from .model import Model, gather
+from .screening import split
 from .signals import Array, Bools
 from .valleys import as_deep
 
@@ -129,13 +131,18 @@ def _everything(model: Model) -> Array:
 
 
 def _shape_error(model: Model, index: int, judge: Judge) -> Array:
-    """How far an effect's values (P, J) move where it has another shape that explains the log as well."""
+    """How far an effect's values (P, J) move where it has another shape that explains the log as well.
+
+    One that looks like a delay may do so with the delays divided otherwise.
+    """
     one, rows = model.applied[index], judge.every
-    moved = np.zeros(one.values.shape)
+    bound, moved = _AS_WELL * model.error(rows), np.zeros(one.values.shape)
     for law in one.law.alternatives:
-        tried = fit_with_delays(model.replacing(index, attrs.evolve(one, law=law)), rows)
-        if tried.error(rows) < _AS_WELL * model.error(rows):
-            moved = np.maximum(moved, np.abs(tried.applied[index].values - one.values))
+        other = model.replacing(index, attrs.evolve(one, law=law))
+        starts = split(other) if law.shifts and not remembers(model) else (other,)
+        for tried in (fit_with_delays(start, rows) for start in starts):
+            if tried.error(rows) < bound:
+                moved = np.maximum(moved, np.abs(tried.applied[index].values - one.values))
     return moved
 
 

@@ -114,10 +114,15 @@ class Ground:
 
 def divided(model: Model) -> Iterator[Model]:
     """The model, and with its delays divided in other ways between input and output, and some commands off."""
+    yield from split(model)
+    yield from later(model, _PERIODS)
+
+
+def split(model: Model) -> Iterator[Model]:
+    """The model, and with its delays divided in other ways between input and output."""
     yield model
     i, o = model.input_delay, model.output_delay
     yield from _possible(model, [(i + o - at, np.full_like(o, at)) for at in _OUTPUTS])
-    yield from later(model, _PERIODS)
 
 
 def later(model: Model, by: Sequence[float]) -> Iterator[Model]:
