@@ -62,15 +62,22 @@ def chased(torque: Any, age: Any, dt: Any, start: Any, rate: Any) -> Any:
 
 
 def _along(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[Any, ...]) -> Any:
-    """A loop over the last axis but one of `rows`; `numbers` have no rows of their own."""
-    axes = [(-2,)] * len(rows) + [()] * len(numbers) + [(-2,)]
-    flat = (one[..., 0, :] if np.ndim(one) > 1 else one for one in map(np.asarray, numbers))
-    return loop(*rows, *flat, axes=axes)
+    """A loop over the last axis but one of `rows`; `numbers` have one row, or none of their own."""
+    numbers = tuple(map(np.atleast_2d, numbers))
+    shape = np.broadcast_shapes(*map(np.shape, (*rows, *numbers)))
+    out = np.empty(shape)
+    series = [np.broadcast_to(one, shape).reshape(-1, *shape[-2:]) for one in rows]
+    flat = [np.broadcast_to(one, (*shape[:-2], 1, shape[-1])).reshape(-1, shape[-1]) for one in numbers]
+    loop(*series, *flat, out.reshape(-1, *shape[-2:]))
+    return out
 
 
 @cache
 def _compiled() -> dict[str, Callable[..., Any]]:
-    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk."""
+    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk.
+
+    Not as universal functions, which Numba keeps in two files that break each other where several processes compile at once.
+    """
     import numba  # takes time and memory that a running model need not spend
     from numba.extending import register_jitable
 
@@ -78,34 +85,38 @@ def _compiled() -> dict[str, Callable[..., Any]]:
         register_jitable(step)
 
     def played(seen: Any, start: Any, gap: Any, out: Any) -> None:
-        follows = seen[0]
-        for n in range(len(seen)):
-            follows = seen[n] if start[n] else play(follows, seen[n], gap)
-            out[n] = follows
+        for b, j in np.ndindex(gap.shape):
+            follows = seen[b, 0, j]
+            for n in range(seen.shape[1]):
+                follows = seen[b, n, j] if start[b, n, j] else play(follows, seen[b, n, j], gap[b, j])
+                out[b, n, j] = follows
 
     def bent(q: Any, start: Any, reach: Any, beta: Any, out: Any) -> None:
-        z = 0.0
-        for n in range(len(q)):
-            z = 0.0 if n == 0 or start[n] else bend(z, (q[n] - q[n - 1]) / reach, beta)
-            out[n] = z
+        for b, j in np.ndindex(reach.shape):
+            z = 0.0
+            for n in range(q.shape[1]):
+                fresh = n == 0 or start[b, n, j]
+                z = 0.0 if fresh else bend(z, (q[b, n, j] - q[b, n - 1, j]) / reach[b, j], beta[b, j])
+                out[b, n, j] = z
 
     def chased(torque: Any, age: Any, dt: Any, start: Any, rate: Any, out: Any) -> None:
-        given, slope = torque[0], 0.0
-        for n in range(len(torque)):
-            if n == 0 or start[n]:
-                given, slope = torque[n], 0.0
-            else:
-                given, slope = chase(given, torque[n - 1], slope, torque[n], age[n], dt[n], rate)
-            out[n] = given
+        for b, j in np.ndindex(rate.shape):
+            given, slope = torque[b, 0, j], 0.0
+            for n in range(torque.shape[1]):
+                now = torque[b, n, j]
+                if n == 0 or start[b, n, j]:
+                    given, slope = now, 0.0
+                else:
+                    before = torque[b, n - 1, j]
+                    given, slope = chase(given, before, slope, now, age[b, n, j], dt[b, n, j], rate[b, j])
+                out[b, n, j] = given
 
-    rows, on, number = "f8[:]", "b1[:]", "f8"
-    compiled: Any = numba.guvectorize
+    rows, on = (numba.types.Array(kind, 3, "A", readonly=True) for kind in (numba.float64, numba.boolean))
+    number, out = numba.types.Array(numba.float64, 2, "A", readonly=True), numba.float64[:, :, ::1]
     kinds = {
-        played: ((rows, on, number, rows), "(n),(n),()->(n)"),
-        bent: ((rows, on, number, number, rows), "(n),(n),(),()->(n)"),
-        chased: ((rows, rows, rows, on, number, rows), "(n),(n),(n),(n),()->(n)"),
+        played: (rows, on, number, out),
+        bent: (rows, on, number, number, out),
+        chased: (rows, rows, rows, on, number, out),
     }
-    return {
-        loop.__name__: compiled([f"void({','.join(types)})"], shapes, nopython=True, cache=True)(loop)
-        for loop, (types, shapes) in kinds.items()
-    }
+    compiled: Any = numba.njit
+    return {loop.__name__: compiled(numba.void(*types), cache=True)(loop) for loop, types in kinds.items()}

@@ -1,0 +1,33 @@
+"""Compiled loops are kept on disk, where several identifications at once may find or put them."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+CALL = """
+import numpy as np
+from quadvel_actuator.effects import recurrence
+
+rows, start, one = np.linspace(0.0, 1.0, 50)[:, None], np.arange(50)[:, None] == 0, np.ones((50, 1))
+print(recurrence.played(rows, start, 0.1)[-1], recurrence.bent(rows, start, 0.5, 0.2)[-1])
+print(recurrence.chased(rows, 0.0 * one, 0.001 * one, start, 1000.0)[-1])
+"""
+SEVERAL, AGAIN = 3, 2
+
+
+def test_loops_compiled_by_several_processes_at_once_serve_the_ones_to_come(tmp_path: Path) -> None:
+    for attempt in range(AGAIN):
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / str(attempt)), "OMP_NUM_THREADS": "1"}
+        for together in (SEVERAL, 1):
+            calls = [
+                subprocess.Popen(
+                    [sys.executable, "-c", CALL], env=environment, stdout=subprocess.PIPE, text=True
+                )
+                for _ in range(together)
+            ]
+            said = {call.communicate()[0] for call in calls}
+            assert [call.returncode for call in calls] == [0] * together
+            assert len(said) == 1
