@@ -48,6 +48,19 @@ def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
     assert "held-out data leave" not in plain["decision"]
 
 
+def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect():
+    """Both logs follow one script, and both joints are pushed when it begins and when it ends."""
+
+    def pushed(k, q, dq, tau):
+        return tau + 1.0 * (k < 800 or k >= 5200)
+
+    logs = [record(_truth(), 2, 6.0, 500, seed=4, distort=pushed) for _ in range(2)]
+    again = np.random.default_rng(1).normal(0.0, np.sqrt(TABLE_4["noise"]), logs[1].tau.shape)
+    logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
+    report = identify(logs[:1], logs[1:], Options(values=3000)).report  # two pieces of 0.75 s of each
+    assert report["effects"] == []
+
+
 def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
     """A quarter of the torque's noise again, through kd: whatever averages dq would predict better than the truth."""
     log = record(parameters(joints=3), joints=3, seed=6)

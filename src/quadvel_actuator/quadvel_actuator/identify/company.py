@@ -27,6 +27,9 @@ _BETTER_FORM = 0.99
 _PROMISING = 0.25
 """Of what a law takes off the error: a rival that promises less is not fitted."""
 
+_OF_UNSAID = 0.1
+"""Of what a model leaves above the noise: an effect worth less stands in for what no effect says."""
+
 
 @attrs.frozen
 class Said:
@@ -157,12 +160,19 @@ class Company:
             losses = [self.loss(model, k) for k in range(len(model.applied))]
             worst = int(np.argmin([loss.gain for loss, _ in losses]))
             loss, less = losses[worst]
-            share = worth(loss.joint_gain, model.applied[worst].active, self.noise)
-            if loss.p_any * len(registry()) < LEVEL and share > WORTH:
+            share = worth(loss.joint_gain, model.applied[worst].active, self._least(model))
+            if loss.p_any * len(registry()) < LEVEL and share > 1.0:
                 break
             model = less
             del said[worst]
         return (fit_with_delays(model, self.judge.fit) if model.applied else model), said
+
+    def _least(self, model: Model) -> Array:
+        """What an effect of this model has to be worth on a joint, N^2 m^2 (J,)."""
+        rows = self.judge.judge
+        left = np.where(rows, model.samples.tau - model.predict(), 0.0)
+        above = np.sum(left**2, axis=0) / np.maximum(rows.sum(axis=0), 1) - self.noise
+        return np.maximum(WORTH * self.noise, _OF_UNSAID * above)
 
     def simplest(self, model: Model, said: Sequence[Said]) -> tuple[Model, list[Said]]:
         """With simpler laws where these say as much: what came later may have been why the other law was needed."""

@@ -83,7 +83,8 @@ def identify(
         logs, body = _moving(logs, kp, kd)
         windows = (logs[0].period,)
     rows = options.values // (len(logs) * len(logs[0].joints))
-    parts = [pieces(log, rows * log.period) for log in logs]
+    # One script may have led all logs: what judges comes from other instants of it than what is fitted.
+    parts = [pieces(log, rows * log.period, between=k >= len(train)) for k, log in enumerate(logs)]
     chosen = [piece for part in parts for piece in part]
     fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
     tell(0.02, "gains and delays")

@@ -154,7 +154,8 @@ def _shorter_or_better(
         return True
     if _one_shape(named) and alone.inputs[0] == _SHAPED:
         return found.gain > 0.0 and len(alone.terms) <= len(named.findings)
-    return found.gain > -_AS_WELL * floor and _words(None, alone) < _words(named.model, beside)
+    more = _words(named.model, beside) - _words(None, alone)
+    return more >= 0.0 and found.gain > (-_AS_WELL * floor if more else 0.0)
 
 
 def _words(laws: Model | None, terms: Learned | None) -> float:
