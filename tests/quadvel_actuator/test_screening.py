@@ -278,6 +278,19 @@ def test_an_effect_leaves_a_joint_that_needs_it_no_more():
     np.testing.assert_allclose(model.applied[0].values[0, 0], -0.009, atol=5e-4)
 
 
+@pytest.mark.parametrize(("shake", "kept"), [(0.0, ["torque_offset"]), (1.0, [])])
+def test_an_effect_stays_where_little_is_left_beside_it(shake, kept):
+    """0.16 N m on a joint, 40 % of the noise: less than a tenth of what a shake leaves that no effect says."""
+    log = _log(seconds=6.0)
+    tau = log.tau + shake * np.sin(2.0 * np.pi * 9.7 * log.t)[:, None] + np.array([0.16, 0.0])
+    looked = about(attrs.evolve(log, tau=tau), 0.009, 0.003)
+    offset = Applied(
+        registry()["torque_offset"](), np.array([True, False]), np.array([[0.16, 0.0]]), np.arange(2)
+    )
+    model, _ = company(looked).pruned(looked.model.plus(offset), [Said()])
+    assert [one.law.name for one in model.applied] == kept
+
+
 def test_a_supply_that_sags_is_one_for_all_joints():
     """Friction beside it, on one joint alone, must not pass for another sag there."""
     sag = Effect("supply_sag", JOINTS, {"of": "power", "what": "gain", "sag": 0.02, "T": 0.01})
