@@ -38,10 +38,9 @@ def pieces(log: Log, seconds: float, between: bool = False) -> list[Piece]:
     """The log, or stretches of it of some `seconds` in all that are spread evenly; or those between these."""
     if log.duration <= seconds:
         return [Piece(log, float(log.t[0]))]
-    count = max(int(seconds / PIECE), 2)
-    starts = np.linspace(float(log.t[0]), float(log.t[-1]) - PIECE, count)
-    if between:
-        starts = 0.5 * (starts[:-1] + starts[1:])
+    count = max(int(seconds / PIECE), 1)
+    places = np.linspace(float(log.t[0]), float(log.t[-1]) - PIECE, max(2 * count - 1, 2))
+    starts = places[1::2] if between else places[::2]
     found = (_cut(log, start, start + PIECE) for start in starts)
     return [Piece(one, float(log.t[0])) for one in found if one is not None]
 
