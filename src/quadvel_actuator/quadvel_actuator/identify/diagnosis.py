@@ -30,6 +30,8 @@ _AS_WELL = 0.02
 
 _NEARLY, _MUCH = 0.7, 0.1
 """Of the best gain; and of the noise, what is much beside it"""
+Otherwise = Callable[[Model, Model], Model | None]
+"""From effects, and those without the last one, to the model beside terms that say more; None where they do not"""
 BETTER_SAID = "terms of named signals say it better than the named laws together"
 
 
@@ -50,10 +52,12 @@ class Diagnosis:
     model: Model
     findings: tuple[Finding, ...]
     rejected: tuple[Rejected, ...]
+    instead: Model | None = None
+    """beside the terms that were preferred to all effects, if they were"""
 
 
 def diagnosed(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[Model], bool], cores: int
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Otherwise, cores: int
 ) -> Diagnosis:
     """The effects on `model`; where its gains are far from those commanded, also with these held while effects are sought.
 
@@ -62,7 +66,7 @@ def diagnosed(
     Without measured torque the gains set the scale of all.
     """
     found = diagnose(model, judge, noise, tick, otherwise, cores)
-    if model.implied or not model.samples.commanded or found.model.believable:
+    if model.implied or not model.samples.commanded or (found.instead or found.model).believable:
         return found
     other = diagnose(fit_with_delays(model.as_commanded(), judge.fit), judge, noise, tick, otherwise, cores)
     if not other.findings:
@@ -74,12 +78,11 @@ def diagnosed(
 
 
 def diagnose(
-    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Callable[[Model], bool], cores: int
+    model: Model, judge: Judge, noise: Array, tick: Tick, otherwise: Otherwise, cores: int
 ) -> Diagnosis:
     """Add effects to `model` while it pays; `noise` (J,) is the floor of each joint, N^2 m^2.
 
-    Several that still leave much, even with the next, are given up where `otherwise(model)` says that there is a better
-    account without them.
+    Several that still leave much, even with the next, are given up where `otherwise` knows of a better account without them.
     """
     bare = model
     given_up: list[Rejected] = []
@@ -100,8 +103,10 @@ def diagnose(
         if more:
             best, ties = choice(_simpler_first(candidates, judge, noise, few), judge, noise)
             model, before = company.exchanged(company.taken(about, best), said)
-        if said and _unsaid(model, judge, noise) and otherwise(model):
-            return Diagnosis(bare, (), (*given_up, *rejected))
+        if said and _unsaid(model, judge, noise):
+            instead = otherwise(model, about.model)
+            if instead is not None:
+                return Diagnosis(bare, (), (*given_up, *rejected), instead)
         if not more:
             break
         near = tuple(one.name for one in candidates if one.gain > _NEARLY * candidates[0].gain)

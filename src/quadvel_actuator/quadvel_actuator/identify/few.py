@@ -17,7 +17,9 @@ from .model import Model
 from .signals import Array, Bools, Samples
 
 APART, TOGETHER = 1800, 4000
-"""Rows, some more or less: one by one, and in stretches"""
+"""Rows, some more or less: one by one, and in stretches;"""
+_APART_VALUES, _TOGETHER_VALUES = 11_000, 29_000
+"""fewer where there are many joints: of all of them so many values"""
 
 
 def remembers(model: Model) -> bool:
@@ -32,12 +34,15 @@ class Few:
         """left: what a model leaves of each row, (N, J), in units of the noise: stretches lie where there is much of it."""
         whole = samples.reaching(judge.fit)
         fitted = judge.fit[: len(whole.t)]
+        joints = fitted.shape[1]
         self.fitted_rows = fitted.sum(axis=0)
         """of all rows, those that are fitted, (J,)"""
-        apart, rows = whole.thinned(max(1, int(fitted.any(axis=1).sum()) // APART))
+        apart, rows = whole.thinned(
+            max(1, int(fitted.any(axis=1).sum()) // min(APART, _APART_VALUES // joints))
+        )
         self._apart = apart, fitted[rows]
         weight = np.where(fitted, left[: len(fitted)] ** 2, 0.0).sum(axis=1)
-        together, rows, known = whole.stretches(TOGETHER, weight)
+        together, rows, known = whole.stretches(min(TOGETHER, _TOGETHER_VALUES // joints), weight)
         self._together = together, fitted[rows] & known[:, None]
 
     def of(self, model: Model, law: EffectLaw | None = None) -> tuple[Model, Bools]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import ctypes
 
-M_MMAP_THRESHOLD, LARGE = -3, 1 << 22  # of glibc's mallopt; bytes
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, LARGE = -1, -3, 1 << 25  # of glibc's mallopt; bytes
 
 
 def give_large_arrays_back() -> None:
     """Have large arrays returned as soon as they are free: left to itself glibc keeps ever larger ones, with gaps."""
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
         mallopt(M_MMAP_THRESHOLD, LARGE)
+        mallopt(M_TRIM_THRESHOLD, 4 * LARGE)
 
 
 def give_gaps_back() -> None:

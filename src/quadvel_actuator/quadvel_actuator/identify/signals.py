@@ -18,6 +18,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from . import reading
 from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
 from .log import Log
 
@@ -47,6 +48,9 @@ _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 BETWEEN = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
 _OF_JOINTS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
+
+_ALMOST = 1e-9
+"""s: a command counts that is sent no later than this after an instant, which is a sum of rounded numbers"""
 
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Its multiples' fractions fill the unit interval evenly, in no period."""
@@ -120,6 +124,7 @@ class _LogSignals:
 
     def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float, steady: float) -> None:
         self.log, self.origin = log, origin
+        self.t, self.t_cmd = _double(log.t), _double(log.t_cmd)
         self.states = {"q": _double(log.q), "dq": _double(log.dq)}
         if steady > 0.0:
             self.states = {k: lines(_double(log.t), values, steady)[0] for k, values in self.states.items()}
@@ -153,10 +158,8 @@ class _LogSignals:
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
     def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
-        """Of times: the state row before, and how far towards the next, 0 to 1; shape of `at`."""
-        t = self.log.t
-        row = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-        return row, np.clip((at - t[row]) / (t[row + 1] - t[row]), 0.0, 1.0)
+        """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
+        return reading.between(self.t, at)
 
     def state(
         self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
@@ -164,37 +167,26 @@ class _LogSignals:
         """A state signal, linear between rows; `found` is `between(at)` where that is known."""
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        return self._read(values, self.between(at) if found is None else found)
-
-    def _read(self, values: Array, found: tuple[NDArray[np.intp], Array]) -> Array:
-        """Values of the rows (N, J), linear between them."""
-        row, share = found
-        early: Array = values[row]
-        late = values[row + 1]
-        late -= early
-        late *= share[:, None]
-        late += early
-        return late
+        return reading.read(values, *(self.between(at) if found is None else found))
 
     def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
         """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
         if name == "ddq":
-            return self._read(self._smeared[:, joints], self.between(at))
+            return reading.read(self._smeared[:, joints], *self.between(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
             if len(self._smooth) >= _KEPT_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
-            t = _double(self.log.t)
-            come = self._acting(t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, t, _double(self.log.dq), come)
+            come = self._acting(self.t, delays, self._integral)
+            self._smooth[key] = smooth_part(name, self.t, _double(self.log.dq), come)
         smooth, answer = self._smooth[key]
-        jumps = self._acting(at, delays, lambda values, _, sent: values[self.log.command_rows(sent + 1e-9)])
-        return self._read(smooth[:, joints], self.between(at)) + jumps @ answer[:, joints]
+        jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
+        return reading.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
 
     @cached_property
     def _smeared(self) -> Array:
         """rad/s^2 by rows, whatever commands do."""
-        return slope(_double(self.log.t), _double(self.log.dq), HALF_WIDTHS["ddq"])
+        return slope(self.t, _double(self.log.dq), HALF_WIDTHS["ddq"])
 
     def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
         """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
@@ -206,14 +198,13 @@ class _LogSignals:
                 found[:, joints] = read(values, sums, at - delay)
         return found
 
-    def shifted(self, name: str, at: Array) -> Array:
-        """A state signal of every joint at times of its own, (..., N, J)."""
-        values = self.states[name]
-        in_order = at.swapaxes(-1, -2)  # each joint's times, which is quicker to look up
-        row, share = (one.swapaxes(-1, -2) for one in self.between(in_order))
-        joint = np.arange(values.shape[1])
-        early: Array = values[row, joint]
-        return early + share * (values[row + 1, joint] - early)
+    def shifted(self, name: str, at: Array, late: Array) -> Array:
+        """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
+        return reading.read_late(self.states[name], self.t, at, late)
+
+    def in_force(self, at: Array) -> NDArray[np.intp]:
+        """The command row that counts at the times `at` (N,), s."""
+        return reading.rows_at(self.t_cmd, at + _ALMOST)
 
     def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
         """A command signal: the mean over `at` to `at + window`."""
@@ -221,14 +212,13 @@ class _LogSignals:
         if name not in self.sums:
             return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
-            return values[self.log.command_rows(at + 1e-9)]
+            return values[self.in_force(at)]
         sums = self.sums[name][:, joints]
         late, early = (self._integral(values, sums, end) for end in (at + window, at))
         return (late - early) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
-        row = self.log.command_rows(at)
-        return sums[row] + values[row] * (at - self.log.t_cmd[row])[:, None]
+        return reading.integral(values, sums, self.t_cmd, at)
 
 
 def _double(values: NDArray[np.floating]) -> Array:
@@ -434,13 +424,16 @@ class Samples:
         """Of each log the instants at which the torque of these rows was asked for."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
         for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
-            yield _double(one.log.t)[self.row[a:b] - first] - self.early[a:b] - output_delay
+            yield one.t[self.row[a:b] - first] - self.early[a:b] - output_delay
 
     def _elsewhere(self, output_delay: Array | float, name: str, late: Array) -> Array:
         """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
+        before = np.squeeze(late, -2) if np.ndim(late) > 1 else late
+        before = np.broadcast_to(
+            before + output_delay, np.broadcast_shapes(np.shape(before), self.tau.shape[1:])
+        )
         parts = [
-            one.shifted(name, at[:, None] - output_delay - late)
-            for one, at in zip(self.logs, self._instants(0.0), strict=True)
+            one.shifted(name, at, before) for one, at in zip(self.logs, self._instants(0.0), strict=True)
         ]
         return np.concatenate(parts, axis=-2)
 
@@ -462,11 +455,11 @@ class Samples:
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
             for name in one.commands.keys() - constant:
                 parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
-            row = one.log.command_rows(at - input_delay + 1e-9)
+            row = one.in_force(at - input_delay)
             for name in one.gains.keys() - constant:
                 parts.setdefault(name, []).append(one.gains[name][:, chosen][row])
             packets.append((row + first)[:, None])
-            ages.append((at - input_delay - one.log.t_cmd[row] + (1.0 if window else 0.0))[:, None])
+            ages.append((at - input_delay - one.t_cmd[row] + (1.0 if window else 0.0))[:, None])
         signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
         signals |= self._state(output_delay, joints)
         for name, value in constant.items():

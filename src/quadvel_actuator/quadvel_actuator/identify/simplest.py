@@ -30,6 +30,9 @@ _MOST = 0.8
 _OF_TWO, _OF_MORE = 0.25, 0.5
 """Of what two laws leave above the noise, to which a third may come, and of what more do: what terms may leave"""
 
+_HOPELESS, _LITTLE_MORE = 0.1, 1.0 / 3.0
+"""Of what laws leave above the noise: what terms may leave, in any number of words, where the last law took so little off it"""
+
 _AS_WELL = 0.02
 """Of the noise: what a shorter account may lose."""
 
@@ -77,14 +80,22 @@ class Alone:
         good = [terms for terms in believable if left[id(terms)] - min(left.values()) < _LITTLE * most]
         return min(good, key=lambda terms: (_words(None, terms), left[id(terms)]))
 
-    def says_more(self, laws: Model) -> bool:
-        """Do terms of no more words than the laws of this model leave no more than the noise, or far less than these do?"""
+    def says_more(self, laws: Model, before: Model) -> Model | None:
+        """The model beside terms that say more than `laws`, which were `before` the last one came; None if they do not.
+
+        Terms of no more words leave no more than the noise, or far less than the laws do; of more words next to nothing
+        beside what the laws leave, while these come no nearer.
+        """
         terms = self.learned
-        if terms is None or _words(None, terms) > _words(laws, None):
-            return False
+        if terms is None:
+            return None
+        with_terms, with_laws = self._above(terms.model, terms), self._above(laws, None)
+        if _words(None, terms) > _words(laws, None):
+            nearer = with_laws < (1.0 - _LITTLE_MORE) * self._above(before, None)
+            return terms.model if with_terms < _HOPELESS * with_laws and not nearer else None
         share = _OF_TWO if len(laws.applied) == 2 else _OF_MORE
-        far_less = self._above(terms.model, terms) < share * self._above(laws, None)
-        return far_less or self._at_floor(terms.model, terms)
+        more = with_terms < share * with_laws or self._at_floor(terms.model, terms)
+        return terms.model if more else None
 
     def _at_floor(self, model: Model, terms: Learned | None) -> bool:
         return self._above(model, terms) < (_AT_FLOOR - 1.0) * _floor(self._judge, self._noise)

@@ -1,0 +1,124 @@
+"""Series read between their rows, in compiled loops: an identification reads its logs at tens of thousands of delays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.intp]
+
+_STEPS = 16
+"""Rows that are looked at one after the other before the rest is halved"""
+
+
+def rows_at(times: Array, at: Array) -> Rows:
+    """The last row whose time (K,) is not after each of `at` (N,), the first one where none is."""
+    found = np.empty(len(at), dtype=np.intp)
+    _compiled()["rows_at"](times, at, found)
+    return found
+
+
+def between(times: Array, at: Array) -> tuple[Rows, Array]:
+    """Of each of `at` (N,): the row before it, of which there is a next one, and how far it is towards that, 0 to 1."""
+    found, share = np.empty(len(at), dtype=np.intp), np.empty(len(at))
+    _compiled()["between"](times, at, found, share)
+    return found, share
+
+
+def read(values: Array, row: Rows, share: Array) -> Array:
+    """Values (K, J), linear between rows, where `between` says (N,): (N, J)."""
+    found = np.empty((len(row), values.shape[1]))
+    _compiled()["read"](values, row, share, found)
+    return found
+
+
+def read_late(values: Array, times: Array, at: Array, late: Array) -> Array:
+    """Each joint's values (K, J) at its own times, `late` (..., J) before `at` (N,): (..., N, J)."""
+    each = late.reshape(-1, values.shape[1])
+    found = np.empty((len(each), len(at), values.shape[1]))
+    _compiled()["read_late"](values, times, at, each, found)
+    return found.reshape(*late.shape[:-1], *found.shape[1:])
+
+
+def integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
+    """What values (K, J), each held from its time to the next, add up to until `at` (N,), with `sums` (K + 1, J) at their times."""
+    found = np.empty((len(at), values.shape[1]))
+    _compiled()["integral"](values, sums, times, at, found)
+    return found
+
+
+def _last(times: Any, at: float, row: int) -> Any:
+    """The last row whose time is not after `at`, sought from `row` on; -1 where none is."""
+    for _ in range(_STEPS):
+        if row >= 0 and times[row] > at:
+            row -= 1
+        elif row + 1 < len(times) and times[row + 1] <= at:
+            row += 1
+        else:
+            return row
+    return np.searchsorted(times, at, side="right") - 1
+
+
+@cache
+def _compiled() -> dict[str, Callable[..., None]]:
+    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk."""
+    import numba
+    from numba.extending import register_jitable
+
+    register_jitable(_last)
+
+    def rows_at(times: Any, at: Any, found: Any) -> None:
+        row = 0
+        for n in range(len(at)):
+            row = _last(times, at[n], row)
+            found[n] = max(row, 0)
+
+    def between(times: Any, at: Any, found: Any, share: Any) -> None:
+        row = 0
+        for n in range(len(at)):
+            row = _last(times, at[n], row)
+            here = min(max(row, 0), len(times) - 2)
+            found[n] = here
+            share[n] = min(max((at[n] - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
+
+    def read(values: Any, row: Any, share: Any, found: Any) -> None:
+        for n in range(len(row)):
+            for j in range(values.shape[1]):
+                early = values[row[n], j]
+                found[n, j] = early + share[n] * (values[row[n] + 1, j] - early)
+
+    def read_late(values: Any, times: Any, at: Any, late: Any, found: Any) -> None:
+        for b, j in np.ndindex(late.shape):
+            row = 0
+            for n in range(len(at)):
+                when = at[n] - late[b, j]
+                row = _last(times, when, row)
+                here = min(max(row, 0), len(times) - 2)
+                share = min(max((when - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
+                early = values[here, j]
+                found[b, n, j] = early + share * (values[here + 1, j] - early)
+
+    def integral(values: Any, sums: Any, times: Any, at: Any, found: Any) -> None:
+        row = 0
+        for n in range(len(at)):
+            row = _last(times, at[n], row)
+            here = max(row, 0)
+            for j in range(values.shape[1]):
+                found[n, j] = sums[here, j] + values[here, j] * (at[n] - times[here])
+
+    one, two = (numba.types.Array(numba.float64, d, "A", readonly=True) for d in (1, 2))
+    rows, out = numba.types.Array(numba.intp, 1, "A", readonly=True), numba.float64[:, ::1]
+    kinds: dict[Callable[..., None], tuple[Any, ...]] = {
+        rows_at: (one, one, numba.intp[::1]),
+        between: (one, one, numba.intp[::1], numba.float64[::1]),
+        read: (two, rows, one, out),
+        read_late: (two, one, one, two, numba.float64[:, :, ::1]),
+        integral: (two, two, one, one, out),
+    }
+    compiled: Any = numba.njit
+    return {loop.__name__: compiled(numba.void(*types), cache=True)(loop) for loop, types in kinds.items()}
