@@ -71,7 +71,7 @@ def intervals(
     if shorter := plateau(model, judge.every):  # where no slope says anything
         delays[0] = shorter + _CLOCK
     delays = np.minimum(delays, np.array(LONGEST)[:, None])
-    return Intervals(gains, tuple(effects), delays, _on_bound(model))
+    return Intervals(gains, tuple(effects), delays, on_bound(model))
 
 
 def _half_widths(model: Model, judge: Judge, rows: Bools, learned: Learned | None) -> Array:
@@ -146,7 +146,7 @@ def _shape_error(model: Model, index: int, judge: Judge) -> Array:
     return moved
 
 
-def _on_bound(model: Model) -> tuple[str, ...]:
+def on_bound(model: Model) -> tuple[str, ...]:
     """Delays, and effect.parameter, of those that sit on a bound of theirs."""
     delays = zip(
         ("input_delay", "output_delay"), (model.input_delay, model.output_delay), LONGEST, strict=True

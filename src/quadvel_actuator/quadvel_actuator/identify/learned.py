@@ -83,10 +83,11 @@ def longest(model: Model, learned: Learned | None, rows: Bools) -> Model:
     return model.with_delays(late.input_delay, late.output_delay)
 
 
-def learn(model: Model, judge: Judge, noise: Array, cores: int = 1) -> Learned | None:
+def learn(model: Model, judge: Judge, noise: Array, cores: int = 1, enough: float = np.inf) -> Learned | None:
     """Terms for what `model` leaves; None where nothing pays. `cores` share the work.
 
-    Gains that are held are left free as soon as terms let them stay near those commanded.
+    Gains that are held are left free as soon as terms let them stay near those commanded. No more terms are sought once
+    there are more than `enough` a joint.
     """
     state = _State((), Scene(model, judge))
     kept: list[Picks] = []
@@ -97,13 +98,23 @@ def learn(model: Model, judge: Judge, noise: Array, cores: int = 1) -> Learned |
         if not better:
             break
         state = _simplest(better, state.left).state(judge).released()
+        if a_joint([pick.joints for pick in state.picks]) > enough:
+            break
     state = _narrowed(_pruned(state, noise), noise)
-    if not state.picks:
-        return None
-    found = _as_terms(state)
     tau = model.samples.tau
-    paid = judge.compare(tau - model.predict(), tau - found.model.predict() - found.torque)
-    return found if paid.p_any < LEVEL else None  # fitted to all, they may give back what they promised
+    while state.picks:
+        found = _as_terms(state)
+        paid = judge.compare(tau - model.predict(), tau - found.model.predict() - found.torque)
+        if paid.gain > 0.0 and paid.p_any < LEVEL:
+            return found
+        state = _State(state.picks[:-1], state.scene).settled()  # bounded, they gave back what they promised
+    return None
+
+
+def a_joint(acting: Sequence[Bools]) -> float:
+    """How many terms a joint has on average, of those that have any; `acting` (J,) of each term."""
+    count = np.sum(acting, axis=0)
+    return float(count[count > 0].mean())
 
 
 @attrs.frozen(eq=False)

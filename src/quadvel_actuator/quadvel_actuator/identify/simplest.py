@@ -14,8 +14,9 @@ import numpy as np
 from .as_sent import as_sent
 from .diagnosis import BETTER_SAID, Diagnosis
 from .few import Few
+from .intervals import on_bound
 from .judging import Judge
-from .learned import LEVEL, Learned, learn
+from .learned import LEVEL, Learned, a_joint, learn
 from .model import Model
 from .picks import WORTH
 from .ranking import Rejected
@@ -52,19 +53,31 @@ class Alone:
     def __init__(self, before: Model, judge: Judge, noise: Array, cores: int = 1) -> None:
         """`cores` share the work."""
         self.before, self._judge, self._noise, self.cores = before, judge, noise, cores
+        self._few: dict[float, Learned | None] = {}
 
     @cached_property
     def learned(self) -> Learned | None:
         """From the gains as they were fitted, or from those commanded, if that leaves much or they stray far."""
+        return self._learned(np.inf)
+
+    def _in_few(self, enough: float) -> Learned | None:
+        """The same, if so many terms a joint are enough; else some of them, but more than that."""
+        if "learned" in self.__dict__:
+            return self.learned
+        if enough not in self._few:
+            self._few[enough] = self._learned(enough)
+        return self._few[enough]
+
+    def _learned(self, enough: float) -> Learned | None:
         before, judge, noise = self.before, self._judge, self._noise
-        found = learn(before, judge, noise, self.cores)
+        found = learn(before, judge, noise, self.cores, enough)
         model = before if found is None else found.model
         if before.implied or not before.samples.commanded:
             return found
         if model.believable and self._at_floor(model, found):
             return found
         few = Few(before.samples, judge, (before.samples.tau - before.predict()) / np.sqrt(noise))
-        other = learn(as_sent(before, few), judge, noise, self.cores)
+        other = learn(as_sent(before, few), judge, noise, self.cores, enough)
         if other is None or other.model.gains_held:  # left free, they stray: nothing can be said of them
             return found
         if found is None:
@@ -86,12 +99,13 @@ class Alone:
         Terms of no more words leave no more than the noise, or far less than the laws do; of more words next to nothing
         beside what the laws leave, while these come no nearer.
         """
-        terms = self.learned
+        with_laws, words = self._above(laws, None), _words(laws, None)
+        nearer = with_laws < (1.0 - _LITTLE_MORE) * self._above(before, None)
+        terms = self._in_few(words / _TERM) if nearer else self.learned
         if terms is None:
             return None
-        with_terms, with_laws = self._above(terms.model, terms), self._above(laws, None)
-        if _words(None, terms) > _words(laws, None):
-            nearer = with_laws < (1.0 - _LITTLE_MORE) * self._above(before, None)
+        with_terms = self._above(terms.model, terms)
+        if _words(None, terms) > words:
             return terms.model if with_terms < _HOPELESS * with_laws and not nearer else None
         share = _OF_TWO if len(laws.applied) == 2 else _OF_MORE
         more = with_terms < share * with_laws or self._at_floor(terms.model, terms)
@@ -164,7 +178,10 @@ def _shorter_or_better(
     if found.gain > WORTH * floor and found.p_any < LEVEL:
         return True
     if _one_shape(named) and alone.inputs[0] == _SHAPED:
-        return found.gain > 0.0 and len(alone.terms) <= len(named.findings)
+        may_lose = (
+            _AS_WELL * floor if on_bound(named.model) else 0.0
+        )  # a law that sits on its bound is another one
+        return found.gain > -may_lose and len(alone.terms) <= len(named.findings)
     more = _words(named.model, beside) - _words(None, alone)
     return more >= 0.0 and found.gain > (-_AS_WELL * floor if more else 0.0)
 
@@ -174,5 +191,4 @@ def _words(laws: Model | None, terms: Learned | None) -> float:
     named = len(laws.applied) if laws is not None else 0
     if terms is None:
         return named
-    acting = np.sum([one.active for one in terms.terms], axis=0)
-    return named + _TERM * float(acting[acting > 0].mean())
+    return named + _TERM * a_joint([one.active for one in terms.terms])

@@ -79,6 +79,8 @@ def read_npz(path: Path) -> Log:
                 for name in shapes
             }
     except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError) as error:
+        if path.stat().st_size == 0:
+            raise LogError(f"{path}: the file is empty, expected an NPZ archive") from None
         raise LogError(f"{path}: no whole NPZ archive: {error or 'it is cut off'}") from None
     names = fields.pop("joint_names", None)
     return _log(path, fields, None if names is None else [str(name) for name in np.ravel(names)], unknown)
@@ -279,7 +281,9 @@ def _joints(path: Path, names: list[str] | None, joints: int, remarks: list[str]
         remarks.append(f"joint_names: not there; the joints are called 1_joint to {joints}_joint")
         names = [str(number) for number in range(1, joints + 1)]
     if len(names) != joints:
-        raise LogError(f"{path}: joint_names: found {len(names)} names, expected {joints} as q has columns")
+        raise LogError(
+            f"{path}: q: found {joints} columns, expected {len(names)}, one for each of joint_names"
+        )
     return tuple(joint_name(name) for name in names)
 
 
