@@ -178,9 +178,8 @@ def _shorter_or_better(
     if found.gain > WORTH * floor and found.p_any < LEVEL:
         return True
     if _one_shape(named) and alone.inputs[0] == _SHAPED:
-        may_lose = (
-            _AS_WELL * floor if on_bound(named.model) else 0.0
-        )  # a law that sits on its bound is another one
+        # A law that sits on its bound is another one.
+        may_lose = _AS_WELL * floor if on_bound(named.model) else 0.0
         return found.gain > -may_lose and len(alone.terms) <= len(named.findings)
     more = _words(named.model, beside) - _words(None, alone)
     return more >= 0.0 and found.gain > (-_AS_WELL * floor if more else 0.0)
