@@ -14,6 +14,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from threadpoolctl import threadpool_limits
 from typer.core import TyperCommand
 
 from ..parameters import ActuatorParameters
@@ -140,7 +141,8 @@ def _run(
     from .report import write
 
     columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=messages, transient=True) as bar:
+    threads = threadpool_limits(1)  # of each copy of this process: they share the cores
+    with threads, Progress(*columns, console=messages, transient=True) as bar:
         task = bar.add_task("", total=1.0)
         found = identify(
             fitted,

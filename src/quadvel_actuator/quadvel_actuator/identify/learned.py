@@ -93,7 +93,7 @@ def learn(model: Model, judge: Judge, noise: Array, cores: int = 1, enough: floa
     kept: list[Picks] = []
     for _ in range(MOST):
         kept = _promising(state, kept, noise, cores)
-        grown = [state.plus(picks).outline for picks in kept[:_FITTED]]
+        grown = _grown(state, kept[:_FITTED], cores)
         better = [one for one in grown if one.left < state.left]
         if not better:
             break
@@ -109,6 +109,12 @@ def learn(model: Model, judge: Judge, noise: Array, cores: int = 1, enough: floa
             return found
         state = _State(state.picks[:-1], state.scene).settled()  # bounded, they gave back what they promised
     return None
+
+
+def _grown(state: _State, kept: Sequence[Picks], cores: int) -> list[_Outline]:
+    """The state with each of these."""
+    samples = state.scene.model.samples
+    return side_by_side(lambda k: state.plus(kept[k]).outline, len(kept), cores, samples)
 
 
 def a_joint(acting: Sequence[Bools]) -> float:
@@ -251,14 +257,14 @@ def _again(kept: Sequence[Pick], scene: Scene, left: Array) -> Iterator[Feature]
 
 def _paying(features: Iterable[Feature], state: _State, noise: Array, cores: int = 1) -> list[Picks]:
     """Those that pay beside the picks of a state, of the same signals the best one, and sets of neighbours; best first."""
-    trial, every = Trial(state.picks, state.scene), list(features)
+    trial, every, samples = Trial(state.picks, state.scene), list(features), state.scene.model.samples
     best: dict[tuple[str, ...], Pick] = {}
     neighbours: dict[Any, list[Pick]] = {}
     parts = side_by_side(
         lambda k: [_pick(one, trial, noise) for one in every[k * _PART : (k + 1) * _PART]],
         -(-len(every) // _PART),
         cores,
-        state.scene.model.samples,
+        samples,
     )
     for pick in (one for part in parts for one in part if one is not None):
         feature = pick.feature
@@ -268,7 +274,8 @@ def _paying(features: Iterable[Feature], state: _State, noise: Array, cores: int
         if feature.family is not None:
             neighbours.setdefault(feature.family, []).append(pick)
     most = sorted(best.values(), key=lambda one: -one.gain)[:_KEPT]
-    found = [(_tuned(one, trial, noise),) for one in most]
+    tuned = side_by_side(lambda k: _tuned(most[k], trial, noise), len(most), cores, samples)
+    found = [(one,) for one in tuned]
     sets = [each for picks in neighbours.values() if len(each := _own_neighbours(picks)) > 1]
     return sorted([*found, *sets], key=lambda one: -sum(pick.gain for pick in one))
 

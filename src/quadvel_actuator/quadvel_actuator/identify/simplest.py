@@ -133,9 +133,10 @@ def account(
     named = _with(diagnosis, beside)
     if not diagnosis.findings or _enough(alone.before, diagnosis, beside, judge, floor):
         return named, beside
-    terms = alone.learned
     if _one_shape(diagnosis):  # what hid the delays is found then
         terms = learn(attrs.evolve(diagnosis.model, applied=()), judge, noise, alone.cores)
+    else:
+        terms = alone.learned
     if terms is None or not _shorter_or_better(named, beside, terms, judge, floor):
         return named, beside
     given_up = tuple(Rejected(one.name, one.gain, BETTER_SAID) for one in diagnosis.findings)
