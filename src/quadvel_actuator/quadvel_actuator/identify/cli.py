@@ -20,12 +20,14 @@ from typer.core import TyperCommand
 from ..parameters import ActuatorParameters
 from .inspect import Inspection, inspect
 from .log import Log, LogError
-from .memory import give_large_arrays_back
+from .memory import give_large_arrays_back, keep_freed_arrays
 from .read_log import read_log
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
 """Unless more are asked for: each takes some 200 MB"""
+_LONG = 1_000_000
+"""Values of q in all logs, from which memory counts for more than time: ten minutes of twelve joints take less than 1 GB"""
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
 
@@ -112,14 +114,10 @@ def identify(
     """
     messages = Console(stderr=True)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, cores or _cores(), messages)
+        _run(logs, holdout or [], out, base, gains, joints, cores, messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
-
-
-def _cores() -> int:
-    return min(CORES, len(os.sched_getaffinity(0)))
 
 
 def _run(
@@ -129,7 +127,7 @@ def _run(
     base: Path | None,
     gains: tuple[float, float] | None,
     joints: Sequence[str] | None,
-    cores: int,
+    cores: int | None,
     messages: Console,
 ) -> None:
     _check_folder(out)
@@ -137,6 +135,10 @@ def _run(
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
     fitted = read(logs, joints, gains, messages)
     judged = read(holdout, joints, gains, messages, like=fitted[0])
+    long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
+    if not long:
+        keep_freed_arrays()
+    cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
     from .identify import Options, identify  # what is wrong with the files shows before the engine is loaded
     from .report import write
 

@@ -81,6 +81,7 @@ class Scene:
         self.start = model.samples.start
         self.views = {at: _past_only(model.seen(at), self.dt) for at in (DRIVE, JOINT)}
         self._taken: dict[Feature, dict[int, Array]] = {}
+        self._factors: dict[tuple[str, str], Array | float] = {}
 
     @cached_property
     def _jacobian(self) -> tuple[Array, Slots]:
@@ -99,22 +100,37 @@ class Scene:
     def taken(self, feature: Feature, joints: Bools) -> dict[int, Array]:
         """The same of each of these joints, (N, K); kept, as few features are taken and these are asked for often."""
         kept = self._taken.setdefault(feature, {})
-        missing = [j for j in np.flatnonzero(joints).tolist() if j not in kept]
-        if missing:
-            columns = self.columns(feature)
-            last = columns.shape[2] - 1
-            kept |= {j: columns[:, :, min(j, last)].copy() for j in missing}
+        for j in np.flatnonzero(joints).tolist():
+            if j not in kept:
+                kept[j] = self.column(feature, j)
         return kept
+
+    def column(self, feature: Feature, joint: int) -> Array:
+        """What the feature is a sum of on one joint, (N, K): of all joints at once it takes hundreds of MB."""
+        u, shape = self._read(feature), feature.shape
+        if u.shape[1] > 1:
+            u, shape = u[:, [joint]], shape.at(np.array([joint]))
+        columns: Array = shape.columns(u, self.start, self.dt)[:, :, 0]
+        by = self._factor(feature)
+        return columns if isinstance(by, float) else columns * by[:, joint, None]
+
+    def _read(self, feature: Feature) -> Array:
+        return read(feature.signal, self.views[feature.at], self.asked, self.joints)
+
+    def _factor(self, feature: Feature) -> Array | float:
+        key = feature.at, feature.times
+        if key not in self._factors:
+            self._factors[key] = factor(feature.times, self.views[feature.at], self.asked)
+        return self._factors[key]
 
     def columns(self, feature: Feature, rows: slice = EVERY) -> Array:
         """What the feature is a sum of, (N, K, J), at some rows."""
-        view = self.views[feature.at]
-        u = read(feature.signal, view, self.asked, self.joints)
+        u = self._read(feature)
         if feature.shape.history:
             columns = feature.shape.columns(u, self.start, self.dt)[rows]
         else:
             columns = feature.shape.columns(u[rows], self.start[rows], self.dt)
-        by = factor(feature.times, view, self.asked)
+        by = self._factor(feature)
         return columns if isinstance(by, float) else columns * by[rows, None]
 
 

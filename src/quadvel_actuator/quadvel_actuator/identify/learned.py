@@ -244,7 +244,7 @@ def leanings(model: Model, judge: Judge) -> tuple[str, ...]:
     best: tuple[str, ...] = ()
     least = 1.0
     for feature in library(scene, scene.residual):
-        p = trial.compare(feature, scene.columns(feature), every).p_any
+        p = trial.compare(feature, every).p_any
         if p < least:
             best, least = feature.key, p
     return best
@@ -296,8 +296,7 @@ def _pick(feature: Feature, trial: Trial, noise: Array) -> Pick | None:
     promising = trial.promising(feature, noise)
     if not promising.any():
         return None
-    columns = trial.scene.columns(feature)
-    found = trial.compare(feature, columns, promising)
+    found = trial.compare(feature, promising)
     taken = (found.p_joints * _TRIED * len(noise) < LEVEL) & (found.joint_gain > WORTH * noise)
     owner = feature.signal.rpartition("/")[0]
     taken &= np.array([name != owner for name in trial.scene.joints])
@@ -309,7 +308,7 @@ def _tuned(pick: Pick, trial: Trial, noise: Array) -> Pick:
     """The pick at the place and with the time constant, frequency or damping with which it says most of the fitted rows."""
 
     def error(feature: Feature) -> float:
-        return trial.error(feature, trial.scene.columns(feature), pick.joints)
+        return trial.error(feature, pick.joints)
 
     best, least = pick.feature, error(pick.feature)
     if best.movable:

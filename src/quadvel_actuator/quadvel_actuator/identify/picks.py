@@ -144,20 +144,20 @@ class Trial:
             found[j] = gain - chance > 0.5 * WORTH * noise[j]
         return found
 
-    def compare(self, feature: Feature, columns: Array, joints: Bools) -> Comparison:
+    def compare(self, feature: Feature, joints: Bools) -> Comparison:
         """Held-out residuals without the feature, and with it on these joints."""
-        return self.scene.judge.compare(self.bare, self._after(feature, columns, joints))
+        return self.scene.judge.compare(self.bare, self._after(feature, joints))
 
-    def error(self, feature: Feature, columns: Array, joints: Bools) -> float:
+    def error(self, feature: Feature, joints: Bools) -> float:
         """Sum of squares that the feature leaves of the fitted rows of these joints."""
-        left = (self._after(feature, columns, joints) * self.scene.judge.fit)[:, joints]
+        left = (self._after(feature, joints) * self.scene.judge.fit)[:, joints]
         return float(np.sum(left * left))
 
-    def _after(self, feature: Feature, columns: Array, joints: Bools) -> Array:
+    def _after(self, feature: Feature, joints: Bools) -> Array:
         """Residual (N, J) with the feature fitted to each of these joints."""
         after = self.bare.copy()
         for j in np.flatnonzero(joints).tolist():
-            own = self._without(j, columns[:, :, min(j, columns.shape[2] - 1)])
+            own = self._without(j, self.scene.column(feature, j))
             fitted = own * self.scene.judge.fit[:, j, None]
             inverse = _inverse(fitted, [feature.shape.penalty])
             after[:, j] -= own @ (inverse @ (fitted.T @ self.bare[:, j]))

@@ -31,6 +31,9 @@ _MOST = 0.8
 _OF_TWO, _OF_MORE = 0.25, 0.5
 """Of what two laws leave above the noise, to which a third may come, and of what more do: what terms may leave"""
 
+_TWO = 2
+"""Laws that may be a part of those there are, whatever they leave"""
+
 _HOPELESS, _LITTLE_MORE = 0.1, 1.0 / 3.0
 """Of what laws leave above the noise: what terms may leave, in any number of words, where the last law took so little off it"""
 
@@ -97,17 +100,19 @@ class Alone:
         """The model beside terms that say more than `laws`, which were `before` the last one came; None if they do not.
 
         Terms of no more words leave no more than the noise, or far less than the laws do; of more words next to nothing
-        beside what the laws leave, while these come no nearer.
+        beside what the laws leave, while these grow in number and come no nearer.
         """
         with_laws, words = self._above(laws, None), _words(laws, None)
+        growing = len(laws.applied) > max(len(before.applied), _TWO)
         nearer = with_laws < (1.0 - _LITTLE_MORE) * self._above(before, None)
-        terms = self._in_few(words / _TERM) if nearer else self.learned
+        hopeless = growing and not nearer
+        terms = self.learned if hopeless else self._in_few(words / _TERM)
         if terms is None:
             return None
         with_terms = self._above(terms.model, terms)
         if _words(None, terms) > words:
-            return terms.model if with_terms < _HOPELESS * with_laws and not nearer else None
-        share = _OF_TWO if len(laws.applied) == 2 else _OF_MORE
+            return terms.model if hopeless and with_terms < _HOPELESS * with_laws else None
+        share = _OF_TWO if len(laws.applied) == _TWO else _OF_MORE
         more = with_terms < share * with_laws or self._at_floor(terms.model, terms)
         return terms.model if more else None
 
