@@ -9,6 +9,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_actuator.identify import learned as learned_module
 from quadvel_actuator.identify.delays import fit_with_delays
 from quadvel_actuator.identify.eam import fit_eam
 from quadvel_actuator.identify.features import Scene
@@ -118,6 +119,24 @@ def test_a_joint_that_rests_while_the_model_is_fitted_makes_up_no_terms():
     bare = Trial([], scene).bare[judge.judge[:, 0], 0]
     assert np.mean(bare**2) < 1.3 * np.mean(scene.residual[judge.judge[:, 0], 0] ** 2)
     assert learn(model, resting, noise) is None
+
+
+def test_terms_that_predict_worse_once_they_are_bounded_are_not_told(monkeypatch):
+    """Large ones that cancel each other on the fitted rows meet their bounds at different instants of others."""
+    as_terms, tried = learned_module._as_terms, []
+
+    def broken(state):
+        tried.append(len(state.picks))
+        found = as_terms(state)
+        return attrs.evolve(found, torque=50.0 * found.torque) if len(state.picks) > 1 else found
+
+    monkeypatch.setattr(learned_module, "_as_terms", broken)
+    model, judge, noise = looked_at(odd_joints.log("friction_with_a_neighbours_load", "mixed", 0, 4.0))
+    monkeypatch.setattr(learned_module, "_narrowed", lambda state, noise: state.plus(state.picks))
+    learned = learn(model, judge, noise)
+    assert tried == [2, 1]
+    left = model.samples.tau - learned.model.predict() - learned.torque
+    assert np.mean(left[judge.judge] ** 2) < model.mse(judge.judge)
 
 
 def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):
