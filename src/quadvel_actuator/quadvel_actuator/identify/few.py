@@ -17,9 +17,9 @@ from .model import Model
 from .signals import Array, Bools, Samples
 
 APART, TOGETHER = 1800, 4000
-"""Rows, some more or less: one by one, and in stretches;"""
-_APART_VALUES, _TOGETHER_VALUES = 11_000, 29_000
-"""fewer where there are many joints: of all of them so many values"""
+"""Rows, some more or less: one by one, and in stretches"""
+_VALUES = 11_000
+"""Of all joints, in rows that stand one by one: robots of many joints have fewer; in stretches bristles and play need them all"""
 
 
 def remembers(model: Model) -> bool:
@@ -37,12 +37,10 @@ class Few:
         joints = fitted.shape[1]
         self.fitted_rows = fitted.sum(axis=0)
         """of all rows, those that are fitted, (J,)"""
-        apart, rows = whole.thinned(
-            max(1, int(fitted.any(axis=1).sum()) // min(APART, _APART_VALUES // joints))
-        )
+        apart, rows = whole.thinned(max(1, int(fitted.any(axis=1).sum()) // min(APART, _VALUES // joints)))
         self._apart = apart, fitted[rows]
         weight = np.where(fitted, left[: len(fitted)] ** 2, 0.0).sum(axis=1)
-        together, rows, known = whole.stretches(min(TOGETHER, _TOGETHER_VALUES // joints), weight)
+        together, rows, known = whole.stretches(TOGETHER, weight)
         self._together = together, fitted[rows] & known[:, None]
 
     def of(self, model: Model, law: EffectLaw | None = None) -> tuple[Model, Bools]:
