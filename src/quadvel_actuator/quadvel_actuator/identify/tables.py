@@ -281,9 +281,7 @@ def _joints(path: Path, names: list[str] | None, joints: int, remarks: list[str]
         remarks.append(f"joint_names: not there; the joints are called 1_joint to {joints}_joint")
         names = [str(number) for number in range(1, joints + 1)]
     if len(names) != joints:
-        raise LogError(
-            f"{path}: q: found {joints} columns, expected {len(names)}, one for each of joint_names"
-        )
+        raise LogError(f"{path}: joint_names: found {len(names)} names, expected {joints} as q has columns")
     return tuple(joint_name(name) for name in names)
 
 
