@@ -6,8 +6,6 @@ the wrong signals. So terms are also tried without any law, and held-out rows de
 
 from __future__ import annotations
 
-from functools import cached_property
-
 import attrs
 import numpy as np
 
@@ -56,20 +54,20 @@ class Alone:
     def __init__(self, before: Model, judge: Judge, noise: Array, cores: int = 1) -> None:
         """`cores` share the work."""
         self.before, self._judge, self._noise, self.cores = before, judge, noise, cores
-        self._few: dict[float, Learned | None] = {}
+        self._found: dict[float, Learned | None] = {}  # by how many terms a joint were enough
 
-    @cached_property
+    @property
     def learned(self) -> Learned | None:
         """From the gains as they were fitted, or from those commanded, if that leaves much or they stray far."""
-        return self._learned(np.inf)
+        return self._in_few(np.inf)
 
     def _in_few(self, enough: float) -> Learned | None:
         """The same, if so many terms a joint are enough; else some of them, but more than that."""
-        if "learned" in self.__dict__:
-            return self.learned
-        if enough not in self._few:
-            self._few[enough] = self._learned(enough)
-        return self._few[enough]
+        if np.inf in self._found:
+            enough = np.inf
+        if enough not in self._found:
+            self._found[enough] = self._learned(enough)
+        return self._found[enough]
 
     def _learned(self, enough: float) -> Learned | None:
         before, judge, noise = self.before, self._judge, self._noise
