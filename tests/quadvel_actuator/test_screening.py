@@ -9,7 +9,7 @@ from quadvel_actuator import Effect
 from quadvel_actuator.effects import JOINT, registry
 from quadvel_actuator.effects.commands import CommandHold
 from quadvel_actuator.identify import backlog, candidates, ranking
-from quadvel_actuator.identify.candidates import About, propose, simplified, started
+from quadvel_actuator.identify.candidates import About, judged, propose, simplified, started
 from quadvel_actuator.identify.company import Company, Said
 from quadvel_actuator.identify.delays import fit_with_delays
 from quadvel_actuator.identify.features import Scene, library
@@ -76,6 +76,24 @@ def test_stretches_lie_where_most_is_left_and_all_over_the_log():
     assert samples.t[rows].min() < 0.1
     assert samples.t[rows].max() > 15.9
     assert len(rows) <= 2000
+
+
+@pytest.mark.parametrize("wrong", ["FR_thigh_joint/dq", "FR_thigh_joint/q"])
+def test_a_coupling_takes_the_neighbour_that_shows_once_the_other_effects_are_known(wrong):
+    """Before they were, it took the wrong one."""
+    joints, right = NAMES[:3], [f"{name}/dq" for name in (NAMES[2], NAMES[0], NAMES[1])]
+    friction = Effect("coulomb_friction", joints, {"c": 0.5, "v_0": 0.05})
+    coupling = Effect("cross_coupling", joints, {"a": -0.15, "source": right})
+    truth = parameters((friction, coupling), input_delay=0.009, output_delay=0.003)
+    looked = about(record(attrs.evolve(truth, joints=joints), 3, 3.0, 500), 0.009, 0.003)
+    rubs = started(looked, registry()["coulomb_friction"]())
+    beside = attrs.evolve(looked.model, applied=rubs.model.applied)
+    at_first = registry()["cross_coupling"].configured({"source": [wrong, right[1], right[2]]}, joints)
+    every = np.ones(3, dtype=bool)
+    groups = np.arange(3)
+    bent = beside.plus(Applied(at_first, every, np.full((len(at_first.names), 3), 0.01), groups))
+    found = company(looked).taken(looked, judged(looked, at_first, bent))
+    assert found.applied[1].law.settings["source"] == right
 
 
 def test_a_feature_has_columns_for_every_joint_that_asks_for_them():

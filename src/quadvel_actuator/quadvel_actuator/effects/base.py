@@ -124,6 +124,10 @@ class EffectLaw(ABC):
         """The same law with its signals taken otherwise; which one suits may change with the other effects."""
         return ()
 
+    def forms_beside(self, rest: Any) -> tuple[EffectLaw, ...]:
+        """Its forms, of which one may suit better beside the `rest` of a model (`identify.candidates.Rest`)."""
+        return self.forms
+
     @property
     def alternatives(self) -> tuple[EffectLaw, ...]:
         """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""

@@ -252,12 +252,12 @@ class CrossCoupling(AddedLaw):
     @classmethod
     def variants(cls, about: Any) -> Sequence[CrossCoupling]:
         """For each joint the other's signal that the residual goes with most, beside what the joint's own explain."""
-        joints = about.samples.joints
-        if len(joints) < 2:
-            return ()
-        names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
-        found = tuple(names[k] for k in about.strongest_neighbour())
-        return tuple(cls._of(found, joints, at) for at in (DRIVE, JOINT))
+        found = about.strongest_neighbours()
+        return tuple(cls._of(found, about.samples.joints, at) for at in (DRIVE, JOINT)) if found else ()
+
+    def forms_beside(self, rest: Any) -> tuple[EffectLaw, ...]:
+        found = rest.strongest_neighbours()
+        return () if found == self.source else (self._of(found, rest.samples.joints, self.at),)
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
 from ..effects import EffectLaw
 from ..effects.commands import CommandHold
@@ -18,7 +17,7 @@ from .few import Few, remembers
 from .judging import Judge
 from .model import Applied, Model, fit
 from .screening import Ground, Started, divided, later, start
-from .signals import Array, Bools
+from .signals import Array, Bools, Samples
 
 _STEPS, _LAST_STEPS, _ON_ALL = 6, 3, 2
 _LATER = tuple(np.arange(-0.003, 0.0031, 0.0005))
@@ -55,6 +54,40 @@ class Candidate:
     @property
     def joints(self) -> Bools:
         return self.model.applied[-1].active
+
+
+@attrs.frozen(eq=False)
+class Rest:
+    """A model without one of its laws, and what the `rows` (N, J) of its residual say of that one."""
+
+    model: Model
+    rows: Bools
+
+    @property
+    def samples(self) -> Samples:
+        return self.model.samples
+
+    def strongest_neighbours(self) -> tuple[str, ...]:
+        """For each joint another joint's q, dq or tau that its residual goes with; none of one joint.
+
+        What the joint's own signals explain linearly is taken out first.
+        """
+        s, torque, joints = self.model.signals, self.model.predict(), self.samples.joints
+        if len(joints) < 2:
+            return ()
+        names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
+        others = np.concatenate([s.q, s.dq, torque], axis=1)
+        found = []
+        for j in range(len(joints)):
+            keep = self.rows[:, j]
+            own = np.column_stack([np.ones(keep.sum()), s.q[keep, j], s.dq[keep, j], s.q_des[keep, j]])
+            basis, _ = np.linalg.qr(own)
+            left = others[keep] - basis @ (basis.T @ others[keep])
+            score = (left.T @ (self.samples.tau - torque)[keep, j]) ** 2
+            score /= np.einsum("nk,nk->k", left, left) + 1e-12
+            score[j :: len(joints)] = -1.0
+            found.append(names[int(np.argmax(score))])
+        return tuple(found)
 
 
 class About:
@@ -108,24 +141,8 @@ class About:
             0
         ]
 
-    def strongest_neighbour(self) -> NDArray[np.intp]:
-        """For each joint the index (over q, dq, tau, then joints) of another joint's signal that its residual goes with.
-
-        What the joint's own signals explain linearly is taken out first.
-        """
-        s, joints = self.signals, len(self.samples.joints)
-        others = np.concatenate([s.q, s.dq, self.torque], axis=1)
-        found = np.zeros(joints, dtype=np.intp)
-        for j in range(joints):
-            keep = self.judge.fit[:, j]
-            own = np.column_stack([np.ones(keep.sum()), s.q[keep, j], s.dq[keep, j], s.q_des[keep, j]])
-            basis, _ = np.linalg.qr(own)
-            left = others[keep] - basis @ (basis.T @ others[keep])
-            r = self.fitted[keep, j]
-            score = (left.T @ r) ** 2 / (np.einsum("nk,nk->k", left, left) + 1e-12)
-            score[j::joints] = -1.0
-            found[j] = int(np.argmax(score))
-        return found
+    def strongest_neighbours(self) -> tuple[str, ...]:
+        return Rest(self.ground.bases[-1], self.judge.fit).strongest_neighbours()
 
     def lost_commands(self, most: int) -> list[tuple[Array, Array]]:
         """How likely the drive lags by 0 to `most` commands: at each row, (N, J, most + 1), and at any; none if it rarely does.

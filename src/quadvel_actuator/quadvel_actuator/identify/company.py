@@ -12,7 +12,7 @@ import numpy as np
 
 from ..effects import EffectLaw, registry
 from .ahead import side_by_side
-from .candidates import About, Candidate, best_form, judged, less_said
+from .candidates import About, Candidate, Rest, best_form, judged, less_said
 from .delays import fit_with_delays
 from .few import Few, remembers
 from .judging import Comparison, Judge
@@ -123,8 +123,8 @@ class Company:
     def _reformed(self, model: Model) -> Model:
         """With those forms of its laws that suit each other best."""
         for index, one in enumerate(model.applied):
-            for form in one.law.forms:
-                other = self._fitted(model.replacing(index, attrs.evolve(one, law=form)), 10)
+            for form in one.law.forms_beside(Rest(model.without(index), self.judge.fit)):
+                other = self._fitted(model.replacing(index, one.formed(form)), 10)
                 if other.error(self.judge.judge) < _BETTER_FORM * model.error(self.judge.judge):
                     model = other
         return model

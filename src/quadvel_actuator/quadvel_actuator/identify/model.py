@@ -45,6 +45,12 @@ class Applied:
             found[name] = one[0] if len(one) == 1 or (one == one[0]).all() else one[:, None]
         return found
 
+    def formed(self, law: EffectLaw) -> Applied:
+        """With another form of its law; parameters that this one had not start from zero."""
+        known = dict(zip(self.law.names, self.values, strict=True))
+        none = np.zeros_like(self.values[0])
+        return attrs.evolve(self, law=law, values=np.array([known.get(name, none) for name in law.names]))
+
     def tidied(self) -> Applied:
         """With parameters in their unique order."""
         p = self.law.tidy(dict(zip(self.law.names, self.values, strict=True)))
