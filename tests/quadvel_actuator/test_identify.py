@@ -1,5 +1,7 @@
 """Identification against injected truth: short logs of two joints, so that it takes seconds."""
 
+import weakref
+
 import attrs
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from simulated_joints import NAMES, TABLE_4, parameters, record
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_actuator.identify.eam import fit_eam
 from quadvel_actuator.identify.identify import Options, identify
+from quadvel_actuator.identify.material import gathered
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -59,6 +62,15 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect(
     logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
     report = identify(logs[:1], logs[1:], Options(values=3000)).report  # two pieces of 0.75 s of each
     assert report["effects"] == []
+
+
+def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
+    log = record(_truth(), 2, 6.0, 500, seed=4)
+    alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
+    material = gathered([log], values=3000)
+    del log
+    assert sum(len(piece.log.t) for piece in material.pieces) == 1500
+    assert [array() for array in alive] == [None] * len(alive)
 
 
 def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():

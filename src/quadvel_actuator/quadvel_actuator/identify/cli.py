@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import attrs
 import numpy as np
@@ -22,6 +22,9 @@ from .inspect import Inspection, inspect
 from .log import Log, LogError
 from .memory import give_large_arrays_back, keep_freed_arrays
 from .read_log import read_log
+
+if TYPE_CHECKING:
+    from .material import Material
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
@@ -133,29 +136,43 @@ def _run(
     _check_folder(out)
     give_large_arrays_back()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
-    fitted = read(logs, joints, gains, messages)
-    judged = read(holdout, joints, gains, messages, like=fitted[0])
-    long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
+    material, long = _material(logs, holdout, joints, gains, messages)
     if not long:
         keep_freed_arrays()
     cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
-    from .identify import Options, identify  # what is wrong with the files shows before the engine is loaded
+    from .identify import identified
     from .report import write
 
     columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     threads = threadpool_limits(1)  # of each copy of this process: they share the cores
     with threads, Progress(*columns, console=messages, transient=True) as bar:
         task = bar.add_task("", total=1.0)
-        found = identify(
-            fitted,
-            judged,
-            Options(gains=gains, base=parameters, cores=cores),
+        found = identified(
+            material,
+            parameters,
+            cores,
             lambda share, text: bar.update(task, completed=share, description=text),
         )
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
+
+
+def _material(
+    logs: Sequence[Path],
+    holdout: Sequence[Path],
+    joints: Sequence[str] | None,
+    gains: tuple[float, float] | None,
+    messages: Console,
+) -> tuple[Material, bool]:
+    """What of the files is computed on, and whether they hold long logs, which are let go of here."""
+    fitted = read(logs, joints, gains, messages)
+    judged = read(holdout, joints, gains, messages, like=fitted[0])
+    long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
+    from .material import gathered  # what is wrong with the files shows before the engine is loaded
+
+    return gathered(fitted, judged, gains), long
 
 
 def read(

@@ -53,7 +53,8 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
     for field in attrs.fields(Log):
         value = getattr(log, field.name)
         if isinstance(value, np.ndarray):
-            taken[field.name] = value[sent if field.name in _OF_COMMANDS else rows]
+            of_it = sent if field.name in _OF_COMMANDS else rows
+            taken[field.name] = value[of_it].copy()  # a view would hold the whole
     if len(taken["t"]) < 50 or len(taken["t_cmd"]) < 10:
         return None
     return attrs.evolve(log, **taken)

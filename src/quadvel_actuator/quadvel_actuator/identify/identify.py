@@ -15,21 +15,21 @@ from ..parameters import ActuatorParameters
 from .delays import fit_with_delays, in_steps, latest
 from .diagnosis import Diagnosis, diagnosed
 from .eam import WINDOWS, Eam, fit_eam, pd_torque
-from .excerpts import Piece, evened, jitters, pieces
+from .excerpts import evened, jitters
 from .findings import Finding
 from .floor import encoder_noise, noise_floor
 from .identification import Identification
-from .inspect import inspect
 from .intervals import intervals
 from .judging import Judge
 from .learned import Learned, beside, longest
 from .log import Log, LogError
+from .material import VALUES, Material, gathered
 from .model import Model
-from .motion import STRETCH, Body, Replay, implied, replayed
+from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Outcome, identification, parameters
 from .ranking import Rejected
 from .residual import remainder
-from .signals import Array, Samples
+from .signals import Samples
 from .simplest import Alone, account
 
 Progress = Callable[[float, str], None]
@@ -56,7 +56,7 @@ class Options:
     """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
     base: ActuatorParameters | None = None
     """its torque limits go into the corrected model"""
-    values: int = 144_000
+    values: int = VALUES
     """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
     cores: int = 1
     """that work side by side; the report is the same"""
@@ -73,35 +73,35 @@ def identify(
     `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
     """
     options = options or Options()
+    material = gathered(train, heldout, options.gains, options.values)
+    return identified(material, options.base, options.cores, progress)
+
+
+def identified(
+    material: Material,
+    base: ActuatorParameters | None = None,
+    cores: int = 1,
+    progress: Progress | None = None,
+) -> Identification:
+    """The same of `material`: who does not hold the whole of a long log has more memory for it."""
     tell = progress or (lambda share, text: None)
-    logs, findings = _checked([*train, *heldout])
-    kp, kd = (np.array([gain]) for gain in options.gains) if options.gains else (None, None)
-    body = None
-    windows: Sequence[float] = WINDOWS
-    if logs[0].tau is None:
-        tell(0.01, "the torque that the motion implies")
-        logs, body = _moving(logs, kp, kd)
-        windows = (logs[0].period,)
-    rows = options.values // (len(logs) * len(logs[0].joints))
-    # One script may have led all logs: what judges comes from other instants of it than what is fitted.
-    parts = [pieces(log, rows * log.period, between=k >= len(train)) for k, log in enumerate(logs)]
-    chosen = [piece for part in parts for piece in part]
-    fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
+    chosen, body = material.pieces, material.body
+    windows = WINDOWS if body is None else (chosen[0].log.period,)
     tell(0.02, "gains and delays")
-    samples, judge, eam, remark = _read(chosen, fitted, kp, kd, windows)
-    findings += remark
+    samples, judge, eam, remark = _read(material, windows)
+    findings = [*material.findings, *remark]
     before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
     late = latest(before, judge.fit)
-    if heldout:  # whose rows may lie otherwise between their commands
+    if material.heldout:  # whose rows may lie otherwise between their commands
         before = late
     noise = noise_floor(samples, judge.fit | judge.judge, samples.tau - before.predict())
     steps = iter(range(10**6))
-    alone = Alone(before, judge, noise, options.cores)
+    alone = Alone(before, judge, noise, cores)
 
     def tick(text: str) -> None:
         tell(min(0.1 + 0.008 * next(steps), 0.85), text)
 
-    diagnosis = diagnosed(before, judge, noise, tick, alone.says_more, options.cores)
+    diagnosis = diagnosed(before, judge, noise, tick, alone.says_more, cores)
     tell(0.88, "what no effect explains")
     late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
@@ -116,7 +116,7 @@ def identify(
             _likely(final, judge, learned), learned,
             _worth(named, learned, judge), remainder(model, learned, judge),
             intervals(final, judge, learned, model), ideal, noise, judge,
-            chosen, *_reference(samples), options.base or ActuatorParameters.default(),
+            chosen, *_reference(samples), base or ActuatorParameters.default(),
         )  # fmt: skip
 
     outcome = told(*account(alone, diagnosis, judge, noise))
@@ -171,27 +171,6 @@ def _steadiest(tries: Sequence[Outcome], body: Body) -> tuple[Outcome, tuple[Rep
     return best, (before, after)
 
 
-def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]:
-    """The logs, `valid` narrowed to what a PD model can explain, and what was seen; refuses what cannot be used."""
-    inspected = [inspect(log) for log in logs]
-    for one in inspected:
-        one.raise_refusal()
-        if (one.log.tau is None) != (logs[0].tau is None):
-            raise LogError(f"{one.log.name}: tau: expected it in every log or in none, as in {logs[0].name}")
-        if one.log.joints != logs[0].joints:
-            raise LogError(
-                f"{one.log.name}: joint_names: found {', '.join(one.log.joints)}, "
-                f"expected those of {logs[0].name}: {', '.join(logs[0].joints)}"
-            )
-    return [one.log for one in inspected], [(one.log.name, f) for one in inspected for f in one.findings]
-
-
-def _moving(logs: Sequence[Log], kp: Array | None, kd: Array | None) -> tuple[list[Log], Body]:
-    """The logs with the torque that their motion implies, and the body that they carry, from the first one."""
-    first, body = implied(logs[0], kp, kd)
-    return [first, *(implied(log, kp, kd, body)[0] for log in logs[1:])], body
-
-
 def _with_motion(report: Mapping[str, Any], replays: tuple[Replay, Replay], body: Body) -> dict[str, Any]:
     """The report with before and after in rad and rad/s, too."""
     before, after = replays
@@ -215,19 +194,20 @@ def _with_motion(report: Mapping[str, Any], replays: tuple[Replay, Replay], body
 
 
 def _read(
-    chosen: Sequence[Piece], fitted: int, kp: Array | None, kd: Array | None, windows: Sequence[float]
+    material: Material, windows: Sequence[float]
 ) -> tuple[Samples, Judge, Eam, list[tuple[str, Finding]]]:
     """Samples and the EAM, with stamps as logged or as an even sender's, q and dq as logged or averaged over some rows.
 
     Whichever explains the torque better.
     """
+    origins = [piece.origin for piece in material.pieces]
 
     def tried(logs: Sequence[Log], steady: float = 0.0) -> Fit:
-        samples = Samples(logs, kp, kd, [piece.origin for piece in chosen], steady)
-        judge = _rows(samples, fitted)
+        samples = Samples(logs, material.kp, material.kd, origins, steady)
+        judge = _rows(samples, material)
         return samples, judge, fit_eam(samples, judge.fit, windows=windows)
 
-    logs = [piece.log for piece in chosen]
+    logs = [piece.log for piece in material.pieces]
     found, notes = tried(logs), []
     if any(jitters(log) for log in logs):
         even = [evened(log) for log in logs]
@@ -282,10 +262,10 @@ def _beside_friction(fit: Fit) -> float:
     return total / int(judge.fit.sum())
 
 
-def _rows(samples: Samples, fitted: int) -> Judge:
-    """Which rows are fitted and which judge: the first `fitted` pieces, or two of three blocks where that is all."""
-    if fitted < len(samples.logs):
-        first = (samples.log_of_row < fitted)[:, None]
+def _rows(samples: Samples, material: Material) -> Judge:
+    """Which rows are fitted and which judge: those of the logs held out, or one block of three where there are none."""
+    if material.heldout:
+        first = (samples.log_of_row < material.fitted)[:, None]
     else:
         spans = [one.log.duration for one in samples.logs]
         length = float(np.clip(min(spans) / _BLOCKS, _SHORTEST_BLOCK, _LONGEST_BLOCK))
@@ -297,7 +277,7 @@ def _rows(samples: Samples, fitted: int) -> Judge:
                 f"{samples.logs[0].log.name}: valid/{joint}: {int(rows.sum(axis=0).min())} rows to be {word}, "
                 f"expected {_LEAST_ROWS} or more"
             )
-    every = None if fitted < len(samples.logs) else samples.judged
+    every = None if material.heldout else samples.judged
     return Judge.of(samples, samples.judged & first, samples.judged & ~first, every)
 
 
