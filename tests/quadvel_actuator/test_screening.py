@@ -377,11 +377,29 @@ def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
     np.testing.assert_allclose(several, backlog._odds(costs, new, backlog.Chances())[0], atol=1e-9)
 
 
-def test_lost_commands_are_told_without_a_look_at_the_torque_that_they_are_judged_by():
-    truth = parameters([Effect("command_hold", JOINTS, {"share": 0.1})], noise=0.01)
-    log = record(attrs.evolve(truth, joints=JOINTS), 2, 3.0, 500, seed=2)
+def _losing(share, joints=JOINTS):
+    """A log that loses that share of its commands, which come at 200 Hz."""
+    truth = parameters([Effect("command_hold", joints, {"share": share})], noise=0.01)
+    log = record(attrs.evolve(truth, joints=joints), len(joints), 3.0, 500, seed=2)
     sent = slice(None, None, 5)  # what changes at 200 Hz
-    log = attrs.evolve(log, **{name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")})
+    return attrs.evolve(log, **{name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")})
+
+
+def test_half_of_the_commands_lost_are_told_beside_a_delay_that_held_them():
+    """At random, so that the drive is k commands behind for a half to the power k + 1 of the time."""
+    joints = NAMES[:6]
+    looked = about(
+        _losing(0.5, joints), 0.0125, 0.001
+    )  # 7.5 ms, and 5 ms that the commands are late on average
+    looked.noise = np.full(len(joints), 0.01)
+    ((_, usual),) = looked.lost_commands(6)
+    np.testing.assert_allclose(
+        usual[:4], 0.5 ** np.arange(1, 5), atol=0.06
+    )  # three standard errors of 600 tosses
+
+
+def test_lost_commands_are_told_without_a_look_at_the_torque_that_they_are_judged_by():
+    log = _losing(0.1)
     looked = about(log, 0.0075, 0.001)
     looked.noise = np.full(2, 0.01)
     ((odds, usual),) = looked.lost_commands(6)

@@ -147,19 +147,35 @@ class About:
     def lost_commands(self, most: int) -> list[tuple[Array, Array]]:
         """How likely the drive lags by 0 to `most` commands: at each row, (N, J, most + 1), and at any; none if it rarely does.
 
-        For each joint without a look at the torque that it is judged by.
+        For each joint without a look at the torque that it is judged by. Losses at random delay the commands by what they
+        do so on average, which is in the delay of a model without them: earlier ones are looked at while that says more.
         """
         if len(self.noise) < 2 or not suspicious(self.model, self.noise, _LOST_SHARE):
             return []
-        found = self._backlog(self.model, most)
-        if 1.0 - found[1][0] < _LOST_SHARE:
+        step = _EARLIER * np.median(np.concatenate([np.diff(log.t_cmd) for log in self.samples.logs]))
+        least, best = np.inf, None
+        for turn in range(_TURNS):
+            delay = np.maximum(self.model.input_delay - turn * step, 0.0)
+            model = self.model.with_delays(delay, self.model.output_delay)
+            odds = self._backlog(model, most)
+            if 1.0 - odds[1][0] < _LOST_SHARE:
+                break
+            losing = self._losing(model, odds)
+            error = losing.error(self.judge.judge)  # the odds of which did not look at their torque
+            if error > _NEARER * least:
+                break
+            least, best = error, losing
+        if best is None or best.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(
+            self.judge.fit
+        ):
             return []
+        return [self._backlog(best.without(len(best.applied) - 1), most)]
+
+    def _losing(self, model: Model, odds: tuple[Array, Array]) -> Model:
+        """The model with commands lost by these odds, fitted."""
         every = np.ones(len(self.noise), dtype=bool)
-        lost = Applied(CommandHold(*found), every, np.full((1, len(every)), 0.05), np.arange(len(every)))
-        better = fit_with_delays(self.model.plus(lost), self.judge.fit, 2)
-        if better.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(self.judge.fit):
-            return []
-        return [self._backlog(better.without(len(better.applied) - 1), most)]
+        lost = Applied(CommandHold(*odds), every, np.full((1, len(every)), 0.05), np.arange(len(every)))
+        return fit_with_delays(model.plus(lost), self.judge.fit, 2)
 
     def _backlog(self, model: Model, most: int) -> tuple[Array, Array]:
         odds = backlog(model, self.noise, most, self.judge.judge)
@@ -168,6 +184,9 @@ class About:
 
 _LOST_SHARE = 0.003
 """Of the rows: commands are not looked at as lost where fewer lag behind."""
+
+_EARLIER, _TURNS, _NEARER = 0.2, 8, 0.98
+"""of the time between two commands; how many such steps; and of the error, what each has to leave at most"""
 
 _FORETOLD = 1.25
 """Times the error of the model without: losses at random leave, all alike, about what a longer delay left in their place.
