@@ -22,6 +22,7 @@ from .base import (
     Stage,
     Start,
     View,
+    of_each,
     rms,
     staged,
 )
@@ -122,7 +123,7 @@ class Cogging(AddedLaw):
         return p | {"a": np.abs(p["a"]), "phi": np.remainder(phi + np.pi, 2.0 * np.pi) - np.pi}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return p["a"] * np.sin(p["n"] * s.q + p["phi"])
+        return p["a"] * of_each(lambda n, phi: np.sin(n * s.q + phi), p["n"], p["phi"])
 
 
 @attrs.frozen(eq=False)

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, smooth_sign
+from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, of_each, smooth_sign
 
 _WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
 _WIDTHS = (0.02, 0.06, 0.2)
@@ -32,8 +32,7 @@ class _Rubbing(AddedLaw):
         """-1 to 1, through zero at rest."""
         if self.turn == "tanh":
             return smooth_sign(v, width)
-        slow: Array = np.arctan(v / width) * (2.0 / np.pi)
-        return slow
+        return of_each(lambda each: np.arctan(v / each) * (2.0 / np.pi), width)
 
 
 class CoulombFriction(_Rubbing):
@@ -94,7 +93,7 @@ class StribeckFriction(_Rubbing):
         return p | {"c_s": np.maximum(p["c_s"], p["c"])}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        sticking = np.exp(-np.square(s.dq / p["v_s"]))
+        sticking = of_each(lambda v_s: np.exp(-np.square(s.dq / v_s)), p["v_s"])
         return -(p["c"] + (p["c_s"] - p["c"]) * sticking) * self.sign(s.dq, p["v_0"])
 
 

@@ -101,20 +101,23 @@ class Curve(Shape):
         x = np.clip((u - self.low) / (self.high - self.low), 0.0, 1.0) * self.pieces
         first = np.minimum(x.astype(np.intp), self.pieces - 1)
         f = x - first
+        rest, square = 1.0 - f, f * f
+        cube = square * f
         return first, [
-            (1.0 - f) ** 3 / 6.0,
-            (3.0 * f**3 - 6.0 * f**2 + 4.0) / 6.0,
-            (-3.0 * f**3 + 3.0 * f**2 + 3.0 * f + 1.0) / 6.0,
-            f**3 / 6.0,
+            rest * rest * rest / 6.0,
+            (3.0 * cube - 6.0 * square + 4.0) / 6.0,
+            (-3.0 * cube + 3.0 * square + 3.0 * f + 1.0) / 6.0,
+            cube / 6.0,
         ]
 
     def columns(self, u: Array, start: NDArray[np.bool_], dt: float) -> Array:
         first, values = self._placed(u)
-        out = np.zeros((len(u), self.count, u.shape[1]))
-        rows, columns = np.indices(u.shape)
+        rows, count = u.shape
+        out = np.zeros(rows * self.count * count)
+        at = (np.arange(rows)[:, None] * self.count + first) * count + np.arange(count)
         for k, value in enumerate(values):
-            out[rows, first + k, columns] = value
-        return out
+            out[at + k * count] = value
+        return out.reshape(rows, self.count, count)
 
     def advance(self, u: Array, dt: float, weights: Array, memory: Memory) -> tuple[Array, Memory]:
         first, values = self._placed(u)

@@ -20,7 +20,7 @@ LOST = 6.0
 _PIECE, _AROUND = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
 
-_ROUNDS = 8
+_ROUNDS, _SETTLED = 8, 1e-3
 _RARE = 1e-6
 _SURE = 50.0
 """nats that one row can say at most: it may be an outlier"""
@@ -89,7 +89,9 @@ def backlog(model: Model, noise: Array, most: int, unread: Bools) -> Array:
     read = (costs - hidden).sum(axis=1, keepdims=True)
     chances = Chances()
     for _ in range(_ROUNDS):
-        chances = Chances.of(_odds(read, new, chances)[1])
+        before, chances = chances, Chances.of(_odds(read, new, chances)[1])
+        if np.allclose(attrs.astuple(chances), attrs.astuple(before), rtol=_SETTLED):
+            break
     return _odds(costs.sum(axis=1, keepdims=True) - hidden, new, chances)[0]
 
 

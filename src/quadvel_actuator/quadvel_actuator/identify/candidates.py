@@ -165,6 +165,8 @@ class About:
             if error > _NEARER * least:
                 break
             least, best = error, losing
+            if odds[1] @ np.arange(most + 1) < _EARLIER:
+                break
         if best is None or best.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(
             self.judge.fit
         ):

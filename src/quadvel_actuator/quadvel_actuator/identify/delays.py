@@ -9,6 +9,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
+from ..effects import DRIVE, AddedLaw, EffectLaw
 from .eam import LONGEST_INPUT, LONGEST_OUTPUT
 from .model import Model, Slots, fit, gather, jacobian, pack, step, with_slots
 from .signals import Array, Bools
@@ -36,8 +37,9 @@ def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
     predicted, slopes = jacobian(model, slots)
     extra = []
     for k in range(2):
-        high = _at(model, k, SLOPE)
-        low = _at(model, k, -SLOPE)
+        moved = attrs.evolve(model, applied=tuple(one for one in model.applied if _feels(one.law, k)))
+        high = _at(moved, k, SLOPE)
+        low = _at(moved, k, -SLOPE)
         reach = (high.input_delay - low.input_delay) + (high.output_delay - low.output_delay)
         extra.append((high.predict() - low.predict()) / reach)
     both = np.stack(extra).transpose(2, 0, 1)
@@ -53,6 +55,15 @@ def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
         count=slots.count + 2 * (int(groups.max()) + 1),
     )
     return predicted, np.concatenate([slopes, both], axis=1), wider
+
+
+def _feels(law: EffectLaw, which: int) -> bool:
+    """Does its torque change with the input delay (0), or the output delay (1)?"""
+    if (
+        not isinstance(law, AddedLaw) or law.of_drive or law.signal == "ddq"
+    ):  # which is read as commands move the joint
+        return True
+    return which == 1 and law.at == DRIVE
 
 
 def _at(model: Model, which: int, by: float) -> Model:

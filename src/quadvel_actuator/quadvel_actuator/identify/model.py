@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
+from ..effects.base import distinct
 from .signals import BETWEEN, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
@@ -173,8 +174,8 @@ class Model:
         if isinstance(law, ErrorLaw):
             if max(part.ndim for part in x) > 2:
                 return law.errors(x, s, p)
-            some, which = _distinct(value)
-            after = law.errors(x, s, one.part(some))
+            first, which = distinct(value)
+            after = law.errors(x, s, one.part(value[first]))
             return tuple(part[which] if part.ndim > 2 else part for part in after)
         if isinstance(law, MemoryLaw):
             return law.series(x, s, p)
@@ -215,13 +216,6 @@ class Model:
 def _lean(batch: Array) -> Array:
     """A batch of equal values as one."""
     return batch[:1] if len(batch) > 1 and (batch == batch[0]).all() else batch
-
-
-def _distinct(batch: Array) -> tuple[Array, NDArray[np.intp]]:
-    """The different ones of a batch, and which of them each is: where slopes are taken, most are the same."""
-    first: dict[bytes, int] = {}
-    which = np.array([first.setdefault(one.tobytes(), len(first)) for one in batch])
-    return batch[np.unique(which, return_index=True)[1]], which
 
 
 def _where(active: Bools, new: Array, old: Array) -> Array:
