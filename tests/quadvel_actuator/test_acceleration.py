@@ -38,7 +38,7 @@ def test_where_a_command_makes_the_acceleration_jump_it_is_not_smeared():
     dq = integral @ answer + 40.0 / 12.0 * -np.cos(12.0 * t[:, None] + [0.0, 1.0])
     dq += 0.002 * rng.standard_normal(dq.shape)
     smeared = np.sqrt(np.mean((slope(t, dq, 0.008) - ddq) ** 2))
-    smooth, found = smooth_part("ddq_smooth", t, dq, integral)
+    smooth, found = smooth_part("ddq_smooth", t, dq, slope(t, dq, 0.008), integral)
     sharp = np.sqrt(np.mean((smooth + jumps @ found - ddq) ** 2))
     np.testing.assert_allclose(found, answer, rtol=0.03, atol=10.0)
     assert smeared > 100.0  # rad/s^2

@@ -7,8 +7,10 @@ from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
+from quadvel_actuator.effects.base import of_each
+from quadvel_actuator.identify.delays import SLOPE, jacobian_with_delays
 from quadvel_actuator.identify.log import Log
-from quadvel_actuator.identify.model import Applied, Model, Slots, jacobian, pack, with_slots
+from quadvel_actuator.identify.model import Applied, Model, Slots, pack, with_slots
 from quadvel_actuator.identify.signals import Samples
 
 JOINTS = NAMES[:3]
@@ -116,13 +118,14 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
     np.testing.assert_array_equal(*torques)
 
 
+@pytest.mark.parametrize("at", ["drive", "joint"])
 @pytest.mark.parametrize("source", ["q", "tau"])
 @pytest.mark.parametrize("name", [name for name, law in registry().items() if law.stage == Stage.ADDED])
-def test_slopes_of_a_fit_are_those_of_the_torque(name, source):
-    """Whether the law depends on the torque of the drive, which changes with the gains, or says that it does not."""
+def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
+    """Whether the law depends on the torque of the drive, or on delays, or says that it does not."""
     t, q, dq, q_des = _motion(300)
-    settings = {"source": [f"{NAMES[1]}/{source}"] * 4} if name == "cross_coupling" else {}
-    law = registry()[name].configured(settings, NAMES[:4])
+    forms = {"cross_coupling": {"source": [f"{NAMES[1]}/{source}"] * 4}, "armature": {"of": "ddq_sharp"}}
+    law = registry()[name].configured({"at": at, **forms.get(name, {})}, NAMES[:4])
     values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in law.names])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
@@ -131,13 +134,32 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source):
         (Applied(law, every, values, np.arange(4)),),
     )  # fmt: skip
     slots = Slots.of(model)
-    torque, slopes = jacobian(model, slots)
+    torque, slopes, _ = jacobian_with_delays(model)
     np.testing.assert_array_equal(torque, model.predict())
     for k, step in enumerate(slots.step):
         moved = pack(model)
         moved[k] += step
         slope = (with_slots(model, moved).predict() - torque) / step
         np.testing.assert_allclose(slopes[:, k].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
+    for k, late in enumerate(np.eye(2) * SLOPE):
+        after, before = (model.with_delays(0.004 + by[0], 0.002 + by[1]).predict() for by in (late, -late))
+        slope = (after - before) / (2.0 * SLOPE)
+        np.testing.assert_allclose(slopes[:, k - 2].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
+
+
+def test_what_is_equal_in_a_batch_is_computed_once():
+    given = []
+
+    def wave(n, phi):
+        given.append(n.shape)
+        return np.sin(n * q + phi)
+
+    q, n, phi = np.linspace(0.0, 1.0, 6).reshape(3, 2), np.full((4, 1, 2), 5.0), np.full((4, 1, 2), 0.3)
+    n[2] += 0.1
+    np.testing.assert_array_equal(of_each(wave, n, phi), np.sin(n * q + phi))
+    np.testing.assert_array_equal(of_each(wave, n, phi[0, 0]), np.sin(n * q + 0.3))
+    np.testing.assert_array_equal(of_each(wave, n[0, 0], phi[0, 0]), np.sin(5.0 * q + 0.3))
+    assert given == [(2, 1, 2), (2, 1, 2), (2,)]
 
 
 @pytest.mark.parametrize("name", ["coulomb_friction", "hysteresis", "load_dependent_friction"])

@@ -54,10 +54,10 @@ def _bend(t: Array, values: Array) -> Array:
     return bend
 
 
-def smooth_part(name: str, t: Array, dq: Array, come: Array) -> tuple[Array, Array]:
+def smooth_part(name: str, t: Array, dq: Array, slope_of_dq: Array, come: Array) -> tuple[Array, Array]:
     """Of ddq (N, J), as `name` says, what is left without B q_des, D dq - B D come, and B (J, J), transposed."""
     half_width, cause, outcome = HALF_WIDTHS[name], _bend(t, come), _bend(t, dq)
     answer: Array = np.asarray(
         np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float
     )
-    return slope(t, dq, half_width) - slope(t, come, half_width) @ answer, answer
+    return slope_of_dq - slope(t, come, half_width) @ answer, answer

@@ -72,9 +72,10 @@ class Rest:
 
         What the joint's own signals explain linearly is taken out first.
         """
-        s, torque, joints = self.model.signals, self.model.predict(), self.samples.joints
+        joints = self.samples.joints
         if len(joints) < 2:
             return ()
+        s, torque = self.model.signals, self.model.predict()
         names = [f"{joint}/{signal}" for signal in ("q", "dq", "tau") for joint in joints]
         others = np.concatenate([s.q, s.dq, torque], axis=1)
         found = []

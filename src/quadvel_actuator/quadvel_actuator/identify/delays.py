@@ -58,10 +58,11 @@ def jacobian_with_delays(model: Model) -> tuple[Array, Array, Slots]:
 
 
 def _feels(law: EffectLaw, which: int) -> bool:
-    """Does its torque change with the input delay (0), or the output delay (1)?"""
-    if (
-        not isinstance(law, AddedLaw) or law.of_drive or law.signal == "ddq"
-    ):  # which is read as commands move the joint
+    """Does its torque change with the input delay (0), or the output delay (1)?
+
+    An acceleration does, which is read as commands move the joint.
+    """
+    if not isinstance(law, AddedLaw) or law.of_drive or law.signal == "ddq":
         return True
     return which == 1 and law.at == DRIVE
 

@@ -106,7 +106,8 @@ class Trial:
         self.others = []  # of each joint: (N, X), columns of size 1 over the fitted rows; slopes over those of all joints
         self.inverse = []
         self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
-        self.onto = []  # of each joint: (X, n), weights of the columns that come closest on few of the fitted rows
+        self.counted = scene.judge.fit[self.few].T[..., None]  # (J, n, 1), those of few rows that are fitted
+        onto = []  # of each joint: (X, n), weights of the columns that come closest on these
         self.bare = np.empty_like(scene.residual)
         for j in range(len(scene.joints)):
             keep = scene.judge.fit[:, j]
@@ -117,10 +118,12 @@ class Trial:
             gram = x[keep].T @ x[keep] + np.diag(ridge * rows)
             self.others.append(x)
             self.inverse.append(np.linalg.inv(gram))
-            some = x[self.few][keep[self.few]]
-            share = ridge * rows * len(some) / max(int(keep.sum()), 1)
-            self.onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
+            some = x[self.few] * self.counted[j]
+            share = ridge * rows * int(self.counted[j].sum()) / max(int(keep.sum()), 1)
+            onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
+        self.onto = np.array(onto)
+        self.some = np.array([x[self.few] for x in self.others]) * self.counted
 
     def _without(self, j: int, values: Array) -> Array:
         """What the other columns do not explain of `values` (N, K)."""
@@ -130,18 +133,13 @@ class Trial:
 
     def promising(self, feature: Feature, noise: Array) -> Bools:
         """The joints where the feature fitted to some of the rows gains more than chance would."""
-        few = self.few
-        columns, fit = self.scene.columns(feature, few), self.scene.judge.fit[few]
-        found = np.zeros(len(noise), dtype=bool)
-        for j, x in enumerate(self.others):
-            keep = fit[:, j]
-            left = self.bare[few, j][keep]
-            b, x = columns[keep, :, min(j, columns.shape[2] - 1)], x[few][keep]
-            b = b - x @ (self.onto[j] @ b)
-            onto = b.T @ left
-            gain = (onto @ _inverse(b, [feature.shape.penalty]) @ onto) / len(left)
-            chance = float(np.mean(left * left)) * feature.shape.count / len(left)
-            found[j] = gain - chance > 0.5 * WORTH * noise[j]
+        columns = self.scene.columns(feature, self.few).transpose(2, 0, 1) * self.counted  # (J, n, K)
+        own = columns - self.some @ (self.onto @ columns)
+        left, rows = self.bare[self.few].T[..., None] * self.counted, self.counted.sum(axis=(1, 2))
+        onto = own.swapaxes(1, 2) @ left
+        gain = (onto.swapaxes(1, 2) @ _inverse(own, [feature.shape.penalty]) @ onto)[:, 0, 0] / rows
+        chance = np.sum(left * left, axis=(1, 2)) * feature.shape.count / rows**2
+        found: Bools = gain - chance > 0.5 * WORTH * noise
         return found
 
     def compare(self, feature: Feature, joints: Bools) -> Comparison:
@@ -176,12 +174,13 @@ def _sizes(scene: Scene) -> Array:
 
 
 def _inverse(x: Array, penalties: Sequence[Array]) -> Array:
-    """Of the second moments of x (N, K), each block of columns with its penalty, in shares of its mean square."""
-    gram: Array = x.T @ x
+    """Of the second moments of x (..., N, K), each block of columns with its penalty, in shares of its mean square."""
+    gram: Array = x.swapaxes(-1, -2) @ x
     first = 0
     for penalty in penalties:
         last = first + len(penalty)
-        size = float(np.trace(gram[first:last, first:last])) / len(penalty)
-        gram[first:last, first:last] += size * penalty + 1e-12 * np.eye(len(penalty))
+        block = gram[..., first:last, first:last]
+        size = np.einsum("...kk->...", block) / len(penalty)
+        block += size[..., None, None] * penalty + 1e-12 * np.eye(len(penalty))
         first = last
     return np.asarray(np.linalg.inv(gram), dtype=np.float64)

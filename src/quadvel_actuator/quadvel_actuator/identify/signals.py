@@ -155,6 +155,7 @@ class _LogSignals:
             if values.any()
         }
         self.all: dict[str, Array] = {**self.states, **self.commands, **self.gains}
+        self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
     def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
@@ -172,21 +173,23 @@ class _LogSignals:
     def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
         """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
         if name == "ddq":
-            return reading.read(self._smeared[:, joints], *self.between(at))
+            return reading.read(self._slope_of_dq(name)[:, joints], *self.between(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
             if len(self._smooth) >= _KEPT_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
             come = self._acting(self.t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, self.t, _double(self.log.dq), come)
+            self._smooth[key] = smooth_part(name, self.t, _double(self.log.dq), self._slope_of_dq(name), come)
         smooth, answer = self._smooth[key]
         jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
         return reading.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
 
-    @cached_property
-    def _smeared(self) -> Array:
-        """rad/s^2 by rows, whatever commands do."""
-        return slope(self.t, _double(self.log.dq), HALF_WIDTHS["ddq"])
+    def _slope_of_dq(self, name: str) -> Array:
+        """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
+        width = HALF_WIDTHS[name]
+        if width not in self._slopes:
+            self._slopes[width] = slope(self.t, _double(self.log.dq), width)
+        return self._slopes[width]
 
     def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
         """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
