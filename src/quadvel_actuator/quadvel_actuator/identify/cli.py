@@ -25,6 +25,7 @@ from .read_log import read_log
 
 if TYPE_CHECKING:
     from .material import Material
+    from .material import Progress as Tell
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
@@ -136,23 +137,23 @@ def _run(
     _check_folder(out)
     give_large_arrays_back()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
-    material, long = _material(logs, holdout, joints, gains, messages)
-    if not long:
-        keep_freed_arrays()
-    cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
-    from .identify import identified
+    columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*columns, console=messages, transient=True) as bar:
+        task = bar.add_task("reading", total=1.0)
+
+        def tell(share: float, text: str) -> None:
+            bar.update(task, completed=share, description=text)
+
+        material, long = _material(logs, holdout, joints, gains, messages, tell)
+        if not long:
+            keep_freed_arrays()
+        from .identify import identified
+
+        cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
+        with threadpool_limits(1):  # of each copy of this process: they share the cores
+            found = identified(material, parameters, cores, tell)
     from .report import write
 
-    columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    threads = threadpool_limits(1)  # of each copy of this process: they share the cores
-    with threads, Progress(*columns, console=messages, transient=True) as bar:
-        task = bar.add_task("", total=1.0)
-        found = identified(
-            material,
-            parameters,
-            cores,
-            lambda share, text: bar.update(task, completed=share, description=text),
-        )
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
@@ -165,6 +166,7 @@ def _material(
     joints: Sequence[str] | None,
     gains: tuple[float, float] | None,
     messages: Console,
+    tell: Tell,
 ) -> tuple[Material, bool]:
     """What of the files is computed on, and whether they hold long logs, which are let go of here."""
     fitted = read(logs, joints, gains, messages)
@@ -172,7 +174,8 @@ def _material(
     long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
     from .material import gathered  # what is wrong with the files shows before the engine is loaded
 
-    return gathered(fitted, judged, gains), long
+    with threadpool_limits(1):
+        return gathered(fitted, judged, gains, progress=tell), long
 
 
 def read(

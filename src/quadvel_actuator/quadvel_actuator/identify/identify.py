@@ -23,7 +23,7 @@ from .intervals import intervals
 from .judging import Judge
 from .learned import Learned, beside, longest
 from .log import Log, LogError
-from .material import VALUES, Material, gathered
+from .material import VALUES, Material, Progress, gathered
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Outcome, identification, parameters
@@ -32,7 +32,6 @@ from .residual import remainder
 from .signals import Samples
 from .simplest import Alone, account
 
-Progress = Callable[[float, str], None]
 Fit = tuple[Samples, Judge, Eam]
 
 _HELD_OUT_EVERY = 3  # one block of three is kept aside where no log is given for it
@@ -66,14 +65,14 @@ def identify(
     train: Sequence[Log],
     heldout: Sequence[Log] = (),
     options: Options | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda share, text: None,
 ) -> Identification:
     """Fit `train`, judge on `heldout`, or on blocks of `train` kept aside where there is none.
 
     `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
     """
     options = options or Options()
-    material = gathered(train, heldout, options.gains, options.values)
+    material = gathered(train, heldout, options.gains, options.values, progress)
     return identified(material, options.base, options.cores, progress)
 
 
@@ -81,13 +80,12 @@ def identified(
     material: Material,
     base: ActuatorParameters | None = None,
     cores: int = 1,
-    progress: Progress | None = None,
+    progress: Progress = lambda share, text: None,
 ) -> Identification:
     """The same of `material`: who does not hold the whole of a long log has more memory for it."""
-    tell = progress or (lambda share, text: None)
     chosen, body = material.pieces, material.body
     windows = WINDOWS if body is None else (chosen[0].log.period,)
-    tell(0.02, "gains and delays")
+    progress(0.02, "gains and delays")
     samples, judge, eam, remark = _read(material, windows)
     findings = [*material.findings, *remark]
     before = attrs.evolve(_plain(samples, eam, judge), implied=body is not None)
@@ -99,10 +97,10 @@ def identified(
     alone = Alone(before, judge, noise, cores)
 
     def tick(text: str) -> None:
-        tell(min(0.1 + 0.008 * next(steps), 0.85), text)
+        progress(min(0.1 + 0.008 * next(steps), 0.85), text)
 
     diagnosis = diagnosed(before, judge, noise, tick, alone.says_more, cores)
-    tell(0.88, "what no effect explains")
+    progress(0.88, "what no effect explains")
     late_whole = _likely(_whole(before, judge, None), judge, None)
     ideal = pd_torque(samples, np.ones_like(before.gains), 0.0, 0.0, 0.0)
 
@@ -123,12 +121,12 @@ def identified(
     if body is None:
         found = identification(outcome, findings)
     else:
-        tell(0.95, "replays")
+        progress(0.95, "replays")
         tries = [outcome, told(diagnosis, None), told(_nothing(before, diagnosis), None)]
         outcome, motion = _steadiest(tries, body)
         found = identification(outcome, findings)
         found = attrs.evolve(found, report=_with_motion(found.report, motion, body))
-    tell(1.0, "done")
+    progress(1.0, "done")
     return found
 
 

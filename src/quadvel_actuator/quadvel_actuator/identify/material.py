@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import attrs
 import numpy as np
@@ -13,6 +13,9 @@ from .inspect import inspect
 from .log import Log, LogError
 from .motion import Body, implied
 from .signals import Array
+
+Progress = Callable[[float, str], None]
+"""Told now and then which share is done, and what is done next."""
 
 VALUES = 144_000
 """Of torque that are looked at, of all logs and joints."""
@@ -45,12 +48,14 @@ def gathered(
     heldout: Sequence[Log] = (),
     gains: tuple[float, float] | None = None,
     values: int = VALUES,
+    progress: Progress = lambda share, text: None,
 ) -> Material:
     """Of the logs to fit and to judge on as many `values` of torque in all. Raises LogError where they can't be used together."""
     logs, findings = _checked([*train, *heldout])
     kp, kd = (np.array([gain]) for gain in gains) if gains else (None, None)
     body = None
     if logs[0].tau is None:
+        progress(0.01, "the torque that the motion implies")
         logs, body = _moving(logs, kp, kd)
     rows = values // (len(logs) * len(logs[0].joints))
     # One script may have led all logs: what judges comes from other instants of it than what is fitted.
