@@ -154,7 +154,7 @@ class About:
         if len(self.noise) < 2 or not suspicious(self.model, self.noise, _LOST_SHARE):
             return []
         step = _EARLIER * np.median(np.concatenate([np.diff(log.t_cmd) for log in self.samples.logs]))
-        least, best = np.inf, None
+        least, best, since = np.inf, None, 0
         for turn in range(_TURNS):
             delay = np.maximum(self.model.input_delay - turn * step, 0.0)
             model = self.model.with_delays(delay, self.model.output_delay)
@@ -163,10 +163,11 @@ class About:
                 break
             losing = self._losing(model, odds)
             error = losing.error(self.judge.judge)  # the odds of which did not look at their torque
-            if error > _NEARER * least:
-                break
-            least, best = error, losing
-            if odds[1] @ np.arange(most + 1) < _EARLIER:
+            if error < least:
+                least, best, since = error, losing, 0
+            else:
+                since += 1
+            if since == _IN_VAIN or odds[1] @ np.arange(most + 1) < _EARLIER:
                 break
         if best is None or best.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(
             self.judge.fit
@@ -188,8 +189,8 @@ class About:
 _LOST_SHARE = 0.003
 """Of the rows: commands are not looked at as lost where fewer lag behind."""
 
-_EARLIER, _TURNS, _NEARER = 0.2, 8, 0.98
-"""of the time between two commands; how many such steps; and of the error, what each has to leave at most"""
+_EARLIER, _TURNS, _IN_VAIN = 0.2, 8, 2
+"""of the time between two commands; how many such steps; and after how many in vain there are no more"""
 
 _FORETOLD = 1.25
 """Times the error of the model without: losses at random leave, all alike, about what a longer delay left in their place.
