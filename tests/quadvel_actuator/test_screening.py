@@ -388,14 +388,12 @@ def _losing(share, joints=JOINTS):
 def test_half_of_the_commands_lost_are_told_beside_a_delay_that_held_them():
     """At random, so that the drive is k commands behind for a half to the power k + 1 of the time."""
     joints = NAMES[:6]
-    looked = about(
-        _losing(0.5, joints), 0.0125, 0.001
-    )  # 7.5 ms, and 5 ms that the commands are late on average
+    late = 0.0075 + 0.005  # s, the delay, and what the commands are late on average
+    looked = about(_losing(0.5, joints), late, 0.001)
     looked.noise = np.full(len(joints), 0.01)
     ((_, usual),) = looked.lost_commands(6)
-    np.testing.assert_allclose(
-        usual[:4], 0.5 ** np.arange(1, 5), atol=0.06
-    )  # three standard errors of 600 tosses
+    # within three standard errors of 600 tosses
+    np.testing.assert_allclose(usual[:4], 0.5 ** np.arange(1, 5), atol=0.06)
 
 
 def test_lost_commands_are_told_without_a_look_at_the_torque_that_they_are_judged_by():

@@ -107,7 +107,8 @@ class Trial:
         self.inverse = []
         self.few = slice(None, None, max(1, len(scene.residual) // _ENOUGH))
         self.counted = scene.judge.fit[self.few].T[..., None]  # (J, n, 1), those of few rows that are fitted
-        onto = []  # of each joint: (X, n), weights of the columns that come closest on these
+        few = []  # of each joint: (n, X), the columns there
+        onto = []  # of each joint: (X, n), weights of these that come closest
         self.bare = np.empty_like(scene.residual)
         for j in range(len(scene.joints)):
             keep = scene.judge.fit[:, j]
@@ -120,10 +121,10 @@ class Trial:
             self.inverse.append(np.linalg.inv(gram))
             some = x[self.few] * self.counted[j]
             share = ridge * rows * int(self.counted[j].sum()) / max(int(keep.sum()), 1)
+            few.append(some)
             onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
-        self.onto = np.array(onto)
-        self.some = np.array([x[self.few] for x in self.others]) * self.counted
+        self.some, self.onto = np.array(few), np.array(onto)
 
     def _without(self, j: int, values: Array) -> Array:
         """What the other columns do not explain of `values` (N, K)."""
