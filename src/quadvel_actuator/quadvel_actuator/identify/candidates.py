@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import attrs
 import numpy as np
@@ -153,27 +153,36 @@ class About:
         """
         if len(self.noise) < 2 or not suspicious(self.model, self.noise, _LOST_SHARE):
             return []
-        step = _EARLIER * np.median(np.concatenate([np.diff(log.t_cmd) for log in self.samples.logs]))
-        least, best, since = np.inf, None, 0
-        for turn in range(_TURNS):
-            delay = np.maximum(self.model.input_delay - turn * step, 0.0)
-            model = self.model.with_delays(delay, self.model.output_delay)
+        best, rows = self._with_losses(most), self.judge.fit
+        if best is None or best.foretold().error(rows) > _FORETOLD * self.model.error(rows):
+            return []
+        return [self._backlog(best.without(len(best.applied) - 1), most)]
+
+    def _with_losses(self, most: int) -> Model | None:
+        """The best of the models that lose commands, from these delays and earlier ones; None if these lose hardly any."""
+        least, best, in_vain = np.inf, None, 0
+        for model in self._earlier():
             odds = self._backlog(model, most)
             if 1.0 - odds[1][0] < _LOST_SHARE:
                 break
             losing = self._losing(model, odds)
             error = losing.error(self.judge.judge)  # the odds of which did not look at their torque
             if error < least:
-                least, best, since = error, losing, 0
+                least, best, in_vain = error, losing, 0
             else:
-                since += 1
-            if since == _IN_VAIN or odds[1] @ np.arange(most + 1) < _EARLIER:
+                in_vain += 1
+            if in_vain == _IN_VAIN or odds[1] @ np.arange(most + 1) < _EARLIER:
                 break
-        if best is None or best.foretold().error(self.judge.fit) > _FORETOLD * self.model.error(
-            self.judge.fit
-        ):
-            return []
-        return [self._backlog(best.without(len(best.applied) - 1), most)]
+        return best
+
+    def _earlier(self) -> Iterator[Model]:
+        """The model, and with input delays ever shorter, until there are none or it was looked at often enough."""
+        step = _EARLIER * np.median(np.concatenate([np.diff(log.t_cmd) for log in self.samples.logs]))
+        for turn in range(_TURNS):
+            delay = np.maximum(self.model.input_delay - turn * step, 0.0)
+            yield self.model.with_delays(delay, self.model.output_delay)
+            if not delay.any():
+                return
 
     def _losing(self, model: Model, odds: tuple[Array, Array]) -> Model:
         """The model with commands lost by these odds, fitted."""

@@ -125,6 +125,7 @@ class Trial:
             onto.append(np.linalg.lstsq(some.T @ some + np.diag(share), some.T, rcond=None)[0])
             self.bare[:, j] = self._without(j, scene.residual[:, j : j + 1])[:, 0]
         self.some, self.onto = np.array(few), np.array(onto)
+        self.few_left = self.bare[self.few].T[..., None] * self.counted
 
     def _without(self, j: int, values: Array) -> Array:
         """What the other columns do not explain of `values` (N, K)."""
@@ -136,7 +137,7 @@ class Trial:
         """The joints where the feature fitted to some of the rows gains more than chance would."""
         columns = self.scene.columns(feature, self.few).transpose(2, 0, 1) * self.counted  # (J, n, K)
         own = columns - self.some @ (self.onto @ columns)
-        left, rows = self.bare[self.few].T[..., None] * self.counted, self.counted.sum(axis=(1, 2))
+        left, rows = self.few_left, self.counted.sum(axis=(1, 2))
         onto = own.swapaxes(1, 2) @ left
         gain = (onto.swapaxes(1, 2) @ _inverse(own, [feature.shape.penalty]) @ onto)[:, 0, 0] / rows
         chance = np.sum(left * left, axis=(1, 2)) * feature.shape.count / rows**2

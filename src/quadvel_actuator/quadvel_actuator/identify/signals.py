@@ -18,9 +18,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from . import reading
-from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
 from .log import Log
+from .log_signals import ALL, Joints, LogSignals, double
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -40,23 +39,14 @@ _CACHED = 2, 64
 _CACHED_VALUES = 400_000
 """as many as have about so many values in each of their signals together"""
 
-_KEPT_SLOPES = 4
-"""accelerations that a log keeps: two kinds at a few delays"""
-
 _OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 
 BETWEEN = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
 _OF_JOINTS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
 
-_ALMOST = 1e-9
-"""s: a command counts that is sent no later than this after an instant, which is a sum of rounded numbers"""
-
 _GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
 """Its multiples' fractions fill the unit interval evenly, in no period."""
-
-Joints = slice | list[int]
-ALL = slice(None)
 
 
 @attrs.frozen(eq=False)
@@ -119,115 +109,6 @@ def scattered(count: int, every: int) -> NDArray[np.intp]:
     return rows[rows < count]
 
 
-class _LogSignals:
-    """One log, ready to be read at any time."""
-
-    def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float, steady: float) -> None:
-        self.log, self.origin = log, origin
-        self.t, self.t_cmd = _double(log.t), _double(log.t_cmd)
-        self.states = {"q": _double(log.q), "dq": _double(log.dq)}
-        if steady > 0.0:
-            self.states = {k: lines(_double(log.t), values, steady)[0] for k, values in self.states.items()}
-        if log.temperature is not None:
-            self.states["temperature"] = _double(log.temperature)
-        if log.voltage is not None:
-            self.states["voltage"] = _double(log.voltage)[:, None]
-        shape = log.q_des.shape
-        zero = np.zeros(shape)
-        self.commands = {
-            "q_des": _double(log.q_des),
-            "dq_des": zero if log.dq_des is None else _double(log.dq_des),
-            "tau_ff": zero if log.tau_ff is None else _double(log.tau_ff),
-        }
-        self.gains = {
-            "kp": np.broadcast_to(
-                _double(log.kp) if kp is None and log.kp is not None else _or_one(kp), shape
-            ),
-            "kd": np.broadcast_to(
-                _double(log.kd) if kd is None and log.kd is not None else _or_one(kd), shape
-            ),
-        }
-        self.gains_known = kp is not None or log.kp is not None
-        spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
-        self.sums = {
-            name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
-            for name, values in self.commands.items()
-            if values.any()
-        }
-        self.all: dict[str, Array] = {**self.states, **self.commands, **self.gains}
-        self._slopes: dict[float, Array] = {}
-        self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
-
-    def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
-        """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
-        return reading.between(self.t, at)
-
-    def state(
-        self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
-    ) -> Array:
-        """A state signal, linear between rows; `found` is `between(at)` where that is known."""
-        values = self.states[name]
-        values = values if values.shape[1] == 1 else values[:, joints]
-        return reading.read(values, *(self.between(at) if found is None else found))
-
-    def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
-        """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
-        if name == "ddq":
-            return reading.read(self._slope_of_dq(name)[:, joints], *self.between(at))
-        key = (name, *delays.tolist())
-        if key not in self._smooth:
-            if len(self._smooth) >= _KEPT_SLOPES:
-                self._smooth.pop(next(iter(self._smooth)))
-            come = self._acting(self.t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, self.t, _double(self.log.dq), self._slope_of_dq(name), come)
-        smooth, answer = self._smooth[key]
-        jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
-        return reading.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
-
-    def _slope_of_dq(self, name: str) -> Array:
-        """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
-        width = HALF_WIDTHS[name]
-        if width not in self._slopes:
-            self._slopes[width] = slope(self.t, _double(self.log.dq), width)
-        return self._slopes[width]
-
-    def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
-        """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
-        found = np.zeros((len(at), len(delays)))
-        if "q_des" in self.sums:
-            for delay in np.unique(delays):
-                joints = delays == delay
-                values, sums = self.commands["q_des"][:, joints], self.sums["q_des"][:, joints]
-                found[:, joints] = read(values, sums, at - delay)
-        return found
-
-    def shifted(self, name: str, at: Array, late: Array) -> Array:
-        """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
-        return reading.read_late(self.states[name], self.t, at, late)
-
-    def in_force(self, at: Array) -> NDArray[np.intp]:
-        """The command row that counts at the times `at` (N,), s."""
-        return reading.rows_at(self.t_cmd, at + _ALMOST)
-
-    def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
-        """A command signal: the mean over `at` to `at + window`."""
-        values = self.commands[name][:, joints]
-        if name not in self.sums:
-            return np.zeros((len(at), values.shape[1]))
-        if window == 0.0:
-            return values[self.in_force(at)]
-        sums = self.sums[name][:, joints]
-        late, early = (self._integral(values, sums, end) for end in (at + window, at))
-        return (late - early) / window
-
-    def _integral(self, values: Array, sums: Array, at: Array) -> Array:
-        return reading.integral(values, sums, self.t_cmd, at)
-
-
-def _double(values: NDArray[np.floating]) -> Array:
-    return np.asarray(values, dtype=np.float64)
-
-
 def _one_row(values: Array) -> Array:
     """`values` (N, J), as a view of one row where all are the same: long logs have many such signals."""
     some = values[:: max(1, len(values) // 10)]  # these tell nearly always, and quickly
@@ -248,10 +129,6 @@ def _constant(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     }
 
 
-def _or_one(values: Array | None) -> Array:
-    return np.ones(1) if values is None else values
-
-
 class Samples:
     """The rows of all `logs`, one after the other: measured torque, who judges what, and the signals behind it.
 
@@ -269,15 +146,15 @@ class Samples:
         steady: float = 0.0,
     ) -> None:
         origins = [float(log.t[0]) for log in logs] if origins is None else origins
-        self.logs = [_LogSignals(log, kp, kd, at, steady) for log, at in zip(logs, origins, strict=True)]
+        self.logs = [LogSignals(log, kp, kd, at, steady) for log, at in zip(logs, origins, strict=True)]
         self.joints = logs[0].joints
         self.commanded = all(one.gains_known for one in self.logs)
         """are the gains that were commanded known?"""
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
-        self.t = np.concatenate([_double(log.t) for log in logs])
+        self.t = np.concatenate([double(log.t) for log in logs])
         self.period = float(np.median(np.concatenate([np.diff(log.t) for log in logs])))
-        self.tau = np.concatenate([_double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
+        self.tau = np.concatenate([double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
         starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
         self.start: Bools = np.concatenate(starts)
         self.dt = np.concatenate(steps)
