@@ -118,6 +118,34 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
     np.testing.assert_array_equal(*torques)
 
 
+def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
+    """Else it would stand for an offset of a joint that no neighbour moves."""
+    sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
+    law = registry()["cross_coupling"].configured({"source": sources}, NAMES[:4])
+    t, q, dq, q_des = _motion(300)
+    s = Samples([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
+    torque = law.torque(s.pull, s, {"a": np.zeros(4), "offset": np.ones(4)})
+    np.testing.assert_array_equal(torque, np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1)))
+    values = np.ones((2, 4))
+    np.testing.assert_array_equal(_on(law, values, 0, 1).values, [np.ones(4), [1, 0, 0, 0]])
+
+
+def test_a_coupling_that_is_of_no_angle_on_its_joints_is_the_same_in_a_file():
+    """Which names the sources of these joints alone."""
+    sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
+    law = registry()["cross_coupling"].configured({"source": sources}, NAMES[:4])
+    kept = _on(law, np.ones((2, 4)), 1, 2)
+    filed = registry()["cross_coupling"].configured({"source": sources[1:3]}, NAMES[:4])
+    assert kept.law.names == filed.names
+    assert _on(kept.law, kept.values, 0, 1, 2).law.names == law.names
+
+
+def _on(law, values, *joints):
+    """The law as it stays on these joints after a fit."""
+    active = np.isin(np.arange(4), joints)
+    return Applied(law, active, values, np.arange(4)).tidied()
+
+
 @pytest.mark.parametrize("at", ["drive", "joint"])
 @pytest.mark.parametrize("source", ["q", "tau"])
 @pytest.mark.parametrize("name", [name for name, law in registry().items() if law.stage == Stage.ADDED])

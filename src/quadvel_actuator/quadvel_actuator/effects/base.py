@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 Params = Mapping[str, Array]
 Errors = tuple[Array, Array]
 """q_des - q (rad) and dq_des - dq (rad/s), as the drive sees them"""
@@ -155,6 +156,10 @@ class EffectLaw(ABC):
         `torque` (N, J) is what the model without the effect gives, `residual` what is left of the measured torque,
         0 where it is not to be explained.
         """
+
+    def among(self, active: Bools) -> EffectLaw:
+        """The form that is left of it on these joints, (J,)."""
+        return self
 
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""

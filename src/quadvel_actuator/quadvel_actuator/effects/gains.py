@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import attrs
@@ -13,6 +13,7 @@ from .base import (
     JOINT,
     AddedLaw,
     Array,
+    Bools,
     EffectLaw,
     Memory,
     MemoryLaw,
@@ -241,8 +242,15 @@ class CrossCoupling(AddedLaw):
     @classmethod
     def _of(cls, source: tuple[str, ...], joints: Sequence[str], at: str) -> CrossCoupling:
         columns = tuple(cls._column(one, joints) for one in source)
-        kind = _PositionCoupling if any(signal == "q" for signal, _ in columns) else CrossCoupling
-        return kind(source, columns, at=at)
+        return cls._kind(columns)(source, columns, at=at)
+
+    @staticmethod
+    def _kind(columns: Iterable[tuple[str, int]]) -> type[CrossCoupling]:
+        return _PositionCoupling if any(signal == "q" for signal, _ in columns) else CrossCoupling
+
+    def among(self, active: Bools) -> CrossCoupling:
+        kind = self._kind(one for one, acts in zip(self.columns, active, strict=True) if acts)
+        return self if type(self) is kind else kind(self.source, self.columns, at=self.at)
 
     @staticmethod
     def _column(source: str, joints: Sequence[str]) -> tuple[str, int]:
@@ -269,13 +277,19 @@ class CrossCoupling(AddedLaw):
 
 @attrs.frozen(eq=False)
 class _PositionCoupling(CrossCoupling):
-    """The same with an offset: where a joint's angle is zero is a convention."""
+    """The same with an offset where it is of q: where a joint's angle is zero is a convention."""
 
     parameters = (*CrossCoupling.parameters, Parameter("offset", "N m", -300.0, 300.0, 0.1))
     linear = ("a", "offset")
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return super().torque(x, s, p) + p["offset"]
+        return super().torque(x, s, p) + self._own(p["offset"])
+
+    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+        return p | {"offset": self._own(p["offset"])}
+
+    def _own(self, offset: Any) -> Any:
+        return offset * np.array([signal == "q" for signal, _ in self.columns])
 
 
 LAWS = (GainAsymmetry, ThermalDrift, SupplySag, CrossCoupling)

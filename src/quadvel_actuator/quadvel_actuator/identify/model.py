@@ -53,9 +53,10 @@ class Applied:
         return attrs.evolve(self, law=law, values=np.array([known.get(name, none) for name in law.names]))
 
     def tidied(self) -> Applied:
-        """With parameters in their unique order."""
-        p = self.law.tidy(dict(zip(self.law.names, self.values, strict=True)))
-        return attrs.evolve(self, values=np.array([p[name] for name in self.law.names]))
+        """With the form of its law that its joints need, and parameters in their unique order."""
+        mine = self.formed(self.law.among(self.active))
+        p = mine.law.tidy(dict(zip(mine.law.names, mine.values, strict=True)))
+        return attrs.evolve(mine, values=np.array([p[name] for name in mine.law.names]))
 
 
 @attrs.frozen(eq=False)
