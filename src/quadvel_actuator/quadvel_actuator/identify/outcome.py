@@ -20,10 +20,11 @@ from .findings import Finding as LogFinding
 from .identification import Identification, Shape, Trace
 from .intervals import Intervals
 from .judging import Judge
-from .learned import Learned, beside
+from .learned import Learned
 from .model import Applied, Model
 from .residual import Remainder
 from .signals import Array
+from .stepped import stepped_delays
 
 SCHEMA = 1
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
@@ -32,9 +33,6 @@ _REMOVABLE = 0.05
 
 _ALIKE = 0.05  # ms
 _OVER = 1.1  # times the limit, that noise and a short peak may reach
-
-STEP = 0.001
-"""s, of the models that run with the parameters"""
 
 _SHOWN = 4000  # points of a series in a picture
 _SIGNAL_UNITS = {
@@ -279,9 +277,7 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
     learned = None if model is o.before else o.learned
     joints = model.samples.joints
     mse = _mse(model.samples.tau - (o.before.predict() if model is o.before else o.after), o.judge.fit)
-    pair = DelayPair(
-        _stepped_delay(model, learned, o.judge), round(float(np.median(model.output_delay)), 7), mse
-    )
+    pair = DelayPair(*stepped_delays(model, learned, o.judge.fit), mse)
     effects = []
     for one, half in zip(model.applied, o.widths.effects, strict=False):
         values: dict[str, Any] = {}
@@ -315,23 +311,6 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         effects=tuple(effects),
         **deviations,
     )
-
-
-def _stepped_delay(model: Model, learned: Learned | None, judge: Judge) -> float:
-    """The input delay (s) with which a model that runs in steps repeats this one.
-
-    Such a model gives means over its steps. One fitted to the instant itself needs half a step more, or whatever the
-    grid of the commands asks for.
-    """
-    delay = float(np.median(model.input_delay))
-    if model.window > 0.0:
-        return round(delay, 7)
-    alone, best = beside(model, learned), 0.5 * STEP
-    for reach in (0.25 * STEP, 0.125 * STEP, 0.0625 * STEP):
-        around = [best + k * reach for k in (-2, -1, 0, 1, 2) if best + k * reach >= 0.0]
-        meant = [attrs.evolve(alone, window=STEP, input_delay=model.input_delay + by) for by in around]
-        best = around[int(np.argmin([one.error(judge.fit) for one in meant]))]
-    return round(delay + best, 7)
 
 
 def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
