@@ -12,6 +12,7 @@ from quadvel_actuator.identify import backlog, candidates, ranking
 from quadvel_actuator.identify.candidates import About, judged, propose, simplified, started
 from quadvel_actuator.identify.company import Company, Said
 from quadvel_actuator.identify.delays import fit_with_delays
+from quadvel_actuator.identify.diagnosis import diagnose
 from quadvel_actuator.identify.features import Scene, library
 from quadvel_actuator.identify.few import Few
 from quadvel_actuator.identify.intervals import intervals
@@ -94,6 +95,20 @@ def test_a_coupling_takes_the_neighbour_that_shows_once_the_other_effects_are_kn
     bent = beside.plus(Applied(at_first, every, np.full((len(at_first.names), 3), 0.01), groups))
     found = company(looked).taken(looked, judged(looked, at_first, bent))
     assert found.applied[1].law.settings["source"] == right
+
+
+def test_an_effect_that_is_worth_nothing_once_all_is_fitted_is_not_reported(monkeypatch):
+    looked, seen = about(_log(FRICTION), 0.009, 0.003), []
+
+    def faded(company, model):
+        seen.extend(one.law.name for one in model.applied)
+        less = tuple(attrs.evolve(one, values=1e-6 * one.values) for one in model.applied)
+        return attrs.evolve(model, applied=less)
+
+    monkeypatch.setattr(Company, "deepened", faded)
+    found = diagnose(looked.model, looked.judge, looked.noise, lambda _: None, lambda *_: None, 1)
+    assert seen == ["coulomb_friction"]
+    assert found.findings == ()
 
 
 def test_a_feature_has_columns_for_every_joint_that_asks_for_them():

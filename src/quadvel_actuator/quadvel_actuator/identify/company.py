@@ -155,17 +155,24 @@ class Company:
 
     def pruned(self, model: Model, said: Sequence[Said]) -> tuple[Model, list[Said]]:
         """Without the effects that the later ones made needless, and fitted once more with the delays."""
-        said = list(said)
-        while model.applied:
-            losses = [self.loss(model, k) for k in range(len(model.applied))]
-            worst = int(np.argmin([loss.gain for loss, _ in losses]))
-            loss, less = losses[worst]
-            share = worth(loss.joint_gain, model.applied[worst].active, self._least(model))
-            if loss.p_any * len(registry()) < LEVEL and share > 1.0:
-                break
-            model = less
-            del said[worst]
+        model, said, _ = self.needed(model, said)
         return (fit_with_delays(model, self.judge.fit) if model.applied else model), said
+
+    def needed(self, model: Model, said: Sequence[Said]) -> tuple[Model, list[Said], list[Comparison]]:
+        """Without the effects that are not worth it beside the others, and what leaving out each of the rest costs."""
+        said = list(said)
+        while True:
+            losses = [self._loss(model, k) for k in range(len(model.applied))]
+            idle = [k for k, (loss, _) in enumerate(losses) if not self._pays(model, k, loss)]
+            if not idle:
+                return model, said, [loss for loss, _ in losses]
+            worst = min(idle, key=lambda k: losses[k][0].gain)
+            model = losses[worst][1]
+            del said[worst]
+
+    def _pays(self, model: Model, index: int, loss: Comparison) -> bool:
+        share = worth(loss.joint_gain, model.applied[index].active, self._least(model))
+        return bool(loss.p_any * len(registry()) < LEVEL and share > 1.0)
 
     def _least(self, model: Model) -> Array:
         """What an effect of this model has to be worth on a joint, N^2 m^2 (J,)."""
@@ -217,7 +224,7 @@ class Company:
     def _deepest(self, model: Model, rows: Bools, rounds: int) -> Model:
         return deepest(model, rows, rounds, self.cores)
 
-    def loss(self, model: Model, index: int) -> tuple[Comparison, Model]:
+    def _loss(self, model: Model, index: int) -> tuple[Comparison, Model]:
         """What leaving an effect out costs on held-out rows, and the model without it."""
         less = self._fitted(model.without(index), 5)
         return self._compared(less, model), less

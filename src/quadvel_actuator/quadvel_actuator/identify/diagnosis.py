@@ -118,7 +118,10 @@ def diagnose(
     model = pooled(company.narrowed(model), judge, noise)
     if model.applied:
         model = company.deepened(model)
-    losses = [company.loss(model, k)[0] for k in range(len(model.applied))]
+    there = len(model.applied)
+    model, said, losses = company.needed(model, said)
+    if 0 < len(model.applied) < there:
+        model = company.deepened(model)
     findings = tuple(
         Finding(one.law.name, loss.gain, loss.p_any, of_it.ties)
         for one, loss, of_it in zip(model.applied, losses, said, strict=True)
