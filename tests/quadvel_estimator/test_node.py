@@ -40,7 +40,7 @@ class Bench:
     """The node under test and a peer that feeds it, served by one executor."""
 
     def __init__(self, arguments: list[str], standing: State) -> None:
-        rclpy.init(args=["--ros-args", "-p", "realtime_priority:=0", *arguments])
+        rclpy.init(args=["--ros-args", *arguments])
         self._standing = standing
         self._executor = SingleThreadedExecutor()
         peer = rclpy.create_node("peer", use_global_arguments=False)

@@ -93,7 +93,7 @@ class EstimatorNode(Node):
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
         self.create_timer(1.0, self._report)
         if not self.get_parameter("use_sim_time").value:  # where time waits for the node there is no hurry
-            self._settings.apply(self.get_logger().debug)
+            self._settings.apply(self.get_logger().warning)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of an estimate
 
     def _on_command(self, message: Any) -> None:

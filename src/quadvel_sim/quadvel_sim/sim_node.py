@@ -61,8 +61,6 @@ class SimNode(Node):
         self.create_service(StepSim, "~/step", self._on_step)
         self.create_service(Push, "~/push", self._on_push)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if self._settings.mode == REALTIME:
-            self._settings.apply(self.get_logger().debug)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
         self._thread = Thread(target=self._simulate, name="simulation")
         self._thread.start()
@@ -84,6 +82,8 @@ class SimNode(Node):
 
     def _simulate(self) -> None:
         try:
+            if self._settings.mode == REALTIME:  # elsewhere nothing has to keep up with a clock
+                self._settings.apply(self.get_logger().warning)
             self._loop.run()
         except Exception as error:  # whatever it was, the node must not go on without its robot
             self._failure = f"{type(error).__name__}: {error}"
