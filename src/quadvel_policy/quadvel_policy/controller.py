@@ -40,7 +40,7 @@ from .observation import RATE_HZ
 from .pauses import Pauses
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import Array, StampCheck, linear_velocity, planar_velocity
-from .supervisor import MODES, STILL, Supervisor, SupervisorConfig, setting
+from .supervisor import MODES, Supervisor, SupervisorConfig, setting
 
 PERIOD = 1.0 / RATE_HZ
 STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
@@ -176,7 +176,7 @@ class Controller(Node):
         now -= self._robot_time.stalled
         velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age)
         command = _fresh(self._command, now, self._settings.command_timeout)
-        self._answer = self._supervisor.tick(now, state, velocity, STILL if command is None else command)
+        self._answer = self._supervisor.tick(now, state, velocity, command)
         self._publish()
 
     def _publish(self) -> None:
@@ -234,7 +234,8 @@ class Controller(Node):
             mode=MODES.index(supervisor.mode),
             mode_name=supervisor.mode,
             reason=supervisor.reason,
-            walk_allowed=supervisor.walk_allowed,
+            walk_allowed=not supervisor.walk_refusal,
+            walk_refusal=supervisor.walk_refusal,
             stance=bool(supervisor.command[3]),
             refused=self._refusals.total,
             **attrs.asdict(stats),
