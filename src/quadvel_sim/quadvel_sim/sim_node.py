@@ -22,7 +22,7 @@ from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import RobotView, fill_quaternion, fill_vector, transforms
@@ -45,6 +45,7 @@ class SimNode(Node):
         simulator = make_simulator(self._settings.config())
         simulator.reset(self._settings.keyframe)
         self._refusals = Refusals()
+        self._has_fallen = False
         self._refused_before = self._unanswered_before = 0
         self._given_up_before = 0.0
         self._to_system_time = time.time_ns() - time.monotonic_ns()
@@ -138,19 +139,34 @@ class SimNode(Node):
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         keyframe = request.keyframe or "lie"
-        return _answer(response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe)
+        return self._carry_out(
+            response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe
+        )
 
     def _on_pause(self, request: Any, response: Any) -> Any:
         done = "paused" if request.data else "running"
-        return _answer(response, done, self._loop.pause, request.data)
+        return self._carry_out(response, done, self._loop.pause, request.data)
 
     def _on_step(self, request: Any, response: Any) -> Any:
-        return _answer(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
+        return self._carry_out(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
 
     def _on_push(self, request: Any, response: Any) -> Any:
         force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))
         body = request.body or "trunk"
-        return _answer(response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration)
+        return self._carry_out(
+            response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration
+        )
+
+    def _carry_out(self, response: Any, done: str, order: Any, *arguments: Any) -> Any:
+        """Carry out an order, and tell the caller and the log how it went."""
+        try:
+            order(*arguments)
+            response.success, response.message = True, done
+            self.get_logger().info(done)
+        except ValueError as error:
+            response.success, response.message = False, str(error)
+            self.get_logger().warning(f"refused: {error}")
+        return response
 
     def _report(self) -> None:
         """Once a second: how the simulation does."""
@@ -170,6 +186,11 @@ class SimNode(Node):
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+        if level == DiagnosticStatus.WARN:
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+        if report.fallen and not self._has_fallen:
+            self.get_logger().warning("the robot has fallen; ~/reset puts it back")
+        self._has_fallen = report.fallen
 
     def _judge(self, report: LoopReport) -> tuple[bytes, str]:
         """Level and summary of the last second."""
@@ -187,16 +208,6 @@ class SimNode(Node):
         if self._loop.paused:
             return DiagnosticStatus.OK, "paused"
         return DiagnosticStatus.OK, "no command: the drives brake" if report.braking else "running"
-
-
-def _answer(response: Any, done: str, order: Any, *arguments: Any) -> Any:
-    """Carry out an order and tell how it went."""
-    try:
-        order(*arguments)
-        response.success, response.message = True, done
-    except ValueError as error:
-        response.success, response.message = False, str(error)
-    return response
 
 
 def main(args: list[str] | None = None) -> None:
