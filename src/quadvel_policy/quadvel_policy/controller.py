@@ -268,6 +268,7 @@ class Controller(Node):
         values = {
             "mode": self._supervisor.mode,
             "reason": self._supervisor.reason,
+            "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
             **{
                 name: f"{value:.4g}"
                 for name, value in attrs.asdict(self._stats.summary(time.perf_counter())).items()

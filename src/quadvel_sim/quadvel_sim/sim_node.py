@@ -176,6 +176,7 @@ class SimNode(Node):
         level, summary = self._judge(report)
         values = {
             "mode": self._settings.mode,
+            "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
             "realtime_factor": f"{report.realtime_factor:.3f}",
             "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
             "given_up_s": f"{report.given_up:.3f}",
