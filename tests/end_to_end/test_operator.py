@@ -137,7 +137,11 @@ def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> N
 def test_the_simulator_is_paused_and_stepped(up: Robot) -> None:
     assert quadvel("pause") == (0, "paused\n")
     assert quadvel("step", "20") == (0, "advances by 20 ms\n")
+    code, text = quadvel("drive", "--vx", "0.3")
+    assert code == 1
+    assert "is the simulator paused?" in text
     assert quadvel("pause", "--off") == (0, "running\n")
+    assert quadvel("drive", "--vx", "0.3", "--seconds", "2")[0] == 0  # the pause was no fault
     code, text = quadvel("step")
     assert code == 1
     assert "pause it first" in text
