@@ -30,6 +30,10 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+    ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
@@ -42,7 +46,7 @@ def demo_command(
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
-        nodes = Stack(use_sim_time=lockstep).commands()
+        nodes = Stack(use_sim_time=lockstep, actuator=actuator).commands()
         problem = ScriptedWalk(draft, "quick" if quick else "full", nodes, lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)

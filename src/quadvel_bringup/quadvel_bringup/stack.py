@@ -42,6 +42,7 @@ class Stack:
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
     policy: Path | None = None
     terrain: str | None = None
+    actuator: Path | None = None
     estimator: str | None = None
     use_sim_time: bool = False
 
@@ -59,7 +60,11 @@ class Stack:
             "controller": low_level.controller | _given(policy=policy),
             "command_mux": _given(),
         }
-        serving = {name: _given(terrain=self.terrain) for name in low_level.nodes}
+        actuator = None if self.actuator is None else str(self.actuator.resolve())
+        simulated = _given(terrain=self.terrain, actuator_file=actuator)
+        if simulated and not low_level.nodes:
+            raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
+        serving = dict.fromkeys(low_level.nodes, simulated)
         if self.use_sim_time:
             serving = {name: values | {"mode": "lockstep"} for name, values in serving.items()}
             followers = {name: values | {"use_sim_time": True} for name, values in followers.items()}
