@@ -239,13 +239,16 @@ def record(
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.
 
+    Exit code 1, and no file, where nothing came. Of a recorder that was killed all but the last second can be read.
+
     \b
     For example:
       quadvel record low_state low_cmd --out walk.mcap
     """
     from .record import record as run_record
 
-    run_record(out, topics or [], seconds)
+    if not run_record(out, topics or [], seconds):
+        raise typer.Exit(1)
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

@@ -15,8 +15,9 @@ import typer
 from rich.console import Console
 
 from quadvel_eval import demo_figures, demo_summary
+from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
-from quadvel_eval.report import output_folder, replacing, segment_table, write_figure, write_json
+from quadvel_eval.report import segment_table, write_figure, write_json
 
 from .doctor import GL_PACKAGES, gl_backend
 from .scripted_walk import ScriptedWalk

@@ -23,7 +23,7 @@ from quadvel_actuator.identify.excitation import EXCITATIONS, PERIOD, Excitation
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_eval.report import output_folder, replacing
+from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 
 from .alone import ensure_alone
@@ -180,9 +180,9 @@ def excite_command(
         raise ValueError(f"motion is {motion!r}, expected one of {', '.join(EXCITATIONS)}")
     excitation = EXCITATIONS[motion]() if seconds is None else EXCITATIONS[motion](seconds=seconds)
     path = out or Path("out/excite") / f"{motion}.mcap"
-    output_folder(path.parent)
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file with --out")
+    output_file(path)
     in_the_air = excitation.hung if hung is None else hung
     parameters: dict[str, Any] = {"hung": in_the_air, "seed": seed}
     if actuator is not None:
