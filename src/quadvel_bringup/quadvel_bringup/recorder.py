@@ -115,7 +115,7 @@ class Recorder:
     def _end_chunk(self) -> None:
         """Hand the chunk to the system, and have it brought to the disk beside us, as a disk may take its time."""
         self._chunk_began = time.monotonic()
-        self._writer.flush()
+        self._writer.flush()  # type: ignore[no-untyped-call]
         if self._synced is None or self._synced.done():
             self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
