@@ -24,7 +24,7 @@ class LowLevel:
 
 
 LOW_LEVELS = {
-    "sim": LowLevel(("sim_node",), {"auto_stand": True}),
+    "sim": LowLevel(("sim_node",), {"auto_stand": True, "robot_waits": True}),
     # Started by somebody else, and perhaps a real robot: it stands up and walks only on an operator's call.
     "external": LowLevel((), {"auto_stand": False, "require_operator": True}),
 }

@@ -27,7 +27,9 @@ class SimParameters(Scheduling):
     mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
     keyframe: str = _parameter("lie", "posture at the start: lie or stand")
     state_rate: int = _parameter(200, "rate of low_state, Hz: a divisor of 1000, 50 at least")
-    answer_timeout: float = _parameter(1.0, "lockstep: s after which a state without answer is sent again")
+    answer_timeout: float = _parameter(
+        1.0, "s that simulated time stands still for an answer; lockstep then sends the state again"
+    )
     publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to base_link")
     seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
     actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
