@@ -14,9 +14,6 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, Ro
 from quadvel_driver import wire
 from quadvel_driver.wire import BoardState, Button, Remote, WireError
 
-settings.register_profile("seeded", deadline=None, derandomize=True)
-settings.load_profile("seeded")
-
 # The formats, written down a second time: struct instead of NumPy, as the fact sheet gives them.
 MOTOR_COMMAND = "BffhhhIII"
 COMMAND = "<BHHIB" + 20 * MOTOR_COMMAND + "12B40sI"

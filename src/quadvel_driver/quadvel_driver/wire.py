@@ -95,8 +95,18 @@ _AXES = ("w", "x", "y", "z")
 _BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 
 
+LENGTH, CRC, CONTENT = "length", "CRC", "content"
+
+
 class WireError(ValueError):
-    """A packet that must not be used, or a record that can't be sent; the text says what was found and expected."""
+    """A packet that must not be used, or a record that can't be sent; the text says what was found and expected.
+
+    about: what is wrong: LENGTH, CRC or CONTENT.
+    """
+
+    def __init__(self, text: str, about: str = CONTENT) -> None:
+        super().__init__(text)
+        self.about = about
 
 
 class Button(IntFlag):
@@ -248,7 +258,7 @@ def _opened(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
     if len(data) != layout.itemsize:
         other = OTHER_FORMATS.get(len(data))
         found = f"{len(data)} bytes" + (f", {other}" if other else "")
-        raise WireError(f"{kind}: {found}, expected {layout.itemsize}")
+        raise WireError(f"{kind}: {found}, expected {layout.itemsize}", LENGTH)
     covered, end = _covered(layout), layout.itemsize - 4
     if any(data[covered:end]):
         raise WireError(
@@ -256,7 +266,7 @@ def _opened(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
         )
     found_crc, expected = int.from_bytes(data[end:], "little"), crc(data[:covered])
     if found_crc != expected:
-        raise WireError(f"{kind}: CRC is 0x{found_crc:08X}, expected 0x{expected:08X}")
+        raise WireError(f"{kind}: CRC is 0x{found_crc:08X}, expected 0x{expected:08X}", CRC)
     packet: np.void = np.frombuffer(data, layout)[0]
     return packet
 
