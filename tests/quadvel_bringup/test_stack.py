@@ -27,6 +27,7 @@ def console_scripts(setup_file: Path) -> list[str]:
 def declared_parameters() -> dict[str, dict[str, Any]]:
     """The defaults of all parameters, by node, as the nodes' own classes have them."""
     quadvel_dds.install()
+    from quadvel_driver.parameters import DriverParameters
     from quadvel_estimator.estimator import EstimatorParameters
     from quadvel_eval.scripted_planner import PlannerParameters
     from quadvel_policy.command_mux_node import MuxParameters
@@ -35,6 +36,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
 
     classes: dict[str, type[attrs.AttrsInstance]] = {
         "sim_node": SimParameters,
+        "driver": DriverParameters,
         "estimator": EstimatorParameters,
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
@@ -60,7 +62,7 @@ def test_every_node_of_the_stack_is_in_the_table() -> None:
 
 
 def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, estimator"):
+    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, driver, estimator"):
         nodes.command("simnode")
 
 

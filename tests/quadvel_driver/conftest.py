@@ -6,6 +6,7 @@ import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -67,6 +68,14 @@ class TestBoard:
             if condition(command):
                 return command
         raise AssertionError("no such command came")
+
+    def forget(self) -> None:
+        """Throw away what came and was not heard yet."""
+        self.socket.setblocking(False)
+        with suppress(BlockingIOError):
+            while True:
+                self.socket.recv(2048)
+        self.socket.settimeout(20.0)
 
     def send(self, data: bytes) -> None:
         """Send a datagram to whom a command came from last."""

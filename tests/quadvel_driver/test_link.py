@@ -100,6 +100,7 @@ def test_of_states_that_wait_the_newest_wins(board: TestBoard, connect: Connect)
     linked.wait_for(lambda: linked.states)
     linked.stop()
     before = link.report().counts
+    board.forget()
     again = connect()
     again.link._board_clock = link._board_clock
     again.link.brake()  # lets the board know it

@@ -75,6 +75,7 @@ class LinkReport:
     silence: float  # s since the last new state, inf before the first
     commanded: bool  # whether the board gets commands that came in, and not the link's own damping
     tick_unit: str  # in which the board counts: "ms", "us", or "" as long as it is not known
+    counter_rate: float | None  # counts a second, where they fit neither
     counts: dict[str, int]
     last_refusal: str  # why the last datagram was not used
     last_error: str  # what the network said last
@@ -83,19 +84,21 @@ class LinkReport:
 class UdpLink:
     """One board. `on_state` is called in the link's thread with each new state, its `time` (s) on `clock`, its `tick` in ms.
 
-    All other methods may be called from any thread. Raises LinkError where it can't bind.
+    All other methods may be called from any thread. endpoint: in place of a socket to the board. Raises LinkError where
+    there can be none.
     """
 
     def __init__(
         self,
         config: LinkConfig,
         on_state: Callable[[BoardState], None],
+        endpoint: socket.socket | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config = config
         self._on_state = on_state
         self._clock = clock
-        self._socket = _connected(config)
+        self._socket = endpoint or _connected(config)
         self._board_clock = BoardClock()
         self._lock = threading.Lock()  # around what follows
         self._damping = wire.encode_command(for_the_board(JointCommand.damping(config.damping_kd)))
@@ -168,6 +171,7 @@ class UdpLink:
                 silence=now - self._heard_at,
                 commanded=self._is_fresh() and not self._braked,
                 tick_unit="" if board.unit is None else {1e-3: "ms", 1e-6: "us"}[board.unit],
+                counter_rate=board.rate,
                 counts={name: counts[name] for name in COUNTED},
                 last_refusal=self._last_refusal,
                 last_error=self._last_error,
@@ -267,6 +271,8 @@ class UdpLink:
 
     def _check_age(self, tick: int) -> None:
         """Raises ValueError where a command answers a state that is to come, or one of long ago."""
+        if self._heard_at == -math.inf:  # it answers somebody else's, in a dry run beside a simulator
+            return
         age = (self._tick - tick + _WRAP // 2) % _WRAP - _WRAP // 2  # ms
         if age < 0:
             raise ValueError(f"it answers tick {tick}, which is to come: the newest is {self._tick}")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import gc
 import sys
-import time
 from collections.abc import Callable
 from threading import Thread
 from typing import Any
 
-from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
@@ -26,6 +24,7 @@ from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import RobotView, fill_quaternion, fill_vector, transforms
+from quadvel_nodes.system_time import SystemTime, as_time
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
 from quadvel_sim.parameters import SimParameters
@@ -33,7 +32,6 @@ from quadvel_sim.simulator import Simulator, Truth
 
 TRUTH_PERIOD = 5  # ms
 VIEW_PERIOD = 20  # ms, of what `RobotView` publishes
-STAMP_TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart before the stamps follow
 
 
 class SimNode(Node):
@@ -47,7 +45,7 @@ class SimNode(Node):
         self._refusals = Refusals()
         self._refused_before = self._unanswered_before = 0
         self._given_up_before = 0.0
-        self._to_system_time = time.time_ns() - time.monotonic_ns()
+        self._system_time = SystemTime()
         self._samples = 0
         self._failure = ""
         mode, period, timeout = self._settings.mode, self._settings.period, self._settings.answer_timeout
@@ -107,13 +105,11 @@ class SimNode(Node):
 
     def _stamp(self, instant: float) -> Any:
         """The instant of a sample as a message; in real time in the time of the system clock."""
-        nanoseconds = round(instant * 1e9)
-        if self._settings.mode == REALTIME:
-            shift = time.time_ns() - time.monotonic_ns()
-            if abs(shift - self._to_system_time) > STAMP_TOLERANCE:  # else stamps would inherit its jitter
-                self._to_system_time = shift
-            nanoseconds += self._to_system_time
-        return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+        return (
+            self._system_time.stamp(instant)
+            if self._settings.mode == REALTIME
+            else as_time(round(instant * 1e9))
+        )
 
     def _publish_truth(self, stamp: Any, truth: Truth, transform: bool) -> None:
         message = Odometry(child_frame_id=BASE)
