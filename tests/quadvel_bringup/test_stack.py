@@ -32,10 +32,11 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     from quadvel_eval.scripted_planner import PlannerParameters
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
-    from quadvel_sim.parameters import SimParameters
+    from quadvel_sim.parameters import BoardParameters, SimParameters
 
     classes: dict[str, type[attrs.AttrsInstance]] = {
         "sim_node": SimParameters,
+        "board": BoardParameters,
         "driver": DriverParameters,
         "estimator": EstimatorParameters,
         "controller": ControllerParameters,
@@ -62,7 +63,7 @@ def test_every_node_of_the_stack_is_in_the_table() -> None:
 
 
 def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, driver, estimator"):
+    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, board, driver, estimator"):
         nodes.command("simnode")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.loop import MODES, Publish, SimulationLoop
 from quadvel_sim.simulator import Simulator
@@ -114,3 +115,12 @@ class SimParameters(PlantParameters):
     def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
         """The loop that runs this robot, in the mode that was asked for."""
         return SimulationLoop(simulator, publish, self.mode, self.period, self.answer_timeout)
+
+
+@attrs.frozen(kw_only=True)
+class BoardParameters(PlantParameters, NetworkConfig):
+    """Those of `board`: where it listens, and how bad the network is."""
+
+    state_rate: int = _parameter(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
+    address: str = _parameter("127.0.0.1", "IP address on which the board listens")
+    port: int = _parameter(8007, "UDP port on which the board listens; 0: any that is free")
