@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_driver.board_clock import LOOK, BoardClock, Instant
+from quadvel_driver.board_clock import LOOK, WINDOW, BoardClock, Instant
 
 COUNTS = {1e-3: 1, 1e-6: 1000}  # a ms, by unit
 
@@ -22,7 +22,7 @@ def test_it_finds_out_whether_a_board_counts_milli_or_microseconds(unit: float) 
     clock = BoardClock()
     instants = stream(clock, 300, unit)
     assert clock.unit == unit
-    nothing = round(1e3 * LOOK)
+    nothing = round(1e3 * LOOK) + WINDOW
     assert instants[: nothing - 1] == (nothing - 1) * [None]
     times = np.array([instant.time for instant in instants[nothing + 1 :]])
     np.testing.assert_allclose(times, 50.0 + 1e-3 * np.arange(nothing + 1, 300), atol=1e-9)

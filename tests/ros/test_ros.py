@@ -24,7 +24,7 @@ CYCLONE = "rmw_cyclonedds_cpp"
 with_cyclone = pytest.mark.parametrize("ros", [CYCLONE], indirect=True)
 
 STACK = ("sim_node", "estimator", "controller", "command_mux")
-LAUNCH = ("ros2", "launch", "quadvel_bringup", "sim.launch.py")
+LAUNCH = ("ros2", "launch", "quadvel_bringup", "robot.launch.py")
 QUADVEL = ("quadvel_bringup", "quadvel")
 STATE = ("controller/state", "quadvel_msgs/msg/ControllerState", "mode_name")
 FORWARD = ("ground_truth/odom", "nav_msgs/msg/Odometry", "twist.twist.linear.x")

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -30,6 +30,18 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    low_level: Annotated[
+        Literal["sim", "board"],
+        typer.Option(
+            help="The robot: simulated, or simulated behind the AlienGo's UDP interface and its driver."
+        ),
+    ] = "sim",
+    loss: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With board: share of packets that are lost, each way.")
+    ] = 0.0,
+    jitter: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="With board: ms that a packet takes at most, each way.")
+    ] = 0.0,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
@@ -42,7 +54,7 @@ def demo_command(
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
-        nodes = Stack(use_sim_time=lockstep).commands()
+        nodes = _stack(low_level, loss, jitter, lockstep).commands()
         problem = ScriptedWalk(draft, "quick" if quick else "full", nodes, lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
@@ -61,6 +73,12 @@ def demo_command(
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
+
+
+def _stack(low_level: str, loss: float, jitter: float, lockstep: bool) -> Stack:
+    network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
+    given = {name: value for name, value in network.items() if value}
+    return Stack(low_level=low_level, use_sim_time=lockstep, network=given)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:

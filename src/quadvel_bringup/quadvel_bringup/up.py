@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 from rich.console import Console
@@ -21,7 +22,7 @@ class PrefixedOutput:
     def __init__(self, names: list[str]) -> None:
         self._console = Console(soft_wrap=True, highlight=False)
         self._width = max(map(len, names))
-        self._colours = dict(zip(names, COLOURS, strict=False))
+        self._colours = dict(zip(names, itertools.cycle(COLOURS), strict=False))
         self._lock = threading.Lock()
 
     def __call__(self, name: str, line: str) -> None:
@@ -37,7 +38,7 @@ def up(stack: Stack) -> int:
     are stopped, and its exit code is ours (1 if that was 0). Raises NotAlone where a robot is there already that
     nobody asked for.
     """
-    if stack.simulates:
+    if stack.brings_robot:
         look_for_others()
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])

@@ -43,6 +43,7 @@ class BoardClock:
         self._advanced = 0.0  # when the newest state arrived, s
         self._offsets: deque[float] = deque(maxlen=WINDOW)  # of arrivals from the board's time, s
         self._last = float("-inf")
+        self._states = 0  # since the unit was found or the board began anew
 
     def follow(self, counter: int, arrival: float) -> Instant | None:
         """The instant of the state with this counter; None where it is not newer than the last, or the unit is not known yet.
@@ -60,12 +61,16 @@ class BoardClock:
         self._advanced = arrival
         if self.unit is None:
             self._find_unit(arrival)
-        return None if self.unit is None else self._instant(self.unit, arrival)
+            return None
+        instant = self._instant(self.unit, arrival)
+        self._states += 1
+        return instant if self._states > WINDOW else None  # the first ones came later than is known yet
 
     def _begin(self, counter: int, arrival: float) -> None:
         """Follow from here."""
         self._count, self._first, self._advanced = counter, (counter, arrival), arrival
         self._offsets.clear()
+        self._states = 0
 
     def _not_newer(self, step: int, counter: int, arrival: float) -> None:
         if step == 0:

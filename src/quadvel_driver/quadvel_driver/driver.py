@@ -27,18 +27,18 @@ from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
-from quadvel_nodes.tick_grid import TickGrid
 
 from .dry_run import DryRun
 from .health import Health, figures
 from .link import SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
+from .thinning import Thinning
 from .wire import BoardState
 
 OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_teleop
 LOCK_EVERY = 5  # of these periods: a stop is said again, to whoever came later
-VIEW_PERIOD = 0.02  # s, of what `RobotView` publishes
+VIEW_RATE = 50  # Hz, of what `RobotView` publishes
 # Standard deviations of the IMU, rad, rad/s, m/s^2: of its class; those of the AlienGo's own are not known.
 ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION = 0.002, 0.01, 0.1
 
@@ -57,7 +57,7 @@ class Driver(Node):
         self._newest: BoardState | None = None
         self._refusals = Refusals()
         self._system_time = SystemTime()
-        self._grid, self._view_grid = TickGrid(1.0 / settings.state_rate), TickGrid(VIEW_PERIOD)
+        self._thinning, self._view_thinning = Thinning(settings.state_rate), Thinning(VIEW_RATE)
         self._operator_ticks = 0
         self._passive_wanted = False
         self._said = ""
@@ -110,11 +110,11 @@ class Driver(Node):
             return
         robot = state.robot
         stamp = self._system_time.stamp(robot.time)
-        if self._grid.periods(robot.time):
+        if self._thinning.passes(robot.tick):
             message = LowState(stamp=stamp)
             write_low_state(robot, message)
             self._low_state.publish(message)
-        if self._view_grid.periods(robot.time):
+        if self._view_thinning.passes(robot.tick):
             self._view.publish(stamp, robot)
 
     # In the executor's thread.
