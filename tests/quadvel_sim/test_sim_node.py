@@ -133,7 +133,9 @@ def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, pee
     simulation.interrupt()
     time.sleep(0.05)
     simulation.interrupt()
-    assert simulation.end() == (0, "")
+    status, text = simulation.end()
+    assert status == 0
+    assert all(line.startswith("[INFO]") for line in text.splitlines()), text
 
 
 def test_a_diverged_simulation_ends_the_node_with_one_sentence(

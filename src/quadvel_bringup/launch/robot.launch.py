@@ -21,7 +21,7 @@ ARGUMENTS = [
         "low_level", default_value="sim", choices=list(LOW_LEVELS), description="the robot"
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
-    DeclareLaunchArgument("terrain", default_value="flat", description="flat, slope or rough"),
+    DeclareLaunchArgument("terrain", default_value="", description="flat, slope or rough; empty: flat"),
     DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
     DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="show it"),
     DeclareLaunchArgument(
@@ -39,7 +39,7 @@ def start(context: LaunchContext) -> list[Action]:
     stack = Stack(
         low_level=chosen["low_level"],
         policy=Path(chosen["policy"]) if chosen["policy"] else None,
-        terrain=chosen["terrain"],
+        terrain=chosen["terrain"] or None,
         parameters=Path(chosen["params"]),
         use_sim_time=chosen["use_sim_time"] == "true",
     )

@@ -42,6 +42,10 @@ def demo_command(
     jitter: Annotated[
         float, typer.Option(min=0.0, max=100.0, help="With board: ms that a packet takes at most, each way.")
     ] = 0.0,
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+    ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
@@ -54,7 +58,7 @@ def demo_command(
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
-        nodes = _stack(low_level, loss, jitter, lockstep).commands()
+        nodes = _stack(low_level, loss, jitter, lockstep, actuator).commands()
         problem = ScriptedWalk(draft, "quick" if quick else "full", nodes, lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
@@ -75,10 +79,10 @@ def demo_command(
     raise typer.Exit(1 if problem or summary["falls"] else 0)
 
 
-def _stack(low_level: str, loss: float, jitter: float, lockstep: bool) -> Stack:
+def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:
     network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
     given = {name: value for name, value in network.items() if value}
-    return Stack(low_level=low_level, use_sim_time=lockstep, network=given)
+    return Stack(low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:

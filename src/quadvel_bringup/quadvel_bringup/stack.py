@@ -65,6 +65,7 @@ class Stack:
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
     policy: Path | None = None
     terrain: str | None = None
+    actuator: Path | None = None
     estimator: str | None = None
     use_sim_time: bool = attrs.field(default=False)
     network: Parameters = attrs.field(factory=dict)
@@ -97,11 +98,15 @@ class Stack:
             "controller": {**low_level.controller, **_given(policy=policy)},
             "command_mux": _given(),
         }
+        actuator = None if self.actuator is None else str(self.actuator.resolve())
+        simulated = _given(terrain=self.terrain, actuator_file=actuator)
+        if simulated and not low_level.simulation:
+            raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
         serving = dict(low_level.nodes)
         if low_level.simulation:
             mode = _given(mode="lockstep" if self.use_sim_time else None)
             own = serving[low_level.simulation]
-            serving[low_level.simulation] = {**own, **_given(terrain=self.terrain), **mode, **self.network}
+            serving[low_level.simulation] = {**own, **simulated, **mode, **self.network}
         if self.use_sim_time:
             followers = {name: {**values, "use_sim_time": True} for name, values in followers.items()}
         return serving | followers

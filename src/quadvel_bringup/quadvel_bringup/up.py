@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 import threading
 
 from rich.console import Console
@@ -14,10 +15,13 @@ from .processes import ProcessGroup, StopSignals
 from .stack import Stack
 
 COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
+LOGGED = re.compile(r"\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]+\]: (.*)")
+"""A line of a node's log: its level and what it says"""
+STYLES = {"WARN": "yellow", "ERROR": "bold red", "FATAL": "bold red"}
 
 
 class PrefixedOutput:
-    """Prints each line behind the name of the process that wrote it, a colour each."""
+    """Prints each line behind the name of the process that wrote it, a colour each; of a log what it says."""
 
     def __init__(self, names: list[str]) -> None:
         self._console = Console(soft_wrap=True, highlight=False)
@@ -27,8 +31,10 @@ class PrefixedOutput:
 
     def __call__(self, name: str, line: str) -> None:
         label = Text(f"{name:>{self._width}} | ", style=self._colours[name])
+        logged = LOGGED.fullmatch(line)
+        said = Text(logged[2], style=STYLES.get(logged[1], "")) if logged else Text.from_ansi(line)
         with self._lock:
-            self._console.print(label + Text.from_ansi(line))
+            self._console.print(label + said)
 
 
 def up(stack: Stack) -> int:
@@ -43,7 +49,7 @@ def up(stack: Stack) -> int:
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])
     with StopSignals() as signals, ProcessGroup(say) as group:
-        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them")
+        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
         for name, arguments in nodes.items():
             if not signals.received:
                 group.start(name, command(name, arguments))

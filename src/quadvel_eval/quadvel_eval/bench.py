@@ -151,7 +151,7 @@ class _TimedSupervisor(Supervisor):
         self.seconds: list[float] = []
 
     def tick(
-        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike
+        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
     ) -> JointCommand:
         """As the supervisor's, and between two ticks what the controller does there."""
         start = time.perf_counter()

@@ -28,19 +28,20 @@ from std_srvs.srv import SetBool
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_time import LONGEST, RobotTime
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
+from .announcements import Announcements
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
 from .pauses import Pauses
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import Array, StampCheck, linear_velocity, planar_velocity
-from .supervisor import MODES, STILL, Supervisor, SupervisorConfig, setting
+from .supervisor import MODES, Supervisor, SupervisorConfig, setting
 
 PERIOD = 1.0 / RATE_HZ
 STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
@@ -48,6 +49,9 @@ NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state 
 
 HELD_UP = 10
 """Simulated states that wait for a command, one after the other, where none comes any more"""
+
+PATIENCE = 5
+"""s without any state after which the log says that the controller waits for one"""
 
 Stamped = tuple[float, Array]
 """Time (s) and value"""
@@ -89,6 +93,8 @@ class Controller(Node):
             "velocity_estimate": StampCheck(self._settings.max_velocity_age),
             "command": StampCheck(self._settings.command_timeout),
         }
+        self._announcements = Announcements(self._supervisor)
+        self._reports = 0
         self._create_interfaces()
         if not self._sim_time:  # where time waits for the node there is no hurry
             self._settings.apply(self.get_logger().warning)
@@ -176,8 +182,9 @@ class Controller(Node):
         now -= self._robot_time.stalled
         velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age)
         command = _fresh(self._command, now, self._settings.command_timeout)
-        self._answer = self._supervisor.tick(now, state, velocity, STILL if command is None else command)
+        self._answer = self._supervisor.tick(now, state, velocity, command)
         self._publish()
+        self._tell()
 
     def _publish(self) -> None:
         self._message.stamp = self.get_clock().now().to_msg()
@@ -212,11 +219,21 @@ class Controller(Node):
 
     def _on_set_mode(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.request(request.mode)
+        if not response.success:
+            self.get_logger().warning(f"refused mode {request.mode}: {response.message}")
+        self._tell()
         return response
 
     def _on_enable_walking(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.enable_walking(request.data)
+        self.get_logger().info(f"the operator {'allows' if request.data else 'forbids'} walking")
+        self._tell()
         return response
+
+    def _tell(self) -> None:
+        log = self.get_logger()
+        for is_fault, sentence in self._announcements.now():
+            (log.error if is_fault else log.info)(sentence)
 
     def _watch(self) -> None:
         """50 times a second: the supervisor learns when states stop, and controller/state is published."""
@@ -234,7 +251,8 @@ class Controller(Node):
             mode=MODES.index(supervisor.mode),
             mode_name=supervisor.mode,
             reason=supervisor.reason,
-            walk_allowed=supervisor.walk_allowed,
+            walk_allowed=not supervisor.walk_refusal,
+            walk_refusal=supervisor.walk_refusal,
             stance=bool(supervisor.command[3]),
             refused=self._refusals.total,
             **attrs.asdict(stats),
@@ -250,6 +268,7 @@ class Controller(Node):
         values = {
             "mode": self._supervisor.mode,
             "reason": self._supervisor.reason,
+            "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
             **{
                 name: f"{value:.4g}"
                 for name, value in attrs.asdict(self._stats.summary(time.perf_counter())).items()
@@ -260,6 +279,21 @@ class Controller(Node):
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+        self._log(level, summary)
+
+    def _log(self, level: bytes, summary: str) -> None:
+        """Once a second: what keeps the robot from moving, and what an operator should look at, now and then."""
+        log = self.get_logger()
+        self._reports += 1
+        for sentence in self._announcements.waiting():
+            log.info(sentence)
+        if self._supervisor.obstacle:
+            log.error(self._supervisor.obstacle, throttle_duration_sec=QUIET)
+        elif self._state is None:
+            if self._reports == PATIENCE:
+                log.warning(f"no message on low_state in {PATIENCE} s: is a simulator or a driver running?")
+        elif level == DiagnosticStatus.WARN:
+            log.warning(summary, throttle_duration_sec=QUIET)
 
     def _rival(self) -> str | None:
         """A sentence where more than one robot reports: what the states say then fits neither."""

@@ -21,7 +21,7 @@ from tf2_msgs.msg import TFMessage
 from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.node import read_parameters
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
 from quadvel_nodes.system_time import SystemTime, as_time
@@ -52,6 +52,7 @@ class SimulationNode(Node, Generic[Settings]):
         self._system_time = SystemTime()
         self._samples = 0
         self._given_up_before = 0.0
+        self._has_fallen = False
         self._failure = ""
         self._loop = self._settings.loop(simulator, self._publish)
         self._thread = Thread(target=self._simulate, name="simulation")
@@ -133,19 +134,34 @@ class SimulationNode(Node, Generic[Settings]):
 
     def _on_reset(self, request: Any, response: Any) -> Any:
         keyframe = request.keyframe or "lie"
-        return _answer(response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe)
+        return self._carry_out(
+            response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe
+        )
 
     def _on_pause(self, request: Any, response: Any) -> Any:
         done = "paused" if request.data else "running"
-        return _answer(response, done, self._loop.pause, request.data)
+        return self._carry_out(response, done, self._loop.pause, request.data)
 
     def _on_step(self, request: Any, response: Any) -> Any:
-        return _answer(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
+        return self._carry_out(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
 
     def _on_push(self, request: Any, response: Any) -> Any:
         force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))
         body = request.body or "trunk"
-        return _answer(response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration)
+        return self._carry_out(
+            response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration
+        )
+
+    def _carry_out(self, response: Any, done: str, order: Any, *arguments: Any) -> Any:
+        """Carry out an order, and tell the caller and the log how it went."""
+        try:
+            order(*arguments)
+            response.success, response.message = True, done
+            self.get_logger().info(done)
+        except ValueError as error:
+            response.success, response.message = False, str(error)
+            self.get_logger().warning(f"refused: {error}")
+        return response
 
     def _report(self) -> None:
         """Once a second: how the simulation does."""
@@ -155,6 +171,7 @@ class SimulationNode(Node, Generic[Settings]):
         level, summary = self._judge(report)
         values = {
             "mode": self._loop.mode,
+            "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
             "realtime_factor": f"{report.realtime_factor:.3f}",
             "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
             "given_up_s": f"{report.given_up:.3f}",
@@ -165,6 +182,11 @@ class SimulationNode(Node, Generic[Settings]):
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+        if level == DiagnosticStatus.WARN:
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+        if report.fallen and not self._has_fallen:
+            self.get_logger().warning("the robot has fallen; ~/reset puts it back")
+        self._has_fallen = report.fallen
 
     def _judge(self, report: LoopReport) -> tuple[bytes, str]:
         """Level and summary of the last second."""
@@ -177,13 +199,3 @@ class SimulationNode(Node, Generic[Settings]):
         if self._loop.paused:
             return DiagnosticStatus.OK, "paused"
         return DiagnosticStatus.OK, "no command: the drives brake" if report.braking else "running"
-
-
-def _answer(response: Any, done: str, order: Any, *arguments: Any) -> Any:
-    """Carry out an order and tell how it went."""
-    try:
-        order(*arguments)
-        response.success, response.message = True, done
-    except ValueError as error:
-        response.success, response.message = False, str(error)
-    return response
