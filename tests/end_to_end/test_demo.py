@@ -6,11 +6,15 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 from mcap.reader import make_reader
 
+from quadvel_dds.recordings import read_messages
+
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
+VIEWED = ("/tf", "/tf_static", "/robot_description")
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +58,25 @@ def test_its_recording_holds_every_state_and_the_answer_to_it(out: Path) -> None
     assert counts["/low_cmd"] == pytest.approx(counts["/low_state"], rel=0.02)
     assert counts["/ground_truth/odom"] == pytest.approx(counts["/low_state"], rel=0.02)
     assert {schema.name for schema in summary.schemas.values()} >= {"quadvel_msgs/msg/LowState"}
+
+
+def test_its_recording_alone_shows_the_robot(out: Path) -> None:
+    """Foxglove and RViz need the description, and one tree of frames from odom to each of its links."""
+    if not (out / "demo.mcap").exists():
+        pytest.skip("the demo made no recording")
+    frames, descriptions = {}, []
+    for topic, _, message in read_messages(out / "demo.mcap", lambda topic, _: topic in VIEWED):
+        if topic == "/robot_description":
+            descriptions.append(message.data)
+            continue
+        for transform in message.transforms:
+            parent = frames.setdefault(transform.child_frame_id, transform.header.frame_id)
+            assert parent == transform.header.frame_id, transform.child_frame_id
+    links = [link.get("name") for link in ElementTree.fromstring(descriptions[0]).iter("link")]
+    assert links[0] == "base_link"
+    for name in [*links, "base_footprint"]:
+        while name != "odom":
+            name = frames[name]
 
 
 def test_a_demo_whose_folder_is_a_file_starts_nothing(tmp_path: Path) -> None:

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from quadvel_description import kinematics, mjcf, robot
-from quadvel_description.urdf import ROOT, urdf
+from quadvel_description.frames import BASE
+from quadvel_description.urdf import urdf
 
 INSTALLED = Path(__file__).parents[2] / "src" / "quadvel_description" / "urdf" / "aliengo.urdf"
 KEEP_FIXED_LINKS = '<mujoco><compiler fusestatic="false" discardvisual="false"/></mujoco>'
@@ -44,7 +45,7 @@ def test_urdf_and_mjcf_weigh_the_same(imported, simulated):
 
 def test_urdf_and_mjcf_have_the_same_centre_of_mass(imported, simulated):
     for _, first, second in _postures(imported, simulated, 20):
-        np.testing.assert_allclose(first.body(ROOT).subtree_com, second.body("trunk").subtree_com, atol=1e-9)
+        np.testing.assert_allclose(first.body(BASE).subtree_com, second.body("trunk").subtree_com, atol=1e-9)
 
 
 def test_urdf_and_mjcf_have_the_same_inertia_about_every_joint(imported, simulated):
@@ -97,9 +98,9 @@ def test_links_form_one_tree_below_a_root_without_inertia():
     children = [joint.find("child").get("link") for joint in tree.iter("joint")]
     parents = [joint.find("parent").get("link") for joint in tree.iter("joint")]
     assert len(set(links)) == len(links)
-    assert sorted([ROOT, *children]) == sorted(links)
+    assert sorted([BASE, *children]) == sorted(links)
     assert set(parents) <= set(links)
-    assert tree.find(f"link[@name='{ROOT}']/inertial") is None
+    assert tree.find(f"link[@name='{BASE}']/inertial") is None
 
 
 def test_the_installed_file_is_the_present_urdf():

@@ -40,7 +40,7 @@ class Bench:
     """The node under test and a peer that feeds it, served by one executor."""
 
     def __init__(self, arguments: list[str], standing: State) -> None:
-        rclpy.init(args=["--ros-args", "-p", "realtime_priority:=0", *arguments])
+        rclpy.init(args=["--ros-args", *arguments])
         self._standing = standing
         self._executor = SingleThreadedExecutor()
         peer = rclpy.create_node("peer", use_global_arguments=False)
@@ -100,7 +100,7 @@ def test_each_state_is_answered_with_the_network_s_velocity(
         bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
     answer = bench.heard["velocity_estimate"][4]
     assert answer.header.stamp == state.stamp
-    assert answer.header.frame_id == "trunk"
+    assert answer.header.frame_id == "base_link"
     velocity = answer.twist.twist.linear
     expected = 0.5 * (features.build(standing(0.0), np.full(12, 0.2)) @ weights + 4)
     np.testing.assert_allclose([velocity.x, velocity.y, velocity.z], expected, atol=1e-4)
@@ -128,8 +128,8 @@ def test_odometry_and_transform_agree_and_carry_the_imu_s_orientation(bench: Ben
         bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
     bench.wait(lambda: len(bench.heard["odom"]) == 2 and len(bench.heard["/tf"]) == 2)
     odom, transform = bench.heard["odom"][-1], bench.heard["/tf"][-1].transforms[0]
-    assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "trunk")
-    assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "trunk")
+    assert (odom.header.frame_id, odom.child_frame_id) == ("odom", "base_link")
+    assert (transform.header.frame_id, transform.child_frame_id) == ("odom", "base_link")
     assert odom.header.stamp == transform.header.stamp == bench.heard["velocity_estimate"][-1].header.stamp
     assert odom.pose.pose.orientation == transform.transform.rotation
     assert odom.pose.pose.orientation.z == pytest.approx(np.sin(0.2), abs=1e-6)

@@ -52,7 +52,7 @@ def odometry(time: float, velocity: np.ndarray, height: float) -> Any:
     )
     return TYPES["nav_msgs/msg/Odometry"](
         header=header(time),
-        child_frame_id="trunk",
+        child_frame_id="base_link",
         pose=with_covariance(pose, "PoseWithCovariance", "pose"),
         twist=with_covariance(twist(*velocity), "TwistWithCovariance", "twist"),
     )

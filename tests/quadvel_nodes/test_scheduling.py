@@ -11,37 +11,69 @@ import pytest
 from quadvel_nodes.scheduling import Scheduling
 
 APPLY = """
-import os, threading
+import os, threading, time
 from quadvel_nodes.scheduling import Scheduling
+
+def scheduled(thread):
+    policy = os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK
+    return policy, os.sched_getparam(thread).sched_priority, os.sched_getaffinity(thread)
+
 go = threading.Event()
-threading.Thread(target=go.wait).start()
+others = [threading.Thread(target=go.wait)]
+others[0].start()
 Scheduling(realtime_priority={priority}, cpus="{cpus}").apply(print)
-for thread in sorted(os.listdir("/proc/self/task")):
-    thread = int(thread)
-    print(os.sched_getscheduler(thread), os.sched_getparam(thread).sched_priority, os.sched_getaffinity(thread))
+others.append(threading.Thread(target=go.wait))
+others[1].start()
+for thread in (0, *(other.native_id for other in others)):
+    print(*scheduled(thread))
+until = time.monotonic() + {spin}
+while time.monotonic() < until:
+    time.sleep({pause})
+print(*scheduled(0))
 go.set()
 """
 
 
-def lines(priority: int, cpus: str = "") -> list[str]:
-    """What a process of its own says after `apply`, a line for each of its two threads at the end."""
-    code = APPLY.format(priority=priority, cpus=cpus)
+def lines(priority: int, cpus: str = "", spin: float = 0.0, pause: float = 0.0) -> list[str]:
+    """What a process of its own says after `apply`: of its main thread, of an older and a newer one, and in the end."""
+    code = APPLY.format(priority=priority, cpus=cpus, spin=spin, pause=pause)
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return result.stdout.splitlines()
 
 
-def test_every_thread_gets_the_priority_or_a_sentence_says_why_not() -> None:
-    *refusal, first, second = lines(7)
-    assert first == second
-    if refusal:
-        assert refusal[0].startswith("runs without real-time priority")
-    else:
-        assert first.startswith(f"{os.SCHED_FIFO} 7 ")
+def realtime_lines(priority: int, **options: float) -> list[str]:
+    """The same where the system allows real-time priority."""
+    found = lines(priority, **options)  # type: ignore[arg-type]
+    if found[0].startswith("runs without real-time priority"):
+        pytest.skip(found[0])
+    return found
+
+
+def test_the_thread_that_asks_gets_the_priority_and_no_other() -> None:
+    control, older, newer, _ = realtime_lines(7)
+    assert control.startswith(f"{os.SCHED_FIFO} 7 ")
+    assert older.startswith(f"{os.SCHED_OTHER} 0 ")
+    assert newer.startswith(f"{os.SCHED_OTHER} 0 ")
+
+
+def test_a_thread_that_spins_loses_its_priority_and_says_so() -> None:
+    *_, sentence, control = realtime_lines(7, spin=0.4)
+    assert sentence == "computed for 0.05 s without a pause: its real-time priority was taken back"
+    assert control.startswith(f"{os.SCHED_OTHER} 0 ")
+
+
+def test_a_thread_that_pauses_keeps_its_priority() -> None:
+    assert realtime_lines(7, spin=0.4, pause=0.001)[-1].startswith(f"{os.SCHED_FIFO} 7 ")
+
+
+def test_without_being_asked_nothing_has_a_priority() -> None:
+    assert Scheduling().realtime_priority == 0
+    assert all(line.startswith(f"{os.SCHED_OTHER} 0 ") for line in lines(0))
 
 
 def test_every_thread_stays_on_the_cores_that_were_chosen() -> None:
     core = max(os.sched_getaffinity(0))
-    assert lines(0, str(core)) == [f"{os.sched_getscheduler(0)} 0 {{{core}}}"] * 2
+    assert lines(0, str(core)) == [f"{os.sched_getscheduler(0)} 0 {{{core}}}"] * 4
 
 
 @pytest.mark.parametrize(

@@ -5,18 +5,15 @@ ros2 launch quadvel_bringup sim.launch.py terrain:=rough
 
 from pathlib import Path
 
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from launch import LaunchContext, LaunchDescription
 from launch.action import Action
-from launch.actions import DeclareLaunchArgument, EmitEvent, LogInfo, OpaqueFunction
+from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction
 from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
-from launch_ros.parameter_descriptions import ParameterValue
 
 from quadvel_bringup.nodes import NODES
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
-from quadvel_description.urdf import urdf
 
 ARGUMENTS = [
     DeclareLaunchArgument(
@@ -34,14 +31,6 @@ ARGUMENTS = [
     ),
 ]
 NAMES = [argument.name for argument in ARGUMENTS]
-
-
-def is_there(package: str) -> bool:
-    try:
-        get_package_prefix(package)
-    except PackageNotFoundError:
-        return False
-    return True
 
 
 def start(context: LaunchContext) -> list[Action]:
@@ -65,14 +54,6 @@ def start(context: LaunchContext) -> list[Action]:
         for name, overrides in stack.overrides().items()
     ]
     shared = {"use_sim_time": stack.use_sim_time}
-    if is_there("robot_state_publisher"):
-        description = ParameterValue(urdf(), value_type=str)
-        parameters = [{"robot_description": description, **shared}]
-        actions.append(
-            Node(package="robot_state_publisher", executable="robot_state_publisher", parameters=parameters)
-        )
-    else:
-        actions.append(LogInfo(msg="robot_state_publisher is not installed: no transforms of the links"))
     if chosen["rviz"] == "true":
         config = str(PARAMETERS.parent / "robot.rviz")
         actions.append(

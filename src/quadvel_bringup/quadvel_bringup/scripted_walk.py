@@ -29,7 +29,9 @@ RECORDED = {
     "/low_state": "quadvel_msgs/msg/LowState",
     "/odom": "nav_msgs/msg/Odometry",
     "/planner/step": "std_msgs/msg/String",
+    "/robot_description": "std_msgs/msg/String",
     "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
     "/velocity_estimate": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
 LOOK = 0.2  # s, between two looks whether all nodes still run

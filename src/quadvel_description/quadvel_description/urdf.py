@@ -1,4 +1,4 @@
-"""The AlienGo as a URDF for `robot_state_publisher` and RViz; `python -m quadvel_description.urdf` prints it.
+"""The AlienGo as a URDF for RViz, Foxglove and MoveIt; `python -m quadvel_description.urdf` prints it.
 
 Links, inertials and limits come from `robot`, shapes from the MJCF. Simulation uses the MJCF, not this.
 """
@@ -11,10 +11,8 @@ import mujoco
 import numpy as np
 
 from . import robot
+from .frames import BASE
 from .mjcf import Plant, load_model
-
-ROOT = "base"
-"""Link that carries the trunk: KDL, which robot_state_publisher uses, wants a root without inertia."""
 
 
 def _text(*values: float) -> str:
@@ -81,7 +79,7 @@ def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
     """What holds `link` to its parent: a joint of the joint table, or a fixed one."""
     name = f"{link.name}_joint" if link.axis else f"{link.name}_fixed"
     element = ElementTree.SubElement(parent, "joint", name=name, type="revolute" if link.axis else "fixed")
-    ElementTree.SubElement(element, "parent", link=link.parent or ROOT)
+    ElementTree.SubElement(element, "parent", link=link.parent or BASE)
     ElementTree.SubElement(element, "child", link=link.name)
     ElementTree.SubElement(element, "origin", xyz=_text(*link.origin), rpy="0 0 0")
     if link.axis:
@@ -101,10 +99,10 @@ def _add_joint(parent: ElementTree.Element, link: robot.Link) -> None:
 
 
 def urdf() -> str:
-    """The URDF as text: root link `base`, the trunk fixed to it, joints named as in `robot.JOINT_NAMES`."""
+    """The URDF as text: root link `base_link`, the trunk fixed to it, joints named as in `robot.JOINT_NAMES`."""
     model = load_model(Plant(plane=False))
     root = ElementTree.Element("robot", name="aliengo")
-    ElementTree.SubElement(root, "link", name=ROOT)
+    ElementTree.SubElement(root, "link", name=BASE)
     for link in robot.LINKS:
         _add_link(root, link, model)
         _add_joint(root, link)

@@ -13,19 +13,21 @@ from typing import Any
 import attrs
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import Point, TransformStamped, TwistWithCovarianceStamped, Vector3
+from geometry_msgs.msg import TwistWithCovarianceStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 from tf2_msgs.msg import TFMessage
 
+from quadvel_description.frames import BASE, ODOM, Placed, footprint
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_time import RobotTime
+from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
 from quadvel_nodes.scheduling import Scheduling
 
 from . import features
@@ -51,9 +53,11 @@ class EstimatorParameters(Scheduling):
     kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
     model: str = _parameter("", "file of the learned estimator's network, ONNX; empty: the shipped one")
     reset_gap: float = _parameter(0.1, "time without a state after which the estimator starts anew, s")
-    odom_frame: str = _parameter("odom", "frame of the odometry's pose")
-    body_frame: str = _parameter("trunk", "frame of the velocities, the odometry's child")
-    publish_tf: bool = _parameter(True, "whether to publish the transform from odom_frame to body_frame")
+    odom_frame: str = _parameter(ODOM, "frame of the odometry's pose")
+    body_frame: str = _parameter(BASE, "frame of the velocities, the odometry's child")
+    publish_tf: bool = _parameter(
+        True, "whether to publish the transforms of body_frame in odom_frame and of base_footprint"
+    )
 
     def __attrs_post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -89,7 +93,7 @@ class EstimatorNode(Node):
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
         self.create_timer(1.0, self._report)
         if not self.get_parameter("use_sim_time").value:  # where time waits for the node there is no hurry
-            self._settings.apply(self.get_logger().debug)
+            self._settings.apply(self.get_logger().warning)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of an estimate
 
     def _on_command(self, message: Any) -> None:
@@ -127,17 +131,16 @@ class EstimatorNode(Node):
         message = Odometry(child_frame_id=self._settings.body_frame)
         message.header.stamp = stamp
         message.header.frame_id = self._settings.odom_frame
-        message.pose.pose.position = _vector(Point, estimate.position)
-        orientation = message.pose.pose.orientation
-        orientation.w, orientation.x, orientation.y, orientation.z = (float(x) for x in state.quaternion)
+        fill_vector(message.pose.pose.position, estimate.position)
+        fill_quaternion(message.pose.pose.orientation, state.quaternion)
         message.pose.covariance = _covariance(np.diag(estimate.position_deviation**2), ORIENTATION_VARIANCE)
         _fill_twist(message.twist, state, estimate)
         self._odom.publish(message)
         if self._settings.publish_tf:
-            transform = TransformStamped(header=message.header, child_frame_id=message.child_frame_id)
-            transform.transform.translation = _vector(Vector3, estimate.position)
-            transform.transform.rotation = orientation
-            self._tf.publish(TFMessage(transforms=[transform]))
+            frames = self._settings
+            base = Placed(frames.odom_frame, frames.body_frame, estimate.position, state.quaternion)
+            floor = attrs.evolve(footprint(state.q, state.quaternion), parent=frames.body_frame)
+            self._tf.publish(TFMessage(transforms=transforms(stamp, [base, floor])))
 
     def _report(self) -> None:
         """Once a second: how the last second went."""
@@ -173,14 +176,9 @@ class _Report:
 
 def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
     """A TwistWithCovariance: the velocity estimated, the angular velocity measured."""
-    twist.twist.linear = _vector(Vector3, estimate.velocity)
-    twist.twist.angular = _vector(Vector3, state.angular_velocity)
+    fill_vector(twist.twist.linear, estimate.velocity)
+    fill_vector(twist.twist.angular, state.angular_velocity)
     twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
-
-
-def _vector(kind: Any, xyz: NDArray[np.float64]) -> Any:
-    x, y, z = xyz.tolist()
-    return kind(x=x, y=y, z=z)
 
 
 def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import os
+import resource
+import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -10,6 +13,12 @@ import attrs
 
 HIGHEST = 99
 THREADS = Path("/proc/self/task")
+LOOK = 0.05
+"""s, ten periods of the control loop: a thread that computes this long without a pause is not waiting for a robot"""
+BUSY = 0.9
+"""share of LOOK that a thread computed, from which on it counts as one that does not pause"""
+LAST_RESORT = 1_000_000
+"""us of computing without a pause after which the kernel ends the process: the watchdog could not run"""
 
 
 @attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
@@ -20,9 +29,9 @@ class Scheduling:
     """
 
     realtime_priority: int = attrs.field(
-        default=50,
+        default=0,
         metadata={
-            "description": "priority of the node's threads among real-time ones (SCHED_FIFO), 1 to 99; 0: none"
+            "description": "priority of the control thread among real-time ones (SCHED_FIFO), 1 to 99; 0: none"
         },
     )
     cpus: str = attrs.field(
@@ -41,14 +50,43 @@ class Scheduling:
             raise ValueError(f"cpus is {value!r}, expected some of {','.join(map(str, sorted(there)))}")
 
     def apply(self, say: Callable[[str], object]) -> None:
-        """To all threads of this process, and those that they start; where the system refuses, `say` why."""
-        threads = [int(thread.name) for thread in THREADS.iterdir()]
-        for thread in threads if self.cpus else ():
-            os.sched_setaffinity(thread, {int(word) for word in self.cpus.split(",")})
+        """The cores to all threads of this process, the priority to the thread that calls.
+
+        Threads that it starts do not inherit the priority. A watchdog takes it back from a thread that does not pause,
+        since a real-time thread that spins takes its core from everybody else. `say` is told of that, and of a system
+        that refuses the priority.
+        """
+        for thread in THREADS.iterdir() if self.cpus else ():
+            os.sched_setaffinity(int(thread.name), {int(word) for word in self.cpus.split(",")})
+        if not self.realtime_priority:
+            return
         try:
-            for thread in threads if self.realtime_priority else ():
-                os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(self.realtime_priority))
+            _become_realtime(self.realtime_priority)
         except PermissionError:
             say(
                 "runs without real-time priority: the limit rtprio of this user or container does not allow it"
             )
+            return
+        resource.setrlimit(resource.RLIMIT_RTTIME, (LAST_RESORT, LAST_RESORT))
+        watched = threading.get_native_id(), time.pthread_getcpuclockid(threading.get_ident())
+        above = min(self.realtime_priority + 1, HIGHEST)
+        threading.Thread(target=_watch, args=(*watched, above, say), name="watchdog", daemon=True).start()
+
+
+def _become_realtime(priority: int) -> None:
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+
+
+def _watch(thread: int, cpu_clock: int, priority: int, say: Callable[[str], object]) -> None:
+    """Take the real-time priority of a thread back once it computes without a pause. Runs before that thread."""
+    _become_realtime(priority)
+    try:
+        while True:
+            began, used = time.monotonic(), time.clock_gettime(cpu_clock)
+            time.sleep(LOOK)
+            if time.clock_gettime(cpu_clock) - used >= BUSY * (time.monotonic() - began):
+                os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+                say(f"computed for {LOOK:g} s without a pause: its real-time priority was taken back")
+                return
+    except OSError:  # the thread has ended
+        return

@@ -91,7 +91,7 @@ class Controller(Node):
         }
         self._create_interfaces()
         if not self._sim_time:  # where time waits for the node there is no hurry
-            self._settings.apply(self.get_logger().debug)
+            self._settings.apply(self.get_logger().warning)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a tick
 
     def _create_interfaces(self) -> None:

@@ -28,7 +28,7 @@ class SimParameters(Scheduling):
     keyframe: str = _parameter("lie", "posture at the start: lie or stand")
     state_rate: int = _parameter(200, "rate of low_state, Hz: a divisor of 1000, 50 at least")
     answer_timeout: float = _parameter(1.0, "lockstep: s after which a state without answer is sent again")
-    publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to trunk")
+    publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to base_link")
     seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
     actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
     terrain: str = _parameter(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")

@@ -9,33 +9,30 @@ from collections.abc import Callable
 from threading import Thread
 from typing import Any
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
-from numpy.typing import NDArray
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMessage
-from sensor_msgs.msg import Imu, JointState
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description import robot
+from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.robot_view import RobotView, fill_quaternion, fill_vector, transforms
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
 from quadvel_sim.parameters import SimParameters
 from quadvel_sim.simulator import Simulator, Truth
 
 TRUTH_PERIOD = 5  # ms
-VIEW_PERIOD = 20  # ms, of what is there for people's tools: imu, joint_states, tf
+VIEW_PERIOD = 20  # ms, of what `RobotView` publishes
 STAMP_TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart before the stamps follow
 
 
@@ -47,7 +44,6 @@ class SimNode(Node):
         self._settings = read_parameters(self, SimParameters)
         simulator = make_simulator(self._settings.config())
         simulator.reset(self._settings.keyframe)
-        self._noise = simulator.config.noise
         self._refusals = Refusals()
         self._refused_before = self._unanswered_before = 0
         self._given_up_before = 0.0
@@ -57,14 +53,14 @@ class SimNode(Node):
         mode, period, timeout = self._settings.mode, self._settings.period, self._settings.answer_timeout
         self._loop = SimulationLoop(simulator, self._publish, mode, period, timeout)
         self._create_publishers()
+        noise = simulator.config.noise
+        self._view = RobotView(self, noise.orientation, noise.angular_velocity, noise.linear_acceleration)
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 10)
         self.create_service(ResetSim, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
         self.create_service(StepSim, "~/step", self._on_step)
         self.create_service(Push, "~/push", self._on_push)
         self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        if self._settings.mode == REALTIME:
-            self._settings.apply(self.get_logger().debug)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
         self._thread = Thread(target=self._simulate, name="simulation")
         self._thread.start()
@@ -77,8 +73,6 @@ class SimNode(Node):
 
     def _create_publishers(self) -> None:
         self._low_state = self.create_publisher(LowState, "low_state", 10)
-        self._imu = self.create_publisher(Imu, "imu", 10)
-        self._joint_states = self.create_publisher(JointState, "joint_states", 10)
         self._truth = self.create_publisher(Odometry, "ground_truth/odom", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
         self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
@@ -88,6 +82,8 @@ class SimNode(Node):
 
     def _simulate(self) -> None:
         try:
+            if self._settings.mode == REALTIME:  # elsewhere nothing has to keep up with a clock
+                self._settings.apply(self.get_logger().warning)
             self._loop.run()
         except Exception as error:  # whatever it was, the node must not go on without its robot
             self._failure = f"{type(error).__name__}: {error}"
@@ -106,7 +102,7 @@ class SimNode(Node):
         if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
             self._publish_truth(stamp, self._loop.simulator.truth(), view and self._settings.publish_tf)
         if view:
-            self._publish_view(stamp, state)
+            self._view.publish(stamp, state)
         self._samples += 1
 
     def _stamp(self, instant: float) -> Any:
@@ -120,36 +116,17 @@ class SimNode(Node):
         return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
 
     def _publish_truth(self, stamp: Any, truth: Truth, transform: bool) -> None:
-        message = Odometry(child_frame_id="trunk")
+        message = Odometry(child_frame_id=BASE)
         message.header.stamp = stamp
-        message.header.frame_id = "odom"
-        _fill(message.pose.pose.position, truth.position)
-        _fill_quaternion(message.pose.pose.orientation, truth.quaternion)
-        _fill(message.twist.twist.linear, truth.linear_velocity)
-        _fill(message.twist.twist.angular, truth.angular_velocity)
+        message.header.frame_id = ODOM
+        fill_vector(message.pose.pose.position, truth.position)
+        fill_quaternion(message.pose.pose.orientation, truth.quaternion)
+        fill_vector(message.twist.twist.linear, truth.linear_velocity)
+        fill_vector(message.twist.twist.angular, truth.angular_velocity)
         self._truth.publish(message)
         if transform:
-            odom_to_trunk = TransformStamped(header=message.header, child_frame_id="trunk")
-            _fill(odom_to_trunk.transform.translation, truth.position)
-            _fill_quaternion(odom_to_trunk.transform.rotation, truth.quaternion)
-            self._tf.publish(TFMessage(transforms=[odom_to_trunk]))
-
-    def _publish_view(self, stamp: Any, state: RobotState) -> None:
-        joints = JointState(name=list(robot.JOINT_NAMES))
-        joints.header.stamp = stamp
-        joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
-        joints.effort = state.tau.tolist()
-        self._joint_states.publish(joints)
-        imu = Imu()
-        imu.header.stamp = stamp
-        imu.header.frame_id = "imu_link"
-        _fill_quaternion(imu.orientation, state.quaternion)
-        _fill(imu.angular_velocity, state.angular_velocity)
-        _fill(imu.linear_acceleration, state.linear_acceleration)
-        imu.orientation_covariance = _covariance(self._noise.orientation)
-        imu.angular_velocity_covariance = _covariance(self._noise.angular_velocity)
-        imu.linear_acceleration_covariance = _covariance(self._noise.linear_acceleration)
-        self._imu.publish(imu)
+            base = Placed(ODOM, BASE, truth.position, truth.quaternion)
+            self._tf.publish(TFMessage(transforms=transforms(stamp, [base])))
 
     # In the executor's thread.
 
@@ -220,18 +197,6 @@ def _answer(response: Any, done: str, order: Any, *arguments: Any) -> Any:
     except ValueError as error:
         response.success, response.message = False, str(error)
     return response
-
-
-def _fill(message: Any, vector: NDArray[np.float64]) -> None:
-    message.x, message.y, message.z = vector.tolist()
-
-
-def _fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
-    message.w, message.x, message.y, message.z = wxyz.tolist()
-
-
-def _covariance(deviation: float) -> NDArray[np.float64]:
-    return np.diag(np.full(3, deviation**2)).ravel()
 
 
 def main(args: list[str] | None = None) -> None:

@@ -1,0 +1,92 @@
+"""The robot on the standard topics, so that RViz, Foxglove and Nav2 see it without knowing quadvel. Needs rclpy.
+
+Joint angles and IMU as messages of sensor_msgs, the links' transforms, and the robot's description for whoever
+comes later. What serves `low_state`, a simulator or a driver, publishes this beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import TransformStamped
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
+from sensor_msgs.msg import Imu, JointState
+from std_msgs.msg import String
+from tf2_msgs.msg import TFMessage
+
+from quadvel_description import robot
+from quadvel_description.frames import IMU, Placed, fixed_links, moving_links
+from quadvel_description.state import RobotState
+from quadvel_description.urdf import urdf
+
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class RobotView:
+    """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, in the name of a node."""
+
+    def __init__(
+        self, node: Node, orientation: float, angular_velocity: float, linear_acceleration: float
+    ) -> None:
+        """The numbers are the IMU's standard deviations: rad about each axis, rad/s, m/s^2."""
+        self._joint_states = node.create_publisher(JointState, "joint_states", 10)
+        self._tf = node.create_publisher(TFMessage, "/tf", 100)
+        self._imu = node.create_publisher(Imu, "imu", 10)
+        self._noise = Imu()
+        self._noise.orientation_covariance = _covariance(orientation)
+        self._noise.angular_velocity_covariance = _covariance(angular_velocity)
+        self._noise.linear_acceleration_covariance = _covariance(linear_acceleration)
+        self._latched = [
+            node.create_publisher(TFMessage, "/tf_static", LATCHED),
+            node.create_publisher(String, "robot_description", LATCHED),
+        ]
+        stamp = node.get_clock().now().to_msg()
+        self._latched[0].publish(TFMessage(transforms=transforms(stamp, fixed_links())))
+        self._latched[1].publish(String(data=urdf()))
+
+    def publish(self, stamp: Any, state: RobotState) -> None:
+        """One sample; `stamp` (builtin_interfaces/Time) is the instant at which it held."""
+        joints = JointState(name=list(robot.JOINT_NAMES))
+        joints.header.stamp = stamp
+        joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
+        joints.effort = state.tau.tolist()
+        self._joint_states.publish(joints)
+        self._tf.publish(TFMessage(transforms=transforms(stamp, moving_links(state.q))))
+        imu = self._noise
+        imu.header.stamp = stamp
+        imu.header.frame_id = IMU
+        fill_quaternion(imu.orientation, state.quaternion)
+        fill_vector(imu.angular_velocity, state.angular_velocity)
+        fill_vector(imu.linear_acceleration, state.linear_acceleration)
+        self._imu.publish(imu)
+
+
+def transforms(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
+    """Frames as geometry_msgs/TransformStamped with this stamp."""
+    messages = []
+    for frame in placed:
+        message = TransformStamped(child_frame_id=frame.child)
+        message.header.stamp = stamp
+        message.header.frame_id = frame.parent
+        fill_vector(message.transform.translation, frame.position)
+        fill_quaternion(message.transform.rotation, frame.quaternion)
+        messages.append(message)
+    return messages
+
+
+def fill_vector(message: Any, vector: NDArray[np.float64]) -> None:
+    """Fill a geometry_msgs Vector3 or Point from (3,) numbers."""
+    message.x, message.y, message.z = vector.tolist()
+
+
+def fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
+    """Fill a geometry_msgs/Quaternion from (4,) numbers, w first."""
+    message.w, message.x, message.y, message.z = wxyz.tolist()
+
+
+def _covariance(deviation: float) -> NDArray[np.float64]:
+    return np.diag(np.full(3, deviation**2)).ravel()
