@@ -121,7 +121,14 @@ def build(name: str, folder: Path, release: str) -> None:
     structures = libraries / f"lib{name}__{STRUCTURES}.so"
     link(name, structures, objects[STRUCTURES], libraries, [STRUCTURES])
     for part in TYPE_SUPPORTS:
-        link(name, libraries / f"lib{name}__{part}.so", objects[part], libraries, [STRUCTURES, part], structures)
+        link(
+            name,
+            libraries / f"lib{name}__{part}.so",
+            objects[part],
+            libraries,
+            [STRUCTURES, part],
+            structures,
+        )
     extension = python / f"{name}_s__rosidl_typesupport_c.so"
     parts = [STRUCTURES, "rosidl_generator_py", "rosidl_typesupport_c"]
     link(name, extension, objects["rosidl_typesupport_c"] + objects["py"], libraries, parts, structures)
@@ -182,7 +189,14 @@ def link(
     libraries = [f"-l{package}__{part}" for package in used_packages(name) for part in parts]
     libraries += [f"-l{library}" for library in RUNTIME]
     libraries += [str(own)] if own else []
-    shared = ["g++", "-shared", f"-Wl,-soname,{target.name}", "-Wl,--allow-shlib-undefined", "-o", str(target)]
+    shared = [
+        "g++",
+        "-shared",
+        f"-Wl,-soname,{target.name}",
+        "-Wl,--allow-shlib-undefined",
+        "-o",
+        str(target),
+    ]
     # The wheels of ROS 2 start Python with lib/ among the places where libraries are looked for.
     run([*shared, *objects, f"-L{PREFIX / 'lib'}", f"-L{folder}", *libraries])
 
@@ -219,10 +233,16 @@ def run(command: list[str]) -> None:
 def pack(folder: Path, release: str, wheel: Path) -> None:
     """Write what lies in `folder` as the wheel of a release ("NAME-VERSION")."""
     info = f"{release}.dist-info"
-    files = {str(file.relative_to(folder)): file.read_bytes() for file in sorted(folder.rglob("*")) if file.is_file()}
+    files = {
+        str(file.relative_to(folder)): file.read_bytes()
+        for file in sorted(folder.rglob("*"))
+        if file.is_file()
+    }
     title, version = release.split("-")
     files[f"{info}/METADATA"] = f"Metadata-Version: 2.1\nName: {title}\nVersion: {version}\n".encode()
-    files[f"{info}/WHEEL"] = f"Wheel-Version: 1.0\nGenerator: quadvel\nRoot-Is-Purelib: false\nTag: {tag()}\n".encode()
+    files[f"{info}/WHEEL"] = (
+        f"Wheel-Version: 1.0\nGenerator: quadvel\nRoot-Is-Purelib: false\nTag: {tag()}\n".encode()
+    )
     lines = [f"{name},sha256={checksum(content)},{len(content)}" for name, content in files.items()]
     files[f"{info}/RECORD"] = "\n".join([*lines, f"{info}/RECORD,,", ""]).encode()
     with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:

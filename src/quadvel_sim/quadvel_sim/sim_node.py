@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import sys
 import time
 from collections.abc import Callable
 from threading import Thread
@@ -24,7 +23,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView, fill_quaternion, fill_vector, transforms
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport, SimulationLoop
@@ -155,7 +154,8 @@ class SimNode(Node):
     def _report(self) -> None:
         """Once a second: how the simulation does."""
         if self._failure:
-            sys.exit(f"sim_node: {self._failure}")
+            end(self, f"sim_node: {self._failure}")
+            return
         report = self._loop.report()
         level, summary = self._judge(report)
         values = {
