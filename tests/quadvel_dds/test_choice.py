@@ -63,7 +63,5 @@ def test_who_asks_for_the_embedded_one_gets_it_without_a_word(foreign: Path) -> 
 
 
 def test_the_doctor_says_that_an_rclpy_is_left_aside_and_why(foreign: Path) -> None:
-    program = (
-        "from quadvel_bringup import doctor\nprint(next(f.text for f in doctor.examine() if f.subject == 'ROS 2'))"
-    )
+    program = "from quadvel_bringup import doctor\nprint(next(f.text for f in doctor.examine() if f.subject == 'ROS 2'))"
     assert run(program, foreign).stdout.startswith("ROS 2's rclpy is here, but not quadvel_msgs")

@@ -18,7 +18,7 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from quadvel_dds.messages import STORE
+from quadvel_recordings.definitions import STORE
 
 ANY_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Hears every publisher, a reliable one too; of the fastest topic it holds seconds, for where other work keeps us from writing."""

@@ -1,9 +1,9 @@
 """Message and service classes that look and behave like those which ROS 2 generates for Python.
 
-Definitions come from `rosbags` (Jazzy), from `definitions` and from the files of `quadvel_msgs`; a class is
-made when it is first asked for. As in ROS 2, fields are not checked on assignment unless the environment
-variable ROS_PYTHON_CHECK_FIELDS is 1 (then a wrong type, range or length raises AssertionError). A value that
-cannot be sent raises ValueError when it is published, where ROS 2 would cut it off or read past its end.
+Definitions come from `quadvel_recordings`; a class is made when it is first asked for. As in ROS 2, fields are not
+checked on assignment unless the environment variable ROS_PYTHON_CHECK_FIELDS is 1 (then a wrong type, range or length
+raises AssertionError). A value that cannot be sent raises ValueError when it is published, where ROS 2 would cut it
+off or read past its end.
 """
 
 from __future__ import annotations
@@ -12,18 +12,14 @@ import array
 import os
 from collections.abc import Callable, Sequence, Set
 from functools import cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from quadvel_dds import cdr
-from quadvel_dds.definitions import SERVICES
+from quadvel_recordings.definitions import STORE
 
-HERE = Path(__file__).parent
-OWN_PACKAGE = "quadvel_msgs"
 # Default values, which the definitions carried by rosbags leave out.
 DEFAULTS = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
@@ -32,33 +28,6 @@ DEFAULTS = {
 CHECK_FIELDS = os.environ.get("ROS_PYTHON_CHECK_FIELDS") == "1"
 
 Describe = tuple[type, cdr.Fields]
-
-
-def _own_definitions() -> Path:
-    """In `interfaces` where pip installed us, beside us in the source tree, or where colcon installed them."""
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
-    folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
-    return next(folder for folder in folders if (folder / "msg").is_dir())
-
-
-def _load_store() -> Any:
-    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
-    store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
-    for file in sorted(own_files.glob("msg/*.msg")):
-        store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
-    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
-    for name, text in {**SERVICES, **own}.items():
-        package, _, short = name.split("/")
-        # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.
-        request, _, response = f"\n{text}\n".partition("\n---\n")
-        for part, definition in {"Request": request, "Response": response}.items():
-            (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
-            store.register({f"{name}_{part}": parsed})
-    return store
-
-
-STORE = _load_store()
 
 
 def is_interface_package(package: str) -> bool:
