@@ -40,7 +40,7 @@ test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile
 
 test-ros: $(ROS_VENV)/.test  ## run the tests of the nodes on ROS 2's own rclpy, and beside embedded nodes
-	$(ROS_PY) -m pytest -n 2 --dist loadfile -m "nodes or mixed"
+	$(ROS_PY) -m pytest -n 2 --dist loadfile @tests/on_rclpy.txt
 
 lint: $(VENV)/.lint  ## ruff and mypy
 	$(VENV)/bin/ruff check

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.nodes
-
 PROGRAM = """
 import sys, threading
 import quadvel_dds
