@@ -18,7 +18,7 @@ BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
 INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
 INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
-.PHONY: help setup ros demo close-the-loop paper test test-ros lint format bench lock clean
+.PHONY: help setup ros demo close-the-loop paper test ros-tests test-ros lint format bench lock clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -38,6 +38,8 @@ ros: $(ROS_VENV)/.run  ## create .venv-ros, where all runs on ROS 2's own rclpy,
 
 test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile
+
+ros-tests: $(ROS_VENV)/.test
 
 test-ros: $(ROS_VENV)/.test  ## run the tests of the nodes on ROS 2's own rclpy, and beside embedded nodes
 	$(ROS_PY) -m pytest -n 2 --dist loadfile @tests/on_rclpy.txt
