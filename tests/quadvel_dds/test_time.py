@@ -1,15 +1,12 @@
 """Time: timers, simulated time, points in time and spans."""
 
-import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 
 import pytest
 import rclpy
 from rclpy.clock import Clock, ClockType
 from rclpy.duration import Duration
-from rclpy.exceptions import ROSInterruptException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.time import Time
@@ -64,55 +61,6 @@ def test_simulated_time_comes_from_the_clock_topic(ros: Start, spin_until: SpinU
     assert spin_until(node, lambda: node.get_clock().now().nanoseconds == 42 * 10**9)
     node.set_parameters([Parameter("use_sim_time", value=False)])
     assert abs(node.get_clock().now().nanoseconds - time.time_ns()) < 10**10
-
-
-def test_sleep_lasts_until_the_clock_reaches_the_time_or_communication_ends(ros: Start) -> None:
-    ros("--ros-args", "-p", "use_sim_time:=true")
-    node, outcomes = Node("control", start_parameter_services=False), []
-    clock = node.get_clock()
-    drive_clock(node, 0.5)
-    target = Time(seconds=1.0, clock_type=ClockType.ROS_TIME)
-    first = threading.Thread(target=lambda: outcomes.append(clock.sleep_until(target)))
-    second = threading.Thread(target=lambda: outcomes.append(clock.sleep_for(Duration(seconds=100.0))))
-    first.start()
-    second.start()
-    drive_clock(node, 0.99)
-    first.join(timeout=0.05)
-    assert first.is_alive()
-    drive_clock(node, 1.0)
-    first.join(timeout=20.0)
-    assert outcomes == [True]
-    rclpy.shutdown()
-    second.join(timeout=20.0)
-    assert outcomes == [True, False]
-
-
-def test_rate_sleeps_to_its_deadlines_until_communication_ends(ros: Start) -> None:
-    ros("--ros-args", "-p", "use_sim_time:=true")
-    node, woken = Node("control", start_parameter_services=False), []
-    rate = node.create_rate(10.0)
-
-    def sleep_on() -> None:
-        with suppress(ROSInterruptException):
-            while True:
-                rate.sleep()
-                woken.append(node.get_clock().now().nanoseconds / 1e9)
-
-    thread = threading.Thread(target=sleep_on)
-    thread.start()
-    drive_clock(node, 0.09)
-    thread.join(timeout=0.05)
-    assert not woken
-    for tenths in range(1, 1000):
-        drive_clock(node, tenths / 10)
-        thread.join(timeout=0.01)
-        if len(woken) > 1:
-            break
-    rclpy.shutdown()
-    thread.join(timeout=20.0)
-    assert not thread.is_alive()
-    assert len(woken) > 1
-    assert woken[0] >= 0.1
 
 
 def test_times_and_durations_compute() -> None:

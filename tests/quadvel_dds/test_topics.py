@@ -7,7 +7,6 @@ from collections.abc import Callable
 import pytest
 import rclpy
 from geometry_msgs.msg import Twist
-from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Int32, String
@@ -81,15 +80,6 @@ def test_callback_may_take_the_message_information(ros: Start, spin_until: SpinU
     node.create_publisher(String, "chatter", 1).publish(String())
     assert spin_until(node, lambda: received)
     assert before <= received[0]["source_timestamp"] <= time.time_ns()
-
-
-def test_publisher_waits_until_reliable_readers_have_all(ros: Start) -> None:
-    ros()
-    node = Node("talker")
-    node.create_subscription(String, "chatter", lambda _: None, 10)
-    publisher = node.create_publisher(String, "chatter", 10)
-    publisher.publish(String(data="hello"))
-    assert publisher.wait_for_all_acked(Duration(seconds=10.0))
 
 
 def test_raw_bytes_pass_through(ros: Start, spin_until: SpinUntil) -> None:

@@ -1,4 +1,4 @@
-"""The error that says what the embedded middleware does not offer, and small helpers that raise it."""
+"""The error that says what the embedded middleware does not offer, and what raises it."""
 
 from __future__ import annotations
 
@@ -20,13 +20,17 @@ class UnsupportedModuleError(UnsupportedError, ImportError):
     """A module of rclpy that is not offered; an ImportError, for those who look whether it is there."""
 
 
-def unsupported(what: str) -> Callable[..., NoReturn]:
-    """A function that raises UnsupportedError however it is called."""
+class UnsupportedMemberError(UnsupportedError, AttributeError):
+    """A method or property that is not offered; an AttributeError, for those who look whether it is there."""
 
-    def refuse(*args: Any, **kwargs: Any) -> NoReturn:
-        raise UnsupportedError(what)
 
-    return refuse
+class Partial:
+    """Base of what has a part of the members of rclpy's class: any other public one raises UnsupportedError."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        raise UnsupportedMemberError(f"{type(self).__name__}.{name}")
 
 
 def refuse_options(where: str, **options: Any) -> None:

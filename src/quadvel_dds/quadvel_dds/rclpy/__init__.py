@@ -11,15 +11,14 @@ from typing import Any
 if __name__ != "rclpy":
     raise ImportError("import this package as 'rclpy', after quadvel_dds.install()")
 
-from quadvel_dds.errors import module_getattr
+from quadvel_dds.errors import module_getattr, refuse_options
 
-from . import signals, utilities
-from .context import Context
+from . import signals
+from .context import Context, get_default_context
 from .executors import Executor, SingleThreadedExecutor
 from .node import Node
 from .parameter import Parameter
 from .task import Future
-from .utilities import get_default_context, get_rmw_implementation_identifier, ok
 
 __all__ = [
     "Context",
@@ -39,7 +38,6 @@ __all__ = [
     "try_shutdown",
 ]
 __getattr__ = module_getattr(__name__, Path(__file__).parent)
-_global_executor: Executor | None = None
 
 
 def init(
@@ -50,55 +48,37 @@ def init(
     signal_handler_options: signals.SignalHandlerOptions | None = None,
 ) -> None:
     """Start communication: read the arguments (sys.argv if None), take over SIGINT and SIGTERM."""
-    default = get_default_context()
-    context = context or default
-    if signal_handler_options is None:
-        options = signals.SignalHandlerOptions
-        signal_handler_options = options.ALL if context is default else options.NO
-    context.init(args, domain_id=domain_id)
-    signals.install_signal_handlers(signal_handler_options)
+    refuse_options("rclpy.init", context=context)
+    get_default_context().init(args, domain_id=domain_id)
+    options = signals.SignalHandlerOptions.ALL if signal_handler_options is None else signal_handler_options
+    signals.install_signal_handlers(options)
 
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
     """Stop communication. Raises RuntimeError if it does not run."""
-    is_default = context is None or context is get_default_context()
-    utilities.shutdown(context=context)
-    if uninstall_handlers or (uninstall_handlers is None and is_default):
+    refuse_options("rclpy.shutdown", context=context)
+    get_default_context(shutting_down=True).shutdown()
+    if uninstall_handlers is None or uninstall_handlers:
         signals.uninstall_signal_handlers()
 
 
 def try_shutdown(*, context: Context | None = None) -> None:
     """Stop communication if it runs."""
-    utilities.try_shutdown(context=context)
+    refuse_options("rclpy.try_shutdown", context=context)
+    get_default_context(shutting_down=True).try_shutdown()
 
 
-def create_node(
-    node_name: str,
-    *,
-    context: Context | None = None,
-    cli_args: list[str] | None = None,
-    namespace: str | None = None,
-    use_global_arguments: bool = True,
-    enable_rosout: bool = True,
-    start_parameter_services: bool = True,
-    parameter_overrides: list[Parameter] | None = None,
-    allow_undeclared_parameters: bool = False,
-    automatically_declare_parameters_from_overrides: bool = False,
-    enable_logger_service: bool = False,
-) -> Node:
-    return Node(
-        node_name,
-        context=context,
-        cli_args=cli_args,
-        namespace=namespace,
-        use_global_arguments=use_global_arguments,
-        enable_rosout=enable_rosout,
-        start_parameter_services=start_parameter_services,
-        parameter_overrides=parameter_overrides,
-        allow_undeclared_parameters=allow_undeclared_parameters,
-        automatically_declare_parameters_from_overrides=automatically_declare_parameters_from_overrides,
-        enable_logger_service=enable_logger_service,
-    )
+def ok(*, context: Context | None = None) -> bool:
+    refuse_options("rclpy.ok", context=context)
+    return get_default_context().ok()
+
+
+def get_rmw_implementation_identifier() -> str:
+    return "quadvel_dds"
+
+
+create_node = Node
+_global_executor: Executor | None = None
 
 
 def get_global_executor() -> Executor:

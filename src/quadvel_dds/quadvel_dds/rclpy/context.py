@@ -11,17 +11,16 @@ from threading import Lock, RLock
 from typing import Any
 
 from quadvel_dds import arguments, wire
+from quadvel_dds.errors import Partial
 
 from ._graph import GraphAnnouncer
 
 _contexts: weakref.WeakSet[Context] = weakref.WeakSet()
+_default_context: Context | None = None
+_default_lock = Lock()
 
 
-def live_contexts() -> list[Context]:
-    return [context for context in list(_contexts) if context.ok()]
-
-
-class Context:
+class Context(Partial):
     def __init__(self) -> None:
         self._lock = RLock()
         self._running = self._initialized = False
@@ -99,11 +98,6 @@ class Context:
                 return
         callback()
 
-    def _forget_shutdown_callback(self, callback: Callable[[], None]) -> None:
-        with self._lock:
-            if callback in self._shutdown_callbacks:
-                self._shutdown_callbacks.remove(callback)
-
     def _wake(self) -> None:
         for executor in list(self._wakers):
             executor.wake()
@@ -118,12 +112,21 @@ class Context:
         if participant is not None:
             participant.close()
 
-    def __enter__(self) -> Context:
-        self.init()
-        return self
 
-    def __exit__(self, *exception: Any) -> None:
-        self.try_shutdown()
+def get_default_context(*, shutting_down: bool = False) -> Context:
+    """The context of this process; a new one after it was shut down."""
+    global _default_context
+    with _default_lock:
+        if _default_context is None:
+            _default_context = Context()
+        context = _default_context
+        if shutting_down:
+            _default_context = None
+        return context
+
+
+def live_contexts() -> list[Context]:
+    return [context for context in list(_contexts) if context.ok()]
 
 
 @atexit.register

@@ -7,13 +7,13 @@ from typing import Any
 
 from builtin_interfaces.msg import Duration as DurationMessage
 
-from quadvel_dds.errors import unsupported
+from quadvel_dds.errors import Partial
 
 S_TO_NS = 10**9
 
 
 @total_ordering
-class Duration:
+class Duration(Partial):
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0) -> None:
         total = int(seconds * S_TO_NS) + int(nanoseconds)
         if not -(2**63) <= total < 2**63:
@@ -27,18 +27,11 @@ class Duration:
     def __repr__(self) -> str:
         return f"Duration(nanoseconds={self.nanoseconds})"
 
-    def __str__(self) -> str:
-        return f"{self.nanoseconds} nanoseconds"
-
     def __eq__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self.nanoseconds == other.nanoseconds
-        return NotImplemented
+        return self.nanoseconds == other.nanoseconds if isinstance(other, Duration) else NotImplemented
 
     def __lt__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self.nanoseconds < other.nanoseconds
-        return NotImplemented
+        return self.nanoseconds < other.nanoseconds if isinstance(other, Duration) else NotImplemented
 
     def __hash__(self) -> int:
         return hash(self.nanoseconds)
@@ -50,5 +43,3 @@ class Duration:
     @classmethod
     def from_msg(cls, msg: Any) -> Duration:
         return cls(seconds=msg.sec, nanoseconds=msg.nanosec)
-
-    get_c_duration = unsupported("Duration.get_c_duration")

@@ -1,8 +1,12 @@
-"""The exceptions of rclpy."""
+"""The exceptions of rclpy that are raised here."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
+
+from quadvel_dds.errors import module_getattr
+
+__getattr__ = module_getattr(__name__)
 
 
 class InvalidHandle(RuntimeError):
@@ -14,80 +18,56 @@ class NotInitializedException(Exception):
         super().__init__("rclpy.init() has not been called." + (f" msg: {message}" if message else ""))
 
 
-class NoTypeSupportImportedException(Exception):
-    def __init__(self) -> None:
-        super().__init__("no type_support imported")
-
-
 class NameValidationException(Exception):
-    def __init__(self, name_type: str, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__(f"Invalid {name_type}: {error_msg}:\n  '{name}'\n   {' ' * invalid_index}^")
+    KIND: ClassVar[str]
+
+    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
+        super().__init__(f"Invalid {self.KIND}: {error_msg}:\n  '{name}'\n   {' ' * invalid_index}^")
 
 
 class InvalidNamespaceException(NameValidationException):
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("namespace", name, error_msg, invalid_index)
+    KIND = "namespace"
 
 
 class InvalidNodeNameException(NameValidationException):
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("node name", name, error_msg, invalid_index)
+    KIND = "node name"
 
 
 class InvalidTopicNameException(NameValidationException):
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("topic name", name, error_msg, invalid_index)
+    KIND = "topic name"
 
 
 class InvalidServiceNameException(NameValidationException):
-    def __init__(self, name: str, error_msg: str, invalid_index: int) -> None:
-        super().__init__("service name", name, error_msg, invalid_index)
+    KIND = "service name"
 
 
 class ParameterException(Exception):
-    def __init__(self, error_msg: str, parameters: str | list[str]) -> None:
-        super().__init__(f"{error_msg}: {parameters}")
+    TEXT: ClassVar[str]
+
+    def __init__(self, parameter: str) -> None:
+        super().__init__(f"{self.TEXT}: {parameter}")
 
 
 class ParameterNotDeclaredException(ParameterException):
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__("Invalid access to undeclared parameter(s)", parameters)
+    TEXT = "Invalid access to undeclared parameter(s)"
 
 
 class ParameterAlreadyDeclaredException(ParameterException):
-    def __init__(self, parameters: str | list[str]) -> None:
-        super().__init__("Parameter(s) already declared", parameters)
+    TEXT = "Parameter(s) already declared"
+
+
+class ParameterUninitializedException(ParameterException):
+    TEXT = "The parameter is not initialized"
 
 
 class InvalidParameterException(ParameterException):
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__("Invalid parameter name", parameter_name)
+    TEXT = "Invalid parameter name"
 
 
 class InvalidParameterTypeException(ParameterException):
     def __init__(self, desired_parameter: Any, expected_type: Any) -> None:
-        super().__init__(
+        self.TEXT = (  # type: ignore[misc]
             f"Trying to set parameter '{desired_parameter.name}' to '{desired_parameter.value}' of type "
-            f"'{desired_parameter.type_.name}', expecting type '{expected_type.name}'",
-            desired_parameter.name,
+            f"'{desired_parameter.type_.name}', expecting type '{expected_type.name}'"
         )
-
-
-class InvalidParameterValueException(ParameterException):
-    def __init__(self, parameter: str, value: Any, reason: str) -> None:
-        super().__init__(f"Invalid parameter value ({value}) for parameter. Reason: {reason}", parameter)
-
-
-class ParameterImmutableException(ParameterException):
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__("Attempted to modify read-only parameter", parameter_name)
-
-
-class ParameterUninitializedException(ParameterException):
-    def __init__(self, parameter_name: str) -> None:
-        super().__init__(f"The parameter '{parameter_name}' is not initialized", parameter_name)
-
-
-class ROSInterruptException(Exception):
-    def __init__(self) -> None:
-        super().__init__("rclpy.shutdown() has been called")
+        super().__init__(desired_parameter.name)

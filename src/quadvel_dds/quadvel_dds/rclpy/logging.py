@@ -1,12 +1,14 @@
-"""Loggers of ROS 2."""
+"""Loggers of ROS 2: lines on stderr, and messages on /rosout."""
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
-from quadvel_dds.errors import module_getattr
-
-from .impl.rcutils_logger import RcutilsLogger, levels
+from quadvel_dds.errors import Partial, module_getattr
 
 __getattr__ = module_getattr(__name__)
 
@@ -18,6 +20,90 @@ class LoggingSeverity(IntEnum):
     WARN = 30
     ERROR = 40
     FATAL = 50
+
+
+levels: dict[str, int] = {"": LoggingSeverity.INFO}  # by logger name; "" is the default
+sinks: dict[str, Callable[[int, str, str, int, Any], None]] = {}
+"""Who else is told, by logger name: (level, name, message, time in ns, frame of the caller)."""
+
+
+class RcutilsLogger(Partial):
+    """Logger with names in a hierarchy ("node.part").
+
+    Every method takes, as keyword options, `once`, `skip_first` and `throttle_duration_sec`; they count for
+    each place in the program that calls.
+    """
+
+    def __init__(self, name: str = "") -> None:
+        self.name = name
+        self._places: dict[tuple[str, int], float] = {}
+
+    def get_child(self, name: str) -> RcutilsLogger:
+        if not name:
+            raise ValueError("Child logger name must not be empty.")
+        return RcutilsLogger(f"{self.name}.{name}" if self.name else name)
+
+    def set_level(self, level: int) -> None:
+        levels[self.name] = int(level)
+
+    def get_effective_level(self) -> int:
+        name = self.name
+        while name and not levels.get(name):
+            name = name.rpartition(".")[0]
+        return int(levels[name])
+
+    def is_enabled_for(self, severity: int) -> bool:
+        return severity >= self.get_effective_level()
+
+    def debug(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.DEBUG, **kwargs)
+
+    def info(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.INFO, **kwargs)
+
+    def warning(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.WARN, **kwargs)
+
+    def warn(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.WARN, **kwargs)
+
+    def error(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.ERROR, **kwargs)
+
+    def fatal(self, message: str, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity.FATAL, **kwargs)
+
+    def log(self, message: str, severity: int, **kwargs: Any) -> bool:
+        return self._log(message, LoggingSeverity(severity), **kwargs)
+
+    def _log(
+        self,
+        message: str,
+        severity: LoggingSeverity,
+        *,
+        once: bool = False,
+        skip_first: bool = False,
+        throttle_duration_sec: float = 0.0,
+    ) -> bool:
+        if not self.is_enabled_for(severity):
+            return False
+        frame = sys._getframe(2)
+        place = (frame.f_code.co_filename, frame.f_lineno)
+        now = time.monotonic()
+        last = self._places.get(place)
+        if last is None and skip_first:
+            self._places[place] = float("-inf")
+            return False
+        if last is not None and now - last < (float("inf") if once else throttle_duration_sec):
+            return False
+        if once or throttle_duration_sec:
+            self._places[place] = now
+        stamp = time.time_ns()
+        seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
+        print(f"[{severity.name}] [{seconds}] [{self.name}]: {message}", file=sys.stderr, flush=True)
+        if sink := sinks.get(self.name.partition(".")[0]) or sinks.get(self.name):
+            sink(severity, self.name, str(message), stamp, frame)
+        return True
 
 
 def get_logger(name: str) -> RcutilsLogger:

@@ -6,15 +6,12 @@ from collections.abc import Callable
 from typing import Any
 
 from quadvel_dds import messages, wire
-from quadvel_dds.errors import unsupported
+from quadvel_dds.errors import Partial
 
-from .duration import Duration
 from .exceptions import InvalidHandle
 
-FOREVER = Duration(nanoseconds=-(10**9))
 
-
-class Publisher:
+class Publisher(Partial):
     def __init__(
         self,
         publisher_impl: wire.Writer,
@@ -43,27 +40,18 @@ class Publisher:
         if isinstance(msg, self.msg_type):
             self._writer.write(messages.serialize(msg))
         elif isinstance(msg, bytes):
-            self._writer.write(bytearray(msg))
+            self._writer.write(msg)
         else:
             raise TypeError(f"Expected {self.msg_type}, got {type(msg)}")
 
     def get_subscription_count(self) -> int:
-        return self._writer.matched() if self._writer else 0
+        return self._writer.count() if self._writer else 0
 
     @property
     def topic_name(self) -> str:
         return self.topic
 
-    def wait_for_all_acked(self, timeout: Duration = FOREVER) -> bool:
-        """Wait until all matched reliable readers have all messages (for ever if the timeout is negative)."""
-        if self._writer is None:
-            raise InvalidHandle(f"the publisher of '{self.topic}' was destroyed")
-        return self._writer.wait_for_acks(timeout.nanoseconds if timeout.nanoseconds >= 0 else 2**63 - 1)
-
     def destroy(self) -> None:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-
-    assert_liveliness = unsupported("Publisher.assert_liveliness")
-    handle = property(unsupported("Publisher.handle"))

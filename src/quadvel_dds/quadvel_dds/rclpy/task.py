@@ -7,12 +7,12 @@ from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
-from quadvel_dds.errors import UnsupportedError
+from quadvel_dds.errors import Partial, UnsupportedError, refuse_options
 
 
-class Future:
+class Future(Partial):
     def __init__(self, *, executor: Any = None) -> None:
-        self._executor = executor
+        refuse_options("Future", executor=executor)
         self._done = self._cancelled = False
         self._result: Any = None
         self._exception: BaseException | None = None
@@ -20,13 +20,13 @@ class Future:
         self._lock = Lock()
 
     def done(self) -> bool:
-        return self._done or self._cancelled
+        return self._done
 
     def cancelled(self) -> bool:
         return self._cancelled
 
     def cancel(self) -> None:
-        if not self.done():
+        if not self._done:
             self._finish(cancelled=True)
 
     def result(self) -> Any:
@@ -45,43 +45,36 @@ class Future:
         self._finish(exception=exception)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
-        """Call `callback(future)` once the future is done; in the executor, if the future has one."""
+        """Call `callback(future)` once the future is done."""
         with self._lock:
-            if not self.done():
+            if not self._done:
                 self._callbacks.append(callback)
                 return
-        self._schedule(callback)
+        callback(self)
 
     def _finish(
         self, result: Any = None, exception: BaseException | None = None, cancelled: bool = False
     ) -> None:
         with self._lock:
             self._result, self._exception = result, exception
-            self._done, self._cancelled = not cancelled, cancelled
+            self._done, self._cancelled = True, cancelled
             callbacks, self._callbacks = self._callbacks, []
         for callback in callbacks:
-            self._schedule(callback)
-
-    def _schedule(self, callback: Callable[[Future], None]) -> None:
-        if self._executor is not None:
-            self._executor.create_task(callback, self)
-        else:
             callback(self)
 
 
 class Task(Future):
     """A callback that runs in an executor; its return value is the result."""
 
-    def __init__(
-        self, handler: Callable[..., Any], args: Any = None, kwargs: Any = None, executor: Any = None
-    ) -> None:
+    def __init__(self, handler: Callable[..., Any], args: Any = (), kwargs: Any = None) -> None:
         if inspect.iscoroutine(handler) or inspect.iscoroutinefunction(handler):
             raise UnsupportedError("a coroutine as a callback")
-        super().__init__(executor=executor)
-        self._handler, self._args, self._kwargs = handler, args or (), kwargs or {}
+        super().__init__()
+        self._call = lambda: handler(*args, **(kwargs or {}))
 
     def __call__(self) -> None:
         try:
-            self.set_result(self._handler(*self._args, **self._kwargs))
+            self.set_result(self._call())
         except Exception as error:
             self.set_exception(error)
+            raise

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from enum import IntEnum
 from functools import total_ordering
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 
-from .clock_type import ClockType
 from .duration import S_TO_NS, Duration
+
+
+class ClockType(IntEnum):
+    UNINITIALIZED = 0
+    ROS_TIME = 1
+    SYSTEM_TIME = 2
+    STEADY_TIME = 3
 
 
 @total_ordering
@@ -18,11 +25,9 @@ class Time:
     ) -> None:
         if not isinstance(clock_type, ClockType):
             raise TypeError("Clock type must be a ClockType enum")
-        if seconds < 0:
-            raise ValueError("Seconds value must not be negative")
-        if nanoseconds < 0:
-            raise ValueError("Nanoseconds value must not be negative")
         total = int(seconds * S_TO_NS) + int(nanoseconds)
+        if seconds < 0 or nanoseconds < 0:
+            raise ValueError("Seconds and nanoseconds values must not be negative")
         if total >= 2**63:
             raise OverflowError("Total nanoseconds value is too large to store in C time point.")
         self._nanoseconds = total
@@ -51,30 +56,25 @@ class Time:
 
     def __sub__(self, other: object) -> Any:
         if isinstance(other, Time):
-            self._check_same_clock(other, "subtract times")
-            return Duration(nanoseconds=self.nanoseconds - other.nanoseconds)
+            return Duration(nanoseconds=self.nanoseconds - self._on_same_clock(other))
         if isinstance(other, Duration):
             return Time(nanoseconds=self.nanoseconds - other.nanoseconds, clock_type=self.clock_type)
         return NotImplemented
 
     def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Time):
-            return NotImplemented
-        self._check_same_clock(other, "compare times")
-        return self.nanoseconds == other.nanoseconds
+        return self.nanoseconds == self._on_same_clock(other) if isinstance(other, Time) else NotImplemented
 
     def __lt__(self, other: object) -> bool:
-        if not isinstance(other, Time):
-            return NotImplemented
-        self._check_same_clock(other, "compare times")
-        return self.nanoseconds < other.nanoseconds
+        return self.nanoseconds < self._on_same_clock(other) if isinstance(other, Time) else NotImplemented
 
     def __hash__(self) -> int:
         return hash((self.nanoseconds, self.clock_type))
 
-    def _check_same_clock(self, other: Time, what: str) -> None:
+    def _on_same_clock(self, other: Time) -> int:
+        """Nanoseconds of the other. Raises TypeError if it is of another clock."""
         if self.clock_type != other.clock_type:
-            raise TypeError(f"Can't {what} with different clock types")
+            raise TypeError("Can't subtract or compare times with different clock types")
+        return other.nanoseconds
 
     def to_msg(self) -> Any:
         seconds, nanoseconds = self.seconds_nanoseconds()
