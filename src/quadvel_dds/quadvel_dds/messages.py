@@ -8,7 +8,7 @@ off or read past its end.
 from __future__ import annotations
 
 import array
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable
 from functools import cache
 from typing import Any, ClassVar
 
@@ -49,15 +49,10 @@ def names_in(package: str, kind: str) -> list[str]:
 
 
 class Message:
-    """Base of all message classes: comparison, text form, and what those of ROS 2 tell about themselves."""
+    """Base of all message classes: comparison and text form."""
 
     __slots__: ClassVar[tuple[str, ...]] = ()
     TYPENAME: ClassVar[str]
-    _fields_and_field_types: ClassVar[dict[str, str]]
-
-    @classmethod
-    def get_fields_and_field_types(cls) -> dict[str, str]:
-        return dict(cls._fields_and_field_types)
 
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
@@ -105,7 +100,6 @@ def message_class(typename: str) -> type[Message]:
         "__module__": f"{package}.{kind}",
         "__doc__": f"Message {typename}.",
         "TYPENAME": typename,
-        "_fields_and_field_types": {field: type_text(description) for field, description in fields},
     }
     for constant, base, value in constants:
         namespace[constant] = bytes([value]) if base == "byte" else value
@@ -171,21 +165,12 @@ def dds_name(typename: str) -> str:
 
 
 def type_text(description: Description) -> str:
-    """Type of a field as `get_fields_and_field_types` of ROS 2 writes it."""
+    """Type of a field as a definition has it."""
     kind, detail = description
-    if kind == Nodetype.NAME:
-        package, _, name = detail.split("/")
-        return f"{package}/{name}"
-    if kind == Nodetype.BASE:
-        name, bound = detail
-        renamed = {
-            "bool": "boolean", "byte": "octet", "char": "uint8", "float32": "float", "float64": "double",
-        }  # fmt: skip
-        return f"string<{bound}>" if bound else renamed.get(name, name)
-    inner, count = type_text(detail[0]), detail[1]
-    if kind == Nodetype.ARRAY:
-        return f"{inner}[{count}]"
-    return f"sequence<{inner}, {count}>" if count else f"sequence<{inner}>"
+    if kind in (Nodetype.NAME, Nodetype.BASE):
+        return detail if kind == Nodetype.NAME else detail[0]
+    limit = detail[1] if kind == Nodetype.ARRAY else f"<={detail[1]}" if detail[1] else ""
+    return f"{type_text(detail[0])}[{limit}]"
 
 
 def _accessor(slot: Any, convert: Callable[[Any], Any] | None) -> Any:
@@ -202,7 +187,11 @@ def _converter(description: Description) -> Callable[[Any], Any] | None:
     if kind == Nodetype.NAME:
         return None
     if kind == Nodetype.BASE:
-        return (lambda value: Octet(value) if isinstance(value, bytes) else value) if detail[0] == "byte" else None
+        return (
+            (lambda value: Octet(value) if isinstance(value, bytes) else value)
+            if detail[0] == "byte"
+            else None
+        )
     item = detail[0]
     if item[0] == Nodetype.NAME or item[1][0] == "string":
         return None
@@ -276,39 +265,15 @@ def _make_init(typename: str, fields: Any) -> Callable[..., None]:
 
 
 def fault(message: Message) -> str | None:
-    """The first field, nested ones included, whose value does not fit, in a sentence; None if all do."""
+    """The first field, nested ones included, that cannot be sent, in a sentence; None if all can."""
     for field, description in STORE.fielddefs[message.TYPENAME][1]:
         value = getattr(message, f"_{field}")
-        expected = _mismatch(description, value)
-        if expected:
-            return f"field '{field}' must be {expected}, found {value!r}"
-        inner = value if isinstance(value, list) else [value]
-        if sentence := next(filter(None, (fault(item) for item in inner if isinstance(item, Message))), None):
-            return sentence
+        if isinstance(value, Message) and (inner := fault(value)):
+            return inner
+        alone = type(message)()
+        setattr(alone, f"_{field}", value)
+        try:
+            STORE.serialize_cdr(alone, message.TYPENAME)
+        except Exception as error:
+            return f"field '{field}' must be of type {type_text(description)}, found {value!r}: {error}"
     return None
-
-
-def _mismatch(description: Description, value: Any) -> str | None:
-    """What a value should be, if it does not fit the type of its field."""
-    kind, detail = description
-    if kind == Nodetype.NAME:
-        return None if isinstance(value, message_class(detail)) else f"a message of type {detail}"
-    if kind == Nodetype.BASE:
-        return None if _fits(detail[0], value) else f"of type {detail[0]}"
-    item, count = detail
-    is_list = isinstance(value, (Sequence, Set, np.ndarray, array.array)) and not isinstance(value, str)
-    limit = f"at most {count}" if kind == Nodetype.SEQUENCE else str(count)
-    if is_list and (not count or (len(value) <= count if kind == Nodetype.SEQUENCE else len(value) == count)):
-        if isinstance(value, (np.ndarray, array.array)) or all(_mismatch(item, v) is None for v in value):
-            return None
-    return f"{limit if count else 'any number of'} values of type {type_text(item)}"
-
-
-def _fits(base: str, value: Any) -> bool:
-    if base in ("bool", "string", "byte"):
-        kind = {"bool": bool, "string": str, "byte": bytes}[base]
-        return isinstance(value, kind) and (base != "byte" or len(value) == 1)
-    if base in ("float32", "float64"):
-        return isinstance(value, (int, float))
-    limits = np.iinfo(FORMATS[base])
-    return isinstance(value, int) and limits.min <= value <= limits.max

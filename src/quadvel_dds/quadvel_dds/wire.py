@@ -163,7 +163,9 @@ class Reader:
             samples = self.dds.take(1)
             if not samples:
                 return None
-            if samples[0].sample_info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
+            if samples[
+                0
+            ].sample_info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
                 return samples[0].data, samples[0].sample_info
         return None
 

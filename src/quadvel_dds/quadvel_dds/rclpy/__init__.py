@@ -5,6 +5,8 @@ Names, parameters and defaults are those of rclpy 7.1 (Jazzy). What is not here 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +16,13 @@ if __name__ != "rclpy":
 from quadvel_dds.errors import module_getattr, refuse_options
 
 from . import signals
-from .context import Context, get_default_context
+from .context import Context as Context
+from .context import get_default_context
 from .executors import Executor, SingleThreadedExecutor
-from .node import Node
-from .parameter import Parameter
-from .task import Future
+from .node import Node as Node
+from .parameter import Parameter as Parameter
+from .task import Future as Future
 
-__all__ = [
-    "Context",
-    "Future",
-    "Node",
-    "Parameter",
-    "create_node",
-    "get_default_context",
-    "get_global_executor",
-    "get_rmw_implementation_identifier",
-    "init",
-    "ok",
-    "shutdown",
-    "spin",
-    "spin_once",
-    "spin_until_future_complete",
-    "try_shutdown",
-]
 __getattr__ = module_getattr(__name__, Path(__file__).parent)
 
 
@@ -56,10 +42,8 @@ def init(
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
     """Stop communication. Raises RuntimeError if it does not run."""
-    refuse_options("rclpy.shutdown", context=context)
+    refuse_options("rclpy.shutdown", context=context, uninstall_handlers=uninstall_handlers)
     get_default_context(shutting_down=True).shutdown()
-    if uninstall_handlers is None or uninstall_handlers:
-        signals.uninstall_signal_handlers()
 
 
 def try_shutdown(*, context: Context | None = None) -> None:
@@ -73,62 +57,45 @@ def ok(*, context: Context | None = None) -> bool:
     return get_default_context().ok()
 
 
-def get_rmw_implementation_identifier() -> str:
-    return "quadvel_dds"
-
-
 create_node = Node
 _global_executor: Executor | None = None
 
 
 def get_global_executor() -> Executor:
-    """The executor of the spin functions where none is given; it ends with the default context."""
+    """The executor of the spin functions where none is given; a new one after the context was shut down."""
     global _global_executor
-    executor = _global_executor
-    if executor is None:
-        executor = _global_executor = SingleThreadedExecutor()
-        # Called at once if a signal has shut the context down already: the executor then ends at its first step.
-        get_default_context().on_shutdown(_forget_global_executor)
-    return executor
+    if _global_executor is None or _global_executor.context is not get_default_context():
+        _global_executor = SingleThreadedExecutor()
+    return _global_executor
 
 
-def _forget_global_executor() -> None:
-    global _global_executor
-    executor, _global_executor = _global_executor, None
-    if executor is not None:
-        executor.wake()
+@contextmanager
+def _added(node: Node, executor: Any) -> Iterator[Executor]:
+    """The executor given, or the global one, with the node in it."""
+    executor = executor or get_global_executor()
+    is_new = executor.add_node(node)
+    try:
+        yield executor
+    finally:
+        if is_new:
+            executor.remove_node(node)
 
 
 def spin(node: Node, executor: Any = None) -> None:
     """Run the callbacks of a node until the context is shut down."""
-    executor = executor or get_global_executor()
-    try:
-        executor.add_node(node)
-        while executor.context.ok():
-            executor.spin_once()
-    finally:
-        executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin()
 
 
 def spin_once(node: Node, *, executor: Any = None, timeout_sec: float | None = None) -> None:
     """Run one callback; wait for it for `timeout_sec` (None or negative: for ever)."""
-    executor = executor or get_global_executor()
-    try:
-        executor.add_node(node)
-        executor.spin_once(timeout_sec=timeout_sec)
-    finally:
-        executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin_once(timeout_sec)
 
 
 def spin_until_future_complete(
     node: Node, future: Future, executor: Any = None, timeout_sec: float | None = None
 ) -> None:
     """Run callbacks until a future is done, the time is up, or the context is shut down."""
-    executor = executor or get_global_executor()
-    added = False
-    try:
-        added = executor.add_node(node)
-        executor.spin_until_future_complete(future, timeout_sec)
-    finally:
-        if added:
-            executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin_until_future_complete(future, timeout_sec)

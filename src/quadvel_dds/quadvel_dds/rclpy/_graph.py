@@ -34,5 +34,7 @@ def _node_info(node: Any) -> Any:
     writers = [*(one._writer for one in node._publishers), *(call.writer for call in calls)]
     info: Any = NodeEntitiesInfo(node_namespace=node.get_namespace(), node_name=node.get_name())
     info.reader_gid_seq = [Gid(data=list(reader.gid)) for reader in readers]
-    info.writer_gid_seq = [Gid(data=list(writer.gid)) for writer in writers if writer is not None]  # None: destroyed
+    info.writer_gid_seq = [
+        Gid(data=list(writer.gid)) for writer in writers if writer is not None
+    ]  # None: destroyed
     return info

@@ -6,7 +6,7 @@ import atexit
 import os
 import sys
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from threading import Lock, RLock
 from typing import Any
 
@@ -28,18 +28,11 @@ class Context(Partial):
         self._participant_lock = Lock()
         self._announcer: GraphAnnouncer | None = None
         self._nodes: list[Any] = []
-        self._shutdown_callbacks: list[Callable[[], None]] = []
         self._wakers: weakref.WeakSet[Any] = weakref.WeakSet()
         self._domain_id = 0
         self.arguments = arguments.RosArguments()
 
-    def init(
-        self,
-        args: Sequence[str] | None = None,
-        *,
-        initialize_logging: bool = True,
-        domain_id: int | None = None,
-    ) -> None:
+    def init(self, args: Sequence[str] | None, domain_id: int | None = None) -> None:
         """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
         from .logging import set_levels
 
@@ -52,8 +45,7 @@ class Context(Partial):
             domain_id = int(text)
         self._domain_id = domain_id
         self.arguments = arguments.parse(sys.argv if args is None else args)
-        if initialize_logging:
-            set_levels(self.arguments.log_levels)
+        set_levels(self.arguments.log_levels)
         self._initialized = self._running = True
         _contexts.add(self)
 
@@ -85,29 +77,17 @@ class Context(Partial):
             if not self._running:
                 return
             self._running = False
-            callbacks, self._shutdown_callbacks = self._shutdown_callbacks, []
-        for callback in callbacks:
-            callback()
         self._wake()
-        self._leave_if_unused()
-
-    def on_shutdown(self, callback: Callable[[], None]) -> None:
-        with self._lock:
-            if self._running:
-                self._shutdown_callbacks.append(callback)
-                return
-        callback()
+        self._leave()
 
     def _wake(self) -> None:
         for executor in list(self._wakers):
             executor.wake()
 
-    def _leave_if_unused(self) -> None:
+    def _leave(self, unless_used: bool = True) -> None:
         """Leave the domain once the context is shut down and its last node destroyed."""
-        if not self._running and not self._nodes:
-            self._leave()
-
-    def _leave(self) -> None:
+        if unless_used and (self._running or self._nodes):
+            return
         participant, self._participant, self._announcer = self._participant, None, None
         if participant is not None:
             participant.close()
@@ -133,4 +113,4 @@ def live_contexts() -> list[Context]:
 def _leave_all() -> None:
     for context in list(_contexts):
         context.try_shutdown()
-        context._leave()
+        context._leave(unless_used=False)

@@ -9,14 +9,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from inspect import iscoroutinefunction
 from threading import RLock
 from typing import Any
 
 from quadvel_dds import wire
-from quadvel_dds.errors import Partial, module_getattr, refuse_options
+from quadvel_dds.errors import Partial, UnsupportedError, module_getattr, refuse_options
 
 from .context import get_default_context
-from .task import Future, Task
+from .task import Future
 from .timer import Timer
 
 __getattr__ = module_getattr(__name__)
@@ -31,7 +32,7 @@ class Executor(Partial):
         refuse_options("Executor", context=context)
         self._context = get_default_context()
         self._nodes: list[Any] = []
-        self._tasks: deque[Task] = deque()
+        self._tasks: deque[Callable[[], None]] = deque()
         self._ready: deque[Any] = deque()  # entities that had data or were due after the last wait
         self._lock = RLock()
         self._waitset: wire.WaitSet | None = None
@@ -61,15 +62,14 @@ class Executor(Partial):
                 self._nodes.remove(node)
         self.wake()
 
-    def get_nodes(self) -> list[Any]:
-        with self._lock:
-            return list(self._nodes)
-
-    def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Task:
-        task = Task(callback, args, kwargs)
-        self._tasks.append(task)
+    def create_task(self, callback: Callable[..., Any], *args: Any, **kwargs: Any) -> Future:
+        """Have the thread that spins call a function; the future that is returned gets its result."""
+        if iscoroutinefunction(callback):
+            raise UnsupportedError("a coroutine as a callback")
+        future = Future()
+        self._tasks.append(lambda: future.set_result(callback(*args, **kwargs)))
         self.wake()
-        return task
+        return future
 
     def wake(self) -> None:
         """End the current wait, because something changed."""
@@ -151,12 +151,6 @@ class Executor(Partial):
         self._timers = [entity for entity in entities if isinstance(entity, Timer)]
         self._waiting = [entity for entity in entities if not isinstance(entity, Timer)]
         waitset.update({entity._reader for entity in self._waiting})
-
-    def __enter__(self) -> Executor:
-        return self
-
-    def __exit__(self, *exception: Any) -> None:
-        self.shutdown()
 
 
 class SingleThreadedExecutor(Executor):

@@ -28,20 +28,11 @@ sinks: dict[str, Callable[[int, str, str, int, Any], None]] = {}
 
 
 class RcutilsLogger(Partial):
-    """Logger with names in a hierarchy ("node.part").
-
-    Every method takes, as keyword options, `once`, `skip_first` and `throttle_duration_sec`; they count for
-    each place in the program that calls.
-    """
+    """Logger with names in a hierarchy ("node.part"); keyword options of each method are those of `_log`."""
 
     def __init__(self, name: str = "") -> None:
         self.name = name
         self._places: dict[tuple[str, int], float] = {}
-
-    def get_child(self, name: str) -> RcutilsLogger:
-        if not name:
-            raise ValueError("Child logger name must not be empty.")
-        return RcutilsLogger(f"{self.name}.{name}" if self.name else name)
 
     def set_level(self, level: int) -> None:
         levels[self.name] = int(level)
@@ -52,9 +43,6 @@ class RcutilsLogger(Partial):
             name = name.rpartition(".")[0]
         return int(levels[name])
 
-    def is_enabled_for(self, severity: int) -> bool:
-        return severity >= self.get_effective_level()
-
     def debug(self, message: str, **kwargs: Any) -> bool:
         return self._log(message, LoggingSeverity.DEBUG, **kwargs)
 
@@ -64,17 +52,11 @@ class RcutilsLogger(Partial):
     def warning(self, message: str, **kwargs: Any) -> bool:
         return self._log(message, LoggingSeverity.WARN, **kwargs)
 
-    def warn(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.WARN, **kwargs)
-
     def error(self, message: str, **kwargs: Any) -> bool:
         return self._log(message, LoggingSeverity.ERROR, **kwargs)
 
     def fatal(self, message: str, **kwargs: Any) -> bool:
         return self._log(message, LoggingSeverity.FATAL, **kwargs)
-
-    def log(self, message: str, severity: int, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity(severity), **kwargs)
 
     def _log(
         self,
@@ -82,19 +64,15 @@ class RcutilsLogger(Partial):
         severity: LoggingSeverity,
         *,
         once: bool = False,
-        skip_first: bool = False,
         throttle_duration_sec: float = 0.0,
     ) -> bool:
-        if not self.is_enabled_for(severity):
+        """Whether it was said. once, throttle_duration_sec: how often, for each place in the program that calls."""
+        if severity < self.get_effective_level():
             return False
         frame = sys._getframe(2)
         place = (frame.f_code.co_filename, frame.f_lineno)
-        now = time.monotonic()
-        last = self._places.get(place)
-        if last is None and skip_first:
-            self._places[place] = float("-inf")
-            return False
-        if last is not None and now - last < (float("inf") if once else throttle_duration_sec):
+        now, last = time.monotonic(), self._places.get(place, float("-inf"))
+        if now - last < throttle_duration_sec or (once and place in self._places):
             return False
         if once or throttle_duration_sec:
             self._places[place] = now

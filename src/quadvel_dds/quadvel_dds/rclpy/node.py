@@ -283,7 +283,7 @@ class Node(ParameterMixin):
         if self in self._context._nodes:
             self._context._nodes.remove(self)
             self._context._announce_nodes()
-        self._context._leave_if_unused()
+        self._context._leave()
 
     # Who else is there.
     def count_publishers(self, topic_name: str) -> int:

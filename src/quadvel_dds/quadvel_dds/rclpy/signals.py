@@ -25,7 +25,6 @@ class SignalHandlerOptions(IntFlag):
 
 
 _former: dict[int, Any] = {}
-_waker: socket.socket | None = None
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
@@ -47,27 +46,15 @@ def _wake_on_signals(receiver: socket.socket) -> None:
 
 def install_signal_handlers(options: SignalHandlerOptions = SignalHandlerOptions.ALL) -> None:
     """Take over the signals named; does nothing outside the main thread, where Python allows no handlers."""
-    global _waker
     if threading.current_thread() is not threading.main_thread() or not options:
         return
-    if _waker is None:
-        receiver, _waker = socket.socketpair()
-        _waker.setblocking(False)
+    if not _former:
+        receiver, waker = socket.socketpair()
+        waker.setblocking(False)
         threading.Thread(target=_wake_on_signals, args=(receiver,), daemon=True, name="signals").start()
-        signal.set_wakeup_fd(_waker.fileno(), warn_on_full_buffer=False)
-    for option, number in (
-        (SignalHandlerOptions.SIGINT, signal.SIGINT),
-        (SignalHandlerOptions.SIGTERM, signal.SIGTERM),
-    ):
+        signal.set_wakeup_fd(waker.detach(), warn_on_full_buffer=False)
+    for option in (SignalHandlerOptions.SIGINT, SignalHandlerOptions.SIGTERM):
         if options & option:
+            number = signal.Signals[str(option.name)]
             _former.setdefault(number, signal.getsignal(number))
             signal.signal(number, _on_signal)
-
-
-def uninstall_signal_handlers() -> None:
-    """Give the signals back, SIGINT only if it never came (see the module's text)."""
-    if threading.current_thread() is not threading.main_thread():
-        return
-    for number in list(_former):
-        if signal.getsignal(number) is _on_signal:
-            signal.signal(number, _former.pop(number))

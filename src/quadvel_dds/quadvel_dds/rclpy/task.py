@@ -1,19 +1,18 @@
-"""Futures, and tasks that an executor runs."""
+"""Futures."""
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
 from threading import Lock
 from typing import Any
 
-from quadvel_dds.errors import Partial, UnsupportedError, refuse_options
+from quadvel_dds.errors import Partial, refuse_options
 
 
 class Future(Partial):
     def __init__(self, *, executor: Any = None) -> None:
         refuse_options("Future", executor=executor)
-        self._done = self._cancelled = False
+        self._done = False
         self._result: Any = None
         self._exception: BaseException | None = None
         self._callbacks: list[Callable[[Future], None]] = []
@@ -21,13 +20,6 @@ class Future(Partial):
 
     def done(self) -> bool:
         return self._done
-
-    def cancelled(self) -> bool:
-        return self._cancelled
-
-    def cancel(self) -> None:
-        if not self._done:
-            self._finish(cancelled=True)
 
     def result(self) -> Any:
         """The result, None as long as there is none. Raises the exception that was set."""
@@ -39,10 +31,10 @@ class Future(Partial):
         return self._exception
 
     def set_result(self, result: Any) -> None:
-        self._finish(result=result)
+        self._finish(result, None)
 
     def set_exception(self, exception: BaseException) -> None:
-        self._finish(exception=exception)
+        self._finish(None, exception)
 
     def add_done_callback(self, callback: Callable[[Future], None]) -> None:
         """Call `callback(future)` once the future is done."""
@@ -52,29 +44,9 @@ class Future(Partial):
                 return
         callback(self)
 
-    def _finish(
-        self, result: Any = None, exception: BaseException | None = None, cancelled: bool = False
-    ) -> None:
+    def _finish(self, result: Any, exception: BaseException | None) -> None:
         with self._lock:
-            self._result, self._exception = result, exception
-            self._done, self._cancelled = True, cancelled
+            self._done, self._result, self._exception = True, result, exception
             callbacks, self._callbacks = self._callbacks, []
         for callback in callbacks:
             callback(self)
-
-
-class Task(Future):
-    """A callback that runs in an executor; its return value is the result."""
-
-    def __init__(self, handler: Callable[..., Any], args: Any = (), kwargs: Any = None) -> None:
-        if inspect.iscoroutine(handler) or inspect.iscoroutinefunction(handler):
-            raise UnsupportedError("a coroutine as a callback")
-        super().__init__()
-        self._call = lambda: handler(*args, **(kwargs or {}))
-
-    def __call__(self) -> None:
-        try:
-            self.set_result(self._call())
-        except Exception as error:
-            self.set_exception(error)
-            raise
