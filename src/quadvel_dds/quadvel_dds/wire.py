@@ -15,17 +15,8 @@ import uuid
 from collections.abc import Iterator
 from typing import Any
 
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
-from cyclonedds.core import (
-    DDSException,
-    Entity,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-)
-from cyclonedds.core import WaitSet as DdsWaitSet
+from cyclonedds import builtin, core
+from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
@@ -35,8 +26,7 @@ from cyclonedds.util import duration
 
 from quadvel_dds import idl, messages
 
-ANY = SampleState.Any | ViewState.Any | InstanceState.Any
-FOREVER = 2**63 - 1  # ns
+ANY = core.SampleState.Any | core.ViewState.Any | InstanceState.Any
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
 # Cyclone drops what comes over other interfaces than these, and ROS 2 looks for nodes of its host on this one.
@@ -44,6 +34,7 @@ LOOPBACK = '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
 # How often participants introduce themselves to their peers: ROS 2 may start later, and by default it calls
 # over multicast alone, which nodes that stay on this host do not hear.
 ANNOUNCEMENT = "2 s"
+REACHES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
 _domains: dict[int, Domain] = {}
 
 
@@ -51,10 +42,8 @@ def domain_configuration() -> str:
     """Cyclone's settings for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
     peers = [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
-    if reach not in ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF"):
-        raise ValueError(
-            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected LOCALHOST, SUBNET, SYSTEM_DEFAULT or OFF"
-        )
+    if reach not in REACHES:
+        raise ValueError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected {', '.join(REACHES)}")
     general = discovery = ""
     if reach == "LOCALHOST":
         peers.insert(0, "localhost")
@@ -74,7 +63,7 @@ def domain_configuration() -> str:
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
 
 
-def delete(entity: Entity) -> None:
+def delete(entity: core.Entity) -> None:
     """Delete a DDS entity now. Cyclone offers this in its finaliser alone; a second call is harmless."""
     entity.__del__()
 
@@ -89,30 +78,27 @@ class Participant:
         self.gid = self.dds.guid.bytes
         self._topics: dict[tuple[str, str], Topic[Any]] = {}
         self._builtin = {
-            topic: BuiltinDataReader(self.dds, topic)
-            for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+            "publication": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsPublication),
+            "subscription": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsSubscription),
         }
 
-    def topic(self, name: str, typename: str) -> Topic[Any]:
-        key = (name, typename)
-        if key not in self._topics:
-            self._topics[key] = Topic(self.dds, name, idl.struct(typename))
-        return self._topics[key]
-
     def writer(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Writer:
-        qos = to_dds_qos(profile, user_data + _hash_text(typename))
-        return Writer(DataWriter(self.dds, self.topic(topic, typename), qos), idl.struct(typename))
+        return Writer(DataWriter(self.dds, *self._as_dds(topic, typename, profile, user_data)))
 
     def reader(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Reader:
-        qos = to_dds_qos(profile, user_data + _hash_text(typename))
-        return Reader(DataReader(self.dds, self.topic(topic, typename), qos))
+        return Reader(DataReader(self.dds, *self._as_dds(topic, typename, profile, user_data)))
+
+    def _as_dds(self, topic: str, typename: str, profile: Any, user_data: str) -> tuple[Topic[Any], Qos]:
+        key = (topic, typename)
+        if key not in self._topics:
+            self._topics[key] = Topic(self.dds, topic, idl.struct(typename))
+        type_hash = f"typehash={messages.type_hash(typename)};"
+        return self._topics[key], to_dds_qos(profile, user_data + type_hash)
 
     def endpoints(self, kind: str) -> Iterator[Any]:
         """All writers ("publication") or readers ("subscription") on the domain, our own included."""
-        topic = BuiltinTopicDcpsPublication if kind == "publication" else BuiltinTopicDcpsSubscription
-        for endpoint in self._builtin[topic].read(N=100_000):
-            if endpoint.sample_info.instance_state == InstanceState.Alive:
-                yield endpoint
+        found = self._builtin[kind].read(N=100_000)
+        return (end for end in found if end.sample_info.instance_state == InstanceState.Alive)
 
     def count(self, kind: str, topic: str) -> int:
         return sum(endpoint.topic_name == topic for endpoint in self.endpoints(kind))
@@ -124,11 +110,11 @@ class Participant:
 class Writer:
     """A DDS writer of ready CDR bytes."""
 
-    def __init__(self, dds: DataWriter[Any], sample: Any) -> None:
+    def __init__(self, dds: DataWriter[Any]) -> None:
         self.dds = dds
         self.handle = dds.instance_handle % 2**64  # Cyclone's Python layer gives it a sign
         self.gid = dds.guid.bytes
-        self._sample = sample
+        self._sample: Any = dds.topic.data_type
 
     def write(self, data: bytes | bytearray) -> None:
         self.dds.write(self._sample(data))
@@ -150,7 +136,7 @@ class Reader:
 
     def __init__(self, dds: DataReader[Any]) -> None:
         self.dds = dds
-        self.condition = ReadCondition(dds, ANY)
+        self.condition = core.ReadCondition(dds, ANY)
         self.gid = dds.guid.bytes
         self.is_closed = False
 
@@ -186,8 +172,8 @@ class WaitSet:
     """Waits until one of a changing set of readers has data, or until another thread wakes it."""
 
     def __init__(self, participant: Participant) -> None:
-        self.dds = DdsWaitSet(participant.dds)
-        self.guard = GuardCondition(participant.dds)
+        self.dds = core.WaitSet(participant.dds)
+        self.guard = core.GuardCondition(participant.dds)
         self.dds.attach(self.guard)
         self.readers: set[Reader] = set()
 
@@ -281,7 +267,3 @@ def to_dds_qos(profile: Any, user_data: str) -> Qos:
     if profile.lifespan.nanoseconds:
         policies.append(Policy.Lifespan(profile.lifespan.nanoseconds))
     return Qos(*policies)
-
-
-def _hash_text(typename: str) -> str:
-    return f"typehash={messages.type_hash(typename)};"

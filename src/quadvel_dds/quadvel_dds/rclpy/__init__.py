@@ -15,12 +15,12 @@ if __name__ != "rclpy":
 
 from quadvel_dds.errors import module_getattr, refuse_options
 
-from . import signals
 from .context import Context as Context
 from .context import get_default_context
 from .executors import Executor, SingleThreadedExecutor
 from .node import Node as Node
 from .parameter import Parameter as Parameter
+from .signals import SignalHandlerOptions
 from .task import Future as Future
 
 __getattr__ = module_getattr(__name__, Path(__file__).parent)
@@ -31,13 +31,11 @@ def init(
     args: list[str] | None = None,
     context: Context | None = None,
     domain_id: int | None = None,
-    signal_handler_options: signals.SignalHandlerOptions | None = None,
+    signal_handler_options: SignalHandlerOptions | None = None,
 ) -> None:
-    """Start communication: read the arguments (sys.argv if None), take over SIGINT and SIGTERM."""
+    """Start communication: read the arguments (sys.argv if None). No signals are taken over: see `signals`."""
     refuse_options("rclpy.init", context=context)
     get_default_context().init(args, domain_id=domain_id)
-    options = signals.SignalHandlerOptions.ALL if signal_handler_options is None else signal_handler_options
-    signals.install_signal_handlers(options)
 
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:

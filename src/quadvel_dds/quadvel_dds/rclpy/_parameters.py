@@ -4,25 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
+from rcl_interfaces import srv
 from rcl_interfaces.msg import ListParametersResult, ParameterDescriptor, ParameterEvent, SetParametersResult
-from rcl_interfaces.srv import (
-    DescribeParameters,
-    GetParameters,
-    GetParameterTypes,
-    ListParameters,
-    SetParameters,
-    SetParametersAtomically,
-)
 
 from quadvel_dds.errors import Partial, refuse_options
 
-from .exceptions import (
-    InvalidParameterException,
-    InvalidParameterTypeException,
-    ParameterAlreadyDeclaredException,
-    ParameterNotDeclaredException,
-    ParameterUninitializedException,
-)
+from . import exceptions
 from .parameter import Parameter
 from .qos import qos_profile_parameters
 
@@ -47,9 +34,9 @@ class ParameterMixin(Partial):
         InvalidParameterTypeException on an override of another type.
         """
         if name in self._parameters:
-            raise ParameterAlreadyDeclaredException(name)
+            raise exceptions.ParameterAlreadyDeclaredException(name)
         if not name or name.startswith(".") or name.endswith("."):
-            raise InvalidParameterException(name)
+            raise exceptions.InvalidParameterException(name)
         descriptor = ParameterDescriptor() if descriptor is None else descriptor
         refuse_options(
             f"parameter {name}",
@@ -67,7 +54,7 @@ class ParameterMixin(Partial):
             value = self._parameter_overrides[name].value
         parameter = Parameter(name, value=value)
         if value is not None and kind != Parameter.Type.NOT_SET and not kind.check(value):
-            raise InvalidParameterTypeException(parameter, kind)
+            raise exceptions.InvalidParameterTypeException(parameter, kind)
         self._descriptors[name] = descriptor
         self._parameters[name] = Parameter(name)
         if value is not None:
@@ -79,10 +66,10 @@ class ParameterMixin(Partial):
 
     def get_parameter(self, name: str) -> Parameter:
         if name not in self._parameters:
-            raise ParameterNotDeclaredException(name)
+            raise exceptions.ParameterNotDeclaredException(name)
         parameter = self._parameters[name]
         if parameter.type_ == Parameter.Type.NOT_SET:
-            raise ParameterUninitializedException(name)
+            raise exceptions.ParameterUninitializedException(name)
         return parameter
 
     def get_parameters(self, names: list[str]) -> list[Parameter]:
@@ -96,7 +83,7 @@ class ParameterMixin(Partial):
         """Set all parameters or, if one of them is refused, none. Raises ParameterNotDeclaredException."""
         for parameter in parameter_list:
             if parameter.name not in self._parameters:
-                raise ParameterNotDeclaredException(parameter.name)
+                raise exceptions.ParameterNotDeclaredException(parameter.name)
             if fault := self._fault(parameter):
                 return SetParametersResult(successful=False, reason=fault)
         self._apply(parameter_list)
@@ -126,27 +113,26 @@ class ParameterMixin(Partial):
 
     # The services through which `ros2 param` and operator tools read and set them.
     def _start_parameter_services(self) -> None:
-        for type_, name in (
-            (DescribeParameters, "describe_parameters"),
-            (GetParameters, "get_parameters"),
-            (GetParameterTypes, "get_parameter_types"),
-            (ListParameters, "list_parameters"),
-            (SetParameters, "set_parameters"),
-            (SetParametersAtomically, "set_parameters_atomically"),
+        for kind, name, answer in (
+            (srv.DescribeParameters, "describe_parameters", self._on_describe),
+            (srv.GetParameters, "get_parameters", self._on_get),
+            (srv.GetParameterTypes, "get_parameter_types", self._on_types),
+            (srv.ListParameters, "list_parameters", self._on_list),
+            (srv.SetParameters, "set_parameters", self._on_set),
+            (srv.SetParametersAtomically, "set_parameters_atomically", self._on_set_atomically),
         ):
-            answer = getattr(self, f"_serve_{name}")
-            self.create_service(type_, f"~/{name}", answer, qos_profile=qos_profile_parameters)
+            self.create_service(kind, f"~/{name}", answer, qos_profile=qos_profile_parameters)
 
-    def _serve_describe_parameters(self, request: Any, response: Any) -> Any:
+    def _on_describe(self, request: Any, response: Any) -> Any:
         response.descriptors = [self._descriptors[name] for name in self._all_or_none(request.names)]
         return response
 
-    def _serve_get_parameters(self, request: Any, response: Any) -> Any:
+    def _on_get(self, request: Any, response: Any) -> Any:
         names = self._all_or_none(request.names)
         response.values = [self._parameters[name].get_parameter_value() for name in names]
         return response
 
-    def _serve_get_parameter_types(self, request: Any, response: Any) -> Any:
+    def _on_types(self, request: Any, response: Any) -> Any:
         response.types = [self._parameters[name].type_.value for name in self._all_or_none(request.names)]
         return response
 
@@ -154,7 +140,7 @@ class ParameterMixin(Partial):
         """The names, none of them if one is not declared: so answers ROS 2."""
         return names if all(name in self._parameters for name in names) else []
 
-    def _serve_list_parameters(self, request: Any, response: Any) -> Any:
+    def _on_list(self, request: Any, response: Any) -> Any:
         """Names below the prefixes (none: all), at most `depth` parts below (0: any), and their prefixes."""
         response.result = result = ListParametersResult()
         for name in self._parameters:
@@ -166,16 +152,16 @@ class ParameterMixin(Partial):
                 result.prefixes += [prefix] if prefix and prefix not in result.prefixes else []
         return response
 
-    def _serve_set_parameters(self, request: Any, response: Any) -> Any:
-        response.results = [self._serve_set([parameter]) for parameter in request.parameters]
+    def _on_set(self, request: Any, response: Any) -> Any:
+        response.results = [self._set([parameter]) for parameter in request.parameters]
         return response
 
-    def _serve_set_parameters_atomically(self, request: Any, response: Any) -> Any:
-        response.result = self._serve_set(request.parameters)
+    def _on_set_atomically(self, request: Any, response: Any) -> Any:
+        response.result = self._set(request.parameters)
         return response
 
-    def _serve_set(self, parameters: list[Any]) -> Any:
+    def _set(self, parameters: list[Any]) -> Any:
         try:
             return self.set_parameters_atomically([Parameter.from_parameter_msg(p) for p in parameters])
-        except ParameterNotDeclaredException as error:
+        except exceptions.ParameterNotDeclaredException as error:
             return SetParametersResult(successful=False, reason=str(error))

@@ -19,19 +19,14 @@ WAIT_STEP = 0.01  # s, between two looks for a service
 
 class Client(Partial):
     def __init__(
-        self,
-        context: Any,
-        client_impl: wire.CallEndpoint,
-        srv_type: Any,
-        srv_name: str,
-        qos_profile: Any,
+        self, context: Any, client_impl: wire.CallEndpoint, srv_type: Any, srv_name: str, qos_profile: Any,
         callback_group: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.context = context
         self._endpoint = client_impl
         self._reader = client_impl.reader
         self.srv_type = srv_type
-        self.srv_name = srv_name
+        self.service_name = srv_name
         self.qos_profile = qos_profile
         self._numbers = itertools.count(1)
         self._pending: dict[int, Future] = {}
@@ -64,10 +59,6 @@ class Client(Partial):
             time.sleep(WAIT_STEP)
         return self.service_is_ready()
 
-    @property
-    def service_name(self) -> str:
-        return self.srv_name
-
     def destroy(self) -> None:
         self._endpoint.close()
 
@@ -78,7 +69,7 @@ class Client(Partial):
         try:
             (client_id, number), response = self._endpoint.decode(sample[0], self.srv_type.Response.TYPENAME)
         except ValueError as error:
-            get_logger("rclpy").error(f"dropped an answer of {self.srv_name}: {error}")
+            get_logger("rclpy").error(f"dropped an answer of {self.service_name}: {error}")
             return None
         with self._lock:
             future = self._pending.get(number)

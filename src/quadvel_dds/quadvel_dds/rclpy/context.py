@@ -7,13 +7,14 @@ import os
 import sys
 import weakref
 from collections.abc import Sequence
-from threading import Lock, RLock
+from threading import Lock
 from typing import Any
 
 from quadvel_dds import arguments, wire
 from quadvel_dds.errors import Partial
 
 from ._graph import GraphAnnouncer
+from .logging import set_levels
 
 _contexts: weakref.WeakSet[Context] = weakref.WeakSet()
 _default_context: Context | None = None
@@ -22,7 +23,6 @@ _default_lock = Lock()
 
 class Context(Partial):
     def __init__(self) -> None:
-        self._lock = RLock()
         self._running = self._initialized = False
         self._participant: wire.Participant | None = None
         self._participant_lock = Lock()
@@ -34,8 +34,6 @@ class Context(Partial):
 
     def init(self, args: Sequence[str] | None, domain_id: int | None = None) -> None:
         """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
-        from .logging import set_levels
-
         if self._initialized:
             raise RuntimeError("Context.init() must only be called once")
         if domain_id is None:
@@ -72,17 +70,12 @@ class Context(Partial):
         self.try_shutdown()
 
     def try_shutdown(self) -> None:
-        """Stop communication if it runs. Called by signal handlers, so it only tells others to end."""
-        with self._lock:
-            if not self._running:
-                return
+        """Stop communication if it runs. May be called by a signal handler: it only tells others to end."""
+        if self._running:
             self._running = False
-        self._wake()
-        self._leave()
-
-    def _wake(self) -> None:
-        for executor in list(self._wakers):
-            executor.wake()
+            for executor in list(self._wakers):
+                executor.wake()
+            self._leave()
 
     def _leave(self, unless_used: bool = True) -> None:
         """Leave the domain once the context is shut down and its last node destroyed."""
@@ -97,16 +90,10 @@ def get_default_context(*, shutting_down: bool = False) -> Context:
     """The context of this process; a new one after it was shut down."""
     global _default_context
     with _default_lock:
-        if _default_context is None:
-            _default_context = Context()
-        context = _default_context
+        context = _default_context = _default_context or Context()
         if shutting_down:
             _default_context = None
         return context
-
-
-def live_contexts() -> list[Context]:
-    return [context for context in list(_contexts) if context.ok()]
 
 
 @atexit.register

@@ -23,6 +23,10 @@ from .timer import Timer
 __getattr__ = module_getattr(__name__)
 
 
+FOREVER = 2**63 - 1  # ns
+LONGEST_WAIT = 200_000_000  # ns: Python runs its handlers of signals only between two waits
+
+
 class ExternalShutdownException(Exception):
     """The context was shut down while the executor waited."""
 
@@ -30,7 +34,7 @@ class ExternalShutdownException(Exception):
 class Executor(Partial):
     def __init__(self, *, context: Any = None) -> None:
         refuse_options("Executor", context=context)
-        self._context = get_default_context()
+        self.context = get_default_context()
         self._nodes: list[Any] = []
         self._tasks: deque[Callable[[], None]] = deque()
         self._ready: deque[Any] = deque()  # entities that had data or were due after the last wait
@@ -41,18 +45,16 @@ class Executor(Partial):
         self._waiting: list[Any] = []
         self._has_changed = True
         self._is_shutdown = False
-        self._context._wakers.add(self)
-
-    @property
-    def context(self) -> Any:
-        return self._context
+        self.context._wakers.add(self)
 
     def add_node(self, node: Any) -> bool:
         with self._lock:
             if node in self._nodes:
                 return False
             self._nodes.append(node)
-        node.executor = self
+        former, node.executor = node.executor, self
+        if former not in (None, self):
+            former.remove_node(node)
         self.wake()
         return True
 
@@ -90,7 +92,7 @@ class Executor(Partial):
         return True
 
     def spin(self) -> None:
-        while self._context.ok() and not self._is_shutdown:
+        while self.context.ok() and not self._is_shutdown:
             self.spin_once()
 
     def spin_once(self, timeout_sec: float | None = None) -> None:
@@ -100,7 +102,7 @@ class Executor(Partial):
     def spin_until_future_complete(self, future: Future, timeout_sec: float | None = None) -> None:
         future.add_done_callback(lambda _: self.wake())
         deadline = _deadline(timeout_sec)
-        while self._context.ok() and not future.done() and not self._is_shutdown:
+        while self.context.ok() and not future.done() and not self._is_shutdown:
             self._spin_once(deadline, future.done)
             if time.monotonic_ns() >= deadline:
                 return
@@ -112,7 +114,7 @@ class Executor(Partial):
         """
         first = True
         while not self._is_shutdown and not until():
-            if not self._context.ok():
+            if not self.context.ok():
                 raise ExternalShutdownException
             if self._tasks:
                 return self._tasks.popleft()()
@@ -132,25 +134,22 @@ class Executor(Partial):
             if self._is_shutdown:
                 return
             if self._waitset is None:
-                self._waitset = wire.WaitSet(self._context.participant)
+                self._waitset = wire.WaitSet(self.context.participant)
             waitset = self._waitset
             if self._has_changed:
-                self._look_up(waitset)
+                self._has_changed = False
+                entities = [entity for node in self._nodes for entity in node._entities()]
+                self._timers = [entity for entity in entities if isinstance(entity, Timer)]
+                self._waiting = [entity for entity in entities if not isinstance(entity, Timer)]
+                waitset.update({entity._reader for entity in self._waiting})
             timers, waiting = self._timers, self._waiting
-        if not self._context.ok():  # a signal came while there was no wait set yet that it could have woken
+        if not self.context.ok():  # a signal came while there was no wait set yet that it could have woken
             return
         wakes = (timer._wake_ns() for timer in timers)
         wake_ns = min([deadline_ns, *(wake for wake in wakes if wake is not None)])
-        waitset.wait(max(0, wake_ns - time.monotonic_ns()) if wake_ns < wire.FOREVER else wire.FOREVER)
+        waitset.wait(min(max(0, wake_ns - time.monotonic_ns()), LONGEST_WAIT))
         self._ready.extend(timer for timer in timers if timer.is_ready())
         self._ready.extend(entity for entity in waiting if entity._reader.has_data())
-
-    def _look_up(self, waitset: wire.WaitSet) -> None:
-        entities = [entity for node in self._nodes for entity in node._entities()]
-        self._has_changed = False
-        self._timers = [entity for entity in entities if isinstance(entity, Timer)]
-        self._waiting = [entity for entity in entities if not isinstance(entity, Timer)]
-        waitset.update({entity._reader for entity in self._waiting})
 
 
 class SingleThreadedExecutor(Executor):
@@ -160,5 +159,5 @@ class SingleThreadedExecutor(Executor):
 def _deadline(timeout_sec: float | None) -> int:
     """Monotonic time in ns at which a wait ends."""
     if timeout_sec is None or timeout_sec < 0:
-        return wire.FOREVER
+        return FOREVER
     return time.monotonic_ns() + int(timeout_sec * 1e9)

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from enum import IntEnum
+from functools import partialmethod
 from typing import Any
 
 from quadvel_dds.errors import Partial, module_getattr
@@ -43,28 +44,8 @@ class RcutilsLogger(Partial):
             name = name.rpartition(".")[0]
         return int(levels[name])
 
-    def debug(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.DEBUG, **kwargs)
-
-    def info(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.INFO, **kwargs)
-
-    def warning(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.WARN, **kwargs)
-
-    def error(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.ERROR, **kwargs)
-
-    def fatal(self, message: str, **kwargs: Any) -> bool:
-        return self._log(message, LoggingSeverity.FATAL, **kwargs)
-
     def _log(
-        self,
-        message: str,
-        severity: LoggingSeverity,
-        *,
-        once: bool = False,
-        throttle_duration_sec: float = 0.0,
+        self, severity: LoggingSeverity, message: str, *, once: bool = False, throttle_duration_sec: float = 0
     ) -> bool:
         """Whether it was said. once, throttle_duration_sec: how often, for each place in the program that calls."""
         if severity < self.get_effective_level():
@@ -82,6 +63,12 @@ class RcutilsLogger(Partial):
         if sink := sinks.get(self.name.partition(".")[0]) or sinks.get(self.name):
             sink(severity, self.name, str(message), stamp, frame)
         return True
+
+    debug = partialmethod(_log, LoggingSeverity.DEBUG)
+    info = partialmethod(_log, LoggingSeverity.INFO)
+    warning = partialmethod(_log, LoggingSeverity.WARN)
+    error = partialmethod(_log, LoggingSeverity.ERROR)
+    fatal = partialmethod(_log, LoggingSeverity.FATAL)
 
 
 def get_logger(name: str) -> RcutilsLogger:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -12,33 +11,21 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 from quadvel_dds import arguments, names, wire
 from quadvel_dds.errors import refuse_options
 
+from . import exceptions, qos
 from ._parameters import ParameterMixin
 from .client import Client
-from .clock import Clock, ROSClock
+from .clock import Clock, ClockType
 from .context import get_default_context
-from .exceptions import (
-    InvalidNamespaceException,
-    InvalidNodeNameException,
-    InvalidServiceNameException,
-    InvalidTopicNameException,
-    NotInitializedException,
-)
 from .logging import get_logger, sinks
 from .parameter import Parameter
 from .publisher import Publisher
-from .qos import (
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_profile_parameter_events,
-    qos_profile_rosout_default,
-    qos_profile_services_default,
-)
+from .qos import QoSProfile
 from .service import Service
 from .subscription import Subscription
 from .time import Time
 from .timer import Timer
 
-CLOCK_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+CLOCK_QOS = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
 
 
 class Node(ParameterMixin):
@@ -56,11 +43,11 @@ class Node(ParameterMixin):
             automatically_declare_parameters_from_overrides=automatically_declare_parameters_from_overrides,
             enable_logger_service=enable_logger_service,
         )
-        self._context = get_default_context()
-        if not self._context.ok():
-            raise NotInitializedException("cannot create node")
+        self.context = get_default_context()
+        if not self.context.ok():
+            raise exceptions.NotInitializedException("cannot create node")
         local = arguments.parse(["--ros-args", *(cli_args or [])])
-        sources = [local, self._context.arguments] if use_global_arguments else [local]
+        sources = [local, self.context.arguments] if use_global_arguments else [local]
         self._rules = [rule for source in sources for rule in source.remappings]
         self._name, self._namespace = self._resolve_own_name(node_name, namespace or "")
         self._logger = get_logger(self.get_fully_qualified_name()[1:].replace("/", "."))
@@ -69,10 +56,10 @@ class Node(ParameterMixin):
         self._services: list[Service] = []
         self._clients: list[Client] = []
         self._timers: list[Timer] = []
-        self._executor: Callable[[], Any] = lambda: None
-        self._clock = ROSClock()
+        self.executor: Any = None
+        self._clock = Clock(clock_type=ClockType.ROS_TIME)
         self._clock_subscription: Subscription | None = None
-        self._context._nodes.append(self)
+        self.context._nodes.append(self)
 
         overrides: dict[str, Any] = {}
         for source in reversed(sources):
@@ -80,10 +67,10 @@ class Node(ParameterMixin):
         given = {name: Parameter(name, value=value) for name, value in overrides.items()}
         self._init_parameters(given | {parameter.name: parameter for parameter in parameter_overrides or []})
         if enable_rosout:
-            self._rosout = self.create_publisher(Log, "/rosout", qos_profile_rosout_default)
+            self._rosout = self.create_publisher(Log, "/rosout", qos.qos_profile_rosout_default)
             sinks[self._logger.name] = self._publish_log
         self._parameter_events = self.create_publisher(
-            ParameterEvent, "/parameter_events", qos_profile_parameter_events
+            ParameterEvent, "/parameter_events", qos.qos_profile_parameter_events
         )
         self.declare_parameter("use_sim_time", False)
         if start_parameter_services:
@@ -93,14 +80,14 @@ class Node(ParameterMixin):
         name, namespace = names.remap_node(name, namespace, self._rules)
         namespace = namespace if namespace.startswith("/") else f"/{namespace}"
         if fault := names.fault(names.NODE, name):
-            raise InvalidNodeNameException(name, *fault)
+            raise exceptions.InvalidNodeNameException(name, *fault)
         if fault := names.fault(names.ABSOLUTE, namespace):
-            raise InvalidNamespaceException(namespace, *fault)
+            raise exceptions.InvalidNamespaceException(namespace, *fault)
         return name, namespace
 
     def _on_parameters_set(self, parameters: list[Parameter], event: Any) -> None:
         event.stamp = self._clock.now().to_msg()
-        if self._context.ok():
+        if self.context.ok():
             self._parameter_events.publish(event)
         for parameter in parameters:
             if parameter.name == "use_sim_time":
@@ -121,7 +108,7 @@ class Node(ParameterMixin):
         self._clock._simulated_ns = message.clock.sec * 10**9 + message.clock.nanosec
 
     def _publish_log(self, level: int, name: str, message: str, stamp_ns: int, frame: Any) -> None:
-        if self._context.ok():
+        if self.context.ok():
             stamp = Time(nanoseconds=stamp_ns).to_msg()
             code = frame.f_code
             log = Log(stamp=stamp, level=level, name=name, msg=message, file=code.co_filename)
@@ -144,20 +131,6 @@ class Node(ParameterMixin):
     def get_clock(self) -> Clock:
         return self._clock
 
-    @property
-    def context(self) -> Any:
-        return self._context
-
-    @property
-    def executor(self) -> Any:
-        return self._executor()
-
-    @executor.setter
-    def executor(self, executor: Any) -> None:
-        former, self._executor = self.executor, weakref.ref(executor) if executor else lambda: None
-        if former is not None and former is not executor:
-            former.remove_node(self)
-
     def _entities(self) -> Iterator[Any]:
         """All that an executor serves; timers come first."""
         yield from self._timers
@@ -165,12 +138,12 @@ class Node(ParameterMixin):
         yield from (*self._subscriptions, *self._clients, *self._services)
 
     def _changed(self) -> None:
-        self._context._announce_nodes()
+        self.context._announce_nodes()
         self._wake_executor()
 
     def _wake_executor(self) -> None:
-        if (executor := self.executor) is not None:
-            executor.wake()
+        if self.executor is not None:
+            self.executor.wake()
 
     def _added(self, entity: Any, entities: list[Any]) -> Any:
         entities.append(entity)
@@ -187,10 +160,10 @@ class Node(ParameterMixin):
 
     # Topics.
     def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
-        return self._resolve(topic, only_expand, InvalidTopicNameException)
+        return self._resolve(topic, only_expand, exceptions.InvalidTopicNameException)
 
     def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
-        return self._resolve(service, only_expand, InvalidServiceNameException)
+        return self._resolve(service, only_expand, exceptions.InvalidServiceNameException)
 
     def _resolve(self, name: str, only_expand: bool, error: Callable[..., Exception]) -> str:
         if fault := names.fault(names.TOPIC, name):
@@ -205,9 +178,9 @@ class Node(ParameterMixin):
         options = {"event_callbacks": event_callbacks, "qos_overriding_options": qos_overriding_options}
         refuse_options("create_publisher", callback_group=callback_group, **options)
         profile, name = _profile(qos_profile), self.resolve_topic_name(topic)
-        writer = self._context.participant.writer(f"rt{name}", _typename(msg_type), profile)
+        writer = self.context.participant.writer(f"rt{name}", _typename(msg_type), profile)
         publisher = publisher_class(writer, msg_type, name, profile, None, None)
-        publisher._is_valid = self._context.ok
+        publisher._is_valid = self.context.ok
         return self._added(publisher, self._publishers)
 
     def create_subscription(
@@ -217,32 +190,32 @@ class Node(ParameterMixin):
         options = {"event_callbacks": event_callbacks, "qos_overriding_options": qos_overriding_options}
         refuse_options("create_subscription", callback_group=callback_group, **options)
         profile, name = _profile(qos_profile), self.resolve_topic_name(topic)
-        reader = self._context.participant.reader(f"rt{name}", _typename(msg_type), profile)
+        reader = self.context.participant.reader(f"rt{name}", _typename(msg_type), profile)
         subscription = Subscription(reader, msg_type, name, callback, None, profile, raw, None)
         return self._added(subscription, self._subscriptions)
 
     # Services.
     def create_service(
         self, srv_type: Any, srv_name: str, callback: Callable[[Any, Any], Any], *,
-        qos_profile: QoSProfile = qos_profile_services_default, callback_group: Any = None,
+        qos_profile: QoSProfile = qos.qos_profile_services_default, callback_group: Any = None,
     ) -> Service:  # fmt: skip
         refuse_options("create_service", callback_group=callback_group)
         name = self.resolve_service_name(srv_name)
         typename = _typename(srv_type)
-        endpoint = wire.CallEndpoint(self._context.participant, typename, name, qos_profile, serves=True)
+        endpoint = wire.CallEndpoint(self.context.participant, typename, name, qos_profile, serves=True)
         service = Service(endpoint, srv_type, name, callback, None, qos_profile)
         service._look._on_change = self._wake_executor
         return self._added(service, self._services)
 
     def create_client(
-        self, srv_type: Any, srv_name: str, *, qos_profile: QoSProfile = qos_profile_services_default,
+        self, srv_type: Any, srv_name: str, *, qos_profile: QoSProfile = qos.qos_profile_services_default,
         callback_group: Any = None,
     ) -> Client:  # fmt: skip
         refuse_options("create_client", callback_group=callback_group)
         name = self.resolve_service_name(srv_name)
         typename = _typename(srv_type)
-        endpoint = wire.CallEndpoint(self._context.participant, typename, name, qos_profile, serves=False)
-        client = Client(self._context, endpoint, srv_type, name, qos_profile, None)
+        endpoint = wire.CallEndpoint(self.context.participant, typename, name, qos_profile, serves=False)
+        client = Client(self.context, endpoint, srv_type, name, qos_profile, None)
         return self._added(client, self._clients)
 
     def create_timer(
@@ -272,31 +245,27 @@ class Node(ParameterMixin):
 
     def destroy_node(self) -> None:
         """Destroy the node and all that was created under it. A second call does nothing."""
-        # Looked up once: the executor is held by a weak reference, and may go at any time.
-        if (executor := self.executor) is not None:
-            executor.remove_node(self)
+        if self.executor is not None:
+            self.executor.remove_node(self)
         sinks.pop(self._logger.name, None)
         for entities in (self._timers, self._subscriptions, self._services, self._clients, self._publishers):
             for entity in entities:
                 entity.destroy()
             entities.clear()
-        if self in self._context._nodes:
-            self._context._nodes.remove(self)
-            self._context._announce_nodes()
-        self._context._leave()
+        if self in self.context._nodes:
+            self.context._nodes.remove(self)
+            self.context._announce_nodes()
+        self.context._leave()
 
     # Who else is there.
     def count_publishers(self, topic_name: str) -> int:
-        return self._context.participant.count("publication", f"rt{self.resolve_topic_name(topic_name)}")
-
-    def count_subscribers(self, topic_name: str) -> int:
-        return self._context.participant.count("subscription", f"rt{self.resolve_topic_name(topic_name)}")
+        return self.context.participant.count("publication", f"rt{self.resolve_topic_name(topic_name)}")
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         refuse_options("get_topic_names_and_types", no_demangle=no_demangle)
         found: dict[str, set[str]] = {}
         for kind in ("publication", "subscription"):
-            for endpoint in self._context.participant.endpoints(kind):
+            for endpoint in self.context.participant.endpoints(kind):
                 if endpoint.topic_name.startswith("rt/"):
                     typename = endpoint.type_name.replace("::dds_::", "/").replace("::", "/").rstrip("_")
                     found.setdefault(endpoint.topic_name[2:], set()).add(typename)

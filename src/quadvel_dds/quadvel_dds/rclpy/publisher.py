@@ -13,17 +13,12 @@ from .exceptions import InvalidHandle
 
 class Publisher(Partial):
     def __init__(
-        self,
-        publisher_impl: wire.Writer,
-        msg_type: Any,
-        topic: str,
-        qos_profile: Any,
-        event_callbacks: Any,
+        self, publisher_impl: wire.Writer, msg_type: Any, topic: str, qos_profile: Any, event_callbacks: Any,
         callback_group: Any,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self._writer: wire.Writer | None = publisher_impl
         self.msg_type = msg_type
-        self.topic = topic
+        self.topic_name = topic
         self.qos_profile = qos_profile
         self._is_valid: Callable[[], bool] = lambda: True  # the node tells whether its context still runs
 
@@ -34,7 +29,7 @@ class Publisher(Partial):
         after shutdown, InvalidHandle after `destroy`.
         """
         if self._writer is None:
-            raise InvalidHandle(f"the publisher of '{self.topic}' was destroyed")
+            raise InvalidHandle(f"the publisher of '{self.topic_name}' was destroyed")
         if not self._is_valid():
             raise RuntimeError("Failed to publish: publisher's context is invalid")
         if isinstance(msg, self.msg_type):
@@ -46,10 +41,6 @@ class Publisher(Partial):
 
     def get_subscription_count(self) -> int:
         return self._writer.count() if self._writer else 0
-
-    @property
-    def topic_name(self) -> str:
-        return self.topic
 
     def destroy(self) -> None:
         if self._writer is not None:

@@ -47,26 +47,16 @@ _UNSUPPORTED = ("deadline", "liveliness", "liveliness_lease_duration", "avoid_ro
 
 
 class InvalidQoSProfileException(Exception):
-    def __init__(self, *args: Any) -> None:
-        super().__init__("Invalid QoSProfile", *args)
+    """A profile that lacks what it must say."""
 
 
 class QoSProfile(Partial):
     """What a publisher offers and a subscription asks for. `history` or `depth` must be given."""
 
-    history: HistoryPolicy
-    depth: int
-    reliability: ReliabilityPolicy
-    durability: DurabilityPolicy
-    lifespan: Duration
-
     def __init__(self, **kwargs: Any) -> None:
-        if "history" not in kwargs:
-            if "depth" not in kwargs:
-                raise InvalidQoSProfileException("History and/or depth settings are required.")
-            kwargs["history"] = HistoryPolicy.KEEP_LAST
-        if kwargs["history"] == HistoryPolicy.KEEP_LAST and "depth" not in kwargs:
-            raise InvalidQoSProfileException("History set to KEEP_LAST without a depth setting.")
+        history = kwargs.setdefault("history", HistoryPolicy.KEEP_LAST)
+        if history == HistoryPolicy.KEEP_LAST and "depth" not in kwargs:
+            raise InvalidQoSProfileException("Invalid QoSProfile: a depth is required")
         for name, value in ({name: default for name, (_, default) in _POLICIES.items()} | kwargs).items():
             setattr(self, name, value)
 
@@ -90,11 +80,6 @@ class QoSProfile(Partial):
         return f"QoSProfile({', '.join(f'{name}={value}' for name, value in vars(self).items())})"
 
 
-qos_profile_system_default = QoSProfile(
-    history=HistoryPolicy.SYSTEM_DEFAULT,
-    reliability=ReliabilityPolicy.SYSTEM_DEFAULT,
-    durability=DurabilityPolicy.SYSTEM_DEFAULT,
-)
 qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)

@@ -20,36 +20,26 @@ LOOK = 5_000_000  # ns, between two looks for it
 
 class Service(Partial):
     def __init__(
-        self,
-        service_impl: wire.CallEndpoint,
-        srv_type: Any,
-        srv_name: str,
-        callback: Callable[[Any, Any], Any],
-        callback_group: Any,
-        qos_profile: Any,
-    ) -> None:
+        self, service_impl: wire.CallEndpoint, srv_type: Any, srv_name: str,
+        callback: Callable[[Any, Any], Any], callback_group: Any, qos_profile: Any,
+    ) -> None:  # fmt: skip
         self._endpoint = service_impl
         self._reader = service_impl.reader
         self.srv_type = srv_type
-        self.srv_name = srv_name
+        self.service_name = srv_name
         self.callback = callback
         self.qos_profile = qos_profile
         # Answers whose client was not found yet, and until when it is looked for; the timer runs while there are any.
         self._waiting: list[tuple[float, Any, Any]] = []
-        self._look = Timer(
-            self._try_again, None, LOOK, Clock(clock_type=ClockType.STEADY_TIME), autostart=False
-        )
-
-    @property
-    def service_name(self) -> str:
-        return self.srv_name
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._look = Timer(self._try_again, None, LOOK, steady, autostart=False)
 
     def send_response(self, response: Any, header: Any) -> None:
         """Send the answer to the request that came with `header`; later, if the client is not found yet."""
         if not isinstance(response, self.srv_type.Response):
             expected = self.srv_type.Response.TYPENAME
             raise TypeError(
-                f"service {self.srv_name}: the callback returned {response!r}, expected {expected}"
+                f"service {self.service_name}: the callback returned {response!r}, expected {expected}"
             )
         if not self._endpoint.answer(response, *header):
             self._waiting.append((time.monotonic() + PATIENCE, response, header))
@@ -63,7 +53,9 @@ class Service(Partial):
             if time.monotonic() < until:
                 self._waiting.append((until, response, header))
             else:
-                get_logger("rclpy").warning(f"service {self.srv_name}: a client that asked does not listen")
+                get_logger("rclpy").warning(
+                    f"service {self.service_name}: a client that asked does not listen"
+                )
         if not self._waiting:
             self._look.cancel()
 
@@ -85,7 +77,7 @@ class Service(Partial):
                 raise ValueError("it came by Fast DDS, whose calls the embedded middleware can not answer")
             request_id, request = self._endpoint.decode(data, self.srv_type.Request.TYPENAME)
         except ValueError as error:
-            get_logger("rclpy").error(f"service {self.srv_name}: dropped a request: {error}")
+            get_logger("rclpy").error(f"service {self.service_name}: dropped a request: {error}")
             return None
         header = (request_id, client)
         return lambda: self.send_response(self.callback(request, self.srv_type.Response()), header)

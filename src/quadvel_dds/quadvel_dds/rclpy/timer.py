@@ -22,35 +22,25 @@ class Timer(Partial):
     """
 
     def __init__(
-        self,
-        callback: Callable[[], Any],
-        callback_group: Any,
-        timer_period_ns: int,
-        clock: Clock,
-        *,
-        context: Any = None,
-        autostart: bool = True,
-    ) -> None:
+        self, callback: Callable[[], Any], callback_group: Any, timer_period_ns: int, clock: Clock, *,
+        context: Any = None, autostart: bool = True,
+    ) -> None:  # fmt: skip
         if timer_period_ns < 0:
             raise ValueError(f"a timer's period must not be negative, found {timer_period_ns} ns")
         self.callback = callback
         self.timer_period_ns = timer_period_ns
-        self._clock = clock
+        self.clock = clock
         self._canceled = not autostart
         self._on_change: Callable[[], None] = lambda: None
         self._restart()
 
     def _restart(self) -> None:
-        self._simulated = self._clock._simulated_ns is not None
+        self._simulated = self.clock._simulated_ns is not None
         self._last_ns = self._now_ns()
         self._next_ns = self._last_ns + self.timer_period_ns
 
     def _now_ns(self) -> int:
-        return self._clock._now_ns() if self._simulated else time.monotonic_ns()
-
-    @property
-    def clock(self) -> Clock:
-        return self._clock
+        return self.clock._now_ns() if self._simulated else time.monotonic_ns()
 
     def is_ready(self) -> bool:
         return not self._canceled and self._remaining_ns() <= 0
@@ -70,7 +60,7 @@ class Timer(Partial):
         self._canceled = True
 
     def _remaining_ns(self) -> int:
-        changed = self._simulated != (self._clock._simulated_ns is not None)
+        changed = self._simulated != (self.clock._simulated_ns is not None)
         if changed or self._now_ns() < self._last_ns:  # set back
             self._restart()
         return self._next_ns - self._now_ns()
