@@ -1,14 +1,12 @@
 """Executors: what runs side by side, what an error in a callback does, how a spin ends."""
 
 import threading
-import time
 from collections.abc import Callable
 
 import pytest
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from std_srvs.srv import SetBool
 
 Start = Callable[..., None]
 

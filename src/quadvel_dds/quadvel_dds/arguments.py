@@ -10,8 +10,6 @@ from typing import Any
 import attrs
 import yaml
 
-from quadvel_dds.errors import UnsupportedError
-
 SCOPE_KEY = "ros__parameters"
 FLAGS = {
     "-p": "-p",
@@ -22,7 +20,6 @@ FLAGS = {
     "--log-level": "log",
 }
 IGNORED_FLAGS = {f"--{on}-{what}" for on in ("enable", "disable") for what in ("rosout-logs", "stdout-logs")}
-UNSUPPORTED_FLAGS = ("-e", "--enclave", "--log-config-file", "--log-file-name")
 
 
 class InvalidROSArgsError(ValueError):
@@ -86,10 +83,8 @@ def parse(args: Sequence[str]) -> RosArguments:
 
 
 def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None:
-    if flag in UNSUPPORTED_FLAGS:
-        raise UnsupportedError(f"argument {flag}")
     if flag not in FLAGS:
-        raise InvalidROSArgsError(f"unknown ROS argument '{flag}'")
+        raise InvalidROSArgsError(f"ROS argument '{flag}' is not known, or not offered here")
     value = next(following, None)
     if value is None:
         raise InvalidROSArgsError(f"argument {flag} needs a value")

@@ -33,6 +33,15 @@ class Partial:
         raise UnsupportedMemberError(f"{type(self).__name__}.{name}")
 
 
+def unsupported(what: str) -> Callable[..., NoReturn]:
+    """A function that raises UnsupportedError however it is called."""
+
+    def refuse(*args: Any, **kwargs: Any) -> NoReturn:
+        raise UnsupportedError(what)
+
+    return refuse
+
+
 def refuse_options(where: str, **options: Any) -> None:
     """Raise UnsupportedError if any of the options is set."""
     for name, value in options.items():

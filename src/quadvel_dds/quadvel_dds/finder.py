@@ -91,11 +91,10 @@ def install() -> bool:
     """
     if is_installed():
         return True
-    fault = None
-    if os.environ.get("QUADVEL_MIDDLEWARE") != "embedded":
-        fault = ros2_fault()
-        if fault is None and find_spec("rclpy") is not None:
-            return False
+    asked = os.environ.get("QUADVEL_MIDDLEWARE") == "embedded"
+    fault = None if asked else ros2_fault()
+    if not asked and not fault and find_spec("rclpy") is not None:
+        return False
     if "rclpy" in sys.modules:
         raise RuntimeError("rclpy of ROS 2 is imported already; call quadvel_dds.install() before")
     if fault:

@@ -30,14 +30,10 @@ def struct(typename: str) -> Any:
     if "/srv/" in typename:
         fields = REQUEST_HEADER | fields
     made: Any = make_idl_struct(typename.rpartition("/")[2], messages.dds_name(typename), fields)
-    made.__init__ = _keep
+    made.__init__ = lambda sample, data: setattr(sample, "data", data)
     made.serialize = lambda sample, **options: sample.data
     made.deserialize = made.deserialize_key = classmethod(lambda cls, data, **options: cls(data))
     return made
-
-
-def _keep(sample: Any, data: bytes | bytearray) -> None:
-    sample.data = data
 
 
 def _field(description: Any) -> type[IdlStruct] | Any:

@@ -102,16 +102,12 @@ def message_class(typename: str) -> type[Message]:
         "TYPENAME": typename,
     }
     for constant, base, value in constants:
-        namespace[constant] = bytes([value]) if base == "byte" else value
+        namespace[constant] = bytes([int(value)]) if base == "byte" else value
     cls = type(name, (Message,), namespace)
     for field, description in fields:
         setattr(cls, field, _accessor(cls.__dict__[f"_{field}"], _converter(description)))
-    cls.__init__ = _make_init(typename, fields)  # type: ignore[misc]
+    cls.__init__ = _make_init(typename, fields)  # type: ignore[misc]  # makes the classes of its fields too
     STORE.types[typename] = _make_reader(cls, fields)  # type: ignore[assignment]
-    for _, description in fields:  # rosbags looks these up while it reads or writes this one
-        inner = description[1][0] if description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE) else description
-        if inner[0] == Nodetype.NAME:
-            message_class(inner[1])
     return cls
 
 
@@ -162,15 +158,6 @@ def dds_name(typename: str) -> str:
     """Name of the type on the wire: "geometry_msgs::msg::dds_::Twist_"."""
     package, kind, name = typename.split("/")
     return f"{package}::{kind}::dds_::{name}_"
-
-
-def type_text(description: Description) -> str:
-    """Type of a field as a definition has it."""
-    kind, detail = description
-    if kind in (Nodetype.NAME, Nodetype.BASE):
-        return detail if kind == Nodetype.NAME else detail[0]
-    limit = detail[1] if kind == Nodetype.ARRAY else f"<={detail[1]}" if detail[1] else ""
-    return f"{type_text(detail[0])}[{limit}]"
 
 
 def _accessor(slot: Any, convert: Callable[[Any], Any] | None) -> Any:
@@ -266,7 +253,7 @@ def _make_init(typename: str, fields: Any) -> Callable[..., None]:
 
 def fault(message: Message) -> str | None:
     """The first field, nested ones included, that cannot be sent, in a sentence; None if all can."""
-    for field, description in STORE.fielddefs[message.TYPENAME][1]:
+    for field, _ in STORE.fielddefs[message.TYPENAME][1]:
         value = getattr(message, f"_{field}")
         if isinstance(value, Message) and (inner := fault(value)):
             return inner
@@ -275,5 +262,5 @@ def fault(message: Message) -> str | None:
         try:
             STORE.serialize_cdr(alone, message.TYPENAME)
         except Exception as error:
-            return f"field '{field}' must be of type {type_text(description)}, found {value!r}: {error}"
+            return f"field '{field}' holds {value!r}: {error}"
     return None

@@ -149,10 +149,9 @@ class Reader:
             samples = self.dds.take(1)
             if not samples:
                 return None
-            if samples[
-                0
-            ].sample_info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
-                return samples[0].data, samples[0].sample_info
+            info = samples[0].sample_info
+            if info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
+                return samples[0].data, info
         return None
 
     def count(self) -> int:
@@ -206,17 +205,15 @@ class WaitSet:
 class CallEndpoint:
     """A client's or a service's writer and reader; every sample starts with (client id, sequence number)."""
 
-    def __init__(
-        self, participant: Participant, typename: str, name: str, profile: Any, serves: bool
-    ) -> None:
+    def __init__(self, place: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
         # Tells which writer and reader belong together, as in rmw_cyclonedds.
         identity = ".".join(f"{byte:02x}" for byte in uuid.uuid4().bytes)
         own, self._other = ("serviceid=", "clientid=") if serves else ("clientid=", "serviceid=")
         request = (f"rq{name}Request", f"{typename}_Request")
         reply = (f"rr{name}Reply", f"{typename}_Response")
         outgoing, incoming = (reply, request) if serves else (request, reply)
-        self.writer = participant.writer(*outgoing, profile, f"{own}{identity};")
-        self.reader = participant.reader(*incoming, profile, f"{own}{identity};")
+        self.writer = place.writer(*outgoing, profile, f"{own}{identity};")
+        self.reader = place.reader(*incoming, profile, f"{own}{identity};")
         self.client_id = self.writer.handle
 
     def understands(self, endpoint: Any) -> bool:

@@ -59,18 +59,13 @@ create_node = Node
 _global_executor: Executor | None = None
 
 
-def get_global_executor() -> Executor:
-    """The executor of the spin functions where none is given; a new one after the context was shut down."""
+@contextmanager
+def _added(node: Node, executor: Any) -> Iterator[Executor]:
+    """The executor given, or one that all calls share as long as the context lives, with the node in it."""
     global _global_executor
     if _global_executor is None or _global_executor.context is not get_default_context():
         _global_executor = SingleThreadedExecutor()
-    return _global_executor
-
-
-@contextmanager
-def _added(node: Node, executor: Any) -> Iterator[Executor]:
-    """The executor given, or the global one, with the node in it."""
-    executor = executor or get_global_executor()
+    executor = executor or _global_executor
     is_new = executor.add_node(node)
     try:
         yield executor

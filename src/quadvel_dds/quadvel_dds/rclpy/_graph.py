@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
+from rmw_dds_common.msg import Gid, NodeEntitiesInfo, ParticipantEntitiesInfo
+
 from quadvel_dds import messages, wire
 
 from .qos import DurabilityPolicy, QoSProfile
 
-Gid, NodeEntitiesInfo, ParticipantEntitiesInfo = (
-    messages.message_class(f"rmw_dds_common/msg/{name}")
-    for name in ("Gid", "NodeEntitiesInfo", "ParticipantEntitiesInfo")
-)
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -23,7 +21,7 @@ class GraphAnnouncer:
 
     def announce(self, nodes: Iterable[Any]) -> None:
         """Publish names and endpoints of all nodes of this process; called whenever one of them changes."""
-        message: Any = ParticipantEntitiesInfo(gid=Gid(data=list(self._gid)))
+        message = ParticipantEntitiesInfo(gid=Gid(data=list(self._gid)))
         message.node_entities_info_seq = [_node_info(node) for node in nodes]
         self._writer.write(messages.serialize(message))
 
@@ -32,7 +30,7 @@ def _node_info(node: Any) -> Any:
     calls = [entity._endpoint for entity in (*node._clients, *node._services)]
     readers = [*(one._reader for one in node._subscriptions), *(call.reader for call in calls)]
     writers = [*(one._writer for one in node._publishers), *(call.writer for call in calls)]
-    info: Any = NodeEntitiesInfo(node_namespace=node.get_namespace(), node_name=node.get_name())
+    info = NodeEntitiesInfo(node_namespace=node.get_namespace(), node_name=node.get_name())
     info.reader_gid_seq = [Gid(data=list(reader.gid)) for reader in readers]
     info.writer_gid_seq = [
         Gid(data=list(writer.gid)) for writer in writers if writer is not None

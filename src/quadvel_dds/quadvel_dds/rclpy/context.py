@@ -23,7 +23,7 @@ _default_lock = Lock()
 
 class Context(Partial):
     def __init__(self) -> None:
-        self._running = self._initialized = False
+        self._running = False
         self._participant: wire.Participant | None = None
         self._participant_lock = Lock()
         self._announcer: GraphAnnouncer | None = None
@@ -34,7 +34,7 @@ class Context(Partial):
 
     def init(self, args: Sequence[str] | None, domain_id: int | None = None) -> None:
         """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
-        if self._initialized:
+        if self._running:
             raise RuntimeError("Context.init() must only be called once")
         if domain_id is None:
             text = os.environ.get("ROS_DOMAIN_ID") or "0"
@@ -44,7 +44,7 @@ class Context(Partial):
         self._domain_id = domain_id
         self.arguments = arguments.parse(sys.argv if args is None else args)
         set_levels(self.arguments.log_levels)
-        self._initialized = self._running = True
+        self._running = True
         _contexts.add(self)
 
     def ok(self) -> bool:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from functools import total_ordering
-
-from quadvel_dds.errors import Partial
+from quadvel_dds.errors import Partial, unsupported
 
 S_TO_NS = 10**9
 
 
-@total_ordering
 class Duration(Partial):
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = int(seconds * S_TO_NS) + int(nanoseconds)
@@ -17,10 +14,5 @@ class Duration(Partial):
     def __repr__(self) -> str:
         return f"Duration(nanoseconds={self.nanoseconds})"
 
-    def __eq__(self, other: object) -> bool:
-        return self.nanoseconds == other.nanoseconds if isinstance(other, Duration) else NotImplemented
-
-    def __lt__(self, other: object) -> bool:
-        return self.nanoseconds < other.nanoseconds if isinstance(other, Duration) else NotImplemented
-
+    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing durations")
     __hash__ = None  # type: ignore[assignment]

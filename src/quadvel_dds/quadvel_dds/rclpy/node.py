@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from rcl_interfaces.msg import Log, ParameterEvent
+from rcl_interfaces.msg import Log
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from quadvel_dds import arguments, names, wire
@@ -45,7 +45,7 @@ class Node(ParameterMixin):
         )
         self.context = get_default_context()
         if not self.context.ok():
-            raise exceptions.NotInitializedException("cannot create node")
+            raise exceptions.NotInitializedException("cannot create node: rclpy.init() has not been called")
         local = arguments.parse(["--ros-args", *(cli_args or [])])
         sources = [local, self.context.arguments] if use_global_arguments else [local]
         self._rules = [rule for source in sources for rule in source.remappings]
@@ -58,7 +58,6 @@ class Node(ParameterMixin):
         self._timers: list[Timer] = []
         self.executor: Any = None
         self._clock = Clock(clock_type=ClockType.ROS_TIME)
-        self._clock_subscription: Subscription | None = None
         self.context._nodes.append(self)
 
         overrides: dict[str, Any] = {}
@@ -69,10 +68,9 @@ class Node(ParameterMixin):
         if enable_rosout:
             self._rosout = self.create_publisher(Log, "/rosout", qos.qos_profile_rosout_default)
             sinks[self._logger.name] = self._publish_log
-        self._parameter_events = self.create_publisher(
-            ParameterEvent, "/parameter_events", qos.qos_profile_parameter_events
-        )
-        self.declare_parameter("use_sim_time", False)
+        if self.declare_parameter("use_sim_time", False).value:
+            self._clock._simulated_ns = 0
+            self.create_subscription(ClockMessage, "/clock", self._on_clock, CLOCK_QOS)
         if start_parameter_services:
             self._start_parameter_services()
 
@@ -80,29 +78,10 @@ class Node(ParameterMixin):
         name, namespace = names.remap_node(name, namespace, self._rules)
         namespace = namespace if namespace.startswith("/") else f"/{namespace}"
         if fault := names.fault(names.NODE, name):
-            raise exceptions.InvalidNodeNameException(name, *fault)
+            raise exceptions.NameValidationException("node name", name, *fault)
         if fault := names.fault(names.ABSOLUTE, namespace):
-            raise exceptions.InvalidNamespaceException(namespace, *fault)
+            raise exceptions.NameValidationException("namespace", namespace, *fault)
         return name, namespace
-
-    def _on_parameters_set(self, parameters: list[Parameter], event: Any) -> None:
-        event.stamp = self._clock.now().to_msg()
-        if self.context.ok():
-            self._parameter_events.publish(event)
-        for parameter in parameters:
-            if parameter.name == "use_sim_time":
-                self._follow_clock(parameter.value)
-
-    def _follow_clock(self, simulated: bool) -> None:
-        """Whether time is what a simulator says on /clock."""
-        if simulated and self._clock_subscription is None:
-            self._clock._simulated_ns = 0
-            self._clock_subscription = self.create_subscription(
-                ClockMessage, "/clock", self._on_clock, CLOCK_QOS
-            )
-        elif not simulated and self._clock_subscription is not None:
-            self.destroy_subscription(self._clock_subscription)
-            self._clock_subscription = self._clock._simulated_ns = None
 
     def _on_clock(self, message: Any) -> None:
         self._clock._simulated_ns = message.clock.sec * 10**9 + message.clock.nanosec
@@ -159,17 +138,12 @@ class Node(ParameterMixin):
         return True
 
     # Topics.
-    def resolve_topic_name(self, topic: str, *, only_expand: bool = False) -> str:
-        return self._resolve(topic, only_expand, exceptions.InvalidTopicNameException)
-
-    def resolve_service_name(self, service: str, *, only_expand: bool = False) -> str:
-        return self._resolve(service, only_expand, exceptions.InvalidServiceNameException)
-
-    def _resolve(self, name: str, only_expand: bool, error: Callable[..., Exception]) -> str:
+    def _resolve(self, name: str, kind: str = "topic") -> str:
+        """Full name of a topic or service, after remapping."""
         if fault := names.fault(names.TOPIC, name):
-            raise error(name, *fault)
+            raise exceptions.NameValidationException(f"{kind} name", name, *fault)
         full = names.expand(name, self._name, self._namespace)
-        return full if only_expand else names.remap(full, self._name, self._namespace, self._rules)
+        return names.remap(full, self._name, self._namespace, self._rules)
 
     def create_publisher(
         self, msg_type: Any, topic: str, qos_profile: QoSProfile | int, *, callback_group: Any = None,
@@ -177,7 +151,7 @@ class Node(ParameterMixin):
     ) -> Publisher:  # fmt: skip
         options = {"event_callbacks": event_callbacks, "qos_overriding_options": qos_overriding_options}
         refuse_options("create_publisher", callback_group=callback_group, **options)
-        profile, name = _profile(qos_profile), self.resolve_topic_name(topic)
+        profile, name = _profile(qos_profile), self._resolve(topic)
         writer = self.context.participant.writer(f"rt{name}", _typename(msg_type), profile)
         publisher = publisher_class(writer, msg_type, name, profile, None, None)
         publisher._is_valid = self.context.ok
@@ -189,7 +163,7 @@ class Node(ParameterMixin):
     ) -> Subscription:  # fmt: skip
         options = {"event_callbacks": event_callbacks, "qos_overriding_options": qos_overriding_options}
         refuse_options("create_subscription", callback_group=callback_group, **options)
-        profile, name = _profile(qos_profile), self.resolve_topic_name(topic)
+        profile, name = _profile(qos_profile), self._resolve(topic)
         reader = self.context.participant.reader(f"rt{name}", _typename(msg_type), profile)
         subscription = Subscription(reader, msg_type, name, callback, None, profile, raw, None)
         return self._added(subscription, self._subscriptions)
@@ -200,7 +174,7 @@ class Node(ParameterMixin):
         qos_profile: QoSProfile = qos.qos_profile_services_default, callback_group: Any = None,
     ) -> Service:  # fmt: skip
         refuse_options("create_service", callback_group=callback_group)
-        name = self.resolve_service_name(srv_name)
+        name = self._resolve(srv_name, "service")
         typename = _typename(srv_type)
         endpoint = wire.CallEndpoint(self.context.participant, typename, name, qos_profile, serves=True)
         service = Service(endpoint, srv_type, name, callback, None, qos_profile)
@@ -212,7 +186,7 @@ class Node(ParameterMixin):
         callback_group: Any = None,
     ) -> Client:  # fmt: skip
         refuse_options("create_client", callback_group=callback_group)
-        name = self.resolve_service_name(srv_name)
+        name = self._resolve(srv_name, "service")
         typename = _typename(srv_type)
         endpoint = wire.CallEndpoint(self.context.participant, typename, name, qos_profile, serves=False)
         client = Client(self.context, endpoint, srv_type, name, qos_profile, None)
@@ -259,7 +233,7 @@ class Node(ParameterMixin):
 
     # Who else is there.
     def count_publishers(self, topic_name: str) -> int:
-        return self.context.participant.count("publication", f"rt{self.resolve_topic_name(topic_name)}")
+        return self.context.participant.count("publication", f"rt{self._resolve(topic_name)}")
 
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         refuse_options("get_topic_names_and_types", no_demangle=no_demangle)
@@ -277,9 +251,6 @@ def _profile(qos_profile: QoSProfile | int) -> QoSProfile:
 
 
 def _typename(interface: Any) -> str:
-    typename = getattr(interface, "TYPENAME", None)
-    if not isinstance(typename, str):
-        raise TypeError(
-            f"expected a message or service class of the embedded middleware, found {interface!r}"
-        )
-    return typename
+    if not hasattr(interface, "TYPENAME"):
+        raise TypeError(f"expected a message or service class of quadvel_dds, found {interface!r}")
+    return str(interface.TYPENAME)

@@ -5,18 +5,16 @@ from __future__ import annotations
 from enum import Enum
 from typing import Any
 
-import attrs
-from rcl_interfaces.msg import Parameter as ParameterMessage
 from rcl_interfaces.msg import ParameterType, ParameterValue
 
-from quadvel_dds.errors import module_getattr
+from quadvel_dds.errors import Partial, module_getattr
 
 __getattr__ = module_getattr(__name__)
 # What a value of each type is made of, in the order in which types are tried: a bool is an int too.
 _ELEMENTS = {"BOOL": bool, "INTEGER": int, "DOUBLE": float, "STRING": str}
 
 
-class Type(Enum):
+class ParameterKind(Enum):
     NOT_SET = ParameterType.PARAMETER_NOT_SET
     BOOL = ParameterType.PARAMETER_BOOL
     INTEGER = ParameterType.PARAMETER_INTEGER
@@ -29,7 +27,7 @@ class Type(Enum):
     STRING_ARRAY = ParameterType.PARAMETER_STRING_ARRAY
 
     @classmethod
-    def from_parameter_value(cls, parameter_value: Any) -> Type:
+    def from_parameter_value(cls, parameter_value: Any) -> ParameterKind:
         """Type of a Python value. Raises TypeError if no parameter can hold it."""
         for member in cls:
             if member.check(parameter_value):
@@ -38,44 +36,28 @@ class Type(Enum):
 
     def check(self, parameter_value: Any) -> bool:
         """Whether a value is of this type. An empty list is one of every kind of list."""
-        if self == Type.NOT_SET:
+        if self == ParameterKind.NOT_SET:
             return parameter_value is None
         if self.name in _ELEMENTS:
-            is_number = not isinstance(parameter_value, bool) or self == Type.BOOL
+            is_number = not isinstance(parameter_value, bool) or self == ParameterKind.BOOL
             return isinstance(parameter_value, _ELEMENTS[self.name]) and is_number
         element = _ELEMENTS.get(self.name.removesuffix("_ARRAY"), bytes)
         is_list = isinstance(parameter_value, (list, tuple))
         return is_list and all(isinstance(value, element) for value in parameter_value)
 
 
-@attrs.frozen(init=False)
-class Parameter:
-    name: str
-    type_: Type
-    value: Any
+class Parameter(Partial):
+    Type = ParameterKind
 
-    Type = Type
-
-    def __init__(self, name: str, type_: Type | None = None, value: Any = None) -> None:
-        type_ = Type.from_parameter_value(value) if type_ is None else type_
-        if not type_.check(value):
+    def __init__(self, name: str, type_: ParameterKind | None = None, value: Any = None) -> None:
+        self.name, self.value = name, value
+        self.type_ = ParameterKind.from_parameter_value(value) if type_ is None else type_
+        if not self.type_.check(value):
             raise ValueError(f"Type '{type_}' and value '{value}' do not agree")
-        self.__attrs_init__(name, type_, value)  # type: ignore[attr-defined]
 
     def get_parameter_value(self) -> Any:
         """The value as message rcl_interfaces/ParameterValue."""
         message = ParameterValue(type=self.type_.value)
-        if self.type_ != Type.NOT_SET:
+        if self.type_ != ParameterKind.NOT_SET:
             setattr(message, f"{self.type_.name.lower()}_value", self.value)
         return message
-
-    def to_parameter_msg(self) -> Any:
-        return ParameterMessage(name=self.name, value=self.get_parameter_value())
-
-    @classmethod
-    def from_parameter_msg(cls, param_msg: Any) -> Parameter:
-        type_ = Type(param_msg.value.type)
-        if type_ == Type.NOT_SET:
-            return cls(param_msg.name, type_)
-        value = getattr(param_msg.value, f"{type_.name.lower()}_value")
-        return cls(param_msg.name, type_, list(value) if type_.name.endswith("ARRAY") else value)

@@ -8,8 +8,6 @@ from typing import Any
 from quadvel_dds import messages, wire
 from quadvel_dds.errors import Partial
 
-from .exceptions import InvalidHandle
-
 
 class Publisher(Partial):
     def __init__(
@@ -23,13 +21,10 @@ class Publisher(Partial):
         self._is_valid: Callable[[], bool] = lambda: True  # the node tells whether its context still runs
 
     def publish(self, msg: Any) -> None:
-        """Send a message, or its ready CDR bytes.
-
-        Raises TypeError on a message of another type, ValueError on one that cannot be sent, RuntimeError
-        after shutdown, InvalidHandle after `destroy`.
-        """
+        """Send a message, or its ready CDR bytes. Raises TypeError on a message of another type, ValueError on one
+        that cannot be sent, and RuntimeError after `destroy` or a shutdown."""
         if self._writer is None:
-            raise InvalidHandle(f"the publisher of '{self.topic_name}' was destroyed")
+            raise RuntimeError(f"the publisher of '{self.topic_name}' was destroyed")
         if not self._is_valid():
             raise RuntimeError("Failed to publish: publisher's context is invalid")
         if isinstance(msg, self.msg_type):

@@ -71,11 +71,6 @@ class QoSProfile(Partial):
             raise ValueError(f"QoS policy '{name}' must be of type {kind.__name__}, found {value!r}")
         super().__setattr__(name, value)
 
-    def __eq__(self, other: object) -> bool:
-        return vars(self) == vars(other) if isinstance(other, QoSProfile) else NotImplemented
-
-    __hash__ = None  # type: ignore[assignment]
-
     def __repr__(self) -> str:
         return f"QoSProfile({', '.join(f'{name}={value}' for name, value in vars(self).items())})"
 
@@ -83,7 +78,6 @@ class QoSProfile(Partial):
 qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 qos_profile_services_default = QoSProfile(depth=10)
 qos_profile_parameters = QoSProfile(depth=1000)
-qos_profile_parameter_events = QoSProfile(depth=1000)
 qos_profile_rosout_default = QoSProfile(
     depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL, lifespan=Duration(seconds=10)
 )

@@ -37,10 +37,8 @@ class Service(Partial):
     def send_response(self, response: Any, header: Any) -> None:
         """Send the answer to the request that came with `header`; later, if the client is not found yet."""
         if not isinstance(response, self.srv_type.Response):
-            expected = self.srv_type.Response.TYPENAME
-            raise TypeError(
-                f"service {self.service_name}: the callback returned {response!r}, expected {expected}"
-            )
+            where, expected = f"service {self.service_name}", self.srv_type.Response.TYPENAME
+            raise TypeError(f"{where}: the callback returned {response!r}, expected {expected}")
         if not self._endpoint.answer(response, *header):
             self._waiting.append((time.monotonic() + PATIENCE, response, header))
             self._look.reset()
@@ -53,9 +51,8 @@ class Service(Partial):
             if time.monotonic() < until:
                 self._waiting.append((until, response, header))
             else:
-                get_logger("rclpy").warning(
-                    f"service {self.service_name}: a client that asked does not listen"
-                )
+                text = f"service {self.service_name}: a client that asked does not listen"
+                get_logger("rclpy").warning(text)
         if not self._waiting:
             self._look.cancel()
 
@@ -79,5 +76,5 @@ class Service(Partial):
         except ValueError as error:
             get_logger("rclpy").error(f"service {self.service_name}: dropped a request: {error}")
             return None
-        header = (request_id, client)
-        return lambda: self.send_response(self.callback(request, self.srv_type.Response()), header)
+        response = self.srv_type.Response()
+        return lambda: self.send_response(self.callback(request, response), (request_id, client))

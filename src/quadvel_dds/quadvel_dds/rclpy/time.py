@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from enum import IntEnum
-from functools import total_ordering
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 
-from quadvel_dds.errors import Partial
+from quadvel_dds.errors import Partial, unsupported
 
-from .duration import S_TO_NS, Duration
+from .duration import S_TO_NS
 
 
 class ClockType(IntEnum):
@@ -20,7 +19,6 @@ class ClockType(IntEnum):
     STEADY_TIME = 3
 
 
-@total_ordering
 class Time(Partial):
     def __init__(
         self, *, seconds: int | float = 0, nanoseconds: int = 0, clock_type: ClockType = ClockType.SYSTEM_TIME
@@ -33,24 +31,9 @@ class Time(Partial):
     def __repr__(self) -> str:
         return f"Time(nanoseconds={self.nanoseconds}, clock_type={self.clock_type.name})"
 
-    def __sub__(self, other: object) -> Any:
-        if not isinstance(other, Time):
-            return NotImplemented
-        return Duration(nanoseconds=self.nanoseconds - self._on_same_clock(other))
-
-    def __eq__(self, other: object) -> bool:
-        return self.nanoseconds == self._on_same_clock(other) if isinstance(other, Time) else NotImplemented
-
-    def __lt__(self, other: object) -> bool:
-        return self.nanoseconds < self._on_same_clock(other) if isinstance(other, Time) else NotImplemented
-
+    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing times")
+    __add__ = __sub__ = unsupported("computing with times")
     __hash__ = None  # type: ignore[assignment]
-
-    def _on_same_clock(self, other: Time) -> int:
-        """Nanoseconds of the other. Raises TypeError if it is of another clock."""
-        if self.clock_type != other.clock_type:
-            raise TypeError("Can't subtract or compare times with different clock types")
-        return other.nanoseconds
 
     def to_msg(self) -> Any:
         seconds, nanoseconds = divmod(self.nanoseconds, S_TO_NS)
