@@ -1,6 +1,7 @@
 """Topics: delivery, quality of service, and what stands on the wire."""
 
 import math
+import time
 from collections.abc import Callable
 
 import pytest
@@ -69,6 +70,16 @@ def test_best_effort_publisher_does_not_serve_a_reliable_subscription(ros: Start
     subscription = node.create_subscription(String, "chatter", lambda _: None, 1)
     assert publisher.get_subscription_count() == 0
     assert subscription.get_publisher_count() == 0
+
+
+def test_callback_may_take_the_message_information(ros: Start, spin_until: SpinUntil) -> None:
+    ros()
+    node, received = Node("listener"), []
+    node.create_subscription(String, "chatter", lambda message, info: received.append(info), 1)
+    before = time.time_ns()
+    node.create_publisher(String, "chatter", 1).publish(String())
+    assert spin_until(node, lambda: received)
+    assert before <= received[0]["source_timestamp"] <= time.time_ns()
 
 
 def test_raw_bytes_pass_through(ros: Start, spin_until: SpinUntil) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 from quadvel_dds import messages, wire
@@ -13,16 +14,17 @@ from .logging import get_logger
 
 class Subscription(Partial):
     def __init__(
-        self, subscription_impl: wire.Reader, msg_type: Any, topic: str, callback: Callable[[Any], Any],
+        self, subscription_impl: wire.Reader, msg_type: Any, topic: str, callback: Callable[..., Any],
         callback_group: Any, qos_profile: Any, raw: bool, event_callbacks: Any,
     ) -> None:  # fmt: skip
-        """callback: takes the message, as bytes where `raw`."""
+        """callback: takes the message, as bytes where `raw`, or the message and its information."""
         self._reader = subscription_impl
         self.msg_type = msg_type
         self.topic_name = topic
         self.callback = callback
         self.qos_profile = qos_profile
         self.raw = raw
+        self._takes_information = not _takes_one(callback)
 
     def get_publisher_count(self) -> int:
         return self._reader.count()
@@ -41,4 +43,14 @@ class Subscription(Partial):
             text = f"dropped a message on {self.topic_name}: {error}"
             get_logger("rclpy").error(text, throttle_duration_sec=1.0)
             return None
-        return lambda: self.callback(message)
+        if not self._takes_information:
+            return lambda: self.callback(message)
+        return lambda: self.callback(message, {"source_timestamp": sample[1].source_timestamp})
+
+
+def _takes_one(callback: Callable[..., Any]) -> bool:
+    try:
+        signature(callback).bind(None)
+    except TypeError:
+        return False
+    return True
