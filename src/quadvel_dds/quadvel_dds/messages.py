@@ -18,8 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from quadvel_recordings import definitions
 
-Description = Any
-"""Of a field, as rosbags has it: a kind of node, and what it is made of."""
+Description = Any  # of a field, as rosbags has it: a kind of node, and what it is made of
 HEADER = b"\x00\x01\x00\x00"  # encapsulation: plain CDR, little endian, no options
 FORMATS = {
     "bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",

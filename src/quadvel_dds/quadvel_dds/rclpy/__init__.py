@@ -27,12 +27,9 @@ __getattr__ = module_getattr(__name__, Path(__file__).parent)
 
 
 def init(
-    *,
-    args: list[str] | None = None,
-    context: Context | None = None,
-    domain_id: int | None = None,
+    *, args: list[str] | None = None, context: Context | None = None, domain_id: int | None = None,
     signal_handler_options: SignalHandlerOptions | None = None,
-) -> None:
+) -> None:  # fmt: skip
     """Start communication: read the arguments (sys.argv if None). No signals are taken over: see `signals`."""
     refuse_options("rclpy.init", context=context)
     get_default_context().init(args, domain_id=domain_id)

@@ -17,9 +17,6 @@ class Clock(Partial):
         self.clock_type = ClockType(clock_type)
         self._simulated_ns: int | None = None  # what /clock said last, where it counts
 
-    def __repr__(self) -> str:
-        return f"Clock(clock_type={self.clock_type.name})"
-
     def now(self) -> Time:
         return Time(nanoseconds=self._now_ns(), clock_type=self.clock_type)
 

@@ -11,8 +11,5 @@ class Duration(Partial):
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0) -> None:
         self.nanoseconds = int(seconds * S_TO_NS) + int(nanoseconds)
 
-    def __repr__(self) -> str:
-        return f"Duration(nanoseconds={self.nanoseconds})"
-
     __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing durations")
     __hash__ = None  # type: ignore[assignment]

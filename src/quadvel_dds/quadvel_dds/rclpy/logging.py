@@ -44,16 +44,18 @@ class RcutilsLogger(Partial):
             name = name.rpartition(".")[0]
         return int(levels[name])
 
-    def _log(self, severity: LoggingSeverity, message: str, *, throttle_duration_sec: float = 0) -> bool:
-        """Whether it was said. throttle_duration_sec: how often at most, for each place in the program that calls."""
+    def _log(
+        self, severity: LoggingSeverity, message: str, *, once: bool = False, throttle_duration_sec: float = 0
+    ) -> bool:
+        """Whether it was said. once, throttle_duration_sec: how often, for each place in the program."""
         if severity < self.get_effective_level():
             return False
         frame = sys._getframe(1)
         place = (frame.f_code.co_filename, frame.f_lineno)
         now, last = time.monotonic(), self._places.get(place, float("-inf"))
-        if now - last < throttle_duration_sec:
+        if now - last < throttle_duration_sec or (once and place in self._places):
             return False
-        if throttle_duration_sec:
+        if once or throttle_duration_sec:
             self._places[place] = now
         stamp = time.time_ns()
         seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"

@@ -28,9 +28,6 @@ class Time(Partial):
         self.nanoseconds = int(seconds * S_TO_NS) + int(nanoseconds)
         self.clock_type = ClockType(clock_type)
 
-    def __repr__(self) -> str:
-        return f"Time(nanoseconds={self.nanoseconds}, clock_type={self.clock_type.name})"
-
     __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing times")
     __add__ = __sub__ = unsupported("computing with times")
     __hash__ = None  # type: ignore[assignment]
