@@ -14,6 +14,10 @@ from mcap.reader import make_reader
 from quadvel_bringup.nodes import NODES
 
 RUN = "from quadvel_bringup.__main__ import main; main()"
+ALONE = {  # nothing goes out to a robot's address, and no port is taken that somebody else may have
+    "board": ("--ros-args", "-p", "port:=0"),
+    "driver": ("--ros-args", "-p", "dry_run:=true"),
+}
 INTERRUPTED_AT_THE_END = (
     f"import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT); {RUN}"
 )
@@ -27,7 +31,12 @@ def interrupt_first() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [("up",), ("drive", "--vx", "0.5"), ("record", "--out", "walk.mcap"), *(("run", name) for name in NODES)],
+    [
+        ("up",),
+        ("drive", "--vx", "0.5"),
+        ("record", "--out", "walk.mcap"),
+        *(("run", name, *ALONE.get(name, ())) for name in NODES),
+    ],
     ids=" ".join,
 )
 def test_ctrl_c_during_start_up_ends_a_command_cleanly(arguments: tuple[str, ...], tmp_path: Path) -> None:

@@ -142,15 +142,19 @@ def test_a_command_starts_walking_once_the_operator_allows_it(
     robot.step(5)
     report = robot.report("stance")
     assert not report.walk_allowed
+    assert "enable_walking" in report.walk_refusal
     refused = robot.graph.call(SetMode, "controller/set_mode", mode="walk")
     assert not refused.success
     assert "enable_walking" in refused.message
     assert robot.graph.call(SetBool, "controller/enable_walking", data=True).success
+    robot.order(0.0)
+    robot.step(5)
     robot.order(0.5)
     robot.step(5)
     report = robot.report("walk")
     assert report.mode == ControllerState.WALK
     assert report.walk_allowed
+    assert not report.walk_refusal
     assert report.command.linear.x == pytest.approx(0.5)
     assert not report.stance
     assert report.inference_p50_us > 0
@@ -160,6 +164,8 @@ def walk(robot: Robot) -> None:
     robot.stand()
     robot.step(65)
     robot.velocity = 0.0
+    robot.order(0.0)
+    robot.step(4)
     robot.order(0.5)
     robot.step(5)
     robot.report("walk")

@@ -155,7 +155,8 @@ def test_walking_waits_until_the_posture_is_reached(rig: Rig) -> None:
     rig.state.q = NOMINAL_Q + 0.2
     rig.tick()
     assert rig.supervisor.request("stance")[0]
-    rig.run(0.29, FORWARD)
+    rig.tick(STILL)
+    rig.run(0.285, FORWARD)
     assert rig.mode == "stance"
     rig.run(0.05, FORWARD)
     assert rig.mode == "walk"
@@ -214,11 +215,14 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
     rig.stand()
     rig.run(0.1, FORWARD)
     assert rig.mode == "stance"
-    assert not rig.supervisor.walk_allowed
+    assert "enable_walking" in rig.supervisor.walk_refusal
     taken, sentence = rig.supervisor.request("walk")
     assert not taken
     assert "enable_walking" in sentence
     rig.supervisor.enable_walking(True)
+    rig.tick(FORWARD)
+    assert rig.mode == "stance"  # that was ordered before it was allowed
+    rig.tick(STILL)
     rig.tick(FORWARD)
     assert rig.mode == "walk"
     rig.supervisor.enable_walking(False)
@@ -231,10 +235,51 @@ def test_the_permission_to_walk_ends_with_passive_and_with_a_fault(policy: Any) 
     rig = Rig(policy, require_operator=True).stand()
     rig.supervisor.enable_walking(True)
     rig.supervisor.fail("a test")
-    assert not rig.supervisor.walk_allowed
+    assert "in fault" in rig.supervisor.walk_refusal
     rig.supervisor.enable_walking(True)
     rig.supervisor.request("passive")
-    assert not rig.supervisor.walk_allowed
+    rig.stand()
+    assert "enable_walking" in rig.supervisor.walk_refusal
+
+
+@pytest.mark.parametrize("standing_still", [STILL, (0.0, 0.0, 0.0, 0.0)])
+def test_a_velocity_counts_only_after_a_zero_one_was_commanded_to_the_standing_robot(
+    rig: Rig, standing_still: tuple[float, ...]
+) -> None:
+    rig.tick(STILL)  # before it stands nothing counts
+    rig.supervisor.request("stand_up")
+    rig.run(2.5, FORWARD)
+    assert rig.mode == "stance"
+    assert rig.supervisor.walk_refusal == "a zero velocity has to be commanded first"
+    rig.run(0.1, None)  # silence is no order
+    rig.run(0.5, FORWARD)
+    assert rig.mode == "stance"
+    rig.tick(standing_still)
+    assert rig.supervisor.walk_refusal == ""
+    rig.tick(FORWARD)
+    assert rig.mode == "walk"
+
+
+def test_after_a_fault_a_velocity_that_is_still_commanded_does_not_count(rig: Rig) -> None:
+    rig.walk()
+    rig.supervisor.fail("a test")
+    rig.tick(FORWARD)
+    rig.supervisor.request("passive")
+    rig.supervisor.request("stand_up")
+    rig.run(3.0, FORWARD)
+    assert rig.mode == "stance"
+
+
+def test_walking_that_was_asked_for_stands_until_a_zero_velocity_was_commanded(rig: Rig) -> None:
+    rig.tick(None)
+    rig.supervisor.request("stand_up")
+    rig.run(2.5, None)
+    assert rig.supervisor.request("walk")[0]
+    rig.run(0.3, FORWARD)
+    np.testing.assert_array_equal(rig.supervisor.command, STILL)
+    rig.tick(STILL)
+    rig.tick(FORWARD)
+    np.testing.assert_allclose(rig.supervisor.command, FORWARD)
 
 
 def test_lying_down_ends_passive(rig: Rig) -> None:

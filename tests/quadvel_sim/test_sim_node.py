@@ -133,7 +133,9 @@ def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, pee
     simulation.interrupt()
     time.sleep(0.05)
     simulation.interrupt()
-    assert simulation.end() == (0, "")
+    status, text = simulation.end()
+    assert status == 0
+    assert all(line.startswith("[INFO]") for line in text.splitlines()), text
 
 
 def test_a_diverged_simulation_ends_the_node_with_one_sentence(
@@ -153,7 +155,7 @@ def test_a_diverged_simulation_ends_the_node_with_one_sentence(
     ("parameters", "sentence"),
     [
         ({"mode": "slow"}, "mode is 'slow', expected one of realtime, lockstep, fast"),
-        ({"friktion": 0.5}, "unknown parameter friktion, expected one of realtime_priority, cpus, mode,"),
+        ({"friktion": 0.5}, "unknown parameter friktion, expected one of realtime_priority, cpus, keyframe,"),
         ({"keyframe": "sit"}, "keyframe: found 'sit', expected one of stand, lie"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 from importlib import import_module
 from pathlib import Path
@@ -22,6 +23,7 @@ Try, one after the other:
   quadvel demo                walk in all directions; results in out/demo
   quadvel up                  the same robot, waiting for your commands
   quadvel drive --vx 0.5      one of them, from another terminal
+  quadvel status              how the robot does
   quadvel eval --grid quick --out out/eval
 
 \b
@@ -38,21 +40,34 @@ Nodes:
 {NODE_LIST}
 
 \b
-What follows the name are arguments of ROS 2:
+What follows are arguments of ROS 2:
   quadvel run sim_node --ros-args -p terrain:=rough
   quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel
 """
 
 PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
-app = typer.Typer(no_args_is_help=True, **PLAIN)
+app = typer.Typer(no_args_is_help=True, **{**PLAIN, "add_completion": True})
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 # Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
 ENDED_BY_CTRL_C = ("run", "up", "drive", "record")
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from .version import version
+
+        print(f"quadvel {version()}")
+        raise typer.Exit
+
+
 @app.callback(help=EXAMPLES)
-def begin(context: typer.Context) -> None:
+def begin(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
     if context.invoked_subcommand not in ENDED_BY_CTRL_C:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
@@ -71,28 +86,49 @@ def doctor() -> None:
 
 
 @app.command(help=RUN_HELP, context_settings=HANDED_ON)
-def run(context: typer.Context, node: Annotated[str, typer.Argument(metavar="NODE")]) -> None:
+def run(
+    context: typer.Context,
+    node: Annotated[str, typer.Argument(metavar="NODE")],
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="sim_node: its actuator.yaml.", show_default="the shipped one"),
+    ] = None,
+) -> None:
     from . import nodes
 
-    nodes.run(node, context.args)
+    arguments = [*context.args]
+    if actuator is not None:
+        arguments = [
+            "--ros-args",
+            *arguments[1:],
+            "-p",
+            f"actuator_file:={json.dumps(str(actuator.resolve()))}",
+        ]
+    nodes.run(node, arguments)
 
 
 @app.command()
 def up(
     low_level: Annotated[
-        Literal["sim", "external"],
-        typer.Option(help="What serves low_state and low_cmd; external: others do."),
+        Literal["sim", "board", "aliengo", "external"],
+        typer.Option(
+            help="The robot: simulated; simulated behind the AlienGo's UDP interface; the AlienGo; or others serve it."
+        ),
     ] = "sim",
     policy: Annotated[
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
     ] = None,
     terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
+    ] = None,
     estimator: Annotated[str | None, typer.Option(help="learned or kalman.", show_default="learned")] = None,
     params: Annotated[
         Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
     ] = PARAMETERS,
 ) -> None:
-    """Start simulator, estimator, controller and command mux, each as a process; Ctrl-C stops them.
+    """Start robot, estimator, controller and command mux, each as a process; Ctrl-C stops them.
 
     \b
     Then, from another terminal:
@@ -102,7 +138,14 @@ def up(
     """
     from .up import up as run_up
 
-    stack = Stack(low_level=low_level, policy=policy, terrain=terrain, estimator=estimator, parameters=params)
+    stack = Stack(
+        low_level=low_level,
+        policy=policy,
+        terrain=terrain,
+        actuator=actuator,
+        estimator=estimator,
+        parameters=params,
+    )
     raise typer.Exit(run_up(stack))
 
 
@@ -114,15 +157,93 @@ def drive(
     seconds: Annotated[float, typer.Option(min=0.1, help="For how long.")] = 3.0,
     topic: Annotated[str, typer.Option(help="An input of the command mux.")] = "cmd_vel_teleop",
 ) -> None:
-    """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop.
+    """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop; says what came of it.
+
+    Exit code 1 where the robot did not follow, 2 where nobody listens.
 
     \b
     For example:
       quadvel drive --vx 0.5 --wz 0.3 --seconds 5
     """
-    from .drive import drive as run_drive
+    raise typer.Exit(_with_middleware("drive").drive(vx, vy, wz, seconds, topic))
 
-    run_drive(vx, vy, wz, seconds, topic)
+
+@app.command()
+def mode(
+    wanted: Annotated[
+        Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="MODE")
+    ],
+) -> None:
+    """Ask the controller for a mode: passive, stand_up, stance, walk or lie_down.
+
+    passive damps the joints, and is the way out of a fault.
+
+    \b
+    In fault, once its cause is gone:
+      quadvel mode passive
+      quadvel mode stand_up
+    """
+    raise typer.Exit(_with_middleware("orders").mode(wanted))
+
+
+@app.command()
+def enable(
+    on: Annotated[bool, typer.Option("--on/--off", help="Allow walking, or forbid it.")] = True,
+) -> None:
+    """Allow a robot that asks for it to walk; a simulated one needs no permission."""
+    raise typer.Exit(_with_middleware("orders").enable(on))
+
+
+@app.command()
+def status() -> None:
+    """Show the robot that runs on one page: nodes, mode, velocity, rates, files, temperatures."""
+    raise typer.Exit(_with_middleware("status").status())
+
+
+@app.command()
+def reset(
+    keyframe: Annotated[Literal["lie", "stand"], typer.Option(help="Its posture.")] = "lie",
+) -> None:
+    """Put the simulated robot back to where it started.
+
+    \b
+    After a fall:
+      quadvel reset
+      quadvel mode passive
+      quadvel mode stand_up
+    """
+    raise typer.Exit(_with_middleware("orders").reset(keyframe))
+
+
+@app.command()
+def pause(
+    on: Annotated[bool, typer.Option("--on/--off", help="Stand still, or go on.")] = True,
+) -> None:
+    """Let simulated time stand still, or go on with --off."""
+    raise typer.Exit(_with_middleware("orders").pause(on))
+
+
+@app.command()
+def step(milliseconds: Annotated[int, typer.Argument(min=1, metavar="MS")] = 5) -> None:
+    """Let a paused simulation run on for some milliseconds."""
+    raise typer.Exit(_with_middleware("orders").step(milliseconds))
+
+
+@app.command()
+def push(
+    fx: Annotated[float, typer.Option(help="Force to the front of the world, N.")] = 0.0,
+    fy: Annotated[float, typer.Option(help="Force to its left, N.")] = 0.0,
+    fz: Annotated[float, typer.Option(help="Force upwards, N.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.001, help="For how long.")] = 0.2,
+    body: Annotated[str, typer.Option(help="Which body of the robot.")] = "trunk",
+) -> None:
+    """Push the simulated robot.
+
+    \b
+    For example:
+      quadvel push --fy 60
+    """
+    raise typer.Exit(_with_middleware("orders").push((fx, fy, fz), seconds, body))
 
 
 @app.command()
@@ -133,13 +254,16 @@ def record(
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.
 
+    Exit code 1, and no file, where nothing came. Of a recorder that was killed all but the last second can be read.
+
     \b
     For example:
       quadvel record low_state low_cmd --out walk.mcap
     """
     from .record import record as run_record
 
-    run_record(out, topics or [], seconds)
+    if not run_record(out, topics or [], seconds):
+        raise typer.Exit(1)
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
@@ -190,6 +314,14 @@ def paper(context: typer.Context) -> None:
 def bench(context: typer.Context) -> None:
     """Measure the speed of simulator, policy and loop on this machine."""
     _hand_on(context, "quadvel_eval.cli:bench_command")
+
+
+def _with_middleware(module: str) -> Any:
+    """A module of this package that needs rclpy, with whichever rclpy there is."""
+    import quadvel_dds
+
+    quadvel_dds.install()
+    return import_module(f".{module}", __package__)
 
 
 def _hand_on(context: typer.Context, where: str) -> None:

@@ -9,16 +9,18 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
 
 from quadvel_eval import demo_figures, demo_summary
+from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
-from quadvel_eval.report import output_folder, replacing, segment_table, write_figure, write_json
+from quadvel_eval.report import segment_table, write_figure, write_json
 
-from .doctor import GL_PACKAGES, gl_backend
+from .doctor import GL_PACKAGES, gl_backend, video_encoder
+from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 
@@ -30,6 +32,22 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    low_level: Annotated[
+        Literal["sim", "board"],
+        typer.Option(
+            help="The robot: simulated, or simulated behind the AlienGo's UDP interface and its driver."
+        ),
+    ] = "sim",
+    loss: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With board: share of packets that are lost, each way.")
+    ] = 0.0,
+    jitter: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="With board: ms that a packet takes at most, each way.")
+    ] = 0.0,
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+    ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
@@ -39,11 +57,13 @@ def demo_command(
     Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
+    stack = _stack(low_level, loss, jitter, lockstep, actuator)
+    rehearse(stack)
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
-        nodes = Stack(use_sim_time=lockstep).commands()
-        problem = ScriptedWalk(draft, "quick" if quick else "full", nodes, lockstep, console).run()
+        script = "quick" if quick else "full"
+        problem = ScriptedWalk(draft, script, stack.commands(), lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
     if problem:
@@ -61,6 +81,12 @@ def demo_command(
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
+
+
+def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:
+    network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
+    given = {name: value for name, value in network.items() if value}
+    return Stack(low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:
@@ -83,9 +109,12 @@ def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> 
     write_figure(folder / "demo.png", demo_figures.tracking_figure(recording))
     if not video:
         return
-    backend = gl_backend()
+    backend, encoder = gl_backend(), video_encoder()
     if backend is None:
         console.print(f"no video: there is no off-screen GL on this machine; sudo apt install {GL_PACKAGES}")
+        return
+    if not encoder.good:
+        console.print(f"no video: {encoder.text}", markup=False)
         return
     with console.status("drawing the video"):
         drawing = subprocess.run(

@@ -1,32 +1,142 @@
-"""`quadvel drive`: one velocity on a topic, again and again, then zero."""
+"""`quadvel drive`: one velocity for a while, then zero, and what came of it.
+
+Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
+"""
 
 from __future__ import annotations
 
+import math
 import time
+from collections import deque
+from typing import Any
 
+import numpy as np
+from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
+from numpy.typing import ArrayLike, NDArray
+
+from quadvel_msgs.msg import ControllerState, VelocityCommand
+
+from .orders import CONTROLLER, LONGEST, WAY_OUT
 from .processes import StopSignals
+from .session import PATIENCE, NobodyThere, Session
 
 PERIOD = 0.05  # s, between two messages; the command mux forgets a source after 0.5 s
+SETTLING = 0.5  # s after the command is in full effect until the measured velocity counts
+SAME = 1e-3  # m/s, rad/s, within which two commands are the same
+ESTIMATES = 10_000  # kept for the mean: 50 s of them
+UNITS = "vx {:+.2f} m/s, vy {:+.2f} m/s, wz {:+.2f} rad/s"
+
+Array = NDArray[np.float64]
 
 
-def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> None:
-    """Publish a Twist (m/s, m/s, rad/s, body frame) for some seconds or until Ctrl-C, then one of zeros."""
-    import quadvel_dds
+class Drive:
+    """What the robot says while it is driven. asked: vx, vy (m/s), wz (rad/s)."""
 
-    quadvel_dds.install()
-    import rclpy
-    from geometry_msgs.msg import Twist
-    from rclpy.signals import SignalHandlerOptions
+    def __init__(self, session: Session, asked: ArrayLike, topic: str) -> None:
+        self._session = session
+        self._asked = np.array(asked, float)
+        self._topic = topic
+        self._publisher = session.node.create_publisher(Twist, topic, 10)
+        self._states = session.listen(ControllerState, "controller/state")
+        self._commands = session.listen(VelocityCommand, "command")
+        self._estimates = session.listen(TwistWithCovarianceStamped, "velocity_estimate", ESTIMATES)
+        self._full_effect: float | None = None  # since when the whole command is in effect, s
+        self._in_effect = np.zeros(3)
 
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("drive")
-    publisher = node.create_publisher(Twist, topic, 10)
-    twist = Twist()
-    twist.linear.x, twist.linear.y, twist.angular.z = vx, vy, wz
-    with StopSignals() as signals:
+    def wait_for_robot(self) -> str:
+        """Until somebody hears us and the robot stands: why it would not follow, or "". Raises NobodyThere."""
+        if not self._session.spin_until(self._publisher.get_subscription_count, PATIENCE):
+            raise NobodyThere(f"{self._topic}: nobody listens; {CONTROLLER}")
+        if not self._session.spin_until(lambda: self._states, PATIENCE):
+            raise NobodyThere(f"controller/state: nothing came; {CONTROLLER}")
+        self._session.spin_until(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
+        # The mux commands zero all the time, which a robot that has just stood up waits for.
+        self._session.spin_until(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
+        if not self._states[-1].rate_hz:
+            return "the controller hears no robot: is the simulator paused?"
+        return self.refusal()
+
+    def refusal(self) -> str:
+        """Why the robot does not follow velocities now; empty where it does."""
+        state = self._states[-1]
+        if state.mode_name == "fault":
+            return f"the robot is in fault: {state.reason}\nonce the cause is gone: {WAY_OUT}"
+        return str(state.walk_refusal)
+
+    def send(self) -> None:
+        """The velocity once more, and note whether all of it is in effect by now."""
+        self._publisher.publish(_twist(self._asked))
+        before, self._in_effect = self._in_effect, _planar(self._states[-1].command)
+        steady = np.abs(self._in_effect - before).max() < SAME
+        followed = self._in_effect.any() == self._asked.any()
+        if self._full_effect is None and steady and followed:
+            self._full_effect = time.monotonic()
+            self._estimates.clear()
+        if self._full_effect and time.monotonic() - self._full_effect < SETTLING:
+            self._estimates.clear()
+
+    def stop(self) -> None:
+        """Zero."""
+        self._publisher.publish(_twist(np.zeros(3)))
+
+    def report(self) -> int:
+        """Print what was commanded, what was in effect, what was measured; the exit code."""
+        print(f"commanded  {UNITS.format(*self._asked)}")
+        if np.abs(self._in_effect - self._asked).max() > SAME:
+            why = "" if self._full_effect else ", still on its way: it changes no faster than the mux lets it"
+            print(
+                f"in effect  {UNITS.format(*self._in_effect)}{why or ', cut to the limits of mux and policy'}"
+            )
+        if source := self._other_source():
+            print(f"not followed: {source} commands the robot")
+            return 1
+        if self._full_effect and self._estimates:
+            velocity = _mean(self._estimates)
+            print(f"measured   {UNITS.format(*velocity)}, mean of {len(self._estimates)} estimates")
+        else:
+            print("measured   nothing: too short for the robot to settle; drive for some seconds more")
+        return 0
+
+    def _other_source(self) -> str:
+        """Who commands the robot instead of us, or ""."""
+        if not self._commands or not self._asked.any() or self._in_effect.any():
+            return ""
+        return f"'{self._commands[-1].source}'"
+
+
+def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> int:
+    """Publish a Twist (m/s, m/s, rad/s, body frame) for some seconds or until Ctrl-C, then one of zeros.
+
+    Returns the exit code: 1 where the robot did not follow. Raises ValueError for what is no number, NobodyThere.
+    """
+    for name, value in {"--vx": vx, "--vy": vy, "--wz": wz, "--seconds": seconds}.items():
+        if not math.isfinite(value):
+            raise ValueError(f"{name} is {value}, expected a finite number")
+    with Session("drive") as session, StopSignals() as signals:
+        robot = Drive(session, (vx, vy, wz), topic)
+        refusal = robot.wait_for_robot()
         until = time.monotonic() + seconds
-        while time.monotonic() < until and not signals.wait(PERIOD):
-            publisher.publish(twist)
-    publisher.publish(Twist())
-    node.destroy_node()
-    rclpy.try_shutdown()
+        while not refusal and not signals.received and time.monotonic() < until:
+            robot.send()
+            session.spin(PERIOD)
+            refusal = robot.refusal()
+        robot.stop()
+        if refusal:
+            print(f"not followed: {refusal}")
+            return 1
+        return robot.report()
+
+
+def _twist(velocity: Array) -> Any:
+    message = Twist()
+    message.linear.x, message.linear.y, message.angular.z = velocity.tolist()
+    return message
+
+
+def _planar(twist: Any) -> Array:
+    return np.array([twist.linear.x, twist.linear.y, twist.angular.z])
+
+
+def _mean(estimates: deque[Any]) -> Array:
+    mean: Array = np.mean([_planar(estimate.twist.twist) for estimate in estimates], axis=0)
+    return mean

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import re
 import threading
 
 from rich.console import Console
@@ -10,39 +12,46 @@ from rich.text import Text
 from .alone import look_for_others
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
+from .rehearsal import rehearse
 from .stack import Stack
 
 COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
+LOGGED = re.compile(r"\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]+\]: (.*)")
+"""A line of a node's log: its level and what it says"""
+STYLES = {"WARN": "yellow", "ERROR": "bold red", "FATAL": "bold red"}
 
 
 class PrefixedOutput:
-    """Prints each line behind the name of the process that wrote it, a colour each."""
+    """Prints each line behind the name of the process that wrote it, a colour each; of a log what it says."""
 
     def __init__(self, names: list[str]) -> None:
         self._console = Console(soft_wrap=True, highlight=False)
         self._width = max(map(len, names))
-        self._colours = dict(zip(names, COLOURS, strict=False))
+        self._colours = dict(zip(names, itertools.cycle(COLOURS), strict=False))
         self._lock = threading.Lock()
 
     def __call__(self, name: str, line: str) -> None:
         label = Text(f"{name:>{self._width}} | ", style=self._colours[name])
+        logged = LOGGED.fullmatch(line)
+        said = Text(logged[2], style=STYLES.get(logged[1], "")) if logged else Text.from_ansi(line)
         with self._lock:
-            self._console.print(label + Text.from_ansi(line))
+            self._console.print(label + said)
 
 
 def up(stack: Stack) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0). Raises NotAlone where a robot is there already that
-    nobody asked for.
+    are stopped, and its exit code is ours (1 if that was 0). Raises ValueError or OSError where a parameter or
+    a file is wrong, and NotAlone where a robot is there already that nobody asked for.
     """
-    if stack.simulates:
+    rehearse(stack)
+    if stack.brings_robot:
         look_for_others()
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])
     with StopSignals() as signals, ProcessGroup(say) as group:
-        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them")
+        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
         for name, arguments in nodes.items():
             if not signals.received:
                 group.start(name, command(name, arguments))

@@ -23,7 +23,7 @@ from tf2_msgs.msg import TFMessage
 from quadvel_description.frames import BASE, ODOM, Placed, footprint
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.robot_time import RobotTime
@@ -151,6 +151,7 @@ class EstimatorNode(Node):
             level, summary = DiagnosticStatus.WARN, "no low_state fit to use in the last second"
         elif refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
         else:
             level, summary = DiagnosticStatus.OK, "estimating"
         values = {

@@ -9,13 +9,15 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from quadvel_actuator import ActuatorParameters
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from . import bench
 from .compare import comparison_table, read_evaluation
 from .grid import evaluate
-from .report import evaluation_table, output_folder, write_evaluation, write_json
+from .output import output_file, output_folder
+from .report import evaluation_table, write_evaluation, write_json
 from .walk import Setup
 
 Cluster = Annotated[
@@ -39,6 +41,10 @@ def eval_command(
         Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
     ] = SHIPPED_MODEL,
     terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
+    actuator: Annotated[
+        Path | None,
+        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+    ] = None,
     randomised: Annotated[
         bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")
     ] = False,
@@ -52,9 +58,12 @@ def eval_command(
         estimator_file=estimator_file,
         terrain=terrain,
         randomised=randomised,
+        actuator=actuator,
     )
     PolicyFile(policy)  # what is wrong with the files shows here, once, before any run
     LearnedEstimator(estimator_file)
+    if actuator is not None:
+        ActuatorParameters.load(actuator)
     folder = output_folder(out)
     with walks_bar() as bar:
         task = bar.add_task("walks", total=None)
@@ -85,7 +94,7 @@ def bench_command(
     out: Annotated[Path, typer.Option(help="JSON file for the figures.")] = Path("out/bench.json"),
 ) -> None:
     """Measure how fast this machine simulates, infers, talks and trains; on an idle machine, some minutes."""
-    output_folder(out.parent)
+    output_file(out)
     results = {}
     messages = Console(stderr=True)
     with messages.status("") as status:

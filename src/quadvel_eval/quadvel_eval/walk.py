@@ -13,6 +13,7 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.learned import SHIPPED_MODEL
@@ -34,6 +35,7 @@ DIAGONAL = 0.555  # m, l_c of Eq. 10: the distance between two diagonal feet
 @attrs.frozen(kw_only=True)
 class Setup:
     """What a walk is made with. estimator: the one in the loop. randomised: draw the plant by the seed.
+    actuator: file of the robot's actuator model, None for the shipped one.
 
     plant: fields of `SimulatorConfig` that are as given here, whatever is said or drawn for them elsewhere.
     """
@@ -43,6 +45,7 @@ class Setup:
     estimator_file: Path = SHIPPED_MODEL
     terrain: str = attrs.field(default="flat", validator=attrs.validators.in_(TERRAINS))
     randomised: bool = False
+    actuator: Path | None = None
     plant: Mapping[str, Any] = attrs.field(factory=dict)
 
     def to_json(self) -> dict[str, Any]:
@@ -56,6 +59,8 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
     terrain = Terrain(kind=setup.terrain, slope=SLOPE if setup.terrain == "slope" else 0.0, seed=seed)
     rng = np.random.default_rng(seed)
     drawn = _draw_plant(rng) if setup.randomised else {}
+    if setup.actuator is not None:
+        drawn["actuator"] = ActuatorParameters.load(setup.actuator)
     simulator = Simulator(SimulatorConfig(**{"terrain": terrain, "seed": seed, **drawn, **setup.plant}))
     simulator.reset("stand")
     if setup.randomised:

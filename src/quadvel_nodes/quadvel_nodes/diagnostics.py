@@ -7,6 +7,9 @@ from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
+QUIET = 5.0
+"""s between two lines of a node's log about what goes on and on, such as refused messages"""
+
 
 def diagnostics(
     stamp: Any, name: str, level: bytes, summary: str, values: Mapping[str, object]

@@ -102,13 +102,26 @@ class CommandMuxNode(Node):
         return response
 
     def _update(self) -> None:
-        self._output = output = self._mux.update(self._now())
+        before, output = self._output, self._mux.update(self._now())
+        self._output = output
+        if before is not None and output.source != before.source:
+            self._tell(output.source)
         message = VelocityCommand(
             stamp=self.get_clock().now().to_msg(), stance=output.stance, source=output.source
         )
         twist = message.twist
         twist.linear.x, twist.linear.y, twist.angular.z = output.velocity.tolist()
         self._command.publish(message)
+
+    def _tell(self, source: str) -> None:
+        """Log who commands from now on, and why nobody does."""
+        if source != "none":
+            self.get_logger().info(f"follows {source}")
+        elif self._mux.locks:
+            self.get_logger().warning(f"stops: locked by {', '.join(sorted(self._mux.locks))}")
+        else:
+            why = "stance was requested" if self._mux.stance_requested else "nobody commands a velocity"
+            self.get_logger().info(f"stands still: {why}")
 
     def _report(self) -> None:
         """Once a second: /diagnostics."""

@@ -29,6 +29,8 @@ FOLLOWS = {
     "lie_down": ("stand_up", "stance", "walk"),
 }
 """From which modes each may be requested; passive always may."""
+FOLLOWING = ("stance", "walk")
+"""In which modes a velocity is followed"""
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 
 Following = tuple[str, str] | None  # the next mode and the reason
@@ -71,7 +73,7 @@ class Supervisor:
     """Runs one mode at a time and latches damping where something is unsafe.
 
     policy: what drives in walk; its metadata gives limits and the nominal posture. After each tick: `mode`
-    (one of MODES), `reason` (one sentence), `command` (4,) in effect, `walk_allowed`, `inference_seconds`
+    (one of MODES), `reason` (one sentence), `command` (4,) in effect, `walk_refusal`, `inference_seconds`
     (nan where no network ran). `obstacle`: what somebody else found that forbids moving, a sentence, or None.
     """
 
@@ -108,20 +110,38 @@ class Supervisor:
         self.obstacle: str | None = None
         self._auto_stand = c.auto_stand
         self._enabled = False
+        self._zero_seen = False  # a command to stand still came since a velocity could have been followed
         self._last: Tick | None = None
         self._age = 0.0
         self._entered: float | None = None  # None: at the next tick
         self._previous = JointCommand.damping(c.damping_kd)
 
     @property
-    def walk_allowed(self) -> bool:
-        """Whether a command that is not zero may start walking."""
+    def walk_refusal(self) -> str:
+        """Why a velocity that is commanded now is not followed, a sentence; empty where it is."""
+        if self.mode == "fault":
+            return "the robot is in fault: request passive, then stand_up"
+        if self.mode not in FOLLOWING:
+            return f"the robot is in mode {self.mode}, expected {' or '.join(FOLLOWING)}"
+        if not self._operator_agrees:
+            return "walking is not allowed yet: call ~/enable_walking"
+        if not self._zero_seen:
+            return "a zero velocity has to be commanded first"
+        return ""
+
+    @property
+    def _operator_agrees(self) -> bool:
         return self._enabled or not self.config.require_operator
 
     def enable_walking(self, enabled: bool) -> tuple[bool, str]:
-        """The operator allows walking, or takes it back: then a walking robot stands still on its policy."""
+        """The operator allows walking, or takes it back: then a walking robot stands still on its policy.
+
+        A velocity that is commanded at that moment does not count: a zero one has to come first.
+        """
+        if enabled and not self._operator_agrees:
+            self._zero_seen = False
         self._enabled = enabled
-        return True, "a command may start walking" if self.walk_allowed else "the robot stands still"
+        return True, "a command may start walking" if self._operator_agrees else "the robot stands still"
 
     def request(self, mode: str) -> tuple[bool, str]:
         """Ask for a mode; (taken or not, a sentence). "passive" is always taken and clears a fault."""
@@ -141,12 +161,14 @@ class Supervisor:
             self._switch("fault", reason)
 
     def tick(
-        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike
+        self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
     ) -> JointCommand:
         """One control tick: what the joints are to do.
 
         now: s, on the clock of state.time. velocity: (3,) m/s, body frame, None without a fresh estimate.
-        command: (4,) vx, vy (m/s), wz (rad/s), stance (0 or 1).
+        command: (4,) vx, vy (m/s), wz (rad/s), stance (0 or 1); None without a fresh one: the robot stands.
+        After every start, fault and rest a velocity counts only once a zero one was commanded to the standing robot, so that
+        it never walks off on an order that was given to another run of the controller.
         """
         self.inference_seconds = float("nan")
         self.command = self._limited(command)
@@ -189,17 +211,23 @@ class Supervisor:
         elapsed = 0.0 if self._entered is None else state.time - self._entered
         return Tick(elapsed, state, velocity, self.command, self._previous)
 
-    def _limited(self, command: ArrayLike) -> Array:
-        """The command in effect: stand still where it says so, is not finite, or walking is not allowed."""
-        asked = np.asarray(command, float)
-        numbers = asked.tolist()
-        if not self.walk_allowed or not _finite(numbers) or numbers[3] >= 0.5:
+    def _limited(self, command: ArrayLike | None) -> Array:
+        """The command in effect: stand still where there is none, where it says so, is not finite, or is refused."""
+        if command is None:
+            return STILL.copy()
+        numbers = np.asarray(command, float).tolist()
+        stands = numbers[3] >= 0.5 or not any(numbers[:3])
+        if stands and self._operator_agrees and self.mode in FOLLOWING:
+            self._zero_seen = True
+        if numbers[3] >= 0.5 or not _finite(numbers) or not (self._zero_seen and self._operator_agrees):
             return STILL.copy()
         return np.array([*self._limits.held(numbers[:3]), 0.0])
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
         self._entered = None
+        if mode not in FOLLOWING:
+            self._zero_seen = False
         if mode in LIMP:
             self._enabled = False
             self._walk.forget()
@@ -286,8 +314,8 @@ class Supervisor:
         return next(self._problems(self._last), None) or self._refusal_of_move(mode, self._last)
 
     def _refusal_of_move(self, mode: str, last: Tick) -> str | None:
-        if mode == "walk" and not self.walk_allowed:
-            return "walking is not allowed yet, call ~/enable_walking"
+        if mode == "walk" and not self._operator_agrees:
+            return "walking is not allowed yet: call ~/enable_walking"
         if mode == "walk" and last.velocity is None:
             return "there is no fresh velocity estimate"
         if self.mode == "passive" and mode == "stance":

@@ -1,0 +1,82 @@
+"""Orders of the operator that need no ROS 2: modes of the controller, and what can be done to a simulated robot.
+
+Each prints what came of it and returns the exit code: 1 where it was refused or failed. Needs `rclpy`: ROS 2's own, or
+the embedded one after `quadvel_dds.install()`.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from geometry_msgs.msg import Vector3, Wrench
+from std_srvs.srv import SetBool
+
+from quadvel_msgs.msg import ControllerState
+from quadvel_msgs.srv import Push, ResetSim, SetMode, StepSim
+
+from .session import NobodyThere, Session
+
+CONTROLLER = "start the robot first: quadvel up"
+WAY_OUT = "quadvel mode passive, then quadvel mode stand_up"
+SIMULATOR = "there is no simulator; start one: quadvel up"
+PASSING = {"stand_up": "stance", "lie_down": "passive"}
+"""Modes that end by themselves, and the one that follows"""
+LONGEST = 10.0
+"""s that standing up or lying down may take"""
+
+
+def mode(wanted: str) -> int:
+    """Ask the controller for a mode; where that takes a while, wait until it is done."""
+    with Session("mode") as session:
+        states = session.listen(ControllerState, "controller/state")
+        response = session.call(SetMode, "controller/set_mode", CONTROLLER, mode=wanted)
+        print(response.message)
+        if not response.success:
+            if session.spin_until(lambda: states, 1.0) and states[-1].mode_name == "fault":
+                print(f"once its cause is gone: {WAY_OUT}")
+            return 1
+        if wanted not in PASSING:
+            return 0
+        asked = time.monotonic()
+        session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
+        session.spin_until(lambda: states and states[-1].mode_name != wanted, LONGEST)
+        if not states:
+            raise NobodyThere(f"controller/state: nothing came for {LONGEST:g} s")
+        state = states[-1]
+        print(f"{state.mode_name}: {state.reason} ({time.monotonic() - asked:.1f} s)")
+        return 0 if state.mode_name == PASSING[wanted] else 1
+
+
+def enable(enabled: bool) -> int:
+    """Allow walking, as a robot wants it from its operator, or forbid it."""
+    return _order("enable", SetBool, "controller/enable_walking", CONTROLLER, data=enabled)
+
+
+def reset(keyframe: str) -> int:
+    """Put the simulated robot back."""
+    return _order("reset", ResetSim, "sim_node/reset", SIMULATOR, keyframe=keyframe)
+
+
+def pause(paused: bool) -> int:
+    """Let simulated time stand still, or go on."""
+    return _order("pause", SetBool, "sim_node/pause", SIMULATOR, data=paused)
+
+
+def step(milliseconds: int) -> int:
+    """Let a paused simulation run on for a while."""
+    return _order("step", StepSim, "sim_node/step", SIMULATOR, steps=milliseconds)
+
+
+def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
+    """Push the simulated robot with a force (N, world frame)."""
+    x, y, z = force
+    wrench = Wrench(force=Vector3(x=x, y=y, z=z))
+    return _order("push", Push, "sim_node/push", SIMULATOR, body=body, wrench=wrench, duration=seconds)
+
+
+def _order(name: str, kind: Any, service: str, serves: str, **fields: Any) -> int:
+    with Session(name) as session:
+        response = session.call(kind, service, serves, **fields)
+    print(response.message)
+    return 0 if response.success else 1

@@ -1,0 +1,127 @@
+"""`quadvel status`: one page on the robot that runs: nodes, mode, velocity, battery, temperatures, files.
+
+Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import attrs
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import TwistWithCovarianceStamped
+from nav_msgs.msg import Odometry
+from rich.console import Console
+
+from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
+
+from .orders import WAY_OUT
+from .session import Session
+
+LISTEN = 2.2
+"""s: every node reports once a second, and is found within the first"""
+HEARD = {
+    "/diagnostics": DiagnosticArray,
+    "controller/state": ControllerState,
+    "command": VelocityCommand,
+    "low_state": LowState,
+    "odom": Odometry,
+    "velocity_estimate": TwistWithCovarianceStamped,
+}
+RATES = ("low_state", "velocity_estimate", "controller/state", "command", "odom")
+LEVELS = {
+    DiagnosticStatus.OK: "[green]ok",
+    DiagnosticStatus.WARN: "[yellow]warning",
+    DiagnosticStatus.ERROR: "[bold red]error",
+    DiagnosticStatus.STALE: "[red]stale",
+}
+FILES = ("actuator", "policy")
+"""Values of /diagnostics that say with which files a node runs"""
+
+Heard = Mapping[str, deque[Any]]
+
+
+@attrs.frozen
+class Node:
+    """What a node said last on /diagnostics."""
+
+    level: bytes
+    summary: str
+    values: dict[str, str]
+
+
+def status() -> int:
+    """Print the page; the exit code is 1 where no robot runs, or its controller is in fault."""
+    with Session("status") as session:
+        heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in HEARD.items()}
+        session.spin(LISTEN)
+    nodes = reported(heard["/diagnostics"])
+    if not nodes:
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        print(f"no robot runs on ROS domain {domain} as far as this machine hears; start one: quadvel up")
+        return 1
+    console = Console(soft_wrap=True, highlight=False)
+    for name, text in [*_nodes(nodes), *_lines(heard), *_equipment(nodes)]:
+        console.print(f"{name:13} {text}")
+    states = heard["controller/state"]
+    return 1 if not states or states[-1].mode_name == "fault" else 0
+
+
+def reported(arrays: deque[Any]) -> dict[str, Node]:
+    """The nodes by name, out of their /diagnostics."""
+    nodes = {}
+    for one in (one for array in arrays for one in array.status):
+        nodes[one.name] = Node(one.level, one.message, {pair.key: pair.value for pair in one.values})
+    return dict(sorted(nodes.items()))
+
+
+def _nodes(nodes: Mapping[str, Node]) -> Iterator[tuple[str, str]]:
+    for name, node in nodes.items():
+        yield name, f"{LEVELS[node.level]}[/] {node.summary}"
+
+
+def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
+    states, commands, estimates = heard["controller/state"], heard["command"], heard["velocity_estimate"]
+    if states:
+        state = states[-1]
+        yield "mode", f"{state.mode_name}: {state.reason}"
+        if state.mode_name == "fault":
+            yield "way out", f"once the cause is gone: {WAY_OUT}"
+        yield "walking", state.walk_refusal or "ready: a velocity makes it walk"
+        yield "command", f"{_planar(state.command)}, from {commands[-1].source if commands else 'nobody'}"
+        loop = f"p99 of its period {state.period_p99_ms:.2f} ms, {state.compute_p50_us:.0f} us from state to command"
+        yield "loop", f"{state.rate_hz:.0f} Hz, {loop}, {state.overruns} deadlines missed"
+    else:
+        yield "mode", "[red]no controller runs"
+    if estimates:
+        yield "estimate", _planar(estimates[-1].twist.twist)
+    if heard["odom"]:
+        position = heard["odom"][-1].pose.pose.position
+        yield (
+            "position",
+            f"{position.x:.2f}, {position.y:.2f}, {position.z:.2f} m since the estimator's start",
+        )
+    yield "rates", ", ".join(f"{topic} {_rate(heard[topic]):.0f}" for topic in RATES) + " Hz"
+
+
+def _equipment(nodes: Mapping[str, Node]) -> Iterator[tuple[str, str]]:
+    values = {key: value for node in nodes.values() for key, value in node.values.items()}
+    for key in FILES:
+        yield key, values.get(key, "not told by any node")
+    yield "battery", values.get("battery", "not told by this robot's low-level interface")
+    temperatures = [f"{key} {value}" for key, value in sorted(values.items()) if "temperature" in key]
+    yield "temperatures", ", ".join(temperatures) or "none told: a simulated robot has none"
+
+
+def _rate(messages: deque[Any]) -> float:
+    """Messages a second by their stamps, Hz."""
+    stamps = [message.stamp if hasattr(message, "stamp") else message.header.stamp for message in messages]
+    times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
+    return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
+
+
+def _planar(twist: Any) -> str:
+    return f"vx {twist.linear.x:+.2f} m/s, vy {twist.linear.y:+.2f} m/s, wz {twist.angular.z:+.2f} rad/s"

@@ -1,0 +1,64 @@
+"""What an operator reads of the controller, over a run with a fault in it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import RobotState
+from quadvel_policy.announcements import Announcements
+from quadvel_policy.supervisor import Supervisor, SupervisorConfig
+
+STILL, FORWARD = (0.0, 0.0, 0.0, 1.0), (0.5, 0.0, 0.0, 0.0)
+
+
+class Run:
+    """A standing robot, and what is said of it."""
+
+    def __init__(self, policy: Any) -> None:
+        self.supervisor = Supervisor(policy, SupervisorConfig())
+        self.announcements = Announcements(self.supervisor)
+        self._ticks = 0
+
+    def tick(self, command: Any, count: int = 1) -> list[tuple[bool, str]]:
+        """What is said during some ticks."""
+        said = []
+        for _ in range(count):
+            self._ticks += 1
+            zeros, upright = np.zeros(12), np.array([1.0, 0.0, 0.0, 0.0])
+            time = 0.005 * self._ticks
+            state = RobotState(
+                time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
+            )
+            self.supervisor.tick(time, state, np.zeros(3), command)
+            said += self.announcements.now()
+        return said
+
+
+def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any) -> None:
+    run = Run(policy)
+    assert run.tick(STILL, 20) == [(False, "passive: waits for an order")]
+    run.supervisor.request("stance")
+    assert run.tick(STILL, 80) == [
+        (False, "stance: was asked for"),
+        (False, "ready: a velocity makes it walk"),
+    ]
+    assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]
+    assert not list(run.announcements.waiting())
+    run.supervisor.fail("a test")
+    assert run.tick(FORWARD, 20) == [
+        (True, "fault: a test; the joints are damped until passive is requested, then stand_up")
+    ]
+
+
+def test_why_a_standing_robot_does_not_walk_is_told_once(policy: Any) -> None:
+    run = Run(policy)
+    run.tick(FORWARD)
+    run.supervisor.request("stance")
+    run.tick(FORWARD, 80)
+    expected = ["follows no velocity: a zero velocity has to be commanded first"]
+    assert list(run.announcements.waiting()) == expected
+    assert list(run.announcements.waiting()) == []
+    assert run.tick(STILL) == [(False, "ready: a velocity makes it walk")]
