@@ -24,8 +24,8 @@ from geometry_msgs.msg import Twist  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
-from quadvel_dds.recordings import read_messages  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
+from quadvel_recordings.reading import read_messages  # noqa: E402
 
 
 @pytest.fixture

@@ -13,6 +13,8 @@ from importlib import metadata, util
 import attrs
 import numpy as np
 
+import quadvel_dds
+
 NEEDED = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
@@ -57,6 +59,8 @@ def _middleware() -> Finding:
         return Finding("ROS 2", True, "not found in this shell: the nodes run on the embedded Cyclone DDS")
     if os.environ.get("QUADVEL_MIDDLEWARE") == "embedded":
         return Finding("ROS 2", True, f"{distro}, left aside: QUADVEL_MIDDLEWARE is 'embedded'")
+    if fault := quadvel_dds.ros2_fault():
+        return Finding("ROS 2", True, fault)
     rmw = os.environ.get("RMW_IMPLEMENTATION", "its default middleware")
     text = f"{distro} with {rmw}: the nodes run on its rclpy"
     if not _has_executor_of_events():

@@ -7,7 +7,6 @@ thread. What the operator's remote asks for becomes cmd_vel_teleop, command_lock
 from __future__ import annotations
 
 import gc
-import sys
 import time
 from collections import deque
 from threading import Thread
@@ -24,7 +23,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
@@ -194,7 +193,8 @@ class Driver(Node):
     def _report(self) -> None:
         """Once a second: /diagnostics."""
         if self._failure:
-            sys.exit(f"driver: {self._failure}")
+            end(self, f"driver: {self._failure}")
+            return
         report = self._link.report()
         level, summary = self._health.judge(report, self._newest, self._pilot.stopped)
         values = {**figures(report, self._newest), "stopped": self._pilot.stopped, **self._refusals.values()}
