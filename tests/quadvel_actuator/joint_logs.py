@@ -65,7 +65,7 @@ def csv(path: Path, log: dict[str, Any]) -> Path:
     return path
 
 
-def mcap(path: Path, log: dict[str, Any], mode: int = 10) -> Path:
+def mcap(path: Path, log: dict[str, Any], mode: int = 10, chunk_size: int = 2**20) -> Path:
     """low_state and low_cmd as the stack sends them, each command 2 ms after its state."""
     time_type = STORE.types["builtin_interfaces/msg/Time"]
     state_type, command_type = (STORE.types[f"quadvel_msgs/msg/{name}"] for name in ("LowState", "LowCmd"))
@@ -77,7 +77,7 @@ def mcap(path: Path, log: dict[str, Any], mode: int = 10) -> Path:
         return np.broadcast_to(np.asarray(values, np.float32), (size,)).copy()
 
     with path.open("wb") as file:
-        writer = Writer(file)
+        writer = Writer(file, chunk_size=chunk_size)
         writer.start(profile="ros2", library="test")
         channels = {}
         for topic, name in (("/low_state", "LowState"), ("/low_cmd", "LowCmd")):

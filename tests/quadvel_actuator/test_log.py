@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import resource
 import subprocess
 import sys
@@ -187,13 +188,39 @@ def test_an_empty_folder_and_no_file_are_refused(tmp_path: Path) -> None:
         read_log(tmp_path / "nothing.npz")
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.99])
-def test_a_recording_that_was_cut_off_is_refused(tmp_path: Path, share: float) -> None:
+@pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
+def test_of_a_recording_that_was_cut_off_what_is_whole_is_read_and_said(tmp_path: Path, share: float) -> None:
+    path = mcap(tmp_path / "cut.mcap", fields(2.0), chunk_size=100_000)
+    whole, data = read_log(path), path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    log = read_log(path)
+    rows = len(log.t)
+    assert share - 0.2 < rows / len(whole.t) <= share + 0.05
+    np.testing.assert_array_equal(log.q, whole.q[:rows])
+    assert re.fullmatch(
+        r"recording: it was cut off; the first \d\.\d s, \d+ messages are kept", log.remarks[0]
+    )
+
+
+@pytest.mark.parametrize("share", [0.01, 0.5])
+def test_a_recording_that_was_cut_off_before_anything_was_whole_is_refused(
+    tmp_path: Path, share: float
+) -> None:
     path = mcap(tmp_path / "cut.mcap", fields(0.2))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(LogError, match=r"cut\.mcap: no whole recording"):
+    with pytest.raises(
+        LogError, match=r"cut\.mcap: the recording was cut off before anything of it was whole"
+    ):
         read_log(path)
+
+
+def test_a_folder_that_is_no_rosbag2_is_called_that(tmp_path: Path) -> None:
+    (tmp_path / "notes.txt").write_text("no recording")
+    with pytest.raises(
+        LogError, match=r"the folder is no recording: a rosbag2 folder holds a metadata\.yaml"
+    ):
+        read_log(tmp_path)
 
 
 def test_an_archive_that_was_cut_off_is_refused(tmp_path: Path) -> None:

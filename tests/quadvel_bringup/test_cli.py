@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -38,6 +40,27 @@ def test_the_help_of_a_command_shows_an_example(command: str, example: str) -> N
     result = CliRunner().invoke(cli.app, [command, "--help"])
     assert result.exit_code == 0
     assert f"  {example}\n" in result.output
+
+
+def test_the_version_names_the_commit_of_a_source_tree() -> None:
+    assert re.fullmatch(r"quadvel \d+\.\d+\.\d+( \(commit \w+(, changed)?\))?\n", quadvel("--version").stdout)
+
+
+def test_a_shell_completes_commands_and_options() -> None:
+    def completed(words: str) -> list[str]:
+        asked = {
+            "_QUADVEL_COMPLETE": "complete_bash",
+            "COMP_WORDS": words,
+            "COMP_CWORD": str(words.count(" ")),
+        }
+        program = [sys.executable, "-m", "quadvel_bringup"]
+        return subprocess.run(
+            program, env={**os.environ, **asked}, capture_output=True, text=True
+        ).stdout.split()
+
+    assert completed("quadvel de") == ["demo"]
+    assert completed("quadvel drive --v") == ["--vx", "--vy"]
+    assert "--show-completion" in completed("quadvel --s")
 
 
 def test_help_loads_no_simulator_and_no_middleware() -> None:

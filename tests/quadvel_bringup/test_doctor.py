@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import sys
+
 import pytest
 
 from quadvel_bringup import doctor
 from quadvel_bringup.doctor import Finding
 
-GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.NEEDED, "GL")]
+GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.NEEDED, "GL", "ffmpeg")]
 
 
 def test_without_torch_all_but_training_can_run() -> None:
@@ -30,6 +32,23 @@ def test_a_missing_gl_library_is_named_with_its_package(monkeypatch: pytest.Monk
     monkeypatch.setattr(doctor, "gl_backend", lambda: None)
     finding = next(f for f in doctor.examine() if f.subject == "GL")
     assert (finding.good, "apt install libegl1" in finding.text) == (False, True)
+
+
+@pytest.mark.parametrize("missing", ["GL", "ffmpeg"])
+def test_a_video_needs_both_what_draws_and_what_encodes(missing: str) -> None:
+    findings = [Finding(f.subject, f.subject != missing, f.text) for f in GOOD]
+    assert not dict(doctor.abilities(findings))["the video of the demo"]
+
+
+def test_a_missing_encoder_is_named_with_how_to_install_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    assert doctor.video_encoder().text == "imageio-ffmpeg is missing, so no video; pip install -e '.[video]'"
+
+
+def test_an_encoder_that_does_not_run_is_no_encoder(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
+    assert not doctor.video_encoder().good
 
 
 def test_ros_is_found_where_rclpy_is_importable(monkeypatch: pytest.MonkeyPatch) -> None:

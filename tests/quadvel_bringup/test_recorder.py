@@ -24,6 +24,7 @@ from geometry_msgs.msg import Twist  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
+from quadvel_dds.recordings import read_messages  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
 
 
@@ -130,6 +131,41 @@ def test_ctrl_c_leaves_a_whole_file(node: Node, tmp_path: Path) -> None:
     assert summary is not None
     assert summary.statistics is not None
     assert 0 < summary.statistics.message_count <= 20  # a busy machine may not have let it take them all
+
+
+def start_recording(*arguments: str) -> subprocess.Popen[str]:
+    program = "from quadvel_bringup.__main__ import main; main()"
+    return subprocess.Popen(
+        [sys.executable, "-c", program, "record", *arguments], stderr=subprocess.PIPE, text=True
+    )
+
+
+def test_of_a_recorder_that_was_killed_all_but_the_last_second_is_read(node: Node, tmp_path: Path) -> None:
+    path = tmp_path / "walk.mcap"
+    recording = start_recording("low_state", "--out", str(path))
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    spin_until(node, lambda: publisher.get_subscription_count() > 0, "recorder", 60.0)
+    size, ticks = path.stat().st_size, 0
+    while path.stat().st_size < size + 20_000 and ticks < 4000:  # two chunks or more
+        publisher.publish(low_state(ticks))
+        ticks += 1
+        time.sleep(0.01)
+    recording.kill()
+    recording.communicate(timeout=60)
+    with pytest.warns(
+        UserWarning, match=r"walk\.mcap: recording: it was cut off; the first \d\.\d s, \d+ messages"
+    ):
+        found = [message.tick for _, _, message in read_messages(path, lambda topic, typename: True)]
+    assert found == sorted(found)
+    assert len(found) > 50
+
+
+def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> None:
+    recording = start_recording("low_state", "--out", str(tmp_path / "walk.mcap"), "--seconds", "0.5")
+    _, said = recording.communicate(timeout=60)
+    assert recording.returncode == 1
+    assert "nothing came on /low_state on ROS domain" in said
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_drive_repeats_one_velocity_and_ends_with_zero(node: Node) -> None:

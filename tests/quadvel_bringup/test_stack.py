@@ -79,14 +79,29 @@ def test_the_parameter_file_holds_every_parameter_of_every_node_with_its_default
 
 
 def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None:
-    stack = Stack(policy=tmp_path / "1", terrain="rough", estimator="kalman", parameters=tmp_path / "my.yaml")
+    stack = Stack(
+        policy=tmp_path / "1",
+        terrain="rough",
+        actuator=tmp_path / "found.yaml",
+        estimator="kalman",
+        parameters=tmp_path / "my.yaml",
+    )
     file = ["--ros-args", "--params-file", str(tmp_path / "my.yaml")]
     assert stack.arguments() == {
-        "sim_node": [*file, "-p", 'terrain:="rough"'],
+        "sim_node": [*file, "-p", 'terrain:="rough"', "-p", f'actuator_file:="{tmp_path}/found.yaml"'],
         "estimator": [*file, "-p", 'kind:="kalman"'],
-        "controller": [*file, "-p", "auto_stand:=true", "-p", f'policy:="{tmp_path}/1"'],
+        "controller": [
+            *file,
+            *("-p", "auto_stand:=true", "-p", "robot_waits:=true", "-p", f'policy:="{tmp_path}/1"'),
+        ],
         "command_mux": file,
     }
+
+
+@pytest.mark.parametrize("chosen", [{"terrain": "rough"}, {"actuator": Path("found.yaml")}])
+def test_what_only_a_simulated_robot_has_is_refused_for_another(chosen: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=r"only a simulated robot has this, not external"):
+        Stack(low_level="external", **chosen).overrides()
 
 
 def test_in_simulated_time_the_simulator_waits_and_the_others_follow_its_clock() -> None:

@@ -101,7 +101,8 @@ def test_beside_another_simulator_it_does_not_start(capfd: pytest.CaptureFixture
                 look_for_others()
                 continue
             break
-        with pytest.raises(NotAlone, match="low_state: somebody publishes it already on ROS domain"):
+        named = f"low_state: somebody publishes it already on ROS domain .*: sim_node \\(pid {other.pid}\\)"
+        with pytest.raises(NotAlone, match=named):
             up.up(Stack())
     finally:
         other.send_signal(signal.SIGINT)

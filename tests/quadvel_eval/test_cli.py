@@ -58,6 +58,15 @@ def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Pa
     assert (tmp_path / "eval.json").read_text() == "old"
 
 
+def test_bench_finds_out_that_it_cannot_write_before_it_measures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(bench, "PARTS", {"simulator": lambda: pytest.fail("it measured")})
+    for out in (tmp_path, Path("/proc/bench.json")):
+        with pytest.raises(OSError, match=r"is a folder, expected a file|can't be written"):
+            bench_command(out)
+
+
 def test_bench_writes_figures_and_says_what_it_skipped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

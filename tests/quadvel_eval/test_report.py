@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 
 from quadvel_eval.grid import Cell, CellResult, summarise
-from quadvel_eval.report import evaluation_table, output_folder, replacing, write_evaluation, write_json
+from quadvel_eval.output import output_file, output_folder, replacing
+from quadvel_eval.report import evaluation_table, write_evaluation, write_json
 from quadvel_eval.segments import Segment
 
 WALKED = CellResult(
@@ -83,3 +84,20 @@ def test_table_tells_falls_and_the_worst_cell() -> None:
     text = console.export_text()
     assert "2, 1" in text
     assert "0.5, 0, 0" in text
+
+
+@pytest.mark.parametrize("folder", ["/proc", "/sys"])  # where nobody can write, root neither
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(folder: str) -> None:
+    with pytest.raises(OSError, match=rf"^{folder}: the folder can't be written to"):
+        output_folder(Path(folder))
+    with pytest.raises(OSError, match=rf"^{folder}/x: the folder can't be made"):
+        output_folder(Path(folder) / "x")
+
+
+def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+    with pytest.raises(IsADirectoryError, match="is a folder, expected a file to write"):
+        output_file(tmp_path)
+    with pytest.raises(OSError, match="the file can't be written: File name too long"):
+        output_file(tmp_path / ("x" * 300))
+    assert output_file(tmp_path / "new" / "bench.json") == tmp_path / "new" / "bench.json"
+    assert list((tmp_path / "new").iterdir()) == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_nodes.robot_time import JITTER, LONGEST, RobotTime
+from quadvel_nodes.robot_time import JITTER, RobotTime
 
 
 def lived(*samples: tuple[float, int]) -> list[float]:
@@ -46,7 +46,6 @@ def test_where_the_tick_stands_or_starts_over_stamps_count(tick: int) -> None:
 
 
 def test_a_long_standstill_counts() -> None:
-    assert lived((8.0, 40), (8.1 + LONGEST, 45)) == [8.0, 8.1 + LONGEST]
     time = RobotTime()
     time.follow(8.0, 40)
     assert time.follow(8.065, 45, longest=0.05) == 8.065
@@ -54,3 +53,12 @@ def test_a_long_standstill_counts() -> None:
 
 def test_stamps_that_were_set_back_are_followed() -> None:
     np.testing.assert_allclose(lived((8.0, 40), (3.0, 45), (3.005, 50)), [8.0, 3.0, 3.005])
+
+
+def test_a_stamp_from_before_a_standstill_keeps_its_place_after_it() -> None:
+    time = RobotTime()
+    states = [time.follow(*sample) for sample in ((8.0, 40), (8.005, 45), (8.31, 50))]
+    np.testing.assert_allclose([time.at(8.0), time.at(8.005), time.at(8.31)], states)
+    assert time.at(8.2) == pytest.approx(8.005)  # the robot stood still
+    assert time.at(8.4) == pytest.approx(8.1)
+    assert RobotTime().at(3.0) == 3.0

@@ -31,7 +31,8 @@ class Bench:
         config = SimulatorConfig(noise=SensorNoise.none(), actuator=ActuatorParameters.ideal(), armature=1e9)
         self.clock = Clock()
         self.samples: list[tuple[RobotState, float]] = []
-        self.loop = SimulationLoop(Simulator(config), self.note, mode, period, clock=self.clock, **fields)
+        fields = {"clock": self.clock, **fields}
+        self.loop = SimulationLoop(Simulator(config), self.note, mode, period, **fields)
 
     def note(self, state: RobotState, instant: float) -> None:
         self.samples.append((state, instant))
@@ -75,6 +76,33 @@ def test_a_command_takes_effect_at_the_millisecond_after_its_arrival() -> None:
         torques.append(bench.torque())
     # It came after 3 ms and counts from 4 ms on; the sample of that instant is the last with the old torque.
     assert torques == pytest.approx([0.0] * 4 + [2.0] * 4 + [3.0] * 4, abs=1e-9)
+
+
+def test_real_time_waits_for_a_controller_that_is_late() -> None:
+    bench = Bench("realtime", clock=time.monotonic, answer_timeout=5.0)
+    with running(bench.loop):
+        for _ in range(20):
+            tick = bench.loop.tick
+            bench.loop.submit(command(1.0, tick))
+            wait_for(lambda: bench.loop.tick > tick)  # noqa: B023
+        time.sleep(0.3)  # it gets no time
+        stopped = bench.loop.tick
+        assert tick + 10 <= stopped <= tick + 15
+        assert bench.loop.report().braking is False
+        bench.loop.submit(command(1.0, stopped))
+        wait_for(lambda: bench.loop.tick > stopped)
+        assert bench.loop.report().given_up > 0.2
+
+
+def test_real_time_waits_for_no_controller_that_has_gone() -> None:
+    bench = Bench("realtime", clock=time.monotonic, answer_timeout=0.1)
+    with running(bench.loop):
+        bench.loop.submit(command(1.0, 0))
+        wait_for(lambda: bench.loop.tick > 100)
+        report = bench.loop.report()
+    assert report.braking
+    assert report.unanswered == 1
+    assert report.given_up == pytest.approx(0.1, abs=0.09)
 
 
 def test_that_millisecond_is_the_same_however_rarely_the_loop_wakes() -> None:

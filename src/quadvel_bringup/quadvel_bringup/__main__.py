@@ -17,7 +17,7 @@ def main() -> None:
     from .cli import app
 
     try:
-        app()
+        app(prog_name="quadvel")  # however it was started: shell completion goes by this name
     except (OSError, ValueError, MemoryError) as error:
         if os.environ.get("QUADVEL_TRACEBACK"):
             raise

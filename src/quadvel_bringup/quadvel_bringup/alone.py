@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import quadvel_dds
 
 TOPIC = "low_state"
+SERVERS = ("sim_node", "board", "driver", "quadvel_bringup.plant")
+"""Words of a command line whose process serves TOPIC"""
 LOOK = 0.5  # s; who is there answers a newcomer at once
 
 
@@ -21,12 +25,64 @@ def ensure_alone(node: Any) -> None:
     until = time.monotonic() + LOOK
     while time.monotonic() < until:
         if node.count_publishers(TOPIC):
-            domain = os.environ.get("ROS_DOMAIN_ID", "0")
             raise NotAlone(
-                f"{TOPIC}: somebody publishes it already on ROS domain {domain}: another simulator or a robot. Stop it (one "
-                "that was killed is forgotten after some 10 s), or set ROS_DOMAIN_ID to another number"
+                f"{TOPIC}: somebody publishes it already on ROS domain {_domain(os.environ)}: {_who()}. Stop it, or set "
+                "ROS_DOMAIN_ID to another number"
             )
         time.sleep(0.02)
+
+
+def _who() -> str:
+    """The processes of this machine that serve TOPIC on our domain, or what else it may be."""
+    found = servers()
+    if not found:
+        return "no process of yours on this machine, so a robot, another host or user, or one that was killed less than 10 s ago"
+    return ", ".join(f"{name} (pid {pid}{_starter(pid)})" for pid, name in found.items())
+
+
+def servers() -> dict[int, str]:
+    """Names, by process id, of what serves TOPIC on our ROS domain, as far as this user may look."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        name = next((word for word in SERVERS if word in _words(folder)), None)
+        if name and int(folder.name) != os.getpid() and _domain(_environment(folder)) == _domain(os.environ):
+            found[int(folder.name)] = name.rpartition(".")[2]
+    return found
+
+
+def _words(folder: Path) -> list[str]:
+    """The command line of a process, without the folders of its words."""
+    try:
+        return [
+            word.rpartition("/")[2] for word in (folder / "cmdline").read_text(errors="replace").split("\0")
+        ]
+    except OSError:  # it has ended meanwhile
+        return []
+
+
+def _environment(folder: Path) -> dict[str, str]:
+    try:
+        pairs = (folder / "environ").read_text(errors="replace").split("\0")
+    except OSError:  # another user's
+        return {"ROS_DOMAIN_ID": "?"}
+    return dict(pair.partition("=")[::2] for pair in pairs)
+
+
+def _domain(environment: Mapping[str, str]) -> str:
+    return environment.get("ROS_DOMAIN_ID") or "0"
+
+
+def _starter(pid: int) -> str:
+    """The `quadvel` command that started a process, if one did."""
+    try:
+        parent = Path("/proc") / Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
+    except OSError:
+        return ""
+    words = [word for word in _words(parent) if word]
+    for program in ("quadvel", "quadvel_bringup"):
+        if program in words[:-1]:
+            return f", started by quadvel {words[words.index(program) + 1]}, pid {parent.name}"
+    return ""
 
 
 def look_for_others() -> None:

@@ -46,15 +46,28 @@ What follows are arguments of ROS 2:
 """
 
 PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
-app = typer.Typer(no_args_is_help=True, **PLAIN)
+app = typer.Typer(no_args_is_help=True, **{**PLAIN, "add_completion": True})
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 # Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
 ENDED_BY_CTRL_C = ("run", "up", "drive", "record")
 
 
+def _version(asked: bool) -> None:
+    if asked:
+        from .version import version
+
+        print(f"quadvel {version()}")
+        raise typer.Exit
+
+
 @app.callback(help=EXAMPLES)
-def begin(context: typer.Context) -> None:
+def begin(
+    context: typer.Context,
+    version: Annotated[
+        bool, typer.Option("--version", help="Show the version and exit.", callback=_version, is_eager=True)
+    ] = False,
+) -> None:
     if context.invoked_subcommand not in ENDED_BY_CTRL_C:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
@@ -241,13 +254,16 @@ def record(
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.
 
+    Exit code 1, and no file, where nothing came. Of a recorder that was killed all but the last second can be read.
+
     \b
     For example:
       quadvel record low_state low_cmd --out walk.mcap
     """
     from .record import record as run_record
 
-    run_record(out, topics or [], seconds)
+    if not run_record(out, topics or [], seconds):
+        raise typer.Exit(1)
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

@@ -15,10 +15,12 @@ import typer
 from rich.console import Console
 
 from quadvel_eval import demo_figures, demo_summary
+from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
-from quadvel_eval.report import output_folder, replacing, segment_table, write_figure, write_json
+from quadvel_eval.report import segment_table, write_figure, write_json
 
-from .doctor import GL_PACKAGES, gl_backend
+from .doctor import GL_PACKAGES, gl_backend, video_encoder
+from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 
@@ -55,11 +57,13 @@ def demo_command(
     Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
+    stack = _stack(low_level, loss, jitter, lockstep, actuator)
+    rehearse(stack)
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
-        nodes = _stack(low_level, loss, jitter, lockstep, actuator).commands()
-        problem = ScriptedWalk(draft, "quick" if quick else "full", nodes, lockstep, console).run()
+        script = "quick" if quick else "full"
+        problem = ScriptedWalk(draft, script, stack.commands(), lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
     if problem:
@@ -105,9 +109,12 @@ def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> 
     write_figure(folder / "demo.png", demo_figures.tracking_figure(recording))
     if not video:
         return
-    backend = gl_backend()
+    backend, encoder = gl_backend(), video_encoder()
     if backend is None:
         console.print(f"no video: there is no off-screen GL on this machine; sudo apt install {GL_PACKAGES}")
+        return
+    if not encoder.good:
+        console.print(f"no video: {encoder.text}", markup=False)
         return
     with console.status("drawing the video"):
         drawing = subprocess.run(

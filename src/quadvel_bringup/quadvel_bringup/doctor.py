@@ -36,6 +36,7 @@ def examine() -> Iterator[Finding]:
     yield _clock()
     yield _priority()
     yield _gl()
+    yield video_encoder()
     yield _torch()
 
 
@@ -116,7 +117,21 @@ def _gl() -> Finding:
     backend = gl_backend()
     if backend is None:
         return Finding("GL", False, f"no off-screen GL, so no video; sudo apt install {GL_PACKAGES}")
-    return Finding("GL", True, f"{backend}: the demo can draw its video")
+    return Finding("GL", True, f"{backend}: draws off screen")
+
+
+def video_encoder() -> Finding:
+    """The program that makes a video of pictures, tried: the package may be there without it."""
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe
+
+        subprocess.run([get_ffmpeg_exe(), "-version"], capture_output=True, check=True)
+    except ImportError:
+        return Finding("ffmpeg", False, "imageio-ffmpeg is missing, so no video; pip install -e '.[video]'")
+    except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
+        reason = " ".join(str(error).split())
+        return Finding("ffmpeg", False, f"imageio-ffmpeg has no program that runs, so no video: {reason}")
+    return Finding("ffmpeg", True, f"imageio-ffmpeg {metadata.version('imageio-ffmpeg')}: encodes the video")
 
 
 def _torch() -> Finding:
@@ -134,5 +149,5 @@ def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
     yield "quadvel demo, up, run, record", runs
     yield "quadvel eval, bench", runs
-    yield "the video of the demo", runs and good["GL"]
+    yield "the video of the demo", runs and good["GL"] and good["ffmpeg"]
     yield "training", runs and torch

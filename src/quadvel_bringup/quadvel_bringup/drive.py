@@ -52,6 +52,8 @@ class Drive:
         self._session.spin_until(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
         # The mux commands zero all the time, which a robot that has just stood up waits for.
         self._session.spin_until(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
+        if not self._states[-1].rate_hz:
+            return "the controller hears no robot: is the simulator paused?"
         return self.refusal()
 
     def refusal(self) -> str:

@@ -23,7 +23,7 @@ from quadvel_actuator.identify.excitation import EXCITATIONS, PERIOD, Excitation
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
-from quadvel_eval.report import output_folder, replacing
+from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 
 from .alone import ensure_alone
@@ -50,9 +50,19 @@ class MotionError(RuntimeError):
 class Player:
     """Answers states with the commands of one motion; time is the states' own."""
 
-    def __init__(self, excitation: Excitation, kp: float = robot.KP, kd: float = robot.KD) -> None:
+    def __init__(
+        self,
+        excitation: Excitation,
+        kp: float | None = None,
+        kd: float | None = None,
+        hung: bool | None = None,
+    ) -> None:
+        """kp (N m/rad), kd (N m s/rad), hung: whether the feet are in the air; the motion's own where None."""
         self._targets = excitation.targets()
-        self._kp, self._kd = kp, kd
+        self._kp = excitation.kp if kp is None else kp
+        self._kd = excitation.kd if kd is None else kd
+        in_the_air = excitation.hung if hung is None else hung
+        self._support = np.zeros_like(self._targets) if in_the_air else excitation.support()
         self._begin: RobotState | None = None
         self._last = 0.0
         self.total = RAMP + excitation.seconds
@@ -78,15 +88,20 @@ class Player:
         self.elapsed = state.time - self._begin.time
         if self.done:
             return JointCommand.damping(tick=state.tick)
-        target = within_torque(self._target(self._begin.q), state.q, state.dq, self._kp, self._kd)
-        return JointCommand(q=target, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick)
+        target, tau = self._wanted(self._begin.q)
+        target = within_torque(target, state.q, state.dq, self._kp, self._kd, tau)
+        return JointCommand(
+            q=target, tau=tau, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick
+        )
 
-    def _target(self, start: np.ndarray) -> np.ndarray:
+    def _wanted(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Joint targets (12,) rad and feed-forward torque (12,) N m of this instant."""
         if self.elapsed < RAMP:
             s = self.elapsed / RAMP
-            return start + s * s * (3.0 - 2.0 * s) * (self._targets[0] - start)
-        row = int((self.elapsed - RAMP) / PERIOD + 0.5)
-        return self._targets[min(row, len(self._targets) - 1)]
+            share = s * s * (3.0 - 2.0 * s)
+            return start + share * (self._targets[0] - start), share * self._support[0]
+        row = min(int((self.elapsed - RAMP) / PERIOD + 0.5), len(self._targets) - 1)
+        return self._targets[row], self._support[row]
 
 
 def _check(state: RobotState) -> None:
@@ -116,8 +131,18 @@ def excite_command(
     ] = "sim",
     hung: Annotated[
         bool | None,
+        typer.Option("--hung/--ground", help="Are the feet in the air?", show_default="as the motion wants"),
+    ] = None,
+    kp: Annotated[
+        float | None,
         typer.Option(
-            "--hung/--ground", help="Simulated robot: in the air?", show_default="as the motion wants"
+            min=1.0, max=500.0, help="Gain of the joints' angles, N m/rad.", show_default="the motion's own"
+        ),
+    ] = None,
+    kd: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0, max=20.0, help="Gain of their speeds, N m s/rad.", show_default="the motion's own"
         ),
     ] = None,
     actuator: Annotated[
@@ -136,6 +161,10 @@ def excite_command(
     chirp         fast swings in the air         steps  steps of all sizes in the air
     creep         slow motion in the air         solo   one joint at a time in the air
 
+    On the ground the legs are as stiff as this robot stands up with (--kp 150 --kd 4) and carry its weight by
+    feed-forward torque: with the policy's gains (--kp 30 --kd 0.5), which the motions in the air take, it tips over.
+    Gains and torque are in the recording.
+
     \b
     For example:
       quadvel excite foot-lifting --out lift.mcap
@@ -151,15 +180,16 @@ def excite_command(
         raise ValueError(f"motion is {motion!r}, expected one of {', '.join(EXCITATIONS)}")
     excitation = EXCITATIONS[motion]() if seconds is None else EXCITATIONS[motion](seconds=seconds)
     path = out or Path("out/excite") / f"{motion}.mcap"
-    output_folder(path.parent)
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file with --out")
-    parameters: dict[str, Any] = {"hung": excitation.hung if hung is None else hung, "seed": seed}
+    output_file(path)
+    in_the_air = excitation.hung if hung is None else hung
+    parameters: dict[str, Any] = {"hung": in_the_air, "seed": seed}
     if actuator is not None:
         parameters["actuator_file"] = str(actuator.resolve())
     nodes = {"sim_node": command("sim_node", sim_arguments(**parameters))} if low_level == "sim" else {}
     try:
-        record_motion(Player(excitation), path, nodes, console)
+        record_motion(Player(excitation, kp, kd, in_the_air), path, nodes, console)
     except MotionError as error:
         console.print(f"[bold red]{error}")
         raise typer.Exit(1) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 import quadvel_dds
+from quadvel_eval.output import output_file
 
 from .processes import StopSignals
 
@@ -19,11 +21,11 @@ LOOK = 0.5  # s, between two looks for new topics
 def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     """Record the topics named, or all, until Ctrl-C or for some seconds; returns the number of messages.
 
-    Raises FileExistsError if the file is there already.
+    Where nothing came there is no file. Raises FileExistsError if the file is there already.
     """
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file")
-    path.parent.mkdir(parents=True, exist_ok=True)
+    output_file(path)
     quadvel_dds.install()
     import rclpy
     from rclpy.executors import SingleThreadedExecutor
@@ -31,7 +33,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
 
     from .recorder import Recorder
 
-    console = Console(stderr=True)
+    console = Console(stderr=True, soft_wrap=True)
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     node = rclpy.create_node("recorder")
     executor = SingleThreadedExecutor()
@@ -46,6 +48,14 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
                 status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
         node.destroy_node()
         rclpy.try_shutdown()
+    if not recorder.counts:
+        path.unlink()
+        sought = ", ".join(wanted) or "any topic"
+        domain = os.environ.get("ROS_DOMAIN_ID", "0")
+        console.print(
+            f"nothing came on {sought} on ROS domain {domain}, so there is no {path}; is a robot up?"
+        )
+        return 0
     for topic in wanted:
         if topic not in recorder.counts:
             console.print(f"nothing came on {topic}")

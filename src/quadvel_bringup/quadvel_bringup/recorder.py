@@ -5,9 +5,11 @@ Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 
 from __future__ import annotations
 
+import os
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -27,16 +29,27 @@ LATCHED = ("/tf_static", "/robot_description")
 """Topics that are published once and kept for those who come later."""
 HIDDEN = ("/parameter_events", "/rosout")
 BATCH = 0.05  # s
+CHUNK = (
+    1.0  # s, after which what was written so far goes to the disk: a recorder that is killed loses no more
+)
 OTHERS = 4  # callbacks that may come between two of ours although messages wait
 
 
 class Recorder:
-    """Writes what the given node receives on some topics until it is closed; the file is whole only then."""
+    """Writes what the given node receives on some topics until it is closed.
+
+    The file has its index only then; where it never comes to that, `quadvel_dds.recordings` reads all but the last
+    CHUNK.
+    """
 
     def __init__(self, node: Node, path: Path) -> None:
         self._node = node
-        self._writer = Writer(str(path), compression=CompressionType.LZ4)
+        self._file = path.open("wb")
+        self._writer = Writer(self._file, compression=CompressionType.LZ4)
         self._writer.start(profile="ros2", library="quadvel")
+        self._chunk_began = time.monotonic()
+        self._disk = ThreadPoolExecutor(1, "disk")
+        self._synced: Future[None] | None = None
         self._open = True
         self._schemas: dict[str, int] = {}
         self._subscriptions: dict[str, Any] = {}
@@ -96,6 +109,15 @@ class Recorder:
             written = self.counts.total()
             executor.spin_once(timeout_sec=0.0)
             in_vain = 0 if self.counts.total() > written else in_vain + 1
+        if time.monotonic() - self._chunk_began > CHUNK:
+            self._end_chunk()
+
+    def _end_chunk(self) -> None:
+        """Hand the chunk to the system, and have it brought to the disk beside us, as a disk may take its time."""
+        self._chunk_began = time.monotonic()
+        self._writer.flush()  # type: ignore[no-untyped-call]
+        if self._synced is None or self._synced.done():
+            self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
     def close(self) -> None:
         """Finish the file. A second call does nothing."""
@@ -105,6 +127,8 @@ class Recorder:
         if self._open:
             self._open = False
             self._writer.finish()  # type: ignore[no-untyped-call]
+            self._disk.shutdown()
+            self._file.close()
 
     def __enter__(self) -> Recorder:
         return self

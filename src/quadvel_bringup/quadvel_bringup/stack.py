@@ -25,12 +25,14 @@ BOARD_PORT = (
 class LowLevel:
     """What serves low_state and low_cmd: its nodes with their parameters, and what it wants of the controller.
 
-    simulation: the one of these nodes that simulates, if one does.
+    simulation: the one of these nodes that simulates, if one does. urgent: whether real time is a matter of safety, so that
+    the threads of the control loop run before all others.
     """
 
     nodes: Mapping[str, Parameters]
     controller: Parameters
     simulation: str = ""
+    urgent: bool = False
 
 
 def _on_loopback() -> dict[str, Parameters]:
@@ -43,12 +45,13 @@ def _on_loopback() -> dict[str, Parameters]:
     }
 
 
+URGENT: Parameters = {"realtime_priority": 50}
 # It stands up and walks only on an operator's call, with the policy loaded but inactive until then.
 _BY_OPERATOR: Parameters = {"auto_stand": False, "require_operator": True}
 LOW_LEVELS = {
-    "sim": LowLevel({"sim_node": {}}, {"auto_stand": True}, simulation="sim_node"),
+    "sim": LowLevel({"sim_node": {}}, {"auto_stand": True, "robot_waits": True}, simulation="sim_node"),
     "board": LowLevel(_on_loopback(), {"auto_stand": True}, simulation="board"),
-    "aliengo": LowLevel({"driver": {}}, _BY_OPERATOR),
+    "aliengo": LowLevel({"driver": URGENT}, _BY_OPERATOR, urgent=True),
     "external": LowLevel({}, _BY_OPERATOR),  # started by somebody else, and perhaps a real robot
 }
 
@@ -93,9 +96,10 @@ class Stack:
         """For each node to start, by name, the parameters that stand above those of the file."""
         low_level = LOW_LEVELS[self.low_level]
         policy = None if self.policy is None else str(self.policy.resolve())
+        urgent: Parameters = URGENT if low_level.urgent else {}
         followers: dict[str, Parameters] = {
-            "estimator": _given(kind=self.estimator),
-            "controller": {**low_level.controller, **_given(policy=policy)},
+            "estimator": {**urgent, **_given(kind=self.estimator)},
+            "controller": {**low_level.controller, **urgent, **_given(policy=policy)},
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())

@@ -23,9 +23,10 @@ from rich.table import Table
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_eval import demo_summary, replay
+from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.recording import Recording, read_recording
-from quadvel_eval.report import output_folder, replacing, write_json
+from quadvel_eval.report import write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 

@@ -12,6 +12,7 @@ from rich.text import Text
 from .alone import look_for_others
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
+from .rehearsal import rehearse
 from .stack import Stack
 
 COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
@@ -41,9 +42,10 @@ def up(stack: Stack) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0). Raises NotAlone where a robot is there already that
-    nobody asked for.
+    are stopped, and its exit code is ours (1 if that was 0). Raises ValueError or OSError where a parameter or
+    a file is wrong, and NotAlone where a robot is there already that nobody asked for.
     """
+    rehearse(stack)
     if stack.brings_robot:
         look_for_others()
     nodes = stack.arguments()

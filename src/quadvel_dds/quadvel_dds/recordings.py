@@ -5,12 +5,14 @@ Definitions come from `STORE`, so a recording is read where no ROS 2 is installe
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 from rosbags.rosbag2 import Reader
 
+from .cut_off import is_cut_off, kept_messages, what_is_kept
 from .messages import STORE
 
 
@@ -18,13 +20,21 @@ class RecordingError(ValueError):
     """A recording that cannot be read; one sentence that names the file."""
 
 
-def read_messages(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tuple[str, int, Any]]:
+def read_messages(
+    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None = None
+) -> Iterator[tuple[str, int, Any]]:
     """Topic, time of arrival (ns) and message, in the order of arrival, where `wanted(topic, typename)`.
 
-    Raises RecordingError for what is no whole recording, and OSError where there is no such file.
+    Of an MCAP file whose recorder was killed come the messages that were written whole. One sentence that says so goes
+    to `tell`, or becomes a warning. Raises RecordingError for what is no recording, and OSError where there is no such file.
     """
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
+    if path.is_dir() and not (path / "metadata.yaml").exists():
+        raise RecordingError(f"{path}: the folder is no recording: a rosbag2 folder holds a metadata.yaml")
+    if is_cut_off(path):
+        yield from _kept(path, wanted, tell)
+        return
     try:
         with Reader(path) as reader:
             chosen = [
@@ -40,3 +50,20 @@ def read_messages(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tu
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
         what = " ".join(str(error).split()) or type(error).__name__
         raise RecordingError(f"{path}: no whole recording, perhaps cut off: {what}") from error
+
+
+def _kept(
+    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None
+) -> Iterator[tuple[str, int, Any]]:
+    """The same of a file that was cut off."""
+    kept = what_is_kept(path)
+    if not kept:
+        raise RecordingError(f"{path}: the recording was cut off before anything of it was whole")
+    text = f"recording: it was cut off; {kept} are kept"
+    if tell is None:
+        warnings.warn(f"{path}: {text}", stacklevel=3)
+    else:
+        tell(text)
+    for one in kept_messages(path):
+        if wanted(one.topic, one.typename) and one.typename in STORE.fielddefs:
+            yield one.topic, one.time, STORE.deserialize_cdr(one.data, one.typename)

@@ -16,7 +16,8 @@ from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from . import bench
 from .compare import comparison_table, read_evaluation
 from .grid import evaluate
-from .report import evaluation_table, output_folder, write_evaluation, write_json
+from .output import output_file, output_folder
+from .report import evaluation_table, write_evaluation, write_json
 from .walk import Setup
 
 Cluster = Annotated[
@@ -93,7 +94,7 @@ def bench_command(
     out: Annotated[Path, typer.Option(help="JSON file for the figures.")] = Path("out/bench.json"),
 ) -> None:
     """Measure how fast this machine simulates, infers, talks and trains; on an idle machine, some minutes."""
-    output_folder(out.parent)
+    output_file(out)
     results = {}
     messages = Console(stderr=True)
     with messages.status("") as status:

@@ -7,9 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,33 +17,13 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from rich.table import Table
 
+from .output import replacing
+
 CSV_COLUMNS = (
     *("vx", "vy", "wz", "seed"),
     *("mean_vx", "mean_vy", "mean_wz"),
     *("error_xy", "error_wz", "fell"),
 )
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """A file to write in `path`'s place, with its suffix; it takes the place only if the block succeeds."""
-    draft = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
-    try:
-        yield draft
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
-
-
-def output_folder(path: Path) -> Path:
-    """`path` as a folder that exists and can be written to. Raises OSError, one sentence."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError):
-        raise NotADirectoryError(f"{path}: is a file or lies below one, expected a folder") from None
-    if not os.access(path, os.W_OK | os.X_OK):
-        raise PermissionError(f"{path}: the folder can't be written to")
-    return path
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -18,8 +18,9 @@ from quadvel_description.mjcf import load_model
 
 from .demo_figures import tracking_figure
 from .demo_summary import commands
+from .output import replacing
 from .recording import Recording, read_recording
-from .report import replacing, write_figure
+from .report import write_figure
 
 Image = NDArray[np.uint8]
 

@@ -13,6 +13,7 @@ included, is no gap in them.
 from __future__ import annotations
 
 import gc
+import math
 import time
 from typing import Any
 
@@ -31,7 +32,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
-from quadvel_nodes.robot_time import LONGEST, RobotTime
+from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
@@ -47,6 +48,8 @@ PERIOD = 1.0 / RATE_HZ
 STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
 
+LONGEST = 0.5
+"""s that a robot may have stood still, with all of the machine, before its next state; longer is a fault"""
 HELD_UP = 10
 """Simulated states that wait for a command, one after the other, where none comes any more"""
 
@@ -66,6 +69,11 @@ class ControllerParameters(SupervisorConfig, Scheduling):
         0.05, "oldest velocity estimate that walking may use before it is a fault, s"
     )
     command_timeout: float = setting(0.5, "oldest command that is followed; after that the robot stands, s")
+    robot_waits: bool = setting(
+        False,
+        "whether the robot's time stands still until a late answer comes, as a simulator's does: then lateness is no fault",
+        positive=False,
+    )
     max_overruns: int = setting(20, "deadlines missed in a row before a fault")
 
 
@@ -75,6 +83,10 @@ class Controller(Node):
     def __init__(self) -> None:
         super().__init__("controller")
         self._settings = read_parameters(self, ControllerParameters)
+        self._patience = 0.0  # s by which a message may be late because nobody ran, the robot neither
+        if self._settings.robot_waits:
+            self._patience = math.inf
+            self._settings = attrs.evolve(self._settings, max_state_age=math.inf)
         policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
         policy.prepare()  # now, as the first time is slow
         self._supervisor = Supervisor(policy, self._settings)
@@ -90,7 +102,7 @@ class Controller(Node):
         self._command: Stamped | None = None
         self._checks = {
             "low_state": StampCheck(self._settings.max_state_age),
-            "velocity_estimate": StampCheck(self._settings.max_velocity_age),
+            "velocity_estimate": StampCheck(self._settings.max_velocity_age + self._patience),
             "command": StampCheck(self._settings.command_timeout),
         }
         self._announcements = Announcements(self._supervisor)
@@ -137,7 +149,7 @@ class Controller(Node):
             self._refusals.add("low_state", error)
             return
         self._pauses.look(now)
-        longest = LONGEST if self._pauses.since_heard else self._settings.max_state_age
+        longest = max(LONGEST if self._pauses.since_heard else 0.0, self._settings.max_state_age)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
         self._pauses.heard()
         sent_again = self._waiting is not None and self._waiting.time == state.time
@@ -147,17 +159,16 @@ class Controller(Node):
             self._take(state, now, start)
 
     def _outruns_others(self, state: RobotState) -> bool:
-        """Whether a simulator shall wait until estimator and mux have kept up, as they do by themselves in real time.
+        """Whether a simulator shall wait until the estimator, and in lockstep the mux, have kept up.
 
-        Not for long: each state is sent again, and those that come after a while are no longer held up.
+        Not for long: it sends a state again or goes on, and states that come after a while are no longer held up.
         """
-        if not self._sim_time:
+        if not (self._sim_time or self._settings.robot_waits):
             return False
-        late = 0.5 * self._settings.command_timeout
-        held_up = (
-            (self._velocity, 1.5 * PERIOD, self._settings.max_velocity_age),
-            (self._command, late, late + HELD_UP * PERIOD),
-        )
+        held_up = [(self._velocity, 1.5 * PERIOD, self._settings.max_velocity_age)]
+        if self._sim_time:
+            late = 0.5 * self._settings.command_timeout
+            held_up.append((self._command, late, late + HELD_UP * PERIOD))
         return any(last is not None and least < state.time - last[0] <= most for last, least, most in held_up)
 
     def _take(self, state: RobotState, now: float, start: float) -> None:
@@ -176,11 +187,12 @@ class Controller(Node):
 
     def _tick(self, state: RobotState, now: float) -> None:
         """One tick of the supervisor, and its command. now: s, on the clock; it is judged by what was known then."""
-        if self._stats.in_a_row > self._settings.max_overruns:
+        overruns = 0 if self._settings.robot_waits else self._stats.in_a_row
+        if overruns > self._settings.max_overruns:
             self._supervisor.fail(f"{self._stats.in_a_row} deadlines were missed in a row")
         self._state = state
         now -= self._robot_time.stalled
-        velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age)
+        velocity = _fresh(self._velocity, state.time, self._settings.max_velocity_age, self._patience)
         command = _fresh(self._command, now, self._settings.command_timeout)
         self._answer = self._supervisor.tick(now, state, velocity, command)
         self._publish()
@@ -195,7 +207,7 @@ class Controller(Node):
         try:
             stamp = seconds(message.header.stamp)
             now = self._accept("velocity_estimate", stamp)
-            self._velocity = stamp - self._robot_time.stalled, linear_velocity(message.twist.twist)
+            self._velocity = self._robot_time.at(stamp), linear_velocity(message.twist.twist)
         except MessageError as error:
             self._refusals.add("velocity_estimate", error)
             return
@@ -206,7 +218,7 @@ class Controller(Node):
             stamp = seconds(message.stamp)
             now = self._accept("command", stamp)
             command = np.append(planar_velocity(message.twist), float(message.stance))
-            self._command = stamp - self._robot_time.stalled, command
+            self._command = self._robot_time.at(stamp), command
         except MessageError as error:
             self._refusals.add("command", error)
             return
@@ -320,14 +332,19 @@ class Controller(Node):
             return DiagnosticStatus.WARN, f"{refused} messages refused in the last second; {status}"
         if paused:
             return DiagnosticStatus.WARN, f"could not run {paused} times in the last second; {status}"
+        if not self._stats.summary(time.perf_counter()).rate_hz:
+            return DiagnosticStatus.WARN, f"no state came for a second; {status}"
         if missed:
             return DiagnosticStatus.WARN, f"{missed} deadlines missed in the last second; {status}"
         return DiagnosticStatus.OK, status
 
 
-def _fresh(stamped: Stamped | None, now: float, limit: float) -> Array | None:
-    """The value, unless its time is more than `limit` (s) off, to come where the clock was set back."""
-    return stamped[1] if stamped is not None and abs(now - stamped[0]) <= limit else None
+def _fresh(stamped: Stamped | None, now: float, limit: float, ahead: float = 0.0) -> Array | None:
+    """The value, unless its time is more than `limit` (s) off, to come where the clock was set back.
+
+    ahead: how much more it may be to come, s: of a state after a standstill that this node does not know of yet.
+    """
+    return stamped[1] if stamped is not None and -limit - ahead <= now - stamped[0] <= limit else None
 
 
 def main(args: list[str] | None = None) -> None:

@@ -6,7 +6,8 @@ No ROS: `sim_node` puts topics around it.
 In real time the loop wakes once a period, at absolute deadlines, and then simulates the period that has just
 passed. A command takes effect at the simulated millisecond that follows its arrival: the robot behaves as if
 the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted: a stall of
-the machine stops the controller, too, and is no event in the robot's world.
+the machine stops the controller, too, and is no event in the robot's world. Nor is a controller that gets no time on a
+loaded machine: the simulation runs at most LEAD ahead of what its commands answer, and waits for it before that.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from quadvel_sim.simulator import DT, Simulator
 
 REALTIME, LOCKSTEP, FAST = MODES = ("realtime", "lockstep", "fast")
 MAX_LAG = 0.01  # s
+LEAD = 10
+"""ms that real time runs ahead of the newest state that was answered: half of the time after which the drives brake"""
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
@@ -50,7 +53,8 @@ class SimulationLoop:
 
     `publish(state, instant)` is called with the lock held, so that samples leave in order. `state.tick` and
     `state.time` go on over resets. `instant` (s) is when the sample holds: on `clock` in real time, else in
-    simulated time.
+    simulated time. answer_timeout: s that simulated time stands still for an answer; then lockstep publishes the state again,
+    and real time goes on without a controller until the next command.
     """
 
     def __init__(
@@ -72,6 +76,10 @@ class SimulationLoop:
         self._inbox: deque[tuple[float, JointCommand]] = deque()
         self._before_reset = 0  # tick of the last reset
         self._answered = self._paused = self._stopped = False
+        self._answered_tick: int | None = (
+            None  # the newest that a command answered; None: nobody controls the robot
+        )
+        self._waits_since: float | None = None  # on the clock, for an answer, in real time
         self._owed = 0  # ms that a paused simulation was asked for and has not simulated yet
         self._given_up = 0.0
         self._unanswered = 0
@@ -119,8 +127,10 @@ class SimulationLoop:
         with self._condition:
             self._check(command)
             self._inbox.append((arrival, command))
+            self._answered_tick = max(self._answered_tick or 0, self.tick - self._age(command))
             if self.mode == LOCKSTEP:
                 self._answered = True
+            if self.mode == LOCKSTEP or self._waits_since is not None:
                 self._condition.notify_all()
 
     def reset(self, keyframe: str) -> None:
@@ -131,7 +141,7 @@ class SimulationLoop:
             self._before_reset = after
             self._anchor()
             self._inbox.clear()
-            self._answered = False
+            self._answered, self._answered_tick = False, None
             self._sample()
             self._condition.notify_all()
 
@@ -210,11 +220,29 @@ class SimulationLoop:
         if lateness < 0.0:
             self._condition.wait(-lateness)
             return False
+        if self._waits():
+            return False
         self._worst_lateness = max(self._worst_lateness, lateness)
         if lateness > MAX_LAG:
             self._given_up += lateness
             self._anchor_time += lateness
         return True
+
+    def _waits(self) -> bool:
+        """Whether real time stands still for the answer of a controller that is late; if so, waits for it a while."""
+        if self._answered_tick is None or self.tick - self._answered_tick < LEAD:
+            self._waits_since = None
+            return False
+        now = self._clock()
+        if self._waits_since is None:
+            self._waits_since = now
+        left = self._waits_since + self._answer_timeout - now
+        if left > 0.0:
+            self._condition.wait(left)
+            return True
+        self._unanswered += 1
+        self._answered_tick = self._waits_since = None
+        return False
 
     def _step(self, steps: int) -> None:
         """Simulate `steps` ms; each command takes effect when it is due."""
@@ -243,7 +271,7 @@ class SimulationLoop:
     def _check(self, command: JointCommand) -> None:
         if command.mode not in (MODE_DAMPING, MODE_SERVO):
             raise ValueError(f"mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
-        age = (self.tick - command.tick + _WRAP // 2) % _WRAP - _WRAP // 2  # ms
+        age = self._age(command)
         if self.mode == LOCKSTEP and age != 0:
             raise ValueError(f"it answers tick {command.tick}, expected {self.tick % _WRAP}")
         if age < 0:
@@ -251,3 +279,7 @@ class SimulationLoop:
         if age > min(MAX_AGE, self.tick - self._before_reset):
             expected = f"expected at most {MAX_AGE} ms, and none from before a reset"
             raise ValueError(f"it answers tick {command.tick}, {age} ms ago: {expected}")
+
+    def _age(self, command: JointCommand) -> int:
+        """How long ago the state was that a command answers, ms; below zero for one that is to come."""
+        return (self.tick - command.tick + _WRAP // 2) % _WRAP - _WRAP // 2

@@ -104,7 +104,9 @@ class SimParameters(PlantParameters):
     """Those of `sim_node`: time may wait for commands."""
 
     mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
-    answer_timeout: float = _parameter(1.0, "lockstep: s after which a state without answer is sent again")
+    answer_timeout: float = _parameter(
+        1.0, "s that simulated time stands still for an answer; lockstep then sends the state again"
+    )
 
     def __attrs_post_init__(self) -> None:
         super().__attrs_post_init__()

@@ -6,6 +6,7 @@ import os
 import sys
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
 import attrs
@@ -231,12 +232,14 @@ def say(inspection: Inspection, messages: Console) -> None:
 
 
 def _check_folder(out: Path) -> None:
-    """Raises OSError where `out` cannot become a folder to write to; nothing is made."""
+    """Raises OSError where `out` cannot become a folder to write to, which is tried; nothing is left of that."""
     there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not there.is_dir():
         raise NotADirectoryError(f"{out}: is a file or lies below one, expected a folder")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise PermissionError(f"{out}: the folder can't be written to")
+    try:
+        TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise type(error)(f"{out}: the folder can't be written to: {error.strerror}") from None
 
 
 def main() -> None:

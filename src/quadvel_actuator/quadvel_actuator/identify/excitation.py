@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description import robot
 from quadvel_description.command_range import held
-from quadvel_description.kinematics import HIPS, inverse_kinematics
+from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinematics
 
 Array = NDArray[np.float64]
 
@@ -34,15 +34,27 @@ def _seconds(default: float) -> Any:
 
 @attrs.frozen
 class Excitation(ABC):
-    """A motion of `seconds`. hung: to be done with the robot hung, its feet in the air."""
+    """A motion of `seconds`.
 
-    hung: ClassVar[bool]
+    hung: to be done with the robot hung, its feet in the air. kp (N m/rad), kd (N m s/rad): the gains it is made
+    for, the policy's own unless a motion says why it takes others.
+    """
+
+    hung: ClassVar[bool] = True
+    kp: ClassVar[float] = robot.KP
+    kd: ClassVar[float] = robot.KD
     seconds: float
 
     def targets(self) -> Array:
         """Joint targets within the limits, (n, 12) rad, one row each PERIOD."""
-        t = PERIOD * np.arange(round(self.seconds / PERIOD), dtype=np.float64)
-        return within_speed(held(self._motion(t)))
+        return within_speed(held(self._motion(self._times())))
+
+    def support(self) -> Array:
+        """Joint torque (n, 12) N m that carries the robot on its feet, a row each PERIOD; zero for motions in the air."""
+        return np.zeros((len(self._times()), 12))
+
+    def _times(self) -> Array:
+        return PERIOD * np.arange(round(self.seconds / PERIOD), dtype=np.float64)
 
     @abstractmethod
     def _motion(self, t: Array) -> Array:
@@ -57,48 +69,75 @@ def lift(k: ArrayLike) -> Array:
     return shape
 
 
-def _lifted(phase: Array, height: Array) -> Array:
-    """Joint targets (n, 12) of feet lifted straight up by `height` (n,) m at the common phase (n,)."""
-    feet = np.empty((len(phase), 4, 3))
-    feet[...] = HIPS
-    feet[..., 1] += robot.THIGH_OFFSET * _SIDE
-    feet[..., 2] = _HEIGHT + height[:, None] * lift((phase[:, None] + _LEG_PHASE) % 4.0)
-    return inverse_kinematics(feet)
+@attrs.frozen
+class OnGround(Excitation):
+    """Diagonal feet lifted in turn, straight up, from a stand on the ground.
+
+    Two feet carry the robot at any time, and it tips about the line between them until the next two come down. These
+    right it only where they do not give way: with the policy's gains the legs sag by 0.1 m, and the trunk tips over
+    within 3 s. So the gains are those with which this robot stands up, and the legs carry the weight by
+    feed-forward torque, so that the feet are where Eq. 9 has them.
+    """
+
+    hung: ClassVar[bool] = False
+    kp: ClassVar[float] = 150.0
+    kd: ClassVar[float] = 4.0
+
+    @abstractmethod
+    def _lifting(self, t: Array) -> tuple[Array, Array]:
+        """At the times (n,): the share of its height that each foot is lifted by (n, 4), and that height (n,) m."""
+
+    def _motion(self, t: Array) -> Array:
+        share, height = self._lifting(t)
+        feet = np.empty((len(t), 4, 3))
+        feet[...] = HIPS
+        feet[..., 1] += robot.THIGH_OFFSET * _SIDE
+        feet[..., 2] = _HEIGHT + height[:, None] * share
+        return inverse_kinematics(feet)
+
+    def support(self) -> Array:
+        """A foot carries the more of the weight the less it is lifted."""
+        down = 1.0 - self._lifting(self._times())[0]
+        force = robot.MASS * robot.GRAVITY * down / down.sum(axis=1, keepdims=True)
+        jacobians = foot_jacobians(self._motion(self._times()))
+        return -(jacobians[:, :, 2] * force[..., None]).reshape(-1, 12)
+
+
+def _lift_of_feet(phase: Array) -> Array:
+    """Shares of the height (n, 4) at the common phase (n,)."""
+    return lift((phase[:, None] + _LEG_PHASE) % 4.0)
 
 
 @attrs.frozen
-class FootLifting(Excitation):
+class FootLifting(OnGround):
     """The paper's trajectory, Eq. 9: diagonal feet lifted in turn by `height` (m), phase `rate` (1/s)."""
 
-    hung: ClassVar[bool] = False
     seconds: float = _seconds(5.0)
     rate: float = 8.0
     height: float = 0.1
 
-    def _motion(self, t: Array) -> Array:
-        return _lifted(self.rate * t, np.full(len(t), self.height))
+    def _lifting(self, t: Array) -> tuple[Array, Array]:
+        return _lift_of_feet(self.rate * t), np.full(len(t), self.height)
 
 
 @attrs.frozen
-class Sweep(Excitation):
+class Sweep(OnGround):
     """Foot lifting whose rate and height rise and fall: loads and speeds in many combinations."""
 
-    hung: ClassVar[bool] = False
     seconds: float = _seconds(20.0)
-    rates: tuple[float, float] = (5.0, 11.0)  # 1/s
-    heights: tuple[float, float] = (0.03, 0.12)  # m
+    rates: tuple[float, float] = (5.0, 9.0)  # 1/s
+    heights: tuple[float, float] = (0.03, 0.1)  # m
 
-    def _motion(self, t: Array) -> Array:
+    def _lifting(self, t: Array) -> tuple[Array, Array]:
         rate = _between(self.rates, np.sin(2 * np.pi * 2 * t / self.seconds))
         height = _between(self.heights, np.sin(2 * np.pi * 5 * t / self.seconds))
-        return _lifted(np.cumsum(rate) * PERIOD, height)
+        return _lift_of_feet(np.cumsum(rate) * PERIOD), height
 
 
 @attrs.frozen
 class Chirp(Excitation):
     """All joints swing at once, each at its own pace, from slow to fast: lags, delays and inertias differ."""
 
-    hung: ClassVar[bool] = True
     seconds: float = _seconds(20.0)
     frequencies: tuple[float, float] = (0.3, 20.0)  # Hz
     amplitude: float = 0.35  # rad, less where the speed limit asks for it
@@ -118,7 +157,6 @@ class Chirp(Excitation):
 class Solo(Excitation):
     """One joint swings at a time while the others hold still: what one joint does to another shows."""
 
-    hung: ClassVar[bool] = True
     seconds: float = _seconds(36.0)
     amplitude: float = 0.4  # rad
 
@@ -137,7 +175,6 @@ class Solo(Excitation):
 class RandomSteps(Excitation):
     """Steps of all sizes at random times: bounds of torque where they are large, play and deadband where small."""
 
-    hung: ClassVar[bool] = True
     seconds: float = _seconds(20.0)
     sizes: tuple[float, float] = (0.01, 0.6)  # rad, drawn evenly in the logarithm
     holds: tuple[float, float] = (0.08, 0.5)  # s
@@ -162,7 +199,6 @@ class RandomSteps(Excitation):
 class Creep(Excitation):
     """Slow back and forth through a wide range: friction at standstill, cogging, springs, rubbing."""
 
-    hung: ClassVar[bool] = True
     seconds: float = _seconds(40.0)
     amplitude: float = 0.5  # rad
     periods: tuple[float, float] = (4.0, 11.0)  # s, of the fastest and the slowest joint
@@ -204,10 +240,13 @@ def within_speed(targets: Array) -> Array:
     return slowed
 
 
-def within_torque(target: Array, q: Array, dq: Array, kp: float, kd: float) -> Array:
-    """`target` (12,) rad held to what asks for TORQUE_SHARE of the torque limit at the state q, dq (12,)."""
+def within_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau: ArrayLike = 0.0) -> Array:
+    """`target` (12,) rad held to what asks for TORQUE_SHARE of the torque limit at the state q, dq (12,).
+
+    tau: feed-forward torque (12,) N m that goes with it.
+    """
     bound = TORQUE_SHARE * robot.TORQUE_LIMIT
-    held = kd * dq
+    held = kd * dq - np.asarray(tau)
     return np.clip(target, q + (held - bound) / kp, q + (held + bound) / kp)
 
 

@@ -55,6 +55,7 @@ def read(path: Path) -> Log:
     rows: dict[str, _Rows] = defaultdict(_Rows)
     topics: dict[str, str] = {}
     types: dict[str, str] = {}
+    remarks: list[str] = []
 
     def wanted(topic: str, typename: str) -> bool:
         if typename in (STATE, COMMAND):
@@ -62,7 +63,7 @@ def read(path: Path) -> Log:
         return topic in types
 
     try:
-        for topic, _, message in read_messages(path, wanted):
+        for topic, _, message in read_messages(path, wanted, remarks.append):
             kind = types[topic]
             if topics.setdefault(kind, topic) != topic:
                 raise LogError(f"{path}: {kind}: found on {topics[kind]} and on {topic}, expected one topic")
@@ -76,7 +77,6 @@ def read(path: Path) -> Log:
     start = rows[STATE].first
     t, state = rows[STATE].arrays(STATE_FIELDS, start)
     t_cmd, command = rows[COMMAND].arrays(COMMAND_FIELDS, start)
-    remarks: list[str] = []
     t, state = drop_repeated_times("t", t, state, remarks)
     t_cmd, command = drop_repeated_times("t_cmd", t_cmd, command, remarks)
     return Log(

@@ -12,7 +12,7 @@ from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 
 from ..cli import Cluster, walks_bar
-from ..report import output_folder
+from ..output import output_folder
 from .files import PAGE
 from .section import Section, Study
 from .study import SECTIONS, Progress, run

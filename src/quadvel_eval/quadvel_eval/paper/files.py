@@ -17,7 +17,8 @@ from matplotlib.figure import Figure
 
 from quadvel_policy.policy_file import PolicyFile
 
-from ..report import replacing, write_figure, write_json
+from ..output import replacing
+from ..report import write_figure, write_json
 from .section import Record, Row, Section, Study, distinct
 
 SCHEMA = 1

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
 
-from ..report import replacing
+from ..output import replacing
 from .cells import Command, cell_record, falls, largest_error, limits, mean_error
 from .conditions import Condition, condition_job, draw
 from .identification import mixed

@@ -1,0 +1,200 @@
+"""An operator and a simulated robot: `quadvel up` and the commands that talk to it, all as processes over DDS.
+
+The tests share one robot; each begins with one that stands.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
+
+
+def quadvel(*arguments: str) -> tuple[int, str]:
+    """Exit code and all that the command wrote."""
+    done = subprocess.run([*QUADVEL, *arguments], capture_output=True, text=True, timeout=90)
+    return done.returncode, done.stdout + done.stderr
+
+
+class Robot:
+    """`quadvel up`, what it wrote, and its nodes."""
+
+    def __init__(self, log: Path, *options: str) -> None:
+        self._log = log
+        with log.open("a") as file:
+            self._process = subprocess.Popen(
+                [*QUADVEL, "up", *options], stdout=file, stderr=subprocess.STDOUT, start_new_session=True
+            )
+
+    def says(self, text: str, seconds: float = 60.0) -> None:
+        """Wait until `up` has shown a line with this text."""
+        until = time.monotonic() + seconds
+        while text not in self._log.read_text():
+            assert self._process.poll() is None, self._log.read_text()
+            assert time.monotonic() < until, f"{text!r} is not in:\n{self._log.read_text()}"
+            time.sleep(0.05)
+
+    def forget(self) -> None:
+        """What it says from now on is what `says` looks at."""
+        with self._log.open("r+") as file:
+            file.truncate(0)
+
+    def node(self, name: str) -> int:
+        """The process of a node."""
+        children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text()
+        for child in map(int, children.split()):
+            if f"\0{name}\0" in Path(f"/proc/{child}/cmdline").read_text():
+                return child
+        raise AssertionError(f"no process of {name}")
+
+    def stand_up(self) -> None:
+        for words in (("reset",), ("mode", "passive"), ("mode", "stand_up")):
+            code, text = quadvel(*words)
+            assert code == 0, text
+
+    def end(self) -> int:
+        if self._process.poll() is None:
+            self._process.send_signal(signal.SIGINT)
+        return self._process.wait(60.0)
+
+
+@pytest.fixture(scope="module")
+def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
+    robot = Robot(tmp_path_factory.mktemp("up") / "up.log")
+    robot.says("ready: a velocity makes it walk")
+    yield robot
+    assert robot.end() == 0
+
+
+def test_drive_says_what_was_commanded_and_what_was_measured(up: Robot) -> None:
+    code, text = quadvel("drive", "--vx", "0.4", "--seconds", "4")
+    assert code == 0, text
+    assert "commanded  vx +0.40 m/s, vy +0.00 m/s, wz +0.00 rad/s" in text
+    measured = re.search(r"measured   vx ([+-][\d.]+) m/s, vy ([+-][\d.]+) m/s", text)
+    assert measured, text
+    assert float(measured[1]) == pytest.approx(0.4, abs=0.1)
+    assert float(measured[2]) == pytest.approx(0.0, abs=0.1)
+    up.says("follows teleop")
+    up.says("walk: a velocity was commanded")
+
+
+def test_drive_says_when_a_command_is_cut(up: Robot) -> None:
+    code, text = quadvel("drive", "--wz", "20", "--seconds", "1")
+    assert code == 0, text
+    assert "commanded  vx +0.00 m/s, vy +0.00 m/s, wz +20.00 rad/s" in text
+    assert "in effect" in text
+
+
+def test_drive_refuses_what_is_no_number() -> None:
+    code, text = quadvel("drive", "--vx", "nan")
+    assert (code, text.strip()) == (2, "quadvel: --vx is nan, expected a finite number")
+
+
+def test_drive_says_that_nobody_listens(up: Robot) -> None:
+    code, text = quadvel("drive", "--vx", "0.2", "--topic", "cmd_vel_of_nobody")
+    assert code == 2
+    assert text.startswith("quadvel: cmd_vel_of_nobody: nobody listens; start the robot first: quadvel up")
+
+
+def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:
+    code, text = quadvel("status")
+    assert code == 0, text
+    for expected in ("sim_node", "estimator", "controller", "command_mux", "walking       ready"):
+        assert expected in text
+    assert "actuator      the shipped AlienGo (Table 4)" in text
+    assert re.search(r"rates +low_state \d+, velocity_estimate \d+, ", text), text
+    assert "battery" in text
+    assert "temperatures" in text
+
+
+def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> None:
+    assert quadvel("push", "--fy", "1500", "--seconds", "0.4")[0] == 0
+    up.says("controller | fault: ")
+    up.says("the robot has fallen")
+    code, text = quadvel("drive", "--vx", "0.3")
+    assert code == 1
+    assert "not followed: the robot is in fault: " in text
+    assert "quadvel mode passive, then quadvel mode stand_up" in text
+    code, text = quadvel("status")
+    assert code == 1
+    assert "way out       once the cause is gone" in text
+    code, text = quadvel("mode", "stand_up")
+    assert code == 1
+    assert "request passive first" in text
+    up.stand_up()
+    assert quadvel("drive", "--vx", "0.3", "--seconds", "2")[0] == 0
+
+
+def test_the_simulator_is_paused_and_stepped(up: Robot) -> None:
+    assert quadvel("pause") == (0, "paused\n")
+    assert quadvel("step", "20") == (0, "advances by 20 ms\n")
+    code, text = quadvel("drive", "--vx", "0.3")
+    assert code == 1
+    assert "is the simulator paused?" in text
+    assert quadvel("pause", "--off") == (0, "running\n")
+    assert quadvel("drive", "--vx", "0.3", "--seconds", "2")[0] == 0  # the pause was no fault
+    code, text = quadvel("step")
+    assert code == 1
+    assert "pause it first" in text
+
+
+def test_lying_down_ends_passive(up: Robot) -> None:
+    code, text = quadvel("mode", "lie_down")
+    assert code == 0, text
+    assert "passive: lies" in text
+    code, text = quadvel("drive", "--vx", "0.3")
+    assert code == 1
+    assert "the robot is in mode passive" in text
+    assert quadvel("mode", "stand_up")[0] == 0
+
+
+@pytest.mark.parametrize("starved", ["controller", "estimator", "command_mux"])
+def test_a_walking_robot_waits_for_a_node_that_gets_no_time(up: Robot, starved: str) -> None:
+    """On a loaded machine a process may stand still for a while; a simulated robot must not fall for that."""
+    up.forget()
+    driving = subprocess.Popen(
+        [*QUADVEL, "drive", "--vx", "0.5", "--seconds", "6"], stdout=subprocess.PIPE, text=True
+    )
+    up.says("follows teleop")
+    for _ in range(4):
+        process = up.node(starved)
+        os.kill(process, signal.SIGSTOP)
+        time.sleep(0.3)
+        os.kill(process, signal.SIGCONT)
+        time.sleep(0.5)
+    text, _ = driving.communicate(timeout=60.0)
+    assert driving.returncode == 0, text
+
+
+def test_a_robot_that_is_started_again_does_not_walk_off(up: Robot, tmp_path: Path) -> None:
+    """Somebody goes on commanding a velocity while the controller ends and another one starts."""
+    driving = subprocess.Popen(
+        [*QUADVEL, "drive", "--vx", "0.5", "--seconds", "60", "--topic", "cmd_vel"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        up.says("follows planner")
+        for words in (("mode", "passive"), ("reset",), ("mode", "stand_up")):
+            assert quadvel(*words)[0] == 0
+        _, text = quadvel("status")
+        assert "stance: stood up" in text
+    finally:
+        driving.kill()
+        driving.communicate()
+
+
+def test_no_robot_is_no_success() -> None:
+    environment = {**os.environ, "ROS_DOMAIN_ID": str(int(os.environ["ROS_DOMAIN_ID"]) // 4 * 4 + 3)}
+    done = subprocess.run([*QUADVEL, "status"], capture_output=True, text=True, timeout=60, env=environment)
+    assert done.returncode == 1
+    assert "no robot runs on ROS domain" in done.stdout

@@ -1,0 +1,92 @@
+"""What is wrong with a stack is said once, before any of its processes starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from quadvel_bringup import up
+from quadvel_bringup.rehearsal import PARTS, rehearse
+from quadvel_bringup.stack import PARAMETERS, Stack
+
+
+@pytest.fixture(autouse=True)
+def nothing_starts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(up.ProcessGroup, "start", lambda *arguments: pytest.fail("a process started"))
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text)
+    return path
+
+
+def test_the_shipped_stack_is_in_order() -> None:
+    rehearse(Stack())
+    rehearse(Stack(low_level="external"))
+    rehearse(Stack(use_sim_time=True))
+    assert set(PARTS) == set(Stack().overrides())
+
+
+@pytest.mark.parametrize(
+    ("choice", "sentence"),
+    [
+        ({"terrain": "moon"}, "sim_node: .*'moon', expected one of flat, slope, rough"),
+        ({"estimator": "magic"}, "estimator: kind is 'magic', expected learned or kalman"),
+        ({"policy": Path("nowhere.onnx")}, r"controller: .*nowhere\.onnx: no such file"),
+        ({"policy": PARAMETERS}, r"controller: .*params\.yaml"),
+        (
+            {"actuator": Path("nowhere.yaml")},
+            "sim_node: actuator_file: cannot read .*nowhere.yaml: No such file",
+        ),
+        ({"parameters": Path("nowhere.yaml")}, "nowhere.yaml' cannot be read: No such file"),
+    ],
+)
+def test_a_wrong_name_or_file_is_refused_before_anything_starts(
+    choice: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises((ValueError, OSError), match=sentence):
+        up.up(Stack(**choice))
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (
+            "sim_node:\n  ros__parameters: {payloat: 1.0}",
+            "sim_node: found the parameter payloat, expected one of",
+        ),
+        ("sim_node:\n  ros__parameters: {payload: 1}", "sim_node: payload is 1, expected a float"),
+        ("sim_node:\n  ros__parameters: {payload: 99.0}", "sim_node: .*payload.*99"),
+        (
+            "simnode:\n  ros__parameters: {payload: 1.0}",
+            "found a section for '/simnode', expected one of sim_node,",
+        ),
+        ("sim_node: [", "p.yaml' is not valid YAML"),
+        (
+            "sim_node:\n  ros__parameters: 5",
+            "p.yaml': '/sim_node' ros__parameters: expected names and values",
+        ),
+        ("command_mux:\n  ros__parameters: {names: [a]}", "command_mux: topics has 3 entries, expected 1"),
+    ],
+)
+def test_a_wrong_parameter_file_is_refused_before_anything_starts(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
+    with pytest.raises(ValueError, match=sentence) as refusal:
+        up.up(Stack(parameters=written(tmp_path / "p.yaml", text)))
+    assert "\n" not in str(refusal.value)
+
+
+def test_parameters_for_every_node_and_for_one_in_any_namespace_are_understood(tmp_path: Path) -> None:
+    text = (
+        "/**:\n  ros__parameters: {use_sim_time: true}\n/**/controller:\n  ros__parameters: {max_tilt: 0.9}"
+    )
+    rehearse(Stack(parameters=written(tmp_path / "p.yaml", text)))
+
+
+def test_a_file_that_is_no_text_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "p.yaml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ValueError, match=r"p\.yaml' is not text"):
+        rehearse(Stack(parameters=tmp_path / "p.yaml"))
