@@ -42,7 +42,7 @@ def serve() -> Iterator[Callable[..., Board]]:
         board = Board(("127.0.0.1", 0), NetworkConfig(**network), off)
         simulator = Simulator()
         simulator.reset("stand")
-        board.loop = SimulationLoop(simulator, board.publish, period=2)
+        board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
         threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
         for thread in threads:
             thread.start()

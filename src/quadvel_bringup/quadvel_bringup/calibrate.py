@@ -15,7 +15,7 @@ from quadvel_dds.recordings import read_messages
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import Found, NotFound, Samples, find
-from quadvel_eval.report import output_folder, replacing
+from quadvel_eval.output import output_folder, replacing
 from quadvel_nodes.messages import read_low_state
 
 TOPIC = "/low_state"

@@ -63,8 +63,8 @@ class PlantParameters(Scheduling):
         return 1000 // self.state_rate
 
     def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
-        """The loop that runs this robot: in real time."""
-        return SimulationLoop(simulator, publish, period=self.period)
+        """The loop that runs this robot: in real time, and it waits for nobody."""
+        return SimulationLoop(simulator, publish, period=self.period, answer_timeout=0.0)
 
     def config(self) -> SimulatorConfig:
         """The simulation asked for. ValueError names what it cannot be."""
