@@ -11,10 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from quadvel_description.kinematics import roll_pitch
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_driver import wire
-from quadvel_driver.link import LinkConfig, UdpLink
+from quadvel_driver.calibration import Calibration
+from quadvel_driver.link import NO_CALIBRATION, LinkConfig, UdpLink
 from quadvel_driver.wire import BoardState
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.board import Board, BoardError
@@ -36,11 +38,11 @@ def serve() -> Iterator[Callable[..., Board]]:
     """Runs a robot that stands behind a board on any free port."""
     ends: list[Callable[[], None]] = []
 
-    def begin(**network: float) -> Board:
-        board = Board(("127.0.0.1", 0), NetworkConfig(**network))
+    def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
+        board = Board(("127.0.0.1", 0), NetworkConfig(**network), off)
         simulator = Simulator()
         simulator.reset("stand")
-        board.loop = SimulationLoop(simulator, board.publish, period=2)
+        board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
         threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
         for thread in threads:
             thread.start()
@@ -57,7 +59,7 @@ def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
     """Connects the driver's link to a board; it holds the robot up."""
     ends: list[Callable[[], None]] = []
 
-    def begin(board: Board) -> tuple[UdpLink, list[BoardState]]:
+    def begin(board: Board, calibration: Calibration = NO_CALIBRATION) -> tuple[UdpLink, list[BoardState]]:
         states: list[BoardState] = []
         host, port = board.address
         config = LinkConfig(board_address=host, board_port=port, local_port=0, command_timeout=0.5)
@@ -67,7 +69,7 @@ def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
             gains = {"kp": np.full(12, 150.0), "kd": np.full(12, 4.0)}
             made.submit(JointCommand(q=np.array(NOMINAL_Q), tick=state.robot.tick, **gains))
 
-        made = UdpLink(config, hold)
+        made = UdpLink(config, hold, calibration)
         thread = threading.Thread(target=made.run)
         thread.start()
         ends.extend((made.stop, thread.join))
@@ -79,7 +81,7 @@ def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
 
 
 Serve = Callable[..., Board]
-Link = Callable[[Board], Any]
+Link = Callable[..., Any]
 
 
 def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Link) -> None:
@@ -92,6 +94,17 @@ def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Link) ->
     assert (states[-1].motor_mode == 10).all()
     assert not board.loop.simulator.fallen
     assert board.counts["commands"] > 0
+
+
+def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Serve, link: Link) -> None:
+    off = Calibration(joint_zeros=np.tile([0.1, -0.1, 0.15], 4), imu_mounting=np.array([0.03, -0.02]))
+    board = serve(off)
+    _, states = link(board, off)
+    wait_for(lambda: len(states) > 200, board)
+    robot, truth = states[-1].robot, board.loop.simulator
+    np.testing.assert_allclose(truth.data.qpos[7:], NOMINAL_Q, atol=0.12)
+    np.testing.assert_allclose(robot.q, truth.data.qpos[7:], atol=0.02)
+    assert np.abs(roll_pitch(robot.quaternion) - roll_pitch(truth.data.qpos[3:7])).max() < 0.01
 
 
 def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve, link: Link) -> None:

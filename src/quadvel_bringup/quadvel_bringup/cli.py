@@ -287,6 +287,12 @@ def identify(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
+def calibrate(context: typer.Context) -> None:
+    """Find what the encoders and the IMU of a robot show at zero."""
+    _hand_on(context, "quadvel_bringup.calibrate:calibrate_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
 def twin(context: typer.Context) -> None:
     """Close the loop on the stack itself: plants that its model does not know, identified from their walks."""
     _hand_on(context, "quadvel_bringup.twin:twin_command")

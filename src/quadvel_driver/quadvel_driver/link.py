@@ -25,6 +25,7 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, Ro
 
 from . import wire
 from .board_clock import BoardClock
+from .calibration import Calibration
 from .wire import BoardState, WireError
 
 SEND_PERIOD = 0.002  # s, between two packets at most, as Unitree's examples have it
@@ -34,6 +35,9 @@ MAX_DATAGRAMS = 256  # taken in at once, so that a flood does not keep the link 
 SILENCE = 0.1  # s without a new state, after which the board counts as silent
 UNIT_TOLERANCE = 0.05  # by which the length of a quaternion may be off one
 _WRAP = 2**32
+
+
+NO_CALIBRATION = Calibration()
 
 
 class LinkError(ValueError):
@@ -84,24 +88,26 @@ class LinkReport:
 class UdpLink:
     """One board. `on_state` is called in the link's thread with each new state, its `time` (s) on `clock`, its `tick` in ms.
 
-    All other methods may be called from any thread. endpoint: in place of a socket to the board. Raises LinkError where
-    there can be none.
+    calibration: of this robot; states and commands are set right by it. endpoint: in place of a socket to the board. Raises
+    LinkError where there can be none. All methods but `run` may be called from any thread.
     """
 
     def __init__(
         self,
         config: LinkConfig,
         on_state: Callable[[BoardState], None],
+        calibration: Calibration = NO_CALIBRATION,
         endpoint: socket.socket | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._config = config
         self._on_state = on_state
+        self._calibration = calibration
         self._clock = clock
         self._socket = endpoint or _connected(config)
         self._board_clock = BoardClock()
         self._lock = threading.Lock()  # around what follows
-        self._damping = wire.encode_command(for_the_board(JointCommand.damping(config.damping_kd)))
+        self._damping = self._packed(JointCommand.damping(config.damping_kd))
         self._packet, self._mode = self._damping, MODE_DAMPING
         self._commanded_at = -math.inf
         self._braked = self._stopped = self._in_command = False
@@ -135,7 +141,7 @@ class UdpLink:
     def submit(self, command: JointCommand) -> None:
         """Send a command and hold it. ValueError says why it is refused: not finite, too old, or of an unknown mode."""
         self._check_age(command.tick)
-        packet = wire.encode_command(for_the_board(command))
+        packet = self._packed(command)
         with self._lock:
             self._packet, self._mode, self._commanded_at = packet, command.mode, self._clock()
             if not self._braked:
@@ -223,12 +229,15 @@ class UdpLink:
         instant = self._board_clock.follow(state.robot.tick, self._clock())
         if instant is None:
             return None
-        state.robot.time, state.robot.tick = instant.time, instant.tick
+        state.robot = attrs.evolve(self._calibration.true(state.robot), time=instant.time, tick=instant.tick)
         return state
 
     def _count(self, name: str) -> None:
         with self._lock:
             self._counts[name] += 1
+
+    def _packed(self, command: JointCommand) -> bytes:
+        return wire.encode_command(self._calibration.sent(for_the_board(command)))
 
     # Sending; with the lock held.
 

@@ -20,6 +20,9 @@ class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
         default=200,
         metadata={"description": "rate of low_state, Hz, up to 1000; the board's own is the highest"},
     )
+    calibration: str = attrs.field(
+        default="", metadata={"description": "file that `quadvel calibrate` wrote of this robot; empty: none"}
+    )
     dry_run: bool = attrs.field(
         default=False,
         metadata={"description": "send nothing, hear nothing, and show once a second what would be sent"},

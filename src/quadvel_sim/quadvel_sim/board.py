@@ -17,6 +17,8 @@ import numpy as np
 
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_driver import wire
+from quadvel_driver.calibration import Calibration
+from quadvel_driver.link import NO_CALIBRATION
 from quadvel_driver.wire import BoardState, Remote, WireError
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.loop import SimulationLoop
@@ -41,12 +43,18 @@ class Board:
     """
 
     def __init__(
-        self, address: Address, network: NetworkConfig, clock: Callable[[], float] = time.monotonic
+        self,
+        address: Address,
+        network: NetworkConfig,
+        off: Calibration = NO_CALIBRATION,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """off: what is off with the robot's sensors."""
         self.loop: SimulationLoop | None = None
         self.remote = Remote()
         self.counts: Counter[str] = Counter()
         self.last_refusal = ""
+        self._off = off
         self._clock = clock
         self._socket = _bound(address)
         self._inward, self._outward = BadNetwork(network, 0), BadNetwork(network, 1)
@@ -69,7 +77,7 @@ class Board:
         mode = MODE_DAMPING if self.loop.simulator.braking else MODE_SERVO
         twelve = np.full(12, WARM)
         packet = wire.encode_state(
-            BoardState(state, np.full(12, mode), 0 * twelve, twelve, WARM, self.remote)
+            BoardState(self._off.reported(state), np.full(12, mode), 0 * twelve, twelve, WARM, self.remote)
         )
         with self._lock:
             self._outward.send(packet, self._clock())
@@ -120,7 +128,7 @@ class Board:
         """Carry out a command, as of now: packets have no time."""
         assert self.loop is not None
         try:
-            command = wire.decode_command(packet)
+            command = self._off.carried_out(wire.decode_command(packet))
             command.tick = self.loop.tick % _WRAP
             self.loop.submit(command)
             self.counts["commands"] += 1

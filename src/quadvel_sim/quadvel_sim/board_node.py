@@ -28,7 +28,7 @@ class BoardNode(SimulationNode[BoardParameters]):
     def __init__(self) -> None:
         super().__init__("board", BoardParameters)
         settings = self._settings
-        self._board = Board((settings.address, settings.port), settings)
+        self._board = Board((settings.address, settings.port), settings, settings.off())
         self._board.loop = self._loop
         self._refused_before = 0
         self._network = Thread(target=self._board.run, name="network")

@@ -8,6 +8,7 @@ import attrs
 import numpy as np
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_driver.calibration import Calibration
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
@@ -62,8 +63,8 @@ class PlantParameters(Scheduling):
         return 1000 // self.state_rate
 
     def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
-        """The loop that runs this robot: in real time."""
-        return SimulationLoop(simulator, publish, period=self.period)
+        """The loop that runs this robot: in real time, and it waits for nobody."""
+        return SimulationLoop(simulator, publish, period=self.period, answer_timeout=0.0)
 
     def config(self) -> SimulatorConfig:
         """The simulation asked for. ValueError names what it cannot be."""
@@ -126,3 +127,9 @@ class BoardParameters(PlantParameters, NetworkConfig):
     state_rate: int = _parameter(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
     address: str = _parameter("127.0.0.1", "IP address on which the board listens")
     port: int = _parameter(8007, "UDP port on which the board listens; 0: any that is free")
+    joint_zeros: tuple[float, ...] = _parameter(12 * (0.0,), "what encoders show at zero, rad")
+    imu_mounting: tuple[float, ...] = _parameter((0.0, 0.0), "how the IMU leans: about x and about y, rad")
+
+    def off(self) -> Calibration:
+        """What is off with this robot's sensors. CalibrationError names what it cannot be."""
+        return Calibration(np.array(self.joint_zeros), np.array(self.imu_mounting))
