@@ -16,6 +16,8 @@ import numpy as np
 import quadvel_dds
 
 NEEDED = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
+FILES = ("actuator", "policy")
+"""Values of /diagnostics that say with which files a node runs"""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -40,6 +42,23 @@ def examine() -> Iterator[Finding]:
     yield _gl()
     yield video_encoder()
     yield _torch()
+    yield _robot()
+
+
+def _robot() -> Finding:
+    """Which robot runs, and on which actuator model."""
+    try:
+        quadvel_dds.install()
+        from .status import look
+    except ImportError as error:
+        return Finding("robot", True, f"not looked for: {error}")
+    nodes = look()
+    if not nodes:
+        return Finding("robot", True, "none runs; `quadvel up` takes the shipped actuator model (Table 4)")
+    told = [f"{key} {node.values[key]}" for node in nodes.values() for key in FILES if key in node.values]
+    return Finding(
+        "robot", True, f"{', '.join(nodes)} run; {', '.join(told) or 'with files that none tells'}"
+    )
 
 
 def _python() -> Finding:
