@@ -131,6 +131,14 @@ def test_options_that_are_not_offered_say_so(ros: Start) -> None:
         SingleThreadedExecutor().create_task(callback)
 
 
+def test_one_place_in_the_program_logs_with_one_severity_as_rclpy_wants_it(ros: Start) -> None:
+    ros()
+    log = Node("talker").get_logger()
+    with pytest.raises(ValueError, match="severity cannot be changed between calls"):
+        for say in (log.info, log.error):
+            say("fault")
+
+
 def test_log_lines_have_levels_throttles_and_reach_rosout(
     ros: Start, spin_until: SpinUntil, capsys: pytest.CaptureFixture[str]
 ) -> None:

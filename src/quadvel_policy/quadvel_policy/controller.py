@@ -245,7 +245,10 @@ class Controller(Node):
     def _tell(self) -> None:
         log = self.get_logger()
         for is_fault, sentence in self._announcements.now():
-            (log.error if is_fault else log.info)(sentence)
+            if is_fault:
+                log.error(sentence)
+            else:  # rclpy wants each place in the program to log with one severity
+                log.info(sentence)
 
     def _watch(self) -> None:
         """50 times a second: the supervisor learns when states stop, and controller/state is published."""

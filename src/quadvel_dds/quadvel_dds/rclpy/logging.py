@@ -33,7 +33,8 @@ class RcutilsLogger(Partial):
 
     def __init__(self, name: str = "") -> None:
         self.name = name
-        self._places: dict[tuple[str, int], float] = {}
+        self._places: dict[tuple[Any, int], float] = {}  # when each spoke last, where that counts
+        self._severities: dict[tuple[Any, int], int] = {}
 
     def set_level(self, level: int) -> None:
         levels[self.name] = int(level)
@@ -51,7 +52,9 @@ class RcutilsLogger(Partial):
         if severity < self.get_effective_level():
             return False
         frame = sys._getframe(1)
-        place = (frame.f_code.co_filename, frame.f_lineno)
+        place = (frame.f_code, frame.f_lasti)
+        if self._severities.setdefault(place, severity) != severity:
+            raise ValueError("Logger severity cannot be changed between calls.")
         now, last = time.monotonic(), self._places.get(place, float("-inf"))
         if now - last < throttle_duration_sec or (once and place in self._places):
             return False

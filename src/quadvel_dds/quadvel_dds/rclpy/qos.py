@@ -71,9 +71,6 @@ class QoSProfile(Partial):
             raise ValueError(f"QoS policy '{name}' must be of type {kind.__name__}, found {value!r}")
         super().__setattr__(name, value)
 
-    def __repr__(self) -> str:
-        return f"QoSProfile({', '.join(f'{name}={value}' for name, value in vars(self).items())})"
-
 
 qos_profile_sensor_data = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)
 qos_profile_services_default = QoSProfile(depth=10)
