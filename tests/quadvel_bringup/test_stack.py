@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from configparser import ConfigParser
 from pathlib import Path
 from typing import Any
@@ -27,14 +28,17 @@ def console_scripts(setup_file: Path) -> list[str]:
 def declared_parameters() -> dict[str, dict[str, Any]]:
     """The defaults of all parameters, by node, as the nodes' own classes have them."""
     quadvel_dds.install()
+    from quadvel_driver.parameters import DriverParameters
     from quadvel_estimator.estimator import EstimatorParameters
     from quadvel_eval.scripted_planner import PlannerParameters
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
-    from quadvel_sim.parameters import SimParameters
+    from quadvel_sim.parameters import BoardParameters, SimParameters
 
     classes: dict[str, type[attrs.AttrsInstance]] = {
         "sim_node": SimParameters,
+        "board": BoardParameters,
+        "driver": DriverParameters,
         "estimator": EstimatorParameters,
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
@@ -60,7 +64,7 @@ def test_every_node_of_the_stack_is_in_the_table() -> None:
 
 
 def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, estimator"):
+    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, board, driver, estimator"):
         nodes.command("simnode")
 
 
@@ -110,6 +114,37 @@ def test_beside_a_robot_that_others_serve_nothing_moves_without_an_operator() ->
     overrides = Stack(low_level="external").overrides()
     assert "sim_node" not in overrides
     assert overrides["controller"] == {"auto_stand": False, "require_operator": True}
+
+
+def test_behind_the_boards_interface_stand_the_simulated_board_and_the_real_driver() -> None:
+    overrides = Stack(low_level="board", terrain="rough", network={"network_loss": 0.1}).overrides()
+    assert list(overrides) == ["board", "driver", "estimator", "controller", "command_mux"]
+    port = 8007 + int(os.environ["ROS_DOMAIN_ID"])
+    assert overrides["board"] == {"port": port, "terrain": "rough", "network_loss": 0.1}
+    assert overrides["driver"] == {"board_address": "127.0.0.1", "board_port": port, "local_port": 0}
+    assert overrides["controller"] == {"auto_stand": True}
+
+
+def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> None:
+    overrides = Stack(low_level="aliengo").overrides()
+    assert list(overrides) == ["driver", "estimator", "controller", "command_mux"]
+    assert overrides["driver"] == overrides["estimator"] == {"realtime_priority": 50}
+    assert overrides["controller"] == {
+        "auto_stand": False,
+        "require_operator": True,
+        "realtime_priority": 50,
+    }
+
+
+def test_what_a_robot_cannot_do_is_refused_by_name() -> None:
+    with pytest.raises(
+        ValueError, match="low_level is 'board', expected 'sim' where simulated time sets the pace"
+    ):
+        Stack(low_level="board", use_sim_time=True)
+    with pytest.raises(
+        ValueError, match="low_level is 'sim', expected 'board' for a network that is bad on purpose"
+    ):
+        Stack(network={"network_loss": 0.1})
 
 
 def test_another_robot_is_refused_by_name() -> None:

@@ -1,66 +1,13 @@
-"""The whole robot under ROS 2: what serves low_state and low_cmd, estimator, controller, command mux.
-
-ros2 launch quadvel_bringup sim.launch.py terrain:=rough
-"""
+"""robot.launch.py under the name that it had before, with the same arguments."""
 
 from pathlib import Path
 
-from launch import LaunchContext, LaunchDescription
-from launch.action import Action
-from launch.actions import DeclareLaunchArgument, EmitEvent, OpaqueFunction
-from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
-from launch_ros.actions import Node
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
 
-from quadvel_bringup.nodes import NODES
-from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
-
-ARGUMENTS = [
-    DeclareLaunchArgument(
-        "low_level", default_value="sim", choices=list(LOW_LEVELS), description="the robot"
-    ),
-    DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
-    DeclareLaunchArgument("terrain", default_value="flat", description="flat, slope or rough"),
-    DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
-    DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="show it"),
-    DeclareLaunchArgument(
-        "use_sim_time",
-        default_value="false",
-        choices=["true", "false"],
-        description="true: in lockstep with the simulator's clock; false: in real time",
-    ),
-]
-NAMES = [argument.name for argument in ARGUMENTS]
-
-
-def start(context: LaunchContext) -> list[Action]:
-    chosen = {name: LaunchConfiguration(name).perform(context) for name in NAMES}
-    stack = Stack(
-        low_level=chosen["low_level"],
-        policy=Path(chosen["policy"]) if chosen["policy"] else None,
-        terrain=chosen["terrain"],
-        parameters=Path(chosen["params"]),
-        use_sim_time=chosen["use_sim_time"] == "true",
-    )
-    actions: list[Action] = [
-        Node(
-            package=NODES[name].package,
-            executable=name,
-            name=name,
-            output="screen",
-            parameters=[str(stack.parameters), *([overrides] if overrides else [])],
-            on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
-        )
-        for name, overrides in stack.overrides().items()
-    ]
-    shared = {"use_sim_time": stack.use_sim_time}
-    if chosen["rviz"] == "true":
-        config = str(PARAMETERS.parent / "robot.rviz")
-        actions.append(
-            Node(package="rviz2", executable="rviz2", arguments=["-d", config], parameters=[shared])
-        )
-    return actions
+ROBOT = Path(__file__).with_name("robot.launch.py")
 
 
 def generate_launch_description() -> LaunchDescription:
-    return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=start)])
+    return LaunchDescription([IncludeLaunchDescription(PythonLaunchDescriptionSource(str(ROBOT)))])

@@ -110,8 +110,10 @@ def run(
 @app.command()
 def up(
     low_level: Annotated[
-        Literal["sim", "external"],
-        typer.Option(help="What serves low_state and low_cmd; external: others do."),
+        Literal["sim", "board", "aliengo", "external"],
+        typer.Option(
+            help="The robot: simulated; simulated behind the AlienGo's UDP interface; the AlienGo; or others serve it."
+        ),
     ] = "sim",
     policy: Annotated[
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
@@ -126,7 +128,7 @@ def up(
         Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
     ] = PARAMETERS,
 ) -> None:
-    """Start simulator, estimator, controller and command mux, each as a process; Ctrl-C stops them.
+    """Start robot, estimator, controller and command mux, each as a process; Ctrl-C stops them.
 
     \b
     Then, from another terminal:
@@ -282,6 +284,12 @@ def identify(context: typer.Context) -> None:
     from quadvel_actuator.identify.cli import app as command
 
     command(context.args, prog_name=context.command_path)
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def calibrate(context: typer.Context) -> None:
+    """Find what the encoders and the IMU of a robot show at zero."""
+    _hand_on(context, "quadvel_bringup.calibrate:calibrate_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

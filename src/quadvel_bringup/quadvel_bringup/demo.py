@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 from rich.console import Console
@@ -32,6 +32,18 @@ def demo_command(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    low_level: Annotated[
+        Literal["sim", "board"],
+        typer.Option(
+            help="The robot: simulated, or simulated behind the AlienGo's UDP interface and its driver."
+        ),
+    ] = "sim",
+    loss: Annotated[
+        float, typer.Option(min=0.0, max=1.0, help="With board: share of packets that are lost, each way.")
+    ] = 0.0,
+    jitter: Annotated[
+        float, typer.Option(min=0.0, max=100.0, help="With board: ms that a packet takes at most, each way.")
+    ] = 0.0,
     actuator: Annotated[
         Path | None,
         typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
@@ -45,7 +57,7 @@ def demo_command(
     Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
-    stack = Stack(use_sim_time=lockstep, actuator=actuator)
+    stack = _stack(low_level, loss, jitter, lockstep, actuator)
     rehearse(stack)
     folder, console = output_folder(out), Console(soft_wrap=True)
     recorded = folder / "demo.mcap"
@@ -69,6 +81,12 @@ def demo_command(
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
+
+
+def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:
+    network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
+    given = {name: value for name, value in network.items() if value}
+    return Stack(low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:

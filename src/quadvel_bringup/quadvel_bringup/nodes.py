@@ -27,6 +27,8 @@ class NodeEntry:
 
 NODES = {
     "sim_node": NodeEntry("quadvel_sim.sim_node", "the stand-in robot: MuJoCo behind low_state and low_cmd"),
+    "board": NodeEntry("quadvel_sim.board_node", "the same robot behind the UDP interface of the AlienGo"),
+    "driver": NodeEntry("quadvel_driver.driver", "the AlienGo itself: its UDP interface and its remote"),
     "estimator": NodeEntry("quadvel_estimator.estimator", "linear velocity from IMU and encoders"),
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),

@@ -206,7 +206,7 @@ def main() -> None:
             publisher = self.create_publisher(LowState, "joint_log", 10)
 
             def log(state: RobotState) -> None:
-                message = LowState(stamp=self._stamp(state.time))
+                message = LowState(stamp=self.stamp(state.time))
                 write_low_state(state, message)
                 publisher.publish(message)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 import threading
 
@@ -26,7 +27,7 @@ class PrefixedOutput:
     def __init__(self, names: list[str]) -> None:
         self._console = Console(soft_wrap=True, highlight=False)
         self._width = max(map(len, names))
-        self._colours = dict(zip(names, COLOURS, strict=False))
+        self._colours = dict(zip(names, itertools.cycle(COLOURS), strict=False))
         self._lock = threading.Lock()
 
     def __call__(self, name: str, line: str) -> None:
@@ -45,7 +46,7 @@ def up(stack: Stack) -> int:
     a file is wrong, and NotAlone where a robot is there already that nobody asked for.
     """
     rehearse(stack)
-    if stack.simulates:
+    if stack.brings_robot:
         look_for_others()
     nodes = stack.arguments()
     say = PrefixedOutput(["quadvel", *nodes])

@@ -21,6 +21,7 @@ from rich.table import Table
 
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_driver import wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
@@ -127,6 +128,21 @@ def estimator() -> dict[str, Any]:
     return _percentiles(_time(lambda: network.update(state, previous_action), 5000))
 
 
+def packets() -> dict[str, Any]:
+    """The robot's packets: a command to bytes and a state from bytes, as the driver does it, and the other way round."""
+    twelve = np.full(12, 10)
+    state = wire.BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
+    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    of_state, of_command = wire.encode_state(state), wire.encode_command(command)
+    jobs: dict[str, Callable[[], object]] = {
+        "encode_command": lambda: wire.encode_command(command),
+        "decode_state": lambda: wire.decode_state(of_state),
+        "encode_state": lambda: wire.encode_state(state),
+        "decode_command": lambda: wire.decode_command(of_command),
+    }
+    return {f"{name}_p50_us": _percentiles(_time(job, 5000))["p50_us"] for name, job in jobs.items()}
+
+
 class _TimedSupervisor(Supervisor):
     """Notes what each of its ticks takes."""
 
@@ -174,6 +190,7 @@ PARTS: dict[str, Callable[[], dict[str, Any]]] = {
     "policy": policy,
     "estimator": estimator,
     "supervisor": supervisor,
+    "packets": packets,
     "round_trip": round_trip.measure,
     "environment": _training("environment"),
     "training": _training("training"),
@@ -191,6 +208,10 @@ ROWS = (  # part, figure, what it is, what is wanted
     ("supervisor", "p50_us", "supervisor tick, median, us", ""),
     ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
     ("estimator", "p50_us", "learned estimator, median, us", ""),
+    ("packets", "encode_command_p50_us", "command to packet, median, us", "60 or less"),
+    ("packets", "decode_state_p50_us", "packet to state, median, us", "60 or less"),
+    ("packets", "encode_state_p50_us", "state to packet, median, us", "60 or less"),
+    ("packets", "decode_command_p50_us", "packet to command, median, us", "60 or less"),
     ("round_trip", "p50_us", "message there and back, median, us", ""),
     ("round_trip", "p99_us", "message there and back, 99 %, us", ""),
     ("environment", "steps_per_s", "training environment, steps/s", ""),

@@ -14,11 +14,12 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_dds.recordings import read_messages
 from quadvel_nodes.messages import seconds
+from quadvel_recordings.reading import read_messages
 
 Array = NDArray[np.float64]
 
+SIMULATIONS = ("sim_node", "board")  # who says how well real time was kept
 TOPICS = (
     "/cmd_vel",
     "/command",
@@ -99,7 +100,7 @@ def read_recording(path: Path) -> Recording:
         loop=_loop([message for _, message in messages["/controller/state"]]),
         answer_time=_answer_time(messages["/low_state"], messages["/low_cmd"]),
         realtime_factor=_by_arrival(
-            [entry for entry in messages["/diagnostics"] if entry[1].status[0].name == "sim_node"],
+            [entry for entry in messages["/diagnostics"] if entry[1].status[0].name in SIMULATIONS],
             lambda m: [float(next(v.value for v in m.status[0].values if v.key == "realtime_factor"))],
         ),
     )

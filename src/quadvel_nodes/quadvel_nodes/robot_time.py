@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 
 JITTER = 0.01  # s, by which stamps may be off the ticks for other reasons
-LONGEST = 1.0  # s, of a standstill that is left out: as long as a simulator waits for an answer
 _WRAP = 2**32
 
 
@@ -23,7 +22,7 @@ class RobotTime:
         # Of the last standstill: what had been left out before it, and the robot's time at which it began, s.
         self._stalled_before, self._began = 0.0, math.inf
 
-    def follow(self, stamp: float, tick: int, longest: float = LONGEST) -> float:
+    def follow(self, stamp: float, tick: int, longest: float = math.inf) -> float:
         """The robot's time of the next state, s. stamp: s. tick: ms, wraps. longest: standstill to leave out, s.
 
         A tick that does not move is no clock: then stamps count.

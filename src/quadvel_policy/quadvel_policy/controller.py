@@ -13,6 +13,7 @@ included, is no gap in them.
 from __future__ import annotations
 
 import gc
+import math
 import time
 from typing import Any
 
@@ -31,7 +32,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
-from quadvel_nodes.robot_time import LONGEST, RobotTime
+from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
@@ -47,6 +48,8 @@ PERIOD = 1.0 / RATE_HZ
 STATE_PERIOD = 0.02  # s, of controller/state and of looking whether states still come
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
 
+LONGEST = 0.5
+"""s that a robot may have stood still, with all of the machine, before its next state; longer is a fault"""
 HELD_UP = 10
 """Simulated states that wait for a command, one after the other, where none comes any more"""
 
@@ -82,8 +85,8 @@ class Controller(Node):
         self._settings = read_parameters(self, ControllerParameters)
         self._patience = 0.0  # s by which a message may be late because nobody ran, the robot neither
         if self._settings.robot_waits:
-            self._patience = LONGEST
-            self._settings = attrs.evolve(self._settings, max_state_age=LONGEST)
+            self._patience = math.inf
+            self._settings = attrs.evolve(self._settings, max_state_age=math.inf)
         policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
         policy.prepare()  # now, as the first time is slow
         self._supervisor = Supervisor(policy, self._settings)
@@ -146,7 +149,7 @@ class Controller(Node):
             self._refusals.add("low_state", error)
             return
         self._pauses.look(now)
-        longest = LONGEST if self._pauses.since_heard else self._settings.max_state_age
+        longest = max(LONGEST if self._pauses.since_heard else 0.0, self._settings.max_state_age)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
         self._pauses.heard()
         sent_again = self._waiting is not None and self._waiting.time == state.time
@@ -329,6 +332,8 @@ class Controller(Node):
             return DiagnosticStatus.WARN, f"{refused} messages refused in the last second; {status}"
         if paused:
             return DiagnosticStatus.WARN, f"could not run {paused} times in the last second; {status}"
+        if not self._stats.summary(time.perf_counter()).rate_hz:
+            return DiagnosticStatus.WARN, f"no state came for a second; {status}"
         if missed:
             return DiagnosticStatus.WARN, f"{missed} deadlines missed in the last second; {status}"
         return DiagnosticStatus.OK, status

@@ -32,6 +32,9 @@ MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
 
+Publish = Callable[[RobotState, float], None]
+"""Takes a sample, and the instant (s) at which it held."""
+
 
 @attrs.frozen
 class LoopReport:
@@ -57,7 +60,7 @@ class SimulationLoop:
     def __init__(
         self,
         simulator: Simulator,
-        publish: Callable[[RobotState, float], None],
+        publish: Publish,
         mode: str = REALTIME,
         period: int = 5,
         answer_timeout: float = 1.0,

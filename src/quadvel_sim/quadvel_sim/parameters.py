@@ -1,4 +1,4 @@
-"""The parameters of the node `sim_node`, and the simulation that they ask for. Knows no ROS."""
+"""The parameters of the nodes `sim_node` and `board`, and the simulation that they ask for. Knows no ROS."""
 
 from __future__ import annotations
 
@@ -8,9 +8,12 @@ import attrs
 import numpy as np
 
 from quadvel_actuator import ActuatorParameters
+from quadvel_driver.calibration import Calibration
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
-from quadvel_sim.loop import MODES
+from quadvel_sim.loop import MODES, Publish, SimulationLoop
+from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import KINDS, Terrain
 
 _NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
@@ -20,16 +23,12 @@ def _parameter(default: Any, description: str) -> Any:
     return attrs.field(default=default, metadata={"description": description})
 
 
-@attrs.frozen
-class SimParameters(Scheduling):
-    """The node's parameters; what each record of the simulation may hold is that record's own matter."""
+@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+class PlantParameters(Scheduling):
+    """The simulated robot and its ground; what each record of the simulation may hold is that record's own matter."""
 
-    mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
     keyframe: str = _parameter("lie", "posture at the start: lie or stand")
-    state_rate: int = _parameter(200, "rate of low_state, Hz: a divisor of 1000, 50 at least")
-    answer_timeout: float = _parameter(
-        1.0, "s that simulated time stands still for an answer; lockstep then sends the state again"
-    )
+    state_rate: int = _parameter(200, "rate of the states, Hz: a divisor of 1000, 50 at least")
     publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to base_link")
     seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
     actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
@@ -55,17 +54,17 @@ class SimParameters(Scheduling):
     noise_orientation: float = _parameter(_NOISE.orientation, "of the orientation, rad an axis")
 
     def __attrs_post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ValueError(f"mode is {self.mode!r}, expected one of {', '.join(MODES)}")
         if not 50 <= self.state_rate <= 1000 or 1000 % self.state_rate:
             raise ValueError(f"state_rate is {self.state_rate} Hz, expected a divisor of 1000, 50 at least")
-        if not 0.0 < self.answer_timeout < 3600.0:
-            raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
 
     @property
     def period(self) -> int:
         """Simulated ms from state to state."""
         return 1000 // self.state_rate
+
+    def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
+        """The loop that runs this robot: in real time, and it waits for nobody."""
+        return SimulationLoop(simulator, publish, period=self.period, answer_timeout=0.0)
 
     def config(self) -> SimulatorConfig:
         """The simulation asked for. ValueError names what it cannot be."""
@@ -98,3 +97,39 @@ class SimParameters(Scheduling):
             return ActuatorParameters.load(self.actuator_file)
         except OSError as error:
             raise ValueError(f"actuator_file: cannot read {self.actuator_file}: {error.strerror}") from error
+
+
+@attrs.frozen(kw_only=True)
+class SimParameters(PlantParameters):
+    """Those of `sim_node`: time may wait for commands."""
+
+    mode: str = _parameter("realtime", f"how time passes: {', '.join(MODES)}; lockstep waits for each LowCmd")
+    answer_timeout: float = _parameter(
+        1.0, "s that simulated time stands still for an answer; lockstep then sends the state again"
+    )
+
+    def __attrs_post_init__(self) -> None:
+        super().__attrs_post_init__()
+        if self.mode not in MODES:
+            raise ValueError(f"mode is {self.mode!r}, expected one of {', '.join(MODES)}")
+        if not 0.0 < self.answer_timeout < 3600.0:
+            raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
+
+    def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
+        """The loop that runs this robot, in the mode that was asked for."""
+        return SimulationLoop(simulator, publish, self.mode, self.period, self.answer_timeout)
+
+
+@attrs.frozen(kw_only=True)
+class BoardParameters(PlantParameters, NetworkConfig):
+    """Those of `board`: where it listens, and how bad the network is."""
+
+    state_rate: int = _parameter(1000, "rate of the states, Hz: a divisor of 1000, 50 at least")
+    address: str = _parameter("127.0.0.1", "IP address on which the board listens")
+    port: int = _parameter(8007, "UDP port on which the board listens; 0: any that is free")
+    joint_zeros: tuple[float, ...] = _parameter(12 * (0.0,), "what encoders show at zero, rad")
+    imu_mounting: tuple[float, ...] = _parameter((0.0, 0.0), "how the IMU leans: about x and about y, rad")
+
+    def off(self) -> Calibration:
+        """What is off with this robot's sensors. CalibrationError names what it cannot be."""
+        return Calibration(np.array(self.joint_zeros), np.array(self.imu_mounting))

@@ -1,0 +1,338 @@
+"""The packets between a PC and the AlienGo's board, byte for byte: a command of 610 bytes, a state of 771.
+
+These are the formats of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and newer). Bytes in,
+plain records out, and back; sockets and time are `link`'s matter.
+
+A packet is accepted only whole. Its CRC covers whole 4-byte words from the start and leaves out what is over, the end of
+the field `reserve` in front of it; these bytes have to be zero here, as the SDK sends them, so that no flipped bit passes.
+"""
+
+from __future__ import annotations
+
+import zlib
+from enum import IntFlag
+from typing import Any, Final
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description.robot import JOINT_NAMES, LEGS
+from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+
+JOINTS = len(JOINT_NAMES)
+LOW_LEVEL = 0xFF  # levelFlag of a command that is for the joints
+POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq with which a board leaves that term of its law out
+
+_HEADER = [
+    ("level_flag", "u1"),
+    ("version", "<u2"),
+    ("robot_id", "<u2"),
+    ("serial", "<u4"),
+    ("bandwidth", "u1"),
+]
+_TAIL = [("remote", "V40"), ("reserve", "<u4"), ("crc", "<u4")]
+_MOTOR_COMMAND = np.dtype(
+    [
+        ("mode", "u1"),
+        ("q", "<f4"),
+        ("dq", "<f4"),
+        ("tau", "<i2"),
+        ("kp", "<i2"),
+        ("kd", "<i2"),
+        ("reserve", "V12"),
+    ]
+)
+_MOTOR_STATE = np.dtype(
+    [
+        *(("mode", "u1"), ("q", "<f4"), ("dq", "<f4"), ("ddq", "<i2"), ("tau", "<i2")),
+        *(("q_raw", "<f4"), ("dq_raw", "<f4"), ("ddq_raw", "<i2")),
+        *(("temperature", "i1"), ("error", "<u4"), ("reserve", "<u4")),
+    ]
+)
+_IMU = [
+    *(("quaternion", "<f4", 4), ("angular_velocity", "<f4", 3), ("linear_acceleration", "<f4", 3)),
+    *(("rpy", "<f4", 3), ("imu_temperature", "i1")),
+]
+_IMU_OFFSET, _IMU_NUMBERS = 10, 10  # bytes, and the numbers of a state that are used: all but rpy
+_SLOTS = 20  # of motors in a packet, of which the AlienGo uses the first twelve
+_COMMAND: Final = np.dtype([*_HEADER, ("motors", _MOTOR_COMMAND, _SLOTS), ("led", "V12"), *_TAIL])
+_STATE: Final = np.dtype(
+    [
+        *(*_HEADER, *_IMU, ("motors", _MOTOR_STATE, _SLOTS)),
+        *(("foot_force", "<i2", 4), ("foot_force_estimate", "<i2", 4), ("tick", "<u4"), *_TAIL),
+    ]
+)
+_REMOTE: Final = np.dtype(
+    [
+        *(("head", "V2"), ("buttons", "<u2"), ("lx", "<f4"), ("rx", "<f4"), ("ry", "<f4")),
+        *(("reserve", "V4"), ("ly", "<f4"), ("idle", "V16")),
+    ]
+)
+COMMAND_BYTES, STATE_BYTES = _COMMAND.itemsize, _STATE.itemsize
+"""Lengths of the packets: 610 and 771."""
+
+OTHER_FORMATS = {
+    540: "the command of firmware 3.1 (aliengo_sdk 1.2)",
+    684: "the state of firmware 3.1 (aliengo_sdk 1.2)",
+    614: "the command of a Go1",
+    807: "the state of a Go1",
+    730: "the command as the SDK's programs hold it",
+    891: "the state as the SDK's programs hold it",
+}
+"""Packets of other robots and versions, by their length."""
+
+# Counts for one N m, N m/rad, N m s/rad; what a count can't hold is cut off towards zero, as the SDK does.
+_TAU, _KP, _KD = 256.0, 32.0, 16.0
+_SCALES = np.array([[_TAU], [_KP], [_KD]], np.float32)
+_COUNTS = 2**15  # that a field holds, and one less upwards: beyond that it would wrap
+# Of q, dq, tau, kp, kd. No joint goes to 100 rad or 1000 rad/s, and it is far from what switches a term off.
+_LOW = np.array([[-100.0], [-1000.0], [-_COUNTS / _TAU], [0.0], [0.0]])
+_HIGH = np.array([[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU, _KP, _KD))])
+_LAW = ("q", "dq", "tau", "kp", "kd")
+
+_AXES = ("w", "x", "y", "z")
+_BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
+
+
+LENGTH, CRC, CONTENT = "length", "CRC", "content"
+
+
+class WireError(ValueError):
+    """A packet that must not be used, or a record that can't be sent; the text says what was found and expected.
+
+    about: what is wrong: LENGTH, CRC or CONTENT.
+    """
+
+    def __init__(self, text: str, about: str = CONTENT) -> None:
+        super().__init__(text)
+        self.about = about
+
+
+class Button(IntFlag):
+    """The buttons of the wireless remote, as their bits come."""
+
+    R1, L1, START, SELECT = 0x0001, 0x0002, 0x0004, 0x0008
+    R2, L2, F1, F2 = 0x0010, 0x0020, 0x0040, 0x0080
+    A, B, X, Y = 0x0100, 0x0200, 0x0400, 0x0800
+    UP, RIGHT, DOWN, LEFT = 0x1000, 0x2000, 0x4000, 0x8000
+
+
+@attrs.frozen
+class Remote:
+    """What the operator holds down. Sticks go from -1 to 1, x to the right, y forward; one that is off reads zero."""
+
+    buttons: Button = Button(0)
+    lx: float = 0.0
+    ly: float = 0.0
+    rx: float = 0.0
+    ry: float = 0.0
+
+
+@attrs.define
+class BoardState:
+    """One state as the board sends it.
+
+    robot: its `tick` is the board's own counter, in whatever unit; its `time` is 0, as the board knows no time; its
+    `foot_force` are the sensors' raw counts. motor_mode: (12,), 10 driven, 0 braking, 8 dropped out. motor_error: (12,), 0
+    where all is well. temperature: (12,) deg C, imu_temperature: deg C.
+    """
+
+    robot: RobotState
+    motor_mode: NDArray[np.uint8]
+    motor_error: NDArray[np.uint32]
+    temperature: NDArray[np.int8]
+    imu_temperature: int = 0
+    remote: Remote = Remote()
+
+
+def crc(data: bytes) -> int:
+    """The board's CRC of whole 4-byte words: CRC-32/MPEG-2 over little-endian words, the highest bit first."""
+    words = np.frombuffer(data, "<u4").byteswap().tobytes()
+    reflected = zlib.crc32(words.translate(_BITS_REVERSED)) ^ 0xFFFFFFFF
+    return int.from_bytes(reflected.to_bytes(4, "little").translate(_BITS_REVERSED), "big")
+
+
+def encode_command(command: JointCommand) -> bytes:
+    """The packet of a command; its `tick` has no place there.
+
+    What a field can't hold is clamped (the fixed-point fields would wrap: 200 N m would become -56), gains below zero to
+    zero. Raises WireError where a number is not finite or the mode is unknown.
+    """
+    if command.mode not in (MODE_DAMPING, MODE_SERVO):
+        raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
+    numbers = np.array((command.q, command.dq, command.tau, command.kp, command.kd), float)
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
+        raise _not_finite("command", dict(zip(_LAW, numbers, strict=True)))
+    numbers = np.minimum(np.maximum(numbers, _LOW), _HIGH).astype(np.float32)
+    packet = np.zeros(1, _COMMAND)
+    packet["level_flag"] = LOW_LEVEL
+    motors = packet["motors"][0, :JOINTS]
+    motors["mode"] = command.mode
+    motors["q"], motors["dq"] = numbers[:2]
+    motors["tau"], motors["kp"], motors["kd"] = (numbers[2:] * _SCALES).astype(np.int16)
+    return _sealed(packet)
+
+
+def decode_command(data: bytes) -> JointCommand:
+    """The command in a packet. Raises WireError."""
+    packet = _opened(data, "command", _COMMAND)
+    if packet["level_flag"] != LOW_LEVEL:
+        found = f"0x{packet['level_flag']:02X}"
+        raise WireError(f"command: levelFlag is {found}, expected 0x{LOW_LEVEL:02X}: the low level")
+    motors = packet["motors"][:JOINTS]
+    numbers = np.concatenate((motors["q"], motors["dq"]))
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of some of these
+        raise _not_finite("command", {"q": motors["q"], "dq": motors["dq"]})
+    q, dq = numbers.astype(float).reshape(2, JOINTS)
+    no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
+    return JointCommand(
+        q=np.where(no_position, 0.0, q),
+        dq=np.where(no_velocity, 0.0, dq),
+        tau=motors["tau"] / _TAU,
+        kp=np.where(no_position, 0.0, motors["kp"] / _KP),
+        kd=np.where(no_velocity, 0.0, motors["kd"] / _KD),
+        mode=_common_mode(motors["mode"]),
+    )
+
+
+def encode_state(state: BoardState) -> bytes:
+    """The packet of a state, clamped to what its fields hold. Raises WireError where a number is not finite."""
+    robot = state.robot
+    fields = ("q", "dq", "tau", "quaternion", "angular_velocity", "linear_acceleration", "foot_force")
+    numbers = {field: getattr(robot, field) for field in fields}
+    if not all(np.isfinite(values).all() for values in numbers.values()):
+        raise _not_finite("state", numbers)
+    packet = np.zeros(1, _STATE)
+    for field in ("quaternion", "angular_velocity", "linear_acceleration"):
+        packet[field] = numbers[field]
+    packet["foot_force"] = _counts(robot.foot_force)
+    packet["imu_temperature"] = state.imu_temperature
+    packet["tick"] = robot.tick
+    packet["remote"] = _remote_bytes(state.remote)
+    motors = packet["motors"][0, :JOINTS]
+    motors["q"], motors["dq"], motors["tau"] = robot.q, robot.dq, _counts(_TAU * robot.tau)
+    motors["mode"], motors["error"], motors["temperature"] = (
+        state.motor_mode,
+        state.motor_error,
+        state.temperature,
+    )
+    return _sealed(packet)
+
+
+def decode_state(data: bytes) -> BoardState:
+    """The state in a packet. Raises WireError."""
+    packet = _opened(data, "state", _STATE)
+    motors = packet["motors"][:JOINTS]
+    imu = np.frombuffer(data, "<f4", _IMU_NUMBERS, offset=_IMU_OFFSET)
+    numbers = np.concatenate((motors["q"], motors["dq"], imu))
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of some of these
+        fields = ("quaternion", "angular_velocity", "linear_acceleration")
+        found = {"q": motors["q"], "dq": motors["dq"], **{field: packet[field] for field in fields}}
+        raise _not_finite("state", found)
+    numbers = numbers.astype(float)
+    imu = numbers[2 * JOINTS :]
+    robot = RobotState(
+        time=0.0,
+        tick=int(packet["tick"]),
+        q=numbers[:JOINTS],
+        dq=numbers[JOINTS : 2 * JOINTS],
+        tau=motors["tau"] / _TAU,
+        quaternion=imu[:4],
+        angular_velocity=imu[4:7],
+        linear_acceleration=imu[7:],
+        foot_force=packet["foot_force"].astype(float),
+    )
+    return BoardState(
+        robot=robot,
+        motor_mode=motors["mode"].copy(),
+        motor_error=motors["error"].copy(),
+        temperature=motors["temperature"].copy(),
+        imu_temperature=int(packet["imu_temperature"]),
+        remote=_remote(packet["remote"].tobytes()),
+    )
+
+
+def _opened(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
+    """The fields of a packet that is whole. Raises WireError."""
+    if len(data) != layout.itemsize:
+        other = OTHER_FORMATS.get(len(data))
+        found = f"{len(data)} bytes" + (f", {other}" if other else "")
+        raise WireError(f"{kind}: {found}, expected {layout.itemsize}", LENGTH)
+    covered, end = _covered(layout), layout.itemsize - 4
+    if any(data[covered:end]):
+        raise WireError(
+            f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC leaves it out"
+        )
+    found_crc, expected = int.from_bytes(data[end:], "little"), crc(data[:covered])
+    if found_crc != expected:
+        raise WireError(f"{kind}: CRC is 0x{found_crc:08X}, expected 0x{expected:08X}", CRC)
+    packet: np.void = np.frombuffer(data, layout)[0]
+    return packet
+
+
+def _sealed(packet: NDArray[np.void]) -> bytes:
+    """The bytes of one packet, with its CRC."""
+    packet["crc"] = crc(packet.tobytes()[: _covered(packet.dtype)])
+    return packet.tobytes()
+
+
+def _covered(layout: np.dtype[Any]) -> int:
+    """How many bytes the CRC covers: whole words, but for the one that holds itself."""
+    return (layout.itemsize // 4 - 1) * 4
+
+
+def _common_mode(modes: NDArray[np.uint8]) -> int:
+    """The mode that all joints are asked for. Raises WireError."""
+    first = int(modes[0])
+    if first not in (MODE_DAMPING, MODE_SERVO):
+        raise WireError(
+            f"command: mode of {JOINT_NAMES[0]} is {first}, expected {MODE_DAMPING} or {MODE_SERVO}"
+        )
+    if (modes != first).any():
+        i = int(np.argmax(modes != first))
+        raise WireError(
+            f"command: mode of {JOINT_NAMES[i]} is {modes[i]}, expected {first}, as the first joint's"
+        )
+    return first
+
+
+def _counts(values: NDArray[np.float64]) -> NDArray[np.int16]:
+    return np.clip(np.trunc(values), -_COUNTS, _COUNTS - 1).astype(np.int16)
+
+
+def _remote_bytes(remote: Remote) -> np.void:
+    fields = np.zeros(1, _REMOTE)
+    fields["buttons"] = int(remote.buttons)
+    for stick in ("lx", "ly", "rx", "ry"):
+        fields[stick] = getattr(remote, stick)
+    return np.void(fields.tobytes())
+
+
+def _remote(data: bytes) -> Remote:
+    """The remote; its sticks have no part in what keeps a robot standing, so that no state is refused for them."""
+    fields = np.frombuffer(data, _REMOTE)[0]
+    sticks = {stick: float(fields[stick]) for stick in ("lx", "ly", "rx", "ry")}
+    if not np.isfinite(list(sticks.values())).all():
+        return Remote()
+    return Remote(Button(int(fields["buttons"])), **sticks)
+
+
+def _not_finite(kind: str, numbers: dict[str, NDArray[np.float64]]) -> WireError:
+    """The error that names the first of these fields with a number that is not finite."""
+    for field, values in numbers.items():
+        for i, value in enumerate(values):
+            if not np.isfinite(value):
+                return WireError(
+                    f"{kind}: {field} of {_place(field, i)} is {value}, expected a finite number"
+                )
+    raise AssertionError("all are finite")
+
+
+def _place(field: str, i: int) -> str:
+    """What the i-th number of a field belongs to."""
+    if field == "foot_force":
+        return f"the foot {LEGS[i]}"
+    if field == "quaternion":
+        return f"axis {_AXES[i]}"
+    return f"axis {_AXES[i + 1]}" if field in ("angular_velocity", "linear_acceleration") else JOINT_NAMES[i]

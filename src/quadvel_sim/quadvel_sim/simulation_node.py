@@ -1,0 +1,201 @@
+"""What the nodes around a simulated robot have in common: its time, its truth, its services, how it does.
+
+How the robot is driven and what it reports is the matter of those that stand on this: `sim_node` and `board_node`.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from threading import Thread
+from typing import Any, Generic, TypeVar
+
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from rclpy.clock import Clock, ClockType
+from rclpy.node import Node
+from std_srvs.srv import SetBool
+from tf2_msgs.msg import TFMessage
+
+from quadvel_description.frames import BASE, ODOM, Placed
+from quadvel_description.state import RobotState
+from quadvel_msgs.srv import Push, ResetSim, StepSim
+from quadvel_nodes.diagnostics import QUIET, diagnostics
+from quadvel_nodes.node import end, read_parameters
+from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
+from quadvel_nodes.system_time import SystemTime, as_time
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.loop import REALTIME, LoopReport
+from quadvel_sim.parameters import PlantParameters
+from quadvel_sim.simulator import Simulator, Truth
+
+TRUTH_PERIOD = 5  # ms
+VIEW_PERIOD = 20  # ms, of what people look at
+
+Settings = TypeVar("Settings", bound=PlantParameters)
+
+
+class SimulationNode(Node, Generic[Settings]):
+    """Services and ground truth around a SimulationLoop, which runs in a thread of its own once `begin` is called."""
+
+    def __init__(
+        self,
+        name: str,
+        parameters: type[Settings],
+        make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator,
+    ) -> None:
+        super().__init__(name)
+        self._settings = read_parameters(self, parameters)
+        simulator = make_simulator(self._settings.config())
+        simulator.reset(self._settings.keyframe)
+        self._system_time = SystemTime()
+        self._samples = 0
+        self._given_up_before = 0.0
+        self._has_fallen = False
+        self._failure = ""
+        self._loop = self._settings.loop(simulator, self._publish)
+        self._thread = Thread(target=self._simulate, name="simulation")
+        self._truth = self.create_publisher(Odometry, "ground_truth/odom", 10)
+        self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_service(ResetSim, "~/reset", self._on_reset)
+        self.create_service(SetBool, "~/pause", self._on_pause)
+        self.create_service(StepSim, "~/step", self._on_step)
+        self.create_service(Push, "~/push", self._on_push)
+        self.create_timer(1.0, self._report, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+    def begin(self) -> None:
+        """Start the simulation, once all that `publish_sample` needs is there."""
+        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
+        self._thread.start()
+
+    def destroy_node(self) -> None:
+        """Stop the simulation, then the node."""
+        self._loop.stop()
+        self._thread.join()
+        super().destroy_node()
+
+    # For those that stand on this.
+
+    def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
+        """One sample, in the simulation's thread. view: whether people are to see it."""
+        raise NotImplementedError
+
+    def figures(self) -> dict[str, object]:
+        """What else /diagnostics shows."""
+        raise NotImplementedError
+
+    def worry(self, report: LoopReport) -> str:
+        """What was wrong in the last second beyond the loop, in a few words, or ""."""
+        raise NotImplementedError
+
+    def stamp(self, instant: float) -> Any:
+        """The instant of a sample as a message; in real time in the time of the system clock."""
+        if self._loop.mode == REALTIME:
+            return self._system_time.stamp(instant)
+        return as_time(round(instant * 1e9))
+
+    # In the simulation's thread.
+
+    def _simulate(self) -> None:
+        try:
+            if self._loop.mode == REALTIME:  # elsewhere nothing has to keep up with a clock
+                self._settings.apply(self.get_logger().warning)
+            self._loop.run()
+        except Exception as error:  # whatever it was, the node must not go on without its robot
+            self._failure = f"{type(error).__name__}: {error}"
+
+    def _publish(self, state: RobotState, instant: float) -> None:
+        if not self.context.ok():
+            self._loop.stop()
+            return
+        view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
+        self.publish_sample(state, instant, view)
+        if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
+            transform = view and self._settings.publish_tf
+            self._publish_truth(self.stamp(instant), self._loop.simulator.truth(), transform)
+        self._samples += 1
+
+    def _publish_truth(self, stamp: Any, truth: Truth, transform: bool) -> None:
+        message = Odometry(child_frame_id=BASE)
+        message.header.stamp = stamp
+        message.header.frame_id = ODOM
+        fill_vector(message.pose.pose.position, truth.position)
+        fill_quaternion(message.pose.pose.orientation, truth.quaternion)
+        fill_vector(message.twist.twist.linear, truth.linear_velocity)
+        fill_vector(message.twist.twist.angular, truth.angular_velocity)
+        self._truth.publish(message)
+        if transform:
+            base = Placed(ODOM, BASE, truth.position, truth.quaternion)
+            self._tf.publish(TFMessage(transforms=transforms(stamp, [base])))
+
+    # In the executor's thread.
+
+    def _on_reset(self, request: Any, response: Any) -> Any:
+        keyframe = request.keyframe or "lie"
+        return self._carry_out(
+            response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe
+        )
+
+    def _on_pause(self, request: Any, response: Any) -> Any:
+        done = "paused" if request.data else "running"
+        return self._carry_out(response, done, self._loop.pause, request.data)
+
+    def _on_step(self, request: Any, response: Any) -> Any:
+        return self._carry_out(response, f"advances by {request.steps} ms", self._loop.step, request.steps)
+
+    def _on_push(self, request: Any, response: Any) -> Any:
+        force, torque = ([v.x, v.y, v.z] for v in (request.wrench.force, request.wrench.torque))
+        body = request.body or "trunk"
+        return self._carry_out(
+            response, f"{body} is pushed", self._loop.push, body, force, torque, request.duration
+        )
+
+    def _carry_out(self, response: Any, done: str, order: Any, *arguments: Any) -> Any:
+        """Carry out an order, and tell the caller and the log how it went."""
+        try:
+            order(*arguments)
+            response.success, response.message = True, done
+            self.get_logger().info(done)
+        except ValueError as error:
+            response.success, response.message = False, str(error)
+            self.get_logger().warning(f"refused: {error}")
+        return response
+
+    def _report(self) -> None:
+        """Once a second: how the simulation does."""
+        if self._failure:
+            end(self, f"{self.get_name()}: {self._failure}")
+            return
+        report = self._loop.report()
+        level, summary = self._judge(report)
+        values = {
+            "mode": self._loop.mode,
+            "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
+            "realtime_factor": f"{report.realtime_factor:.3f}",
+            "worst_lateness_ms": f"{1e3 * report.worst_lateness:.2f}",
+            "given_up_s": f"{report.given_up:.3f}",
+            "unanswered": report.unanswered,
+            "braking": report.braking,
+            "fallen": report.fallen,
+            **self.figures(),
+        }
+        stamp = self.get_clock().now().to_msg()
+        self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+        if level == DiagnosticStatus.WARN:
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+        if report.fallen and not self._has_fallen:
+            self.get_logger().warning("the robot has fallen; ~/reset puts it back")
+        self._has_fallen = report.fallen
+
+    def _judge(self, report: LoopReport) -> tuple[bytes, str]:
+        """Level and summary of the last second."""
+        given_up = report.given_up - self._given_up_before
+        self._given_up_before = report.given_up
+        if worry := self.worry(report):
+            return DiagnosticStatus.WARN, worry
+        if given_up:
+            return DiagnosticStatus.WARN, f"this machine is too slow: {given_up:.2f} s of real time given up"
+        if self._loop.paused:
+            return DiagnosticStatus.OK, "paused"
+        return DiagnosticStatus.OK, "no command: the drives brake" if report.braking else "running"

@@ -1,0 +1,94 @@
+"""`quadvel calibrate` on recordings: from the board whose IMU leans, over driver and recorder, to the file."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import quadvel_dds
+
+quadvel_dds.install()
+
+import rclpy  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+
+from quadvel_bringup.recorder import Recorder  # noqa: E402
+from quadvel_description.robot import NOMINAL_Q  # noqa: E402
+from quadvel_description.state import JointCommand  # noqa: E402
+from quadvel_driver.calibration import Calibration  # noqa: E402
+from quadvel_msgs.msg import LowState  # noqa: E402
+from quadvel_nodes.messages import write_low_state  # noqa: E402
+from quadvel_sim.simulator import Simulator  # noqa: E402
+
+QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
+LEANING = Calibration(imu_mounting=np.radians([2.0, -1.0]))
+
+
+def record_standing(path: Path, seconds: float) -> None:
+    """A robot that stands, as it is reported by one whose IMU leans, in a recording."""
+    rclpy.init(args=["test"])
+    node = rclpy.create_node("standing")
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    simulator = Simulator()
+    simulator.reset("stand")
+    hold = JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+    with Recorder(node, path) as recorder:
+        recorder.record("/low_state", "quadvel_msgs/msg/LowState")
+        for _ in range(round(200 * seconds)):
+            simulator.command(hold)
+            simulator.step(5)
+            message = LowState()
+            message.stamp.sec, nanoseconds = divmod(round(1e9 * simulator.time), 10**9)
+            message.stamp.nanosec = nanoseconds
+            write_low_state(LEANING.reported(simulator.state()), message)
+            publisher.publish(message)
+            recorder.serve(executor, 0.001)
+    node.destroy_node()
+    rclpy.try_shutdown()
+
+
+@pytest.fixture(scope="module")
+def standing(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("standing") / "standing.mcap"
+    record_standing(path, 5.0)
+    return path
+
+
+def calibrate(*arguments: object) -> tuple[int, str]:
+    done = subprocess.run(
+        [*QUADVEL, "calibrate", *map(str, arguments)], capture_output=True, text=True, timeout=120
+    )
+    return done.returncode, done.stdout + done.stderr
+
+
+def test_an_imu_that_leans_by_two_degrees_is_shown_and_written(standing: Path, tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    code, text = calibrate("--standing", standing, "--out", file)
+    assert code == 0, text
+    assert "IMU: leans by +2.0" in text or "IMU: leans by +1.9" in text
+    np.testing.assert_allclose(
+        Calibration.load(file).imu_mounting, LEANING.imu_mounting, atol=np.radians(0.15)
+    )
+    assert "not looked for" in text
+
+
+def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
+    standing: Path, tmp_path: Path
+) -> None:
+    file = tmp_path / "calibration.yaml"
+    for arguments, sentence in (
+        ((), "name a recording with --hung or --standing, or both"),
+        (("--standing", tmp_path / "none.mcap"), "there is no such file"),
+        (("--hung", standing), "hardly moves to and fro; record quadvel excite creep"),
+    ):
+        code, text = calibrate(*arguments, "--out", file)
+        assert code == 2
+        assert sentence in text
+        assert "Traceback" not in text
+    assert not file.exists()

@@ -1,0 +1,144 @@
+"""Sensors that are off: found from a hung and a standing robot, and set right."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import attrs
+import mujoco
+import numpy as np
+import pytest
+
+from quadvel_actuator.identify.excitation import Creep
+from quadvel_description import robot
+from quadvel_description.kinematics import roll_pitch, rotate_inverse
+from quadvel_description.mjcf import Plant, load_model
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import JointCommand, RobotState
+from quadvel_driver.calibration import Calibration, CalibrationError
+from quadvel_driver.find_calibration import NotFound, Samples, find, holding_torque
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import Simulator
+
+DEGREE = np.pi / 180.0
+OFF = Calibration(
+    joint_zeros=DEGREE * np.array([1.0, -2.0, 0.5, 0.0, 1.5, -1.0, -1.0, 0.7, 2.0, 0.4, -0.6, -1.8]),
+    imu_mounting=DEGREE * np.array([2.0, -0.7]),
+)
+
+
+def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
+    """What a simulated robot reports whose sensors are off, driven to where they say it should go."""
+    simulator = Simulator(SimulatorConfig(hung=hung, seed=3))
+    simulator.reset("stand")
+    targets = Creep(seconds=seconds).targets() if hung else np.tile(NOMINAL_Q, (round(1e3 * seconds), 1))
+    states = []
+    for step in range(0, len(targets), 5):
+        wanted = JointCommand(q=targets[step], kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+        simulator.command(off.carried_out(wanted))
+        simulator.step(5)
+        if step > 1000:
+            states.append(off.reported(simulator.state()))
+    return states
+
+
+@pytest.fixture(scope="module")
+def hung() -> Samples:
+    return Samples.of(recorded(True, 60.0, OFF))
+
+
+@pytest.fixture(scope="module")
+def standing() -> Samples:
+    return Samples.of(recorded(False, 3.0, OFF))
+
+
+def test_the_holding_torque_is_that_of_the_simulator() -> None:
+    model = load_model(Plant(hung=True))
+    data = mujoco.MjData(model)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        q = robot.LOWER + rng.uniform(0.2, 0.8, 12) * (robot.UPPER - robot.LOWER)
+        turn = rng.normal(size=4)
+        data.qpos[3:7], data.qpos[7:], data.qvel[:] = turn / np.linalg.norm(turn), q, 0.0
+        mujoco.mj_forward(model, data)
+        down = rotate_inverse(data.qpos[3:7], np.array([0.0, 0.0, -1.0]))
+        np.testing.assert_allclose(holding_torque(q[None], down[None])[0], data.qfrc_bias[6:], atol=1e-9)
+
+
+def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples) -> None:
+    found = find(hung, standing)
+    np.testing.assert_allclose(found.calibration.joint_zeros, OFF.joint_zeros, atol=1.5 * DEGREE)
+    np.testing.assert_allclose(found.calibration.imu_mounting, OFF.imu_mounting, atol=1.2 * DEGREE)
+    assert found.unevenness < 0.005
+    assert (found.zero_errors < 1.0 * DEGREE).all()
+    off = (found.calibration.joint_zeros - OFF.joint_zeros) / found.zero_errors
+    assert np.sqrt(np.mean(off**2)) < 2.0  # the errors that it tells are those that it makes
+
+
+def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None:
+    leaning = Calibration(imu_mounting=DEGREE * np.array([2.0, 0.0]))
+    found = find(None, Samples.of(recorded(False, 3.0, leaning)))
+    np.testing.assert_allclose(found.calibration.imu_mounting, leaning.imu_mounting, atol=0.1 * DEGREE)
+    assert not found.calibration.joint_zeros.any()
+
+
+def test_a_robot_whose_sensors_are_right_is_found_to_be_so() -> None:
+    right = Calibration()
+    found = find(Samples.of(recorded(True, 60.0, right)), Samples.of(recorded(False, 3.0, right)))
+    assert np.abs(found.calibration.joint_zeros).max() < 1.5 * DEGREE
+    assert np.abs(found.calibration.imu_mounting).max() < 1.0 * DEGREE
+
+
+def test_what_is_set_right_is_what_was(standing: Samples) -> None:
+    simulator = Simulator()
+    simulator.reset("stand")
+    state = simulator.state()
+    back = OFF.true(OFF.reported(state))
+    for field in ("q", "quaternion", "angular_velocity", "linear_acceleration"):
+        np.testing.assert_allclose(getattr(back, field), getattr(state, field), atol=1e-12)
+    command = JointCommand(q=np.array(NOMINAL_Q))
+    np.testing.assert_allclose(OFF.carried_out(OFF.sent(command)).q, command.q)
+
+
+def test_an_imu_that_leans_to_the_right_shows_a_level_robot_rolling_to_the_right() -> None:
+    simulator = Simulator(SimulatorConfig(hung=True))
+    simulator.reset("stand")
+    shown = Calibration(imu_mounting=np.array([0.1, 0.0])).reported(simulator.state())
+    np.testing.assert_allclose(roll_pitch(shown.quaternion), [0.1, 0.0], atol=0.01)
+
+
+def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text(OFF.text())
+    read = Calibration.load(file)
+    np.testing.assert_allclose(read.joint_zeros, OFF.joint_zeros, atol=1e-5)
+    np.testing.assert_allclose(read.imu_mounting, OFF.imu_mounting, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("schema: 2", "expected the fields of a calibration with schema: 1"),
+        ("[1, 2]", "expected the fields of a calibration"),
+        (OFF.text().replace("FR_hip_joint", "hip"), "has other names than the twelve joints"),
+        (OFF.text().replace("roll: 0.03491", "roll: .nan"), "imu_mounting is"),
+        (OFF.text().replace("roll: 0.03491", "roll: 1.5"), "expected 2 angles within 0.35 rad"),
+        (OFF.text().replace("roll: 0.03491", "roll: [1]"), "TypeError"),
+        ("{", "ParserError"),
+    ],
+)
+def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, text: str, sentence: str) -> None:
+    file = tmp_path / "calibration.yaml"
+    file.write_text(text)
+    with pytest.raises(CalibrationError, match=sentence) as refused:
+        Calibration.load(file)
+    assert str(file) in str(refused.value)
+
+
+def test_recordings_that_tell_nothing_are_refused(hung: Samples, standing: Samples) -> None:
+    with pytest.raises(NotFound, match="FR_hip_joint hardly moves to and fro; record quadvel excite creep"):
+        find(standing, None)
+    with pytest.raises(NotFound, match="rad/s, expected a robot that stands still"):
+        find(None, attrs.evolve(hung, dq=hung.dq + 0.5))
+    with pytest.raises(NotFound, match="3 states, expected 100 at least"):
+        Samples.of(recorded(False, 1.02, OFF)[:3])

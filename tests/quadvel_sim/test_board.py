@@ -1,0 +1,189 @@
+"""The simulated board over real UDP on loopback, with the real driver's link on the other side."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from quadvel_description.kinematics import roll_pitch
+from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.state import JointCommand
+from quadvel_driver import wire
+from quadvel_driver.calibration import Calibration
+from quadvel_driver.link import NO_CALIBRATION, LinkConfig, UdpLink
+from quadvel_driver.wire import BoardState
+from quadvel_sim.bad_network import NetworkConfig
+from quadvel_sim.board import Board, BoardError
+from quadvel_sim.loop import SimulationLoop
+from quadvel_sim.simulator import Simulator
+
+Wait = Callable[[Callable[[], object]], None]
+
+
+def wait_for(condition: Callable[[], object], board: Board) -> None:
+    deadline = time.monotonic() + 30.0
+    while not condition():
+        assert time.monotonic() < deadline, f"time is up; {board.counts}, {board.last_refusal}"
+        time.sleep(0.005)
+
+
+@pytest.fixture
+def serve() -> Iterator[Callable[..., Board]]:
+    """Runs a robot that stands behind a board on any free port."""
+    ends: list[Callable[[], None]] = []
+
+    def begin(off: Calibration = NO_CALIBRATION, **network: float) -> Board:
+        board = Board(("127.0.0.1", 0), NetworkConfig(**network), off)
+        simulator = Simulator()
+        simulator.reset("stand")
+        board.loop = SimulationLoop(simulator, board.publish, period=2, answer_timeout=0.0)
+        threads = [threading.Thread(target=run) for run in (board.run, board.loop.run)]
+        for thread in threads:
+            thread.start()
+        ends.extend((board.loop.stop, board.stop, *(thread.join for thread in threads)))
+        return board
+
+    yield begin
+    for end in ends:
+        end()
+
+
+@pytest.fixture
+def link() -> Iterator[Callable[[Board], tuple[UdpLink, list[BoardState]]]]:
+    """Connects the driver's link to a board; it holds the robot up."""
+    ends: list[Callable[[], None]] = []
+
+    def begin(board: Board, calibration: Calibration = NO_CALIBRATION) -> tuple[UdpLink, list[BoardState]]:
+        states: list[BoardState] = []
+        host, port = board.address
+        config = LinkConfig(board_address=host, board_port=port, local_port=0, command_timeout=0.5)
+
+        def hold(state: BoardState) -> None:
+            states.append(state)
+            gains = {"kp": np.full(12, 150.0), "kd": np.full(12, 4.0)}
+            made.submit(JointCommand(q=np.array(NOMINAL_Q), tick=state.robot.tick, **gains))
+
+        made = UdpLink(config, hold, calibration)
+        thread = threading.Thread(target=made.run)
+        thread.start()
+        ends.extend((made.stop, thread.join))
+        return made, states
+
+    yield begin
+    for end in ends:
+        end()
+
+
+Serve = Callable[..., Board]
+Link = Callable[..., Any]
+
+
+def test_the_real_link_holds_the_simulated_robot_up(serve: Serve, link: Link) -> None:
+    board = serve()
+    _, states = link(board)
+    wait_for(lambda: len(states) > 300, board)
+    robot = states[-1].robot
+    np.testing.assert_allclose(robot.q, NOMINAL_Q, atol=0.15)
+    assert robot.linear_acceleration[2] == pytest.approx(9.81, abs=2.0)
+    assert (states[-1].motor_mode == 10).all()
+    assert not board.loop.simulator.fallen
+    assert board.counts["commands"] > 0
+
+
+def test_a_robot_whose_sensors_are_off_is_set_right_by_its_calibration(serve: Serve, link: Link) -> None:
+    off = Calibration(joint_zeros=np.tile([0.1, -0.1, 0.15], 4), imu_mounting=np.array([0.03, -0.02]))
+    board = serve(off)
+    _, states = link(board, off)
+    wait_for(lambda: len(states) > 200, board)
+    robot, truth = states[-1].robot, board.loop.simulator
+    np.testing.assert_allclose(truth.data.qpos[7:], NOMINAL_Q, atol=0.12)
+    np.testing.assert_allclose(robot.q, truth.data.qpos[7:], atol=0.02)
+    assert np.abs(roll_pitch(robot.quaternion) - roll_pitch(truth.data.qpos[3:7])).max() < 0.01
+
+
+def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve, link: Link) -> None:
+    board = serve(
+        network_loss=0.1,
+        network_jitter=0.002,
+        network_duplicates=0.1,
+        network_reordering=0.1,
+        network_corruption=0.05,
+    )
+    made, states = link(board)
+    wait_for(lambda: len(states) > 300, board)
+    counts = made.report().counts
+    assert counts["wrong_crc"] + counts["unusable"] > 0
+    assert counts["late"] > 0
+    assert counts["repeated"] > 0
+    assert board.counts["wrong_crc"] > 0
+    assert not board.loop.simulator.fallen
+    ticks = [state.robot.tick for state in states]
+    assert ticks == sorted({*ticks})
+
+
+def test_the_drives_brake_by_themselves_once_the_link_is_gone(serve: Serve) -> None:
+    board = serve()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.connect(board.address)
+        client.settimeout(20.0)
+        client.send(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 150.0))))
+        modes = [int(wire.decode_state(client.recv(2048)).motor_mode[0])]
+        while modes[-1] != 10:
+            modes.append(int(wire.decode_state(client.recv(2048)).motor_mode[0]))
+        while modes[-1] != 0:
+            modes.append(int(wire.decode_state(client.recv(2048)).motor_mode[0]))
+
+
+def test_one_client_is_served_and_after_its_silence_the_next(serve: Serve) -> None:
+    board = serve()
+    packet = wire.encode_command(JointCommand.damping())
+    clients = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2)]
+    for client in clients:
+        client.connect(board.address)
+        client.settimeout(20.0)
+    clients[0].send(packet)
+    clients[0].recv(2048)
+    clients[1].send(packet)
+    wait_for(lambda: board.counts["from_others"] == 1, board)
+
+    def is_served() -> bool:
+        clients[1].send(packet)
+        clients[1].settimeout(0.1)
+        try:
+            return len(clients[1].recv(2048)) == wire.STATE_BYTES
+        except TimeoutError:
+            return False
+
+    wait_for(is_served, board)
+    for client in clients:
+        client.close()
+
+
+@pytest.mark.parametrize(
+    ("datagram", "counted"),
+    [
+        (bytes(540), "wrong_length"),
+        (bytes(609) + b"\1", "wrong_crc"),
+        (b"", "wrong_length"),
+    ],
+)
+def test_what_is_no_command_is_counted_and_moves_nothing(serve: Serve, datagram: bytes, counted: str) -> None:
+    board = serve()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.connect(board.address)
+        client.send(datagram)
+        wait_for(lambda: board.counts[counted] == 1, board)
+    assert board.loop.simulator.braking
+    assert "expected" in board.last_refusal
+
+
+def test_a_port_that_is_taken_is_told_in_one_sentence(serve: Serve) -> None:
+    host, port = serve().address
+    with pytest.raises(BoardError, match=rf"the board can't listen on {host}:{port}: .*in use"):
+        Board((host, port), NetworkConfig())
