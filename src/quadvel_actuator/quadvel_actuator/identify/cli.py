@@ -101,7 +101,7 @@ def identify(
     the error before and after.
 
     \b
-    For example, a recording of the stack, of which blocks are kept aside to judge on:
+    For example, a recording of the stack while it walks, of which blocks are kept aside to judge on:
       quadvel record low_state low_cmd --out walk.mcap --seconds 30
       quadvel identify walk.mcap --out out/identify
     Two logs of another robot; fit one, judge on the other:

@@ -1,0 +1,232 @@
+"""Every example of every document runs as it stands there, or shortened, or is left out for a reason.
+
+Examples are the indented and the fenced blocks of the documents, and the commands in what `--help` shows.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_bringup import cli
+from quadvel_bringup.processes import ProcessGroup
+from quadvel_policy.policy_file import SHIPPED_POLICY
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTS = ("*.md", "docs/**/*.md", "src/*/README.md", "training/README.md", "ros_ws/README.md")
+PROGRAMS = {"quadvel": [sys.executable, "-m", "quadvel_bringup"], "python": [sys.executable]}
+READY = "ready: a velocity makes it walk"
+
+
+@attrs.frozen
+class Step:
+    """An example and how it is run. more: arguments that shorten it. served: it runs until Ctrl-C."""
+
+    example: str
+    more: str = ""
+    served: bool = False
+    then: str = ""  # what it says once the next step may begin
+
+
+ROBOT = [
+    Step("quadvel up --terrain rough", served=True, then=READY),
+    Step("quadvel status"),
+    Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
+    Step("quadvel drive --vx 0.5"),
+    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 12", served=True),
+    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 2"),
+    Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel push --fy 60"),
+    Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
+    Step("quadvel reset"),
+    Step("quadvel mode passive"),
+    Step("quadvel mode stand_up"),
+]
+EXCITE = [
+    Step("quadvel excite foot-lifting --out lift.mcap", more="--seconds 0.5"),
+    Step("quadvel identify lift.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel excite --after out/identify/report.json"),
+    Step("quadvel excite sweep --out sweep.mcap", more="--seconds 0.5"),
+    Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel run sim_node --ros-args -p actuator_file:=out/identify/actuator.yaml", served=True),
+]
+LOGS = [  # of one leg each
+    Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
+    Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
+    Step("quadvel identify hung.npz --gains 30 0.5 --out out/identify"),
+    Step("quadvel identify out/loop/walk.npz --out out/loop/identified"),
+]
+NODES = [
+    Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
+    Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
+    Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
+    Step("quadvel doctor"),
+    Step("python -m quadvel_training --help"),
+]
+SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
+
+LEFT_OUT = {
+    "quadvel up": "as with --terrain",
+    "quadvel demo": "tests/end_to_end/test_demo.py runs it",
+    "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
+    "quadvel twin my_plant.yaml": "the same with a plant of the user's",
+    "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
+    "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
+    "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
+    "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
+    "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
+    "quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd.onnx "
+    "--policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx": "the same",
+    "quadvel paper --out docs/results/ablation --policy rl_pd=out/ablation/rl_pd.onnx "
+    "--policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx --only tracking --only jitter "
+    "--only symmetry --only gap --only robustness --only stance --only sustained": "the same",
+    "quadvel paper --out out/loop/gap --only gap --policy before=src/quadvel_policy/quadvel_policy/policies/aliengo.onnx "
+    "--policy after=out/loop/tuned/tuned.onnx": "the same",
+    "quadvel identify go2_walk_1.npz --holdout go2_walk_2.npz --gains 35 0.5 --out out/go2_1": "measured logs that "
+    "are no part of this repository; tests/quadvel_actuator/test_measured.py takes them where they are",
+    "quadvel identify go2_walk_2.npz --holdout go2_walk_1.npz --gains 35 0.5 --out out/go2_2": "the same",
+    "cd ros_ws && colcon build && source install/setup.bash": "needs ROS 2; tests/ros does it",
+    "colcon build": "needs ROS 2; tests/ros does it",
+    "python3 -m venv --system-site-packages .venv": "makes an environment out of the network",
+}
+LEFT_OUT_KINDS = {
+    r"make [a-z-]+": "make sets up an environment out of the network; the CI runs these",
+    r"\. .*/(activate|setup\.bash)": "changes the shell that it is typed into",
+    r"export .*": "the same",
+    r"(\.venv/bin/)?pip install .*": "needs the network",
+    r"ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
+    r"\.venv/bin/pytest .*": "these are the tests",
+    r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
+    r"torchrun .*": "the same",
+    r"(description|dds|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+}
+
+
+@cache
+def examples() -> dict[str, str]:
+    """Where each example stands first, by its text."""
+    found: dict[str, str] = {}
+    for document in sorted({path for pattern in DOCUMENTS for path in ROOT.glob(pattern)}):
+        for line in _blocks(document.read_text(encoding="utf-8")):
+            found.setdefault(_bare(line), str(document.relative_to(ROOT)))
+    for name, text in _helps():
+        for line in re.findall(r"^ {2,4}((?:quadvel|ros2|python) .*)", text, re.MULTILINE):
+            found.setdefault(_bare(line), f"quadvel {name} --help")
+    return found
+
+
+def _blocks(text: str) -> Iterator[str]:
+    """The lines of indented blocks, which follow an empty line, and of fenced ones; lines that go on are joined."""
+    text = re.sub(r" *\\\n *", " ", text)
+    inside = fenced = False
+    before = ""
+    for line in text.splitlines():
+        if line.startswith("```"):
+            fenced = not fenced
+        elif fenced:
+            yield line
+        elif line.startswith("    ") and (inside or not before):
+            inside = True
+            yield line
+        else:
+            inside = False
+        before = line.strip()
+
+
+def _bare(line: str) -> str:
+    """Without the comment or the explanation behind it, and with single blanks."""
+    return " ".join(re.split(r" +# | {5,}", line.strip())[0].split())
+
+
+def _helps() -> Iterator[tuple[str, str]]:
+    group = typer.main.get_command(cli.app)
+    for name in ("", *group.commands):  # type: ignore[attr-defined]
+        asked = [name, "--help"] if name else ["--help"]
+        yield name, CliRunner().invoke(cli.app, asked, env={"COLUMNS": "200"}).output
+
+
+def test_every_example_runs_or_is_left_out_for_a_reason() -> None:
+    run = {step.example for session in SESSIONS.values() for step in session}
+    new = [
+        f"{where}: {text}"
+        for text, where in examples().items()
+        if text not in run | LEFT_OUT.keys() and not any(re.fullmatch(kind, text) for kind in LEFT_OUT_KINDS)
+    ]
+    assert new == []
+    assert [text for text in (*run, *LEFT_OUT) if text not in examples()] == [], (
+        "no document has these any more"
+    )
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Path:
+    """A folder with the files that the examples take for there."""
+    shutil.copy(SHIPPED_POLICY, tmp_path / "my.onnx")
+    (tmp_path / "out" / "loop").mkdir(parents=True)
+    for seed, name in enumerate(("walk_1", "walk_2", "hung", "out/loop/walk")):
+        np.savez(tmp_path / f"{name}.npz", **leg_log(seed, with_torque=name != "hung"))
+    return tmp_path
+
+
+def leg_log(seed: int, with_torque: bool) -> dict[str, np.ndarray]:
+    """A good second of one leg that swings under the actuator model, at 1 kHz."""
+    rng = np.random.default_rng(seed)
+    t, kp, kd, inertia = 1e-3 * np.arange(1200), 30.0, 0.5, 0.05
+    phase, pace = rng.uniform(0.0, 2 * np.pi, 3), np.array([2.0, 3.1, 4.3])
+    sent = 0.3 * np.sin(2 * np.pi * t[:, None] * pace + phase) + 0.1 * np.sin(
+        2 * np.pi * 5.3 * t[:, None] * pace
+    )
+    drives = ActuatorModel(ActuatorParameters.default(), shape=(12,), seed=seed)
+    q, dq, rows = sent[0].copy(), np.zeros(3), []
+    for wanted in sent:
+        padded = [np.concatenate([x, np.zeros(9)]) for x in (q, dq, wanted)]
+        torque = drives.step(padded[0], padded[1], padded[2], kp, kd)[:3]
+        rows.append((q.copy(), dq.copy(), torque))
+        dq += 1e-3 * (torque - 0.05 * dq) / inertia
+        q += 1e-3 * dq
+    state = dict(zip(("q", "dq", "tau"), map(np.array, zip(*rows, strict=True)), strict=True))
+    names = np.array(["FR_hip", "FR_thigh", "FR_calf"])
+    log = {"t": t, "q_des": sent, "joint_names": names, "kp": np.array(kp), "kd": np.array(kd), **state}
+    if not with_torque:
+        del log["tau"]
+    return log
+
+
+@pytest.mark.parametrize("name", SESSIONS)
+def test_the_examples_run(name: str, sandbox: Path) -> None:
+    said: list[str] = []
+    with ProcessGroup(lambda process, line: said.append(line)) as group:
+        for step in SESSIONS[name]:
+            words = shlex.split(step.example.rstrip(" &"))
+            line = [*PROGRAMS[words[0]], *words[1:], *shlex.split(step.more)]
+            if step.served:
+                group.start(step.example, ["env", "-C", str(sandbox), *line])
+                _wait_for(step, group, said)
+            else:
+                assert set(group.ended().values()) <= {0}, said[-5:]
+                ended = subprocess.run(line, cwd=sandbox, capture_output=True, text=True, timeout=300)
+                assert ended.returncode == 0, f"{step.example}\n{ended.stdout}{ended.stderr}"
+        codes = group.stop()
+    assert not any(codes.values()), f"{codes}: {said[-5:]}"
+
+
+def _wait_for(step: Step, group: ProcessGroup, said: list[str]) -> None:
+    until = time.monotonic() + 120.0
+    while step.then and not any(step.then in line for line in said):
+        assert not group.ended(), f"{step.example}: {said[-5:]}"
+        assert time.monotonic() < until, f"{step.example}: {said[-5:]}"
+        time.sleep(0.1)
