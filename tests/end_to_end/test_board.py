@@ -37,8 +37,8 @@ PATIENT = {
     "board": {"watchdog": 0.5, "network_loss": 0.02, "network_jitter": 0.001},
     "driver": {"command_timeout": 0.5},
     "controller": {
-        "max_state_age": 0.5,
-        "max_velocity_age": 0.5,
+        "max_state_age": 3.0,
+        "max_velocity_age": 3.0,
         "max_overruns": 100_000,
         "require_operator": True,
     },

@@ -128,11 +128,15 @@ class UdpLink:
         try:
             while not self._stopped:
                 select.select([self._socket], [], [], self._until_sending())
-                self._receive()
-                self._repeat()
+                self.serve()
             self._say_farewell()
         finally:
             self._socket.close()
+
+    def serve(self) -> None:
+        """One turn of `run`: take in what has come, and send if it is time. For those that have a clock of their own."""
+        self._receive()
+        self._repeat()
 
     def stop(self) -> None:
         """End `run`."""
