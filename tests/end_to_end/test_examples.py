@@ -112,7 +112,7 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
-    r"(description|dds|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(description|dds|eval|recordings|all of these) .*": "docs/architecture.md: no command, but who may import whom",
 }
 
 
