@@ -7,13 +7,18 @@ SHELL := /bin/sh
 PYTHON ?= python3
 VENV := .venv
 PY := $(VENV)/bin/python
+# A second environment, with ROS 2's own rclpy: see ros_ws/wheels.
+ROS_VENV := .venv-ros
+ROS_PY := $(ROS_VENV)/bin/python
 APT := on Debian 12 and Ubuntu 24.04: sudo apt install
 
 # All installs take their versions from the lock file. A stamp in .venv says that a set is in place.
 LOCKED := pyproject.toml setup.py requirements.lock
-INSTALL = $(PY) -m pip install --quiet --disable-pip-version-check --constraint requirements.lock
+BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
+INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
+INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
-.PHONY: help setup demo close-the-loop paper test lint format bench lock clean
+.PHONY: help setup ros demo close-the-loop paper test ros-tests test-ros lint format bench lock clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -29,8 +34,15 @@ close-the-loop: setup  ## identify three plants that the model does not know; re
 paper: setup  ## measure what the paper's figures show; goes on where it was stopped; results in docs/results/paper
 	$(VENV)/bin/quadvel paper --out docs/results/paper
 
+ros: $(ROS_VENV)/.run  ## create .venv-ros, where all runs on ROS 2's own rclpy, without a ROS 2 installation
+
 test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 	$(PY) -m pytest -n 2 --dist loadfile
+
+ros-tests: $(ROS_VENV)/.test
+
+test-ros: $(ROS_VENV)/.test  ## run the tests of the nodes on ROS 2's own rclpy, and beside embedded nodes
+	$(ROS_PY) -m pytest -n 2 --dist loadfile @tests/on_rclpy.txt
 
 lint: $(VENV)/.lint  ## ruff and mypy
 	$(VENV)/bin/ruff check
@@ -49,8 +61,8 @@ lock: $(PY)  ## write requirements.lock anew from the bounds in pyproject.toml
 	$(PY) -m uv pip compile pyproject.toml --all-extras --universal --python-version 3.11 --upgrade \
 	    --no-annotate --no-emit-index-url --custom-compile-command "make lock" --output-file requirements.lock
 
-clean:  ## remove .venv, out and caches
-	rm -rf $(VENV) out build .mypy_cache .pytest_cache .ruff_cache *.egg-info
+clean:  ## remove both environments, out and caches
+	rm -rf $(VENV) $(ROS_VENV) out build .mypy_cache .pytest_cache .ruff_cache *.egg-info
 
 $(PY):
 	@command -v "$(PYTHON)" >/dev/null || { \
@@ -64,13 +76,28 @@ $(PY):
 
 $(VENV)/.run: $(PY) $(LOCKED)
 	@echo "Installing what quadvel needs into $(VENV) (a few minutes the first time) ..."
-	$(INSTALL) --editable '.[video]'
+	$(PY) $(INSTALL) '.[video]'
 	@touch $@
 
 $(VENV)/.lint: $(VENV)/.run
-	$(INSTALL) --editable '.[video,lint]'
+	$(PY) $(INSTALL) '.[video,lint]'
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
-	$(INSTALL) --editable '.[video,test,train]'
+	$(PY) $(INSTALL) '.[video,test,train]'
+	@touch $@
+
+# The wheels are for x86-64 alone, and our interfaces are compiled: looked at before anything is installed.
+$(ROS_PY): $(PY) $(BUILD_INTERFACES)
+	@$(PY) $(BUILD_INTERFACES) --check
+	$(PY) -m venv $(ROS_VENV)
+
+$(ROS_VENV)/.run: $(ROS_PY) $(LOCKED) $(INTERFACES)
+	@echo "Installing ROS 2's rclpy and what quadvel needs into $(ROS_VENV) (a few minutes the first time) ..."
+	$(ROS_PY) $(INSTALL) '.[video,ros]'
+	$(ROS_PY) $(BUILD_INTERFACES)
+	@touch $@
+
+$(ROS_VENV)/.test: $(ROS_VENV)/.run
+	$(ROS_PY) $(INSTALL) '.[video,ros,test]'
 	@touch $@

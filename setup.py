@@ -8,7 +8,7 @@ package_dir = {}
 for folder in [*sorted(Path("src").glob("quadvel_*")), Path("training")]:
     for package in find_packages(str(folder)):
         package_dir[package] = str(folder / Path(*package.split(".")))
-# The definitions of our own messages are data that the embedded middleware reads.
-package_dir["quadvel_dds.interfaces"] = "src/quadvel_msgs"
+# The definitions of our own messages are data that recordings and the embedded middleware are read with.
+package_dir["quadvel_recordings.interfaces"] = "src/quadvel_msgs"
 
 setup(packages=sorted(package_dir), package_dir=package_dir)

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -29,6 +30,11 @@ DOMAIN_STEP = 4
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
 RUN = os.environ.setdefault("QUADVEL_TEST_RUN", str(random.SystemRandom().randrange(1, 25)))
 os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_STEP * int(RUN) + WORKER % DOMAIN_STEP)
+
+# Left out where they cannot run: tests of ROS 2's tools without ROS 2, and of both middlewares beside each other
+# where there is but one.
+HAS_ROS = "AMENT_PREFIX_PATH" in os.environ or "QUADVEL_ROS_SETUP" in os.environ
+collect_ignore = [*([] if HAS_ROS else ["ros"]), *([] if find_spec("rclpy") else ["mixed"])]
 
 # A run in the background ignores Ctrl-C, and so would what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)

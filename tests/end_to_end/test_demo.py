@@ -11,7 +11,7 @@ from xml.etree import ElementTree
 import pytest
 from mcap.reader import make_reader
 
-from quadvel_dds.recordings import read_messages
+from quadvel_recordings.reading import read_messages
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 VIEWED = ("/tf", "/tf_static", "/robot_description")

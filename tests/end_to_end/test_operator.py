@@ -116,6 +116,13 @@ def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:
     assert "temperatures" in text
 
 
+def test_the_doctor_says_which_actuator_model_runs(up: Robot) -> None:
+    code, text = quadvel("doctor")
+    assert code == 0, text
+    assert "command_mux, controller, estimator, sim_node run; policy the shipped one" in text
+    assert "actuator the shipped AlienGo (Table 4)" in text
+
+
 def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> None:
     assert quadvel("push", "--fy", "1500", "--seconds", "0.4")[0] == 0
     up.says("controller | fault: ")

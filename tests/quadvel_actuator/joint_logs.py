@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from mcap.writer import Writer
 
-from quadvel_dds.messages import STORE
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_recordings.definitions import STORE
 
 KP, KD = 30.0, 0.5
 

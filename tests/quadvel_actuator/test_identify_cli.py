@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 import sys
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 from quadvel_actuator.identify import cli
 
 sys.path.insert(0, str(Path(__file__).parent))
-from joint_logs import fields, npz
+from joint_logs import fields, mcap, npz
 
 
 def test_help_shows_an_example_and_the_fields_of_a_log() -> None:
@@ -49,6 +50,19 @@ def test_a_refusal_is_one_sentence_and_writes_nothing(
     last = capsys.readouterr().err.strip().splitlines()[-1]
     assert last.startswith(f"identify: {tmp_path}/{sentence}")
     assert not out.exists()
+
+
+def test_recordings_are_read_where_no_middleware_is_installed(tmp_path: Path) -> None:
+    recording = mcap(tmp_path / "walk.mcap", fields() | {"dq": -fields()["dq"]})
+    program = (
+        "import runpy, sys\n"
+        "sys.modules |= {'cyclonedds': None, 'rclpy': None}  # their import fails\n"
+        "sys.argv = ['quadvel', 'identify', *sys.argv[1:]]\n"
+        "runpy.run_module('quadvel_bringup', run_name='__main__')"
+    )
+    command = [sys.executable, "-c", program, str(recording), "--out", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert f"{recording}: dq: has the opposite sign" in done.stderr
 
 
 def test_a_heldout_log_with_other_joints_is_refused(tmp_path: Path) -> None:

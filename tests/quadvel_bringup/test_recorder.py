@@ -24,8 +24,8 @@ from geometry_msgs.msg import Twist  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
-from quadvel_dds.recordings import read_messages  # noqa: E402
 from quadvel_msgs.msg import LowState  # noqa: E402
+from quadvel_recordings.reading import read_messages  # noqa: E402
 
 
 @pytest.fixture
@@ -166,17 +166,3 @@ def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> Non
     assert recording.returncode == 1
     assert "nothing came on /low_state on ROS domain" in said
     assert list(tmp_path.iterdir()) == []
-
-
-def test_drive_repeats_one_velocity_and_ends_with_zero(node: Node) -> None:
-    heard: list[tuple[float, float, float]] = []
-    node.create_subscription(
-        Twist, "cmd_vel_teleop", lambda m: heard.append((m.linear.x, m.linear.y, m.angular.z)), 50
-    )
-    program = "import sys; from quadvel_bringup.__main__ import main; main()"
-    arguments = ["drive", "--vx", "0.5", "--vy", "-0.25", "--wz", "1", "--seconds", "2"]
-    driving = subprocess.Popen([sys.executable, "-c", program, *arguments])
-    spin_until(node, lambda: (0.0, 0.0, 0.0) in heard, "the stop", 60.0)
-    assert driving.wait(60) == 0
-    assert set(heard[:-1]) == {(0.5, -0.25, 1.0)}
-    assert heard[-1] == (0.0, 0.0, 0.0)

@@ -9,7 +9,7 @@ import pytest
 
 from quadvel_bringup import up
 from quadvel_bringup.rehearsal import PARTS, rehearse
-from quadvel_bringup.stack import PARAMETERS, Stack
+from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 
 @pytest.fixture(autouse=True)
@@ -24,9 +24,10 @@ def written(path: Path, text: str) -> Path:
 
 def test_the_shipped_stack_is_in_order() -> None:
     rehearse(Stack())
-    rehearse(Stack(low_level="external"))
     rehearse(Stack(use_sim_time=True))
-    assert set(PARTS) == set(Stack().overrides())
+    for low_level in LOW_LEVELS:
+        rehearse(Stack(low_level=low_level))
+    assert set(PARTS) == {name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).overrides()}
 
 
 @pytest.mark.parametrize(

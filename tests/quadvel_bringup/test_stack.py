@@ -128,7 +128,7 @@ def test_behind_the_boards_interface_stand_the_simulated_board_and_the_real_driv
 def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> None:
     overrides = Stack(low_level="aliengo").overrides()
     assert list(overrides) == ["driver", "estimator", "controller", "command_mux"]
-    assert overrides["driver"] == {"realtime_priority": 50}
+    assert overrides["driver"] == overrides["estimator"] == {"realtime_priority": 50}
     assert overrides["controller"] == {
         "auto_stand": False,
         "require_operator": True,

@@ -1,7 +1,6 @@
 """Message classes, and their bytes against the reference serialisation of rosbags."""
 
 import array
-import os
 import subprocess
 import sys
 from functools import cache
@@ -197,7 +196,7 @@ command, twist = LowCmd(), Twist()
 command.q = [0.0] * 11
 twist.linear.x = "fast"
 joints = JointState(position=np.arange(3, dtype=np.float32))
-print(joints.position, LowCmd(q=range(12)).q.dtype)
+print(joints.position.tolist(), LowCmd(q=range(12)).q.dtype)
 for message in command, twist:
     try:
         messages.serialize(message)
@@ -206,48 +205,16 @@ for message in command, twist:
 """
 
 
-def run(program: str, **environment: str) -> str:
-    env = {**os.environ, **environment}
-    result = subprocess.run(
-        [sys.executable, "-c", program], env=env, capture_output=True, text=True, check=True
-    )
+def run(program: str) -> str:
+    result = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     return result.stdout
 
 
 def test_bad_values_are_accepted_on_assignment_and_named_when_sent() -> None:
-    converted, first, second = run(UNCHECKED, ROS_PYTHON_CHECK_FIELDS="0").splitlines()
-    assert converted == "array('d', [0.0, 1.0, 2.0]) float32"
-    assert first.startswith("quadvel_msgs/msg/LowCmd cannot be sent: field 'q' must be 12 values of type")
-    assert second == "geometry_msgs/msg/Twist cannot be sent: field 'x' must be of type float64, found 'fast'"
-
-
-CHECKED = """
-import numpy as np, quadvel_dds
-quadvel_dds.install()
-from diagnostic_msgs.msg import DiagnosticStatus
-from geometry_msgs.msg import Twist, Vector3
-from quadvel_msgs.msg import LowCmd
-from sensor_msgs.msg import JointState
-for cls, field, bad, good in [
-    (LowCmd, "q", [0.0] * 11, [0.0] * 12), (LowCmd, "q", np.zeros(12), np.zeros(12, np.float32)),
-    (JointState, "position", np.zeros(2), [0.0, 0.0]),
-    (LowCmd, "tick", -1, 2**32 - 1), (LowCmd, "tick", 1.0, 1), (Vector3, "x", 1, float("nan")),
-    (Twist, "linear", Twist(), Vector3(x=1.0)), (DiagnosticStatus, "level", 0, b"\\x00"),
-]:
-    message = cls()
-    setattr(message, field, good)
-    try:
-        setattr(message, field, bad)
-    except AssertionError as error:
-        assert f"'{field}'" in str(error)
-    else:
-        raise SystemExit(f"{cls.__name__}.{field} took {bad!r}")
-print("all refused")
-"""
-
-
-def test_fields_are_checked_on_assignment_where_asked_for() -> None:
-    assert run(CHECKED, ROS_PYTHON_CHECK_FIELDS="1") == "all refused\n"
+    converted, first, second = run(UNCHECKED).splitlines()
+    assert converted == "[0.0, 1.0, 2.0] float32"
+    assert first.startswith("quadvel_msgs/msg/LowCmd cannot be sent: field 'q' holds array([0.")
+    assert second.startswith("geometry_msgs/msg/Twist cannot be sent: field 'x' holds 'fast': ")
 
 
 def test_type_hash_and_dds_name_are_those_of_ros() -> None:

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from mcap.writer import Writer
 
-from quadvel_dds.messages import STORE
 from quadvel_eval.demo_figures import loop_figure, tracking_figure
 from quadvel_eval.demo_summary import commands, count_falls, segments, summarise
 from quadvel_eval.recording import read_recording
+from quadvel_recordings.definitions import STORE
 
 T0 = 1_700_000_000.0  # s, some time on the system clock
 FIRST = np.array([0.5, 0.0, 0.2])

@@ -11,11 +11,11 @@ import pytest
 from mcap.writer import Writer
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_dds.messages import STORE
 from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_eval.replay import COMMAND, Joints, open_loop, read_joints, torque_error, tracking_gap
 from quadvel_eval.segments import Segment
+from quadvel_recordings.definitions import STORE
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
 
 SECONDS = 1.5

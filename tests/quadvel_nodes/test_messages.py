@@ -68,8 +68,8 @@ def test_the_quaternion_is_normalised() -> None:
     ],
 )
 def test_what_is_not_fit_to_use_is_refused_by_name(field: str, value: list[float], sentence: str) -> None:
-    fields = {name: getattr(low_state(), name) for name in LowState.get_fields_and_field_types()}
-    message = type("Unchecked", (), fields | {field: value})  # generated classes may check their fields
+    message = low_state()
+    setattr(message, f"_{field}", value)  # past the check that generated classes may make
     with pytest.raises(MessageError) as refused:
         read_low_state(message)
     assert sentence in str(refused.value)

@@ -11,12 +11,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from quadvel_dds.recordings import read_messages
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import Found, NotFound, Samples, find
 from quadvel_eval.output import output_folder, replacing
 from quadvel_nodes.messages import read_low_state
+from quadvel_recordings.reading import read_messages
 
 TOPIC = "/low_state"
 SETTLING = 2.0  # s at the start and

@@ -13,7 +13,11 @@ from importlib import metadata, util
 import attrs
 import numpy as np
 
+import quadvel_dds
+
 NEEDED = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
+FILES = ("actuator", "policy")
+"""Values of /diagnostics that say with which files a node runs"""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
@@ -38,6 +42,23 @@ def examine() -> Iterator[Finding]:
     yield _gl()
     yield video_encoder()
     yield _torch()
+    yield _robot()
+
+
+def _robot() -> Finding:
+    """Which robot runs, and on which actuator model."""
+    try:
+        quadvel_dds.install()
+        from .status import look
+    except ImportError as error:
+        return Finding("robot", True, f"not looked for: {error}")
+    nodes = look()
+    if not nodes:
+        return Finding("robot", True, "none runs; `quadvel up` takes the shipped actuator model (Table 4)")
+    told = [f"{key} {node.values[key]}" for node in nodes.values() for key in FILES if key in node.values]
+    return Finding(
+        "robot", True, f"{', '.join(nodes)} run; {', '.join(told) or 'with files that none tells'}"
+    )
 
 
 def _python() -> Finding:
@@ -57,6 +78,8 @@ def _middleware() -> Finding:
         return Finding("ROS 2", True, "not found in this shell: the nodes run on the embedded Cyclone DDS")
     if os.environ.get("QUADVEL_MIDDLEWARE") == "embedded":
         return Finding("ROS 2", True, f"{distro}, left aside: QUADVEL_MIDDLEWARE is 'embedded'")
+    if fault := quadvel_dds.ros2_fault():
+        return Finding("ROS 2", True, fault)
     rmw = os.environ.get("RMW_IMPLEMENTATION", "its default middleware")
     text = f"{distro} with {rmw}: the nodes run on its rclpy"
     if not _has_executor_of_events():

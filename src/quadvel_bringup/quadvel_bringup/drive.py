@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -32,8 +33,8 @@ Array = NDArray[np.float64]
 class Drive:
     """What the robot says while it is driven. asked: vx, vy (m/s), wz (rad/s)."""
 
-    def __init__(self, session: Session, asked: ArrayLike, topic: str) -> None:
-        self._session = session
+    def __init__(self, session: Session, signals: StopSignals, asked: ArrayLike, topic: str) -> None:
+        self._session, self._signals = session, signals
         self._asked = np.array(asked, float)
         self._topic = topic
         self._publisher = session.node.create_publisher(Twist, topic, 10)
@@ -45,16 +46,22 @@ class Drive:
 
     def wait_for_robot(self) -> str:
         """Until somebody hears us and the robot stands: why it would not follow, or "". Raises NobodyThere."""
-        if not self._session.spin_until(self._publisher.get_subscription_count, PATIENCE):
+        if not self._wait(self._publisher.get_subscription_count, PATIENCE):
             raise NobodyThere(f"{self._topic}: nobody listens; {CONTROLLER}")
-        if not self._session.spin_until(lambda: self._states, PATIENCE):
+        if not self._wait(lambda: self._states, PATIENCE):
             raise NobodyThere(f"controller/state: nothing came; {CONTROLLER}")
-        self._session.spin_until(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
+        if self._signals.received:
+            return ""
+        self._wait(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
         # The mux commands zero all the time, which a robot that has just stood up waits for.
-        self._session.spin_until(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
+        self._wait(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
         if not self._states[-1].rate_hz:
             return "the controller hears no robot: is the simulator paused?"
         return self.refusal()
+
+    def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
+        """Serve until the predicate holds, or Ctrl-C comes; whether one of them does in time."""
+        return self._session.spin_until(lambda: self._signals.received or is_so(), seconds)
 
     def refusal(self) -> str:
         """Why the robot does not follow velocities now; empty where it does."""
@@ -112,9 +119,11 @@ def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> int:
     for name, value in {"--vx": vx, "--vy": vy, "--wz": wz, "--seconds": seconds}.items():
         if not math.isfinite(value):
             raise ValueError(f"{name} is {value}, expected a finite number")
-    with Session("drive") as session, StopSignals() as signals:
-        robot = Drive(session, (vx, vy, wz), topic)
+    with StopSignals() as signals, Session("drive") as session:
+        robot = Drive(session, signals, (vx, vy, wz), topic)
         refusal = robot.wait_for_robot()
+        if signals.received:
+            return 0
         until = time.monotonic() + seconds
         while not refusal and not signals.received and time.monotonic() < until:
             robot.send()

@@ -20,7 +20,7 @@ from rclpy.executors import Executor
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
-from quadvel_dds.messages import STORE
+from quadvel_recordings.definitions import STORE
 
 ANY_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Hears every publisher, a reliable one too; of the fastest topic it holds seconds, for where other work keeps us from writing."""
@@ -38,7 +38,7 @@ OTHERS = 4  # callbacks that may come between two of ours although messages wait
 class Recorder:
     """Writes what the given node receives on some topics until it is closed.
 
-    The file has its index only then; where it never comes to that, `quadvel_dds.recordings` reads all but the last
+    The file has its index only then; where it never comes to that, `quadvel_recordings.reading` reads all but the last
     CHUNK.
     """
 

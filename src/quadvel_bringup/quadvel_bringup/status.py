@@ -18,6 +18,7 @@ from rich.console import Console
 
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 
+from .doctor import FILES
 from .orders import WAY_OUT
 from .session import Session
 
@@ -38,9 +39,6 @@ LEVELS = {
     DiagnosticStatus.ERROR: "[bold red]error",
     DiagnosticStatus.STALE: "[red]stale",
 }
-FILES = ("actuator", "policy")
-"""Values of /diagnostics that say with which files a node runs"""
-
 Heard = Mapping[str, deque[Any]]
 
 
@@ -68,6 +66,14 @@ def status() -> int:
         console.print(f"{name:13} {text}")
     states = heard["controller/state"]
     return 1 if not states or states[-1].mode_name == "fault" else 0
+
+
+def look() -> dict[str, Node]:
+    """The nodes of the robot that runs, by name; none where there is none."""
+    with Session("look") as session:
+        heard = session.listen(DiagnosticArray, "/diagnostics", keep=100)
+        session.spin(LISTEN)
+    return reported(heard)
 
 
 def reported(arrays: deque[Any]) -> dict[str, Node]:

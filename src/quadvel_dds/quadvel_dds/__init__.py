@@ -6,6 +6,6 @@ coroutines, types that `rosbags` does not know; what is not offered raises `Unsu
 """
 
 from quadvel_dds.errors import UnsupportedError
-from quadvel_dds.finder import install, is_installed
+from quadvel_dds.finder import install, is_installed, ros2_fault
 
-__all__ = ["UnsupportedError", "install", "is_installed"]
+__all__ = ["UnsupportedError", "install", "is_installed", "ros2_fault"]

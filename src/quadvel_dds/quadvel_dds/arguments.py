@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import attrs
 import yaml
 
-from quadvel_dds.errors import UnsupportedError
-
 SCOPE_KEY = "ros__parameters"
+FLAGS = {
+    "-p": "-p",
+    "--param": "-p",
+    "-r": "-r",
+    "--remap": "-r",
+    "--params-file": "file",
+    "--log-level": "log",
+}
 IGNORED_FLAGS = {f"--{on}-{what}" for on in ("enable", "disable") for what in ("rosout-logs", "stdout-logs")}
-IGNORED_FLAGS |= {"--enable-external-lib-logs", "--disable-external-lib-logs"}
 
 
 class InvalidROSArgsError(ValueError):
@@ -32,14 +37,21 @@ class Rule:
 
 @attrs.frozen
 class ParameterOverride:
-    """A value for the parameter `name` of the nodes whose full name matches `pattern`."""
+    """A value for the parameter `name` of the nodes whose full name matches `pattern`.
+
+    In a pattern * is one token of the name, ** any number of them.
+    """
 
     pattern: str
     name: str
     value: Any
 
     def applies_to(self, full_name: str) -> bool:
-        return re.fullmatch(_pattern_expression(self.pattern), full_name) is not None
+        meaning = {"/**": "(/[^/]+)*", "*": "[^/]+"}
+        parts = re.split(r"(/\*\*|\*)", self.pattern)
+        return (
+            re.fullmatch("".join(meaning.get(part, re.escape(part)) for part in parts), full_name) is not None
+        )
 
 
 @attrs.define
@@ -49,7 +61,6 @@ class RosArguments:
     remappings: list[Rule] = attrs.field(factory=list)
     overrides: list[ParameterOverride] = attrs.field(factory=list)
     log_levels: dict[str, str] = attrs.field(factory=dict)  # logger name ("" = default) to level
-    rest: list[str] = attrs.field(factory=list)  # what is no ROS argument
 
     def parameters_for(self, full_name: str) -> dict[str, Any]:
         """Overrides of a node ("/ns/name"), later ones first in rank."""
@@ -66,44 +77,25 @@ def parse(args: Sequence[str]) -> RosArguments:
             within = True
         elif within and argument == "--":
             within = False
-        elif within:
+        elif within and argument not in IGNORED_FLAGS:
             _parse_one(argument, arguments, found)
-        else:
-            found.rest.append(argument)
     return found
 
 
-def _parse_one(flag: str, following: Iterable[str], found: RosArguments) -> None:
-    if flag in IGNORED_FLAGS:
-        return
-    takers = {
-        "-p": "-p",
-        "--param": "-p",
-        "-r": "-r",
-        "--remap": "-r",
-        "--params-file": "file",
-        "--log-level": "log",
-    }
-    kind = takers.get(flag)
-    if kind is None and ":=" in flag and not flag.startswith("-"):
-        found.remappings.append(parse_rule(flag, flag))  # a bare rule, the old way to remap
-        return
-    if kind is None:
-        if flag in ("-e", "--enclave", "--log-config-file", "--log-file-name"):
-            raise UnsupportedError(f"argument {flag}")
-        raise InvalidROSArgsError(f"unknown ROS argument '{flag}'")
-    value = next(iter(following), None)
+def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None:
+    if flag not in FLAGS:
+        raise InvalidROSArgsError(f"ROS argument '{flag}' is not known, or not offered here")
+    value = next(following, None)
     if value is None:
         raise InvalidROSArgsError(f"argument {flag} needs a value")
-    if kind == "-p":
+    if FLAGS[flag] == "-p":
         rule = parse_rule(flag, value)
         pattern = f"/**/{rule.node}" if rule.node else "/**"
-        found.overrides.append(
-            ParameterOverride(pattern, rule.name, parse_value(f"{flag} {value}", rule.value))
-        )
-    elif kind == "-r":
+        parsed = parse_value(f"{flag} {value}", rule.value)
+        found.overrides.append(ParameterOverride(pattern, rule.name, parsed))
+    elif FLAGS[flag] == "-r":
         found.remappings.append(parse_rule(flag, value))
-    elif kind == "file":
+    elif FLAGS[flag] == "file":
         found.overrides += read_parameter_file(Path(value))
     else:
         name, _, level = value.rpartition(":=")
@@ -133,11 +125,14 @@ _Loader.add_implicit_resolver(
 
 def parse_value(where: str, text: str) -> Any:
     """A parameter value from YAML text. Raises InvalidROSArgsError."""
+    return check_value(where, _load(where, text) if text else "")
+
+
+def _load(where: str, text: str) -> Any:
     try:
-        value = yaml.load(text, _Loader) if text else ""
+        return yaml.load(text, _Loader)
     except yaml.YAMLError as error:
-        raise InvalidROSArgsError(f"{where}: '{text}' is not valid YAML: {error}") from error
-    return check_value(where, value)
+        raise InvalidROSArgsError(f"{where} is not valid YAML: {error}") from error
 
 
 def check_value(where: str, value: Any) -> Any:
@@ -152,36 +147,29 @@ def check_value(where: str, value: Any) -> Any:
 
 def read_parameter_file(path: Path) -> list[ParameterOverride]:
     """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
+    where = f"parameter file '{path}'"
     try:
-        document = yaml.load(path.read_text(), _Loader)
+        text = path.read_text()
     except OSError as error:
-        raise InvalidROSArgsError(f"parameter file '{path}' cannot be read: {error.strerror}") from error
-    except yaml.YAMLError as error:
-        raise InvalidROSArgsError(f"parameter file '{path}' is not valid YAML: {error}") from error
-    if document is None:
-        return []
-    overrides = list(_walk_nodes(path, "", document))
-    return overrides
+        raise InvalidROSArgsError(f"{where} cannot be read: {error.strerror}") from error
+    document = _load(where, text)
+    return [] if document is None else list(_walk_nodes(where, "", document))
 
 
-def _walk_nodes(path: Path, prefix: str, tree: Any) -> Iterable[ParameterOverride]:
+def _walk_nodes(where: str, prefix: str, tree: Any) -> Iterable[ParameterOverride]:
     if not isinstance(tree, dict):
-        where = f" under '{prefix}'" if prefix else ""
+        below = f" under '{prefix}'" if prefix else ""
         raise InvalidROSArgsError(
-            f"parameter file '{path}': found {tree!r}{where}, expected node names with '{SCOPE_KEY}' below"
+            f"{where}: found {tree!r}{below}, expected node names with '{SCOPE_KEY}' below"
         )
     for key, branch in tree.items():
         if key != SCOPE_KEY:
-            yield from _walk_nodes(path, f"{prefix}/{str(key).strip('/')}", branch)
+            yield from _walk_nodes(where, f"{prefix}/{str(key).strip('/')}", branch)
         elif not isinstance(branch, dict):
-            raise InvalidROSArgsError(
-                f"parameter file '{path}': '{prefix}' {SCOPE_KEY}: expected names and values"
-            )
+            raise InvalidROSArgsError(f"{where}: '{prefix}' {SCOPE_KEY}: expected names and values")
         else:
-            yield from (
-                ParameterOverride(prefix, name, check_value(f"parameter file '{path}', '{name}'", value))
-                for name, value in _flatten("", branch)
-            )
+            for name, value in _flatten("", branch):
+                yield ParameterOverride(prefix, name, check_value(f"{where}, '{name}'", value))
 
 
 def _flatten(prefix: str, branch: dict[Any, Any]) -> Iterable[tuple[str, Any]]:
@@ -190,10 +178,3 @@ def _flatten(prefix: str, branch: dict[Any, Any]) -> Iterable[tuple[str, Any]]:
             yield from _flatten(f"{prefix}{key}.", value)
         else:
             yield f"{prefix}{key}", value
-
-
-def _pattern_expression(pattern: str) -> str:
-    """Regular expression of a node name with wildcards: * is one token of the name, ** any number of them."""
-    parts = re.split(r"(/\*\*|\*)", pattern)
-    meaning = {"/**": "(/[^/]+)*", "*": "[^/]+"}
-    return "".join(meaning.get(part, re.escape(part)) for part in parts)

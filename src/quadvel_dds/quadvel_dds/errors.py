@@ -1,4 +1,4 @@
-"""The error that says what the embedded middleware does not offer, and small helpers that raise it."""
+"""The error that says what the embedded middleware does not offer, and what raises it."""
 
 from __future__ import annotations
 
@@ -18,6 +18,19 @@ class UnsupportedError(NotImplementedError):
 
 class UnsupportedModuleError(UnsupportedError, ImportError):
     """A module of rclpy that is not offered; an ImportError, for those who look whether it is there."""
+
+
+class UnsupportedMemberError(UnsupportedError, AttributeError):
+    """A method or property that is not offered; an AttributeError, for those who look whether it is there."""
+
+
+class Partial:
+    """Base of what has a part of the members of rclpy's class: any other public one raises UnsupportedError."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
+        raise UnsupportedMemberError(f"{type(self).__name__}.{name}")
 
 
 def unsupported(what: str) -> Callable[..., NoReturn]:

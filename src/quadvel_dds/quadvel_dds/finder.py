@@ -69,18 +69,36 @@ def is_installed() -> bool:
     return any(isinstance(finder, EmbeddedFinder) for finder in sys.meta_path)
 
 
+def ros2_fault() -> str | None:
+    """Why the rclpy that is importable here, if any, is none to run on: one sentence. None where nothing is wrong."""
+    if find_spec("rclpy") is None or is_installed():
+        return None
+    interfaces = find_spec("quadvel_msgs")
+    if interfaces is not None and interfaces.origin is not None:  # else a mere folder of that name
+        return None
+    return (
+        "ROS 2's rclpy is here, but not quadvel_msgs: the nodes run on the embedded middleware; build the workspace "
+        "with colcon and source it (ros_ws/README.md), or use the environment of `make ros`"
+    )
+
+
 def install() -> bool:
     """Make `rclpy` and the message packages resolve to the embedded middleware; returns whether they do.
 
-    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Raises
+    Where ROS 2's own rclpy is importable nothing is done, unless QUADVEL_MIDDLEWARE=embedded. Without our interfaces
+    that rclpy is none to run on: this is said on stderr once, and this process and its children run embedded. Raises
     RuntimeError if that rclpy is imported already.
     """
     if is_installed():
         return True
-    embedded = os.environ.get("QUADVEL_MIDDLEWARE") == "embedded"
-    if not embedded and find_spec("rclpy") is not None:
+    asked = os.environ.get("QUADVEL_MIDDLEWARE") == "embedded"
+    fault = None if asked else ros2_fault()
+    if not asked and not fault and find_spec("rclpy") is not None:
         return False
     if "rclpy" in sys.modules:
         raise RuntimeError("rclpy of ROS 2 is imported already; call quadvel_dds.install() before")
+    if fault:
+        print(f"quadvel: {fault}", file=sys.stderr, flush=True)
+        os.environ["QUADVEL_MIDDLEWARE"] = "embedded"
     sys.meta_path.insert(0, EmbeddedFinder())
     return True

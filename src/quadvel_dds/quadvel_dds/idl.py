@@ -1,7 +1,7 @@
-"""Descriptions of our messages for Cyclone DDS.
+"""Our messages as types of Cyclone DDS.
 
-Cyclone checks incoming samples against them, so that malformed data never arrives; the content itself is
-written and read in `cdr`.
+Cyclone checks incoming samples against the types, so that malformed data never arrives. The content passes through it
+as bytes, which `messages` writes and reads.
 """
 
 from __future__ import annotations
@@ -21,15 +21,22 @@ REQUEST_HEADER = {"client_guid_": types.uint64, "sequence_number_": types.int64}
 
 
 @cache
-def struct(typename: str) -> type[IdlStruct]:
-    """Structure of a message; of a service's half, with the header of rmw_cyclonedds in front."""
-    fields = {f"{name}_": _field(description) for name, description in messages.describe(typename)[1]}
+def struct(typename: str) -> Any:
+    """Type of a message; of a service's half, with the header of rmw_cyclonedds in front.
+
+    Its samples are made of CDR bytes, and hold them as `data`.
+    """
+    fields = {f"{name}_": _field(description) for name, description in messages.STORE.fielddefs[typename][1]}
     if "/srv/" in typename:
         fields = REQUEST_HEADER | fields
-    return make_idl_struct(typename.rpartition("/")[2], messages.dds_name(typename), fields)
+    made: Any = make_idl_struct(typename.rpartition("/")[2], messages.dds_name(typename), fields)
+    made.__init__ = lambda sample, data: setattr(sample, "data", data)
+    made.serialize = lambda sample, **options: sample.data
+    made.deserialize = made.deserialize_key = classmethod(lambda cls, data, **options: cls(data))
+    return made
 
 
-def _field(description: Any) -> Any:
+def _field(description: Any) -> type[IdlStruct] | Any:
     kind, detail = description
     if kind == Nodetype.NAME:
         return struct(detail)

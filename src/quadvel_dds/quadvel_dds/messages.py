@@ -1,64 +1,39 @@
 """Message and service classes that look and behave like those which ROS 2 generates for Python.
 
-Definitions come from `rosbags` (Jazzy), from `definitions` and from the files of `quadvel_msgs`; a class is
-made when it is first asked for. As in ROS 2, fields are not checked on assignment unless the environment
-variable ROS_PYTHON_CHECK_FIELDS is 1 (then a wrong type, range or length raises AssertionError). A value that
-cannot be sent raises ValueError when it is published, where ROS 2 would cut it off or read past its end.
+Definitions and their bytes are those of `rosbags`; a class is made when it is first asked for. As in ROS 2, fields are
+not checked on assignment. A value that cannot be sent raises ValueError when it is published, where ROS 2 would cut it
+off or read past its end.
 """
 
 from __future__ import annotations
 
 import array
-import os
-from collections.abc import Callable, Sequence, Set
+from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_typestore
 
-from quadvel_dds import cdr
-from quadvel_dds.definitions import SERVICES
+from quadvel_recordings import definitions
 
-HERE = Path(__file__).parent
-OWN_PACKAGE = "quadvel_msgs"
+Description = Any  # of a field, as rosbags has it: a kind of node, and what it is made of
+HEADER = b"\x00\x01\x00\x00"  # encapsulation: plain CDR, little endian, no options
+FORMATS = {
+    "bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
+    "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
+}  # fmt: skip
+ZEROS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}  # the others: 0
 # Default values, which the definitions carried by rosbags leave out.
 DEFAULTS = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
 }
-CHECK_FIELDS = os.environ.get("ROS_PYTHON_CHECK_FIELDS") == "1"
 
-Describe = tuple[type, cdr.Fields]
-
-
-def _own_definitions() -> Path:
-    """In `interfaces` where pip installed us, beside us in the source tree, or where colcon installed them."""
-    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
-    shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
-    folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
-    return next(folder for folder in folders if (folder / "msg").is_dir())
-
-
-def _load_store() -> Any:
-    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
-    store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
-    for file in sorted(own_files.glob("msg/*.msg")):
-        store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
-    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
-    for name, text in {**SERVICES, **own}.items():
-        package, _, short = name.split("/")
-        # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.
-        request, _, response = f"\n{text}\n".partition("\n---\n")
-        for part, definition in {"Request": request, "Response": response}.items():
-            (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
-            store.register({f"{name}_{part}": parsed})
-    return store
-
-
-STORE = _load_store()
+STORE = get_typestore(Stores.EMPTY)
+"""All definitions, with our classes in the place of those that rosbags would make."""
+STORE.register(definitions.STORE.fielddefs)
 
 
 def is_interface_package(package: str) -> bool:
@@ -73,15 +48,10 @@ def names_in(package: str, kind: str) -> list[str]:
 
 
 class Message:
-    """Base of all message classes: comparison, text form, and what those of ROS 2 tell about themselves."""
+    """Base of all message classes: comparison and text form."""
 
     __slots__: ClassVar[tuple[str, ...]] = ()
     TYPENAME: ClassVar[str]
-    _fields_and_field_types: ClassVar[dict[str, str]]
-
-    @classmethod
-    def get_fields_and_field_types(cls) -> dict[str, str]:
-        return dict(cls._fields_and_field_types)
 
     def __eq__(self, other: object) -> bool:
         if type(self) is not type(other):
@@ -96,6 +66,27 @@ class Message:
         return f"{package}.{kind}.{name}({fields})"
 
 
+class Octet(bytes):
+    """A field of type byte: one byte for those who use it, a number for rosbags."""
+
+    def __index__(self) -> int:
+        return int.from_bytes(self, signed=True)
+
+
+class Numbers(array.array):  # type: ignore[type-arg]
+    """A sequence of numbers: an array.array as in ROS 2, with what rosbags asks of a NumPy array."""
+
+    def view(self, dtype: Any) -> Any:
+        return np.frombuffer(self.tobytes(), dtype)
+
+
+class Flags(list):  # type: ignore[type-arg]
+    """An array or a sequence of bools or bytes: a list as in ROS 2, with what rosbags asks of a NumPy array."""
+
+    def view(self, dtype: Any) -> Any:
+        return np.frombuffer(b"".join(bytes([v]) if isinstance(v, bool) else v for v in self), dtype)
+
+
 @cache
 def message_class(typename: str) -> type[Message]:
     """The class of a message, a request or a response, by its full name ("geometry_msgs/msg/Twist")."""
@@ -108,14 +99,14 @@ def message_class(typename: str) -> type[Message]:
         "__module__": f"{package}.{kind}",
         "__doc__": f"Message {typename}.",
         "TYPENAME": typename,
-        "_fields_and_field_types": {field: type_text(description) for field, description in fields},
     }
     for constant, base, value in constants:
-        namespace[constant] = bytes([value]) if base == "byte" else value
+        namespace[constant] = bytes([int(value)]) if base == "byte" else value
     cls = type(name, (Message,), namespace)
     for field, description in fields:
-        setattr(cls, field, _accessor(cls, field, description))
-    cls.__init__ = _make_init(cls, typename, fields)  # type: ignore[misc]
+        setattr(cls, field, _accessor(cls.__dict__[f"_{field}"], _converter(description)))
+    cls.__init__ = _make_init(typename, fields)  # type: ignore[misc]  # makes the classes of its fields too
+    STORE.types[typename] = _make_reader(cls, fields)  # type: ignore[assignment]
     return cls
 
 
@@ -127,46 +118,32 @@ def service_class(typename: str) -> type:
     return type(name, (), {"__module__": f"{package}.{kind}", "TYPENAME": typename, **parts})
 
 
-def describe(typename: str) -> Describe:
-    return message_class(typename), STORE.fielddefs[typename][1]
-
-
-@cache
-def writer(typename: str) -> Callable[..., None]:
-    return cdr.make_writer(typename, describe)
-
-
-@cache
-def reader(typename: str) -> Callable[..., Any]:
-    return cdr.make_reader(typename, describe)
-
-
 def serialize(message: Message, prefix: bytes = b"") -> bytearray:
     """CDR bytes of a message, encapsulation header included, padded to a multiple of four.
 
-    `prefix` goes in front of the content: the header of a service call. Raises ValueError that says why.
+    `prefix` goes in front of the content: the header of a service call, a multiple of eight bytes. Raises ValueError
+    that says why.
     """
-    data = bytearray(cdr.HEADER + prefix)
     try:
-        writer(message.TYPENAME)(message, data)
+        content = STORE.serialize_cdr(message, message.TYPENAME, little_endian=True)[4:]
     except Exception as error:
-        try:
-            check_message(message)
-        except AssertionError as reason:
-            raise ValueError(f"{message.TYPENAME} cannot be sent: {reason}") from error
-        raise ValueError(f"{message.TYPENAME} cannot be sent: {error}") from error
+        raise ValueError(f"{message.TYPENAME} cannot be sent: {fault(message) or error}") from error
+    data = bytearray(HEADER + prefix)
+    data += content
     data += bytes(-len(data) % 4)
     return data
 
 
 def deserialize(data: bytes, typename: str, prefix_size: int = 0) -> Any:
     """Message from its CDR bytes. Raises ValueError where they do not hold one."""
-    if data[:2] != cdr.HEADER[:2]:
+    if data[:2] != HEADER[:2]:
         raise ValueError(
             f"{typename}: encapsulation {data[:2].hex()} found, expected 0001 (little-endian CDR)"
         )
+    message_class(typename)
     try:
-        return reader(typename)(data, 4 + prefix_size)
+        # A copy, for arrays that may be written to.
+        return STORE.deserialize_cdr(memoryview(bytearray(HEADER + data[4 + prefix_size :])), typename)
     except Exception as error:
         raise ValueError(f"{typename} cannot be read: {error}") from error
 
@@ -182,79 +159,84 @@ def dds_name(typename: str) -> str:
     return f"{package}::{kind}::dds_::{name}_"
 
 
-def type_text(description: Any) -> str:
-    """Type of a field as `get_fields_and_field_types` of ROS 2 writes it."""
+def _accessor(slot: Any, convert: Callable[[Any], Any] | None) -> Any:
+    """How a field is read and assigned: plainly, or converted."""
+    if convert is None:
+        return slot
+    store = slot.__set__
+    return property(slot.__get__, lambda self, value: store(self, convert(value)))
+
+
+def _converter(description: Description) -> Callable[[Any], Any] | None:
+    """What makes of an assigned value what is kept; None where it is kept as it is."""
     kind, detail = description
     if kind == Nodetype.NAME:
-        package, _, name = detail.split("/")
-        return f"{package}/{name}"
+        return None
     if kind == Nodetype.BASE:
-        name, bound = detail
-        renamed = {
-            "bool": "boolean",
-            "byte": "octet",
-            "char": "uint8",
-            "float32": "float",
-            "float64": "double",
-        }
-        return f"string<{bound}>" if bound else renamed.get(name, name)
-    inner, count = type_text(detail[0]), detail[1]
-    if kind == Nodetype.ARRAY:
-        return f"{inner}[{count}]"
-    return f"sequence<{inner}, {count}>" if count else f"sequence<{inner}>"
-
-
-def _accessor(cls: type, field: str, description: Any) -> Any:
-    """How a field is read and assigned: plainly, with conversion to one block of numbers, or checked."""
-    slot = cls.__dict__[f"_{field}"]
-    convert = _converter(description)
-    if CHECK_FIELDS:
-        store = slot.__set__
-        checked = _checked(field, description)
-        return property(slot.__get__, lambda self, value: store(self, convert(checked(value))))
-    if cdr.is_numeric(description):
-        store = slot.__set__
-        return property(slot.__get__, lambda self, value: store(self, convert(value)))
-    return slot
-
-
-def _converter(description: Any) -> Callable[[Any], Any]:
-    kind, detail = description
-    if not cdr.is_numeric(description):
-        return lambda value: value
-    code = cdr.FORMATS[detail[0][1][0]]
-    dtype = np.dtype(code)
+        return (
+            (lambda value: Octet(value) if isinstance(value, bytes) else value)
+            if detail[0] == "byte"
+            else None
+        )
+    item = detail[0]
+    if item[0] == Nodetype.NAME or item[1][0] == "string":
+        return None
+    base = item[1][0]
+    if base in ("bool", "byte"):
+        return Flags
+    dtype = np.dtype(FORMATS[base])
     if kind == Nodetype.ARRAY:
         return lambda value: np.array(value, dtype)
 
     def to_sequence(value: Any) -> Any:
-        if isinstance(value, np.ndarray):
-            return array.array(code, value.astype(dtype, copy=False).tobytes())
-        return array.array(code, value)
+        return Numbers(dtype.char, value.tolist() if isinstance(value, np.ndarray) else value)
 
     return to_sequence
 
 
-def _default(typename: str, field: str, description: Any) -> Callable[[], Any]:
+def _from_bytes(description: Description) -> Callable[[Any], Any] | None:
+    """What makes of a value that rosbags read what is kept; None where it is kept as it is."""
+    kind, detail = description
+    if kind == Nodetype.BASE:
+        return (lambda value: Octet([value % 256])) if detail[0] == "byte" else None
+    if kind == Nodetype.NAME or detail[0][0] == Nodetype.NAME or detail[0][1][0] == "string":
+        return None
+    base = detail[0][1][0]
+    if base == "bool":
+        return lambda values: Flags(values.tolist())
+    if base == "byte":
+        return lambda values: Flags(bytes([value % 256]) for value in values.tolist())
+    code = FORMATS[base]
+    return None if kind == Nodetype.ARRAY else lambda values: Numbers(code, values.tobytes())
+
+
+def _make_reader(cls: type, fields: Any) -> Callable[..., Any]:
+    """Function that makes a message of the values of its fields as rosbags read them."""
+    conversions = [(f"_{field}", _from_bytes(description)) for field, description in fields]
+    names: dict[str, Any] = {"new": object.__new__, "cls": cls}
+    lines = [f"def read({', '.join(slot for slot, _ in conversions)}):", "    m = new(cls)"]
+    for slot, convert in conversions:
+        names[f"convert{slot}"] = convert
+        lines.append(f"    m.{slot} = {f'convert{slot}({slot})' if convert else slot}")
+    exec("\n".join([*lines, "    return m"]), names)
+    return names["read"]
+
+
+def _default(typename: str, field: str, description: Description) -> Callable[[], Any]:
     """Function that makes the default value of a field."""
     kind, detail = description
     if kind == Nodetype.NAME:
         return message_class(detail)
     if kind == Nodetype.BASE:
-        zero = {"bool": False, "byte": b"\0", "string": "", "float32": 0.0, "float64": 0.0}.get(detail[0], 0)
+        zero = Octet(1) if detail[0] == "byte" else ZEROS.get(detail[0], 0)
         value = DEFAULTS.get((typename, field), zero)
         return lambda: value
-    if cdr.is_numeric(description):
-        code = cdr.FORMATS[detail[0][1][0]]
-        if kind == Nodetype.ARRAY:
-            return lambda: np.zeros(detail[1], code)
-        return lambda: array.array(code)
-    item = _default(typename, field, detail[0])
-    count = detail[1] if kind == Nodetype.ARRAY else 0
-    return lambda: [item() for _ in range(count)]
+    item, count = _default(typename, field, detail[0]), detail[1] if kind == Nodetype.ARRAY else 0
+    convert = _converter(description) or list
+    return lambda: convert([item() for _ in range(count)])
 
 
-def _make_init(cls: type, typename: str, fields: cdr.Fields) -> Callable[..., None]:
+def _make_init(typename: str, fields: Any) -> Callable[..., None]:
     """`__init__` with one keyword argument a field; what is not given gets its default."""
     names: dict[str, Any] = {}
     lines = [f"def __init__(self, *, {', '.join(f'{field}=None' for field, _ in fields)}):"]
@@ -268,64 +250,16 @@ def _make_init(cls: type, typename: str, fields: cdr.Fields) -> Callable[..., No
     return names["__init__"]
 
 
-def _checked(field: str, description: Any) -> Callable[[Any], Any]:
-    def checked(value: Any) -> Any:
-        check_field(field, description, value)
-        return value
-
-    return checked
-
-
-def check_message(message: Message) -> None:
-    """Raise AssertionError that names the first field, nested ones included, whose value does not fit."""
-    for field, description in STORE.fielddefs[message.TYPENAME][1]:
+def fault(message: Message) -> str | None:
+    """The first field, nested ones included, that cannot be sent, in a sentence; None if all can."""
+    for field, _ in STORE.fielddefs[message.TYPENAME][1]:
         value = getattr(message, f"_{field}")
-        check_field(field, description, value)
-        for item in value if isinstance(value, list) else [value]:
-            if isinstance(item, Message):
-                check_message(item)
-
-
-def check_field(field: str, description: Any, value: Any) -> None:
-    """Raise AssertionError if a value does not fit the type of a field, as generated code of ROS 2 does."""
-    kind, detail = description
-    if kind == Nodetype.NAME:
-        expected = f"a message of type {detail}"
-        good = isinstance(value, message_class(detail))
-    elif kind == Nodetype.BASE:
-        expected = f"of type {detail[0]}"
-        good = _fits(detail[0], value)
-    else:
-        item, count = detail
-        limit = f"at most {count}" if kind == Nodetype.SEQUENCE else str(count)
-        type_ = item[1] if item[0] == Nodetype.NAME else item[1][0]
-        expected = f"{limit if count else 'any number of'} values of type {type_}"
-        good = _items_fit(kind, item, count, value)
-    assert good, f"field '{field}' must be {expected}, found {value!r}"
-
-
-def _items_fit(kind: int, item: Any, count: int, value: Any) -> bool:
-    """As ROS 2 has it, a NumPy array fits an array of its own type, but no sequence."""
-    is_block = isinstance(value, np.ndarray) and kind == Nodetype.ARRAY and item[0] == Nodetype.BASE
-    if isinstance(value, str) or not (is_block or isinstance(value, (Sequence, Set, array.array))):
-        return False
-    if count and (len(value) != count if kind == Nodetype.ARRAY else len(value) > count):
-        return False
-    if is_block:
-        return bool(value.ndim == 1 and value.dtype == np.dtype(cdr.FORMATS[item[1][0]]))
-    if item[0] == Nodetype.NAME:
-        return all(isinstance(v, message_class(item[1])) for v in value)
-    return all(_fits(item[1][0], v) for v in value)
-
-
-def _fits(base: str, value: Any) -> bool:
-    if base == "bool":
-        return isinstance(value, bool)
-    if base == "string":
-        return isinstance(value, str)
-    if base == "byte":
-        return isinstance(value, bytes) and len(value) == 1
-    if base in ("float32", "float64"):
-        return isinstance(value, float) and not np.finfo(base).max < abs(value) < float("inf")
-    limits = np.iinfo("uint8" if base == "char" else base)
-    return isinstance(value, int) and limits.min <= value <= limits.max
+        if isinstance(value, Message) and (inner := fault(value)):
+            return inner
+        alone = type(message)()
+        setattr(alone, f"_{field}", value)
+        try:
+            STORE.serialize_cdr(alone, message.TYPENAME)
+        except Exception as error:
+            return f"field '{field}' holds {value!r}: {error}"
+    return None

@@ -3,31 +3,20 @@
 Topics are `rt/NAME` with type `PKG::msg::dds_::NAME_`; services are the pair `rq/NAMERequest`,
 `rr/NAMEReply`, each sample led by the request header of rmw_cyclonedds (a 64-bit client id and a 64-bit
 sequence number). rmw_fastrtps matches replies by the RTPS sample identity instead, so topics work with both,
-service calls with rmw_cyclonedds alone.
+service calls with rmw_cyclonedds alone: it is known by its user data, and calls of others are left alone.
 """
 
 from __future__ import annotations
 
-import ctypes
+import contextlib
 import os
 import struct
-import time
 import uuid
 from collections.abc import Iterator
 from typing import Any
 
-from cyclonedds._clayer import ddspy_take, ddspy_write
-from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription
-from cyclonedds.core import (
-    DDSException,
-    Entity,
-    GuardCondition,
-    InstanceState,
-    ReadCondition,
-    SampleState,
-    ViewState,
-)
-from cyclonedds.core import WaitSet as DdsWaitSet
+from cyclonedds import builtin, core
+from cyclonedds.core import DDSException, InstanceState
 from cyclonedds.domain import Domain, DomainParticipant
 from cyclonedds.pub import DataWriter
 from cyclonedds.qos import Policy, Qos
@@ -37,7 +26,7 @@ from cyclonedds.util import duration
 
 from quadvel_dds import idl, messages
 
-ANY = SampleState.Any | ViewState.Any | InstanceState.Any
+ANY = core.SampleState.Any | core.ViewState.Any | InstanceState.Any
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
 # Cyclone drops what comes over other interfaces than these, and ROS 2 looks for nodes of its host on this one.
@@ -45,6 +34,7 @@ LOOPBACK = '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
 # How often participants introduce themselves to their peers: ROS 2 may start later, and by default it calls
 # over multicast alone, which nodes that stay on this host do not hear.
 ANNOUNCEMENT = "2 s"
+REACHES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
 _domains: dict[int, Domain] = {}
 
 
@@ -52,10 +42,8 @@ def domain_configuration() -> str:
     """Cyclone's settings for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
     peers = [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
-    if reach not in ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF"):
-        raise ValueError(
-            f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected LOCALHOST, SUBNET, SYSTEM_DEFAULT or OFF"
-        )
+    if reach not in REACHES:
+        raise ValueError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected {', '.join(REACHES)}")
     general = discovery = ""
     if reach == "LOCALHOST":
         peers.insert(0, "localhost")
@@ -75,45 +63,42 @@ def domain_configuration() -> str:
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
 
 
-def delete(entity: Entity) -> None:
+def delete(entity: core.Entity) -> None:
     """Delete a DDS entity now. Cyclone offers this in its finaliser alone; a second call is harmless."""
     entity.__del__()
 
 
 class Participant:
-    """One process (context) on the domain: makes readers and writers and tells who else is there."""
+    """One process on the domain: makes readers and writers and tells who else is there."""
 
     def __init__(self, domain_id: int) -> None:
         if domain_id not in _domains:
             _domains[domain_id] = Domain(domain_id, domain_configuration())
         self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
-        self.gid = self.dds.get_guid().bytes
+        self.gid = self.dds.guid.bytes
         self._topics: dict[tuple[str, str], Topic[Any]] = {}
         self._builtin = {
-            topic: BuiltinDataReader(self.dds, topic)
-            for topic in (BuiltinTopicDcpsPublication, BuiltinTopicDcpsSubscription)
+            "publication": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsPublication),
+            "subscription": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsSubscription),
         }
 
-    def topic(self, name: str, typename: str) -> Topic[Any]:
-        key = (name, typename)
-        if key not in self._topics:
-            self._topics[key] = Topic(self.dds, name, idl.struct(typename))
-        return self._topics[key]
-
     def writer(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Writer:
-        qos = to_dds_qos(profile, user_data + _hash_text(typename))
-        return Writer(DataWriter(self.dds, self.topic(topic, typename), qos))
+        return Writer(DataWriter(self.dds, *self._as_dds(topic, typename, profile, user_data)))
 
     def reader(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Reader:
-        qos = to_dds_qos(profile, user_data + _hash_text(typename))
-        return Reader(DataReader(self.dds, self.topic(topic, typename), qos))
+        return Reader(DataReader(self.dds, *self._as_dds(topic, typename, profile, user_data)))
+
+    def _as_dds(self, topic: str, typename: str, profile: Any, user_data: str) -> tuple[Topic[Any], Qos]:
+        key = (topic, typename)
+        if key not in self._topics:
+            self._topics[key] = Topic(self.dds, topic, idl.struct(typename))
+        type_hash = f"typehash={messages.type_hash(typename)};"
+        return self._topics[key], to_dds_qos(profile, user_data + type_hash)
 
     def endpoints(self, kind: str) -> Iterator[Any]:
         """All writers ("publication") or readers ("subscription") on the domain, our own included."""
-        topic = BuiltinTopicDcpsPublication if kind == "publication" else BuiltinTopicDcpsSubscription
-        for endpoint in self._builtin[topic].read(N=100_000):
-            if endpoint.sample_info.instance_state == InstanceState.Alive:
-                yield endpoint
+        found = self._builtin[kind].read(N=100_000)
+        return (end for end in found if end.sample_info.instance_state == InstanceState.Alive)
 
     def count(self, kind: str, topic: str) -> int:
         return sum(endpoint.topic_name == topic for endpoint in self.endpoints(kind))
@@ -127,28 +112,20 @@ class Writer:
 
     def __init__(self, dds: DataWriter[Any]) -> None:
         self.dds = dds
-        self.handle = dds.get_instance_handle() % 2**64  # Cyclone's Python layer gives it a sign
-        self.gid = dds.get_guid().bytes
+        self.handle = dds.instance_handle % 2**64  # Cyclone's Python layer gives it a sign
+        self.gid = dds.guid.bytes
+        self._sample: Any = dds.topic.data_type
 
-    def write(self, data: bytearray) -> None:
-        code = ddspy_write(self.dds._ref, data)
-        if code < 0:
-            raise DDSException(code, f"while writing to {self.dds.topic.name}")
+    def write(self, data: bytes | bytearray) -> None:
+        self.dds.write(self._sample(data))
 
-    def matched(self) -> int:
+    def matched(self) -> list[Any]:
+        """The readers that get what is written."""
+        found = (self.dds.get_matched_subscription_data(h) for h in self.dds.get_matched_subscriptions())
+        return [reader for reader in found if reader is not None]
+
+    def count(self) -> int:
         return len(self.dds.get_matched_subscriptions())
-
-    def matches_participant(self, key: Any) -> bool:
-        handles = self.dds.get_matched_subscriptions()
-        matches = [self.dds.get_matched_subscription_data(handle) for handle in handles]
-        return any(match is not None and match.participant_key == key for match in matches)
-
-    def wait_for_acks(self, timeout_ns: int) -> bool:
-        # The Python layer's own wait_for_acks trips over its own time-out (cyclonedds 11.0.1).
-        code = self.dds._wait_for_acks(self.dds._ref, timeout_ns)
-        if code not in (DDSException.DDS_RETCODE_OK, DDSException.DDS_RETCODE_TIMEOUT):
-            raise DDSException(code, f"while waiting for acknowledgements of {self.dds.topic.name}")
-        return bool(code == DDSException.DDS_RETCODE_OK)
 
     def close(self) -> None:
         delete(self.dds)
@@ -159,23 +136,25 @@ class Reader:
 
     def __init__(self, dds: DataReader[Any]) -> None:
         self.dds = dds
-        self.condition = ReadCondition(dds, ANY)
-        self.gid = dds.get_guid().bytes
+        self.condition = core.ReadCondition(dds, ANY)
+        self.gid = dds.guid.bytes
         self.is_closed = False
+
+    def has_data(self) -> bool:
+        return not self.is_closed and self.condition.triggered
 
     def take(self) -> tuple[bytes, Any] | None:
         """The oldest sample that waits and its DDS sample info, or None."""
         while not self.is_closed:
-            samples = ddspy_take(self.dds._ref, ANY, 1)
-            if isinstance(samples, int):
-                raise DDSException(samples, f"while reading {self.dds.topic.name}")
+            samples = self.dds.take(1)
             if not samples:
                 return None
-            if samples[0][1].valid_data:  # else: news of a writer that left, which ROS 2 does not tell
-                return samples[0]
+            info = samples[0].sample_info
+            if info.valid_data:  # else: news of a writer that left, which ROS 2 does not tell
+                return samples[0].data, info
         return None
 
-    def matched(self) -> int:
+    def count(self) -> int:
         return len(self.dds.get_matched_publications())
 
     def writer_of(self, info: Any) -> Any:
@@ -192,33 +171,31 @@ class WaitSet:
     """Waits until one of a changing set of readers has data, or until another thread wakes it."""
 
     def __init__(self, participant: Participant) -> None:
-        self.dds = DdsWaitSet(participant.dds)
-        self.guard = GuardCondition(participant.dds)
-        self.dds._waitset_attach(self.dds._ref, self.guard._ref, 0)
-        self.readers: dict[int, Reader] = {}
-        self.update({})
+        self.dds = core.WaitSet(participant.dds)
+        self.guard = core.GuardCondition(participant.dds)
+        self.dds.attach(self.guard)
+        self.readers: set[Reader] = set()
 
-    def update(self, readers: dict[int, Reader]) -> None:
-        """Wait for these readers from now on; the keys, all above 0, tell which have data."""
-        for key in self.readers.keys() - readers.keys():
-            self.dds._waitset_detach(self.dds._ref, self.readers[key].condition._ref)
-        for key in readers.keys() - self.readers.keys():
-            self.dds._waitset_attach(self.dds._ref, readers[key].condition._ref, key)
+    def update(self, readers: set[Reader]) -> None:
+        """Wait for these readers from now on."""
+        for reader in self.readers - readers:
+            try:
+                self.dds.detach(reader.condition)
+            except DDSException:  # it is closed, and so detached, but Cyclone's Python layer still holds it
+                self.dds.attached = [pair for pair in self.dds.attached if pair[0] is not reader.condition]
+        for reader in readers - self.readers:
+            self.dds.attach(reader.condition)
         self.readers = readers
-        self._triggered = (ctypes.c_void_p * (len(readers) + 1))()
 
-    def wait(self, timeout_ns: int) -> set[int]:
-        """Keys of the readers that have data; empty after the time-out, a wake-up, or once this is closed."""
-        triggered = self._triggered
-        count = self.dds._waitset_wait(self.dds._ref, triggered, len(triggered), timeout_ns)
-        keys = {key for key in triggered[: max(count, 0)] if key}
-        if len(keys) < count:
-            self.guard._take_guardcondition(self.guard._ref, ctypes.byref(ctypes.c_bool()))
-        return keys
+    def wait(self, timeout_ns: int) -> None:
+        """Until a reader has data, the time-out, or a wake-up; returns at once if the participant has left."""
+        with contextlib.suppress(DDSException):
+            self.dds.wait(timeout_ns)
+            self.guard.take()
 
     def wake(self) -> None:
-        # Not `guard.set`, which complains if the participant has left.
-        self.guard._set_guardcondition(self.guard._ref, True)
+        with contextlib.suppress(DDSException):  # the participant has left
+            self.guard.set(True)
 
     def close(self) -> None:
         delete(self.guard)
@@ -228,29 +205,33 @@ class WaitSet:
 class CallEndpoint:
     """A client's or a service's writer and reader; every sample starts with (client id, sequence number)."""
 
-    def __init__(
-        self, participant: Participant, typename: str, name: str, profile: Any, serves: bool
-    ) -> None:
+    def __init__(self, place: Participant, typename: str, name: str, profile: Any, serves: bool) -> None:
         # Tells which writer and reader belong together, as in rmw_cyclonedds.
         identity = ".".join(f"{byte:02x}" for byte in uuid.uuid4().bytes)
-        user_data = f"{'serviceid' if serves else 'clientid'}={identity};"
+        own, self._other = ("serviceid=", "clientid=") if serves else ("clientid=", "serviceid=")
         request = (f"rq{name}Request", f"{typename}_Request")
         reply = (f"rr{name}Reply", f"{typename}_Response")
         outgoing, incoming = (reply, request) if serves else (request, reply)
-        self.writer = participant.writer(*outgoing, profile, user_data)
-        self.reader = participant.reader(*incoming, profile, user_data)
+        self.writer = place.writer(*outgoing, profile, f"{own}{identity};")
+        self.reader = place.reader(*incoming, profile, f"{own}{identity};")
         self.client_id = self.writer.handle
 
-    def ask(self, request: Any, number: int) -> None:
-        self.writer.write(messages.serialize(request, REQUEST_HEADER.pack(self.client_id, number)))
+    def understands(self, endpoint: Any) -> bool:
+        """Whether an endpoint of the other side matches requests and replies as we do."""
+        return Policy.Userdata in endpoint.qos and self._other in endpoint.qos[Policy.Userdata].data.decode()
 
-    def answer(self, response: Any, request_id: tuple[int, int], client: Any, timeout: float = 0.1) -> bool:
-        """Answer once the client's reader is matched (before, it would be lost); False if it never is."""
-        deadline = time.monotonic() + timeout
-        while not self.writer.matches_participant(client.participant_key):
-            if time.monotonic() > deadline:
-                return False
-            time.sleep(0.002)
+    def is_matched(self) -> bool:
+        return self.reader.count() > 0 and any(map(self.understands, self.writer.matched()))
+
+    def ask(self, request: Any, number: int) -> None:
+        """Send a request, if somebody is there who understands it."""
+        if self.is_matched():
+            self.writer.write(messages.serialize(request, REQUEST_HEADER.pack(self.client_id, number)))
+
+    def answer(self, response: Any, request_id: tuple[int, int], client: Any) -> bool:
+        """Answer if the client's reader is matched, and say whether it is: before, the answer would be lost."""
+        if all(reader.participant_key != client.participant_key for reader in self.writer.matched()):
+            return False
         self.writer.write(messages.serialize(response, REQUEST_HEADER.pack(*request_id)))
         return True
 
@@ -261,9 +242,6 @@ class CallEndpoint:
         client_id, number = REQUEST_HEADER.unpack_from(data, 4)
         return (client_id, number), messages.deserialize(data, typename, REQUEST_HEADER.size)
 
-    def is_matched(self) -> bool:
-        return self.writer.matched() > 0 and self.reader.matched() > 0
-
     def close(self) -> None:
         self.writer.close()
         self.reader.close()
@@ -271,30 +249,18 @@ class CallEndpoint:
 
 def to_dds_qos(profile: Any, user_data: str) -> Qos:
     """DDS QoS of a `rclpy.qos.QoSProfile`, as rmw_cyclonedds maps it."""
-    depth = max(profile.depth, 1)
     keep_all = profile.history.name == "KEEP_ALL"
-    history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(depth)
-    best_effort = profile.reliability.name == "BEST_EFFORT"
-    lease = profile.liveliness_lease_duration.nanoseconds or duration(infinite=True)
-    by_topic = profile.liveliness.name == "MANUAL_BY_TOPIC"
+    history = Policy.History.KeepAll if keep_all else Policy.History.KeepLast(max(profile.depth, 1))
+    reliable = Policy.Reliability.Reliable(duration(infinite=True))
     policies = [
         history,
-        Policy.Reliability.BestEffort
-        if best_effort
-        else Policy.Reliability.Reliable(duration(infinite=True)),
-        Policy.Liveliness.ManualByTopic(lease) if by_topic else Policy.Liveliness.Automatic(lease),
+        Policy.Reliability.BestEffort if profile.reliability.name == "BEST_EFFORT" else reliable,
         Policy.Userdata(user_data.encode()),
         Policy.WriterDataLifecycle(autodispose=False),
         Policy.DataRepresentation(use_cdrv0_representation=True, use_xcdrv2_representation=False),
     ]
     if profile.durability.name == "TRANSIENT_LOCAL":
         policies += [Policy.Durability.TransientLocal, Policy.DurabilityService(0, history, -1, -1, -1)]
-    if profile.deadline.nanoseconds:
-        policies.append(Policy.Deadline(profile.deadline.nanoseconds))
     if profile.lifespan.nanoseconds:
         policies.append(Policy.Lifespan(profile.lifespan.nanoseconds))
     return Qos(*policies)
-
-
-def _hash_text(typename: str) -> str:
-    return f"typehash={messages.type_hash(typename)};"

@@ -7,7 +7,6 @@ thread. What the operator's remote asks for becomes cmd_vel_teleop, command_lock
 from __future__ import annotations
 
 import gc
-import sys
 import time
 from collections import deque
 from threading import Thread
@@ -22,15 +21,15 @@ from std_srvs.srv import SetBool
 
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
 from .calibration import Calibration
 from .dry_run import DryRun
-from .health import Health, figures
+from .health import Health, Level, figures
 from .link import NO_CALIBRATION, SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
@@ -39,6 +38,7 @@ from .wire import BoardState
 
 OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_teleop
 LOCK_EVERY = 5  # of these periods: a stop is said again, to whoever came later
+GRACE = 3  # reports, one a second, in which a board may be silent that is only being started
 VIEW_RATE = 50  # Hz, of what `RobotView` publishes
 # Standard deviations of the IMU, rad, rad/s, m/s^2: of its class; those of the AlienGo's own are not known.
 ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION = 0.002, 0.01, 0.1
@@ -61,6 +61,7 @@ class Driver(Node):
         self._system_time = SystemTime()
         self._thinning, self._view_thinning = Thinning(settings.state_rate), Thinning(VIEW_RATE)
         self._operator_ticks = 0
+        self._reports = 0
         self._passive_wanted = False
         self._said = ""
         self._failure = ""
@@ -196,12 +197,16 @@ class Driver(Node):
     def _report(self) -> None:
         """Once a second: /diagnostics."""
         if self._failure:
-            sys.exit(f"driver: {self._failure}")
+            end(self, f"driver: {self._failure}")
+            return
         report = self._link.report()
         level, summary = self._health.judge(report, self._newest, self._pilot.stopped)
         values = {**figures(report, self._newest), "stopped": self._pilot.stopped, **self._refusals.values()}
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), bytes([level]), summary, values))
+        self._reports += 1
+        if level > Level.OK and self._reports > GRACE:
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
 
 
 def main(args: list[str] | None = None) -> None:

@@ -14,8 +14,8 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_dds.recordings import read_messages
 from quadvel_nodes.messages import seconds
+from quadvel_recordings.reading import read_messages
 
 Array = NDArray[np.float64]
 

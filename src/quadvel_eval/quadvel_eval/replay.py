@@ -17,11 +17,11 @@ from scipy.interpolate import interp1d
 from scipy.signal import savgol_filter
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_dds.recordings import read_messages
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
+from quadvel_recordings.reading import read_messages
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
 

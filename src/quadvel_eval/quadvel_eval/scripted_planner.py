@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from typing import Any
 
 import attrs
@@ -12,7 +11,7 @@ from std_msgs.msg import String
 
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.node import end, read_parameters, run
 
 from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 
@@ -53,9 +52,11 @@ class ScriptedPlanner(Node):
         try:
             action = self._runner.update(1e-9 * self.get_clock().now().nanoseconds, self._mode, self._reason)
         except ScriptError as error:
-            sys.exit(f"planner: {error}")
+            end(self, f"planner: {error}")
+            return
         if action is None:
-            sys.exit()
+            end(self)
+            return
         if action.step != self._step:
             self._step = action.step
             self._announcement.publish(String(data=action.step))

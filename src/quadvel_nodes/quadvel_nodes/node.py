@@ -5,21 +5,25 @@ from __future__ import annotations
 import signal
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from socket import socket, socketpair
 from threading import Event, Thread
 from types import FrameType
 from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 import attrs
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 Config = TypeVar("Config")
 STOPS = (signal.SIGINT, signal.SIGTERM)
+LONGEST_WAIT = 60.0
+"""s, between two looks whether a node goes on; without a limit the executor of events of rclpy 7.1.6 spins"""
 
 
 class StartError(ValueError):
@@ -53,8 +57,21 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         raise StartError(f"parameters: {error.args[0]}") from error
 
 
+_endings: WeakKeyDictionary[Node, str] = WeakKeyDictionary()
+
+
+def end(node: Node, error: str = "") -> None:
+    """Have `run` end the node: with exit code 0, or with 1 and the sentence `error` if there is one.
+
+    What a callback does instead of sys.exit, which under rclpy may abort the process. Comes back to its caller.
+    """
+    _endings.setdefault(node, error)
+    if (executor := node.executor) is not None:
+        executor.create_task(lambda: None)  # ends its wait, if another thread calls
+
+
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Start a node and serve it until Ctrl-C or shutdown. If it cannot start: one sentence, exit code 1.
+    """Start a node and serve it until Ctrl-C, shutdown, or `end`. If it cannot start: one sentence, exit code 1.
 
     For the main of a process, which ends with it. SIGINT and SIGTERM end it between two callbacks, instead of
     pulling the context away under them as rclpy's own handlers do: they may come at any moment, and again, and cut
@@ -69,7 +86,7 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
     node = None
     try:
         node = _start(make_node, args)
-        _serve(node, receiver)
+        _serve(node, receiver, sender)
     except ExternalShutdownException:
         pass
     finally:
@@ -78,6 +95,8 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
         rclpy.try_shutdown()
         for number in STOPS:
             signal.signal(number, signal.SIG_IGN)  # while the interpreter ends
+    if error := _endings.get(node, ""):
+        sys.exit(error)
 
 
 def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
@@ -88,8 +107,11 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
         sys.exit(" ".join(str(error).split()))
 
 
-def _serve(node: Node, signals: socket) -> None:
-    """Run the node's callbacks until the first byte from `signals`, or until the context is shut down."""
+def _serve(node: Node, signals: socket, waker: socket) -> None:
+    """Run the node's callbacks until the first byte from `signals`, `end`, or the context's shutdown.
+
+    waker: the other end of `signals`. An executor of events that outlives this crashes the end of the interpreter.
+    """
     executor, stopped = _executor(), Event()
 
     def stop_at_signal() -> None:
@@ -98,12 +120,17 @@ def _serve(node: Node, signals: socket) -> None:
         executor.create_task(lambda: None)  # ends its wait
 
     executor.add_node(node)
-    Thread(target=stop_at_signal, daemon=True).start()
+    listener = Thread(target=stop_at_signal, daemon=True)
+    listener.start()
     try:
-        while rclpy.ok() and not stopped.is_set():
-            executor.spin_once()
+        while rclpy.ok() and not stopped.is_set() and node not in _endings:
+            executor.spin_once(timeout_sec=LONGEST_WAIT)
     finally:
+        with suppress(BlockingIOError):  # so many signals that nothing more fits: the listener has woken
+            waker.send(b"\0")
+        listener.join()
         executor.remove_node(node)
+        executor.shutdown()
 
 
 def _executor() -> Any:
@@ -114,7 +141,7 @@ def _executor() -> Any:
     try:
         from rclpy.experimental import EventsExecutor
     except ImportError:
-        return rclpy.get_global_executor()
+        return SingleThreadedExecutor()
     return EventsExecutor()
 
 

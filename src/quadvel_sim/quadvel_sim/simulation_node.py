@@ -6,7 +6,6 @@ How the robot is driven and what it reports is the matter of those that stand on
 from __future__ import annotations
 
 import gc
-import sys
 from collections.abc import Callable
 from threading import Thread
 from typing import Any, Generic, TypeVar
@@ -22,7 +21,7 @@ from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import QUIET, diagnostics
-from quadvel_nodes.node import read_parameters
+from quadvel_nodes.node import end, read_parameters
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
 from quadvel_nodes.system_time import SystemTime, as_time
 from quadvel_sim.config import SimulatorConfig
@@ -166,7 +165,8 @@ class SimulationNode(Node, Generic[Settings]):
     def _report(self) -> None:
         """Once a second: how the simulation does."""
         if self._failure:
-            sys.exit(f"{self.get_name()}: {self._failure}")
+            end(self, f"{self.get_name()}: {self._failure}")
+            return
         report = self._loop.report()
         level, summary = self._judge(report)
         values = {

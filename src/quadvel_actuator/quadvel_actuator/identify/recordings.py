@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_dds.recordings import RecordingError, read_messages
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_SERVO
+from quadvel_recordings.reading import RecordingError, read_messages
 
 from .log import Array, Log, LogError
 from .tables import drop_repeated_times, precision

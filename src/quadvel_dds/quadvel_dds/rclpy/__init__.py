@@ -5,150 +5,87 @@ Names, parameters and defaults are those of rclpy 7.1 (Jazzy). What is not here 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 if __name__ != "rclpy":
     raise ImportError("import this package as 'rclpy', after quadvel_dds.install()")
 
-from quadvel_dds.errors import module_getattr
+from quadvel_dds.errors import module_getattr, refuse_options
 
-from . import signals, utilities
-from .context import Context
+from .context import Context as Context
+from .context import get_default_context
 from .executors import Executor, SingleThreadedExecutor
-from .node import Node
-from .parameter import Parameter
-from .task import Future
-from .utilities import get_default_context, get_rmw_implementation_identifier, ok
+from .node import Node as Node
+from .parameter import Parameter as Parameter
+from .signals import SignalHandlerOptions
+from .task import Future as Future
 
-__all__ = [
-    "Context",
-    "Future",
-    "Node",
-    "Parameter",
-    "create_node",
-    "get_default_context",
-    "get_global_executor",
-    "get_rmw_implementation_identifier",
-    "init",
-    "ok",
-    "shutdown",
-    "spin",
-    "spin_once",
-    "spin_until_future_complete",
-    "try_shutdown",
-]
 __getattr__ = module_getattr(__name__, Path(__file__).parent)
-_global_executor: Executor | None = None
 
 
 def init(
-    *,
-    args: list[str] | None = None,
-    context: Context | None = None,
-    domain_id: int | None = None,
-    signal_handler_options: signals.SignalHandlerOptions | None = None,
-) -> None:
-    """Start communication: read the arguments (sys.argv if None), take over SIGINT and SIGTERM."""
-    default = get_default_context()
-    context = context or default
-    if signal_handler_options is None:
-        options = signals.SignalHandlerOptions
-        signal_handler_options = options.ALL if context is default else options.NO
-    context.init(args, domain_id=domain_id)
-    signals.install_signal_handlers(signal_handler_options)
+    *, args: list[str] | None = None, context: Context | None = None, domain_id: int | None = None,
+    signal_handler_options: SignalHandlerOptions | None = None,
+) -> None:  # fmt: skip
+    """Start communication: read the arguments (sys.argv if None). No signals are taken over: see `signals`."""
+    refuse_options("rclpy.init", context=context)
+    get_default_context().init(args, domain_id=domain_id)
 
 
 def shutdown(*, context: Context | None = None, uninstall_handlers: bool | None = None) -> None:
     """Stop communication. Raises RuntimeError if it does not run."""
-    is_default = context is None or context is get_default_context()
-    utilities.shutdown(context=context)
-    if uninstall_handlers or (uninstall_handlers is None and is_default):
-        signals.uninstall_signal_handlers()
+    refuse_options("rclpy.shutdown", context=context, uninstall_handlers=uninstall_handlers)
+    get_default_context(shutting_down=True).shutdown()
 
 
 def try_shutdown(*, context: Context | None = None) -> None:
     """Stop communication if it runs."""
-    utilities.try_shutdown(context=context)
+    refuse_options("rclpy.try_shutdown", context=context)
+    get_default_context(shutting_down=True).try_shutdown()
 
 
-def create_node(
-    node_name: str,
-    *,
-    context: Context | None = None,
-    cli_args: list[str] | None = None,
-    namespace: str | None = None,
-    use_global_arguments: bool = True,
-    enable_rosout: bool = True,
-    start_parameter_services: bool = True,
-    parameter_overrides: list[Parameter] | None = None,
-    allow_undeclared_parameters: bool = False,
-    automatically_declare_parameters_from_overrides: bool = False,
-    enable_logger_service: bool = False,
-) -> Node:
-    return Node(
-        node_name,
-        context=context,
-        cli_args=cli_args,
-        namespace=namespace,
-        use_global_arguments=use_global_arguments,
-        enable_rosout=enable_rosout,
-        start_parameter_services=start_parameter_services,
-        parameter_overrides=parameter_overrides,
-        allow_undeclared_parameters=allow_undeclared_parameters,
-        automatically_declare_parameters_from_overrides=automatically_declare_parameters_from_overrides,
-        enable_logger_service=enable_logger_service,
-    )
+def ok(*, context: Context | None = None) -> bool:
+    refuse_options("rclpy.ok", context=context)
+    return get_default_context().ok()
 
 
-def get_global_executor() -> Executor:
-    """The executor of the spin functions where none is given; it ends with the default context."""
+create_node = Node
+_global_executor: Executor | None = None
+
+
+@contextmanager
+def _added(node: Node, executor: Any) -> Iterator[Executor]:
+    """The executor given, or one that all calls share as long as the context lives, with the node in it."""
     global _global_executor
-    executor = _global_executor
-    if executor is None:
-        executor = _global_executor = SingleThreadedExecutor()
-        # Called at once if a signal has shut the context down already: the executor then ends at its first step.
-        get_default_context().on_shutdown(_forget_global_executor)
-    return executor
-
-
-def _forget_global_executor() -> None:
-    global _global_executor
-    executor, _global_executor = _global_executor, None
-    if executor is not None:
-        executor.wake()
+    if _global_executor is None or _global_executor.context is not get_default_context():
+        _global_executor = SingleThreadedExecutor()
+    executor = executor or _global_executor
+    is_new = executor.add_node(node)
+    try:
+        yield executor
+    finally:
+        if is_new:
+            executor.remove_node(node)
 
 
 def spin(node: Node, executor: Any = None) -> None:
     """Run the callbacks of a node until the context is shut down."""
-    executor = executor or get_global_executor()
-    try:
-        executor.add_node(node)
-        while executor.context.ok():
-            executor.spin_once()
-    finally:
-        executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin()
 
 
 def spin_once(node: Node, *, executor: Any = None, timeout_sec: float | None = None) -> None:
     """Run one callback; wait for it for `timeout_sec` (None or negative: for ever)."""
-    executor = executor or get_global_executor()
-    try:
-        executor.add_node(node)
-        executor.spin_once(timeout_sec=timeout_sec)
-    finally:
-        executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin_once(timeout_sec)
 
 
 def spin_until_future_complete(
     node: Node, future: Future, executor: Any = None, timeout_sec: float | None = None
 ) -> None:
     """Run callbacks until a future is done, the time is up, or the context is shut down."""
-    executor = executor or get_global_executor()
-    added = False
-    try:
-        added = executor.add_node(node)
-        executor.spin_until_future_complete(future, timeout_sec)
-    finally:
-        if added:
-            executor.remove_node(node)
+    with _added(node, executor) as serving:
+        serving.spin_until_future_complete(future, timeout_sec)

@@ -6,45 +6,35 @@ import atexit
 import os
 import sys
 import weakref
-from collections.abc import Callable, Sequence
-from threading import Lock, RLock
+from collections.abc import Sequence
+from threading import Lock
 from typing import Any
 
 from quadvel_dds import arguments, wire
+from quadvel_dds.errors import Partial
 
 from ._graph import GraphAnnouncer
+from .logging import set_levels
 
 _contexts: weakref.WeakSet[Context] = weakref.WeakSet()
+_default_context: Context | None = None
+_default_lock = Lock()
 
 
-def live_contexts() -> list[Context]:
-    return [context for context in list(_contexts) if context.ok()]
-
-
-class Context:
+class Context(Partial):
     def __init__(self) -> None:
-        self._lock = RLock()
-        self._running = self._initialized = False
+        self._running = False
         self._participant: wire.Participant | None = None
         self._participant_lock = Lock()
         self._announcer: GraphAnnouncer | None = None
         self._nodes: list[Any] = []
-        self._shutdown_callbacks: list[Callable[[], None]] = []
         self._wakers: weakref.WeakSet[Any] = weakref.WeakSet()
         self._domain_id = 0
         self.arguments = arguments.RosArguments()
 
-    def init(
-        self,
-        args: Sequence[str] | None = None,
-        *,
-        initialize_logging: bool = True,
-        domain_id: int | None = None,
-    ) -> None:
+    def init(self, args: Sequence[str] | None, domain_id: int | None = None) -> None:
         """Read the arguments (sys.argv if None) and join the domain given, or that of ROS_DOMAIN_ID."""
-        from .logging import set_levels
-
-        if self._initialized:
+        if self._running:
             raise RuntimeError("Context.init() must only be called once")
         if domain_id is None:
             text = os.environ.get("ROS_DOMAIN_ID") or "0"
@@ -53,9 +43,8 @@ class Context:
             domain_id = int(text)
         self._domain_id = domain_id
         self.arguments = arguments.parse(sys.argv if args is None else args)
-        if initialize_logging:
-            set_levels(self.arguments.log_levels)
-        self._initialized = self._running = True
+        set_levels(self.arguments.log_levels)
+        self._running = True
         _contexts.add(self)
 
     def ok(self) -> bool:
@@ -81,53 +70,34 @@ class Context:
         self.try_shutdown()
 
     def try_shutdown(self) -> None:
-        """Stop communication if it runs. Called by signal handlers, so it only tells others to end."""
-        with self._lock:
-            if not self._running:
-                return
+        """Stop communication if it runs. May be called by a signal handler: it only tells others to end."""
+        if self._running:
             self._running = False
-            callbacks, self._shutdown_callbacks = self._shutdown_callbacks, []
-        for callback in callbacks:
-            callback()
-        self._wake()
-        self._leave_if_unused()
-
-    def on_shutdown(self, callback: Callable[[], None]) -> None:
-        with self._lock:
-            if self._running:
-                self._shutdown_callbacks.append(callback)
-                return
-        callback()
-
-    def _forget_shutdown_callback(self, callback: Callable[[], None]) -> None:
-        with self._lock:
-            if callback in self._shutdown_callbacks:
-                self._shutdown_callbacks.remove(callback)
-
-    def _wake(self) -> None:
-        for executor in list(self._wakers):
-            executor.wake()
-
-    def _leave_if_unused(self) -> None:
-        """Leave the domain once the context is shut down and its last node destroyed."""
-        if not self._running and not self._nodes:
+            for executor in list(self._wakers):
+                executor.wake()
             self._leave()
 
-    def _leave(self) -> None:
+    def _leave(self, unless_used: bool = True) -> None:
+        """Leave the domain once the context is shut down and its last node destroyed."""
+        if unless_used and (self._running or self._nodes):
+            return
         participant, self._participant, self._announcer = self._participant, None, None
         if participant is not None:
             participant.close()
 
-    def __enter__(self) -> Context:
-        self.init()
-        return self
 
-    def __exit__(self, *exception: Any) -> None:
-        self.try_shutdown()
+def get_default_context(*, shutting_down: bool = False) -> Context:
+    """The context of this process; a new one after it was shut down."""
+    global _default_context
+    with _default_lock:
+        context = _default_context = _default_context or Context()
+        if shutting_down:
+            _default_context = None
+        return context
 
 
 @atexit.register
 def _leave_all() -> None:
     for context in list(_contexts):
         context.try_shutdown()
-        context._leave()
+        context._leave(unless_used=False)

@@ -2,53 +2,14 @@
 
 from __future__ import annotations
 
-from functools import total_ordering
-from typing import Any
-
-from builtin_interfaces.msg import Duration as DurationMessage
-
-from quadvel_dds.errors import unsupported
+from quadvel_dds.errors import Partial, unsupported
 
 S_TO_NS = 10**9
 
 
-@total_ordering
-class Duration:
+class Duration(Partial):
     def __init__(self, *, seconds: int | float = 0, nanoseconds: int = 0) -> None:
-        total = int(seconds * S_TO_NS) + int(nanoseconds)
-        if not -(2**63) <= total < 2**63:
-            raise OverflowError("Total nanoseconds value is too large to store in C duration.")
-        self._nanoseconds = total
+        self.nanoseconds = int(seconds * S_TO_NS) + int(nanoseconds)
 
-    @property
-    def nanoseconds(self) -> int:
-        return self._nanoseconds
-
-    def __repr__(self) -> str:
-        return f"Duration(nanoseconds={self.nanoseconds})"
-
-    def __str__(self) -> str:
-        return f"{self.nanoseconds} nanoseconds"
-
-    def __eq__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self.nanoseconds == other.nanoseconds
-        return NotImplemented
-
-    def __lt__(self, other: object) -> bool:
-        if isinstance(other, Duration):
-            return self.nanoseconds < other.nanoseconds
-        return NotImplemented
-
-    def __hash__(self) -> int:
-        return hash(self.nanoseconds)
-
-    def to_msg(self) -> Any:
-        seconds, nanoseconds = divmod(self.nanoseconds, S_TO_NS)
-        return DurationMessage(sec=seconds, nanosec=nanoseconds)
-
-    @classmethod
-    def from_msg(cls, msg: Any) -> Duration:
-        return cls(seconds=msg.sec, nanoseconds=msg.nanosec)
-
-    get_c_duration = unsupported("Duration.get_c_duration")
+    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing durations")
+    __hash__ = None  # type: ignore[assignment]

@@ -1,12 +1,15 @@
-"""Loggers of ROS 2."""
+"""Loggers of ROS 2: lines on stderr, and messages on /rosout."""
 
 from __future__ import annotations
 
+import sys
+import time
+from collections.abc import Callable
 from enum import IntEnum
+from functools import partialmethod
+from typing import Any
 
-from quadvel_dds.errors import module_getattr
-
-from .impl.rcutils_logger import RcutilsLogger, levels
+from quadvel_dds.errors import Partial, module_getattr
 
 __getattr__ = module_getattr(__name__)
 
@@ -18,6 +21,54 @@ class LoggingSeverity(IntEnum):
     WARN = 30
     ERROR = 40
     FATAL = 50
+
+
+levels: dict[str, int] = {"": LoggingSeverity.INFO}  # by logger name; "" is the default
+sinks: dict[str, Callable[[int, str, str, int, Any], None]] = {}
+"""Who else is told, by logger name: (level, name, message, time in ns, frame of the caller)."""
+
+
+class RcutilsLogger(Partial):
+    """Logger with names in a hierarchy ("node.part"); keyword options of each method are those of `_log`."""
+
+    def __init__(self, name: str = "") -> None:
+        self.name = name
+        self._places: dict[tuple[str, int], float] = {}
+
+    def set_level(self, level: int) -> None:
+        levels[self.name] = int(level)
+
+    def get_effective_level(self) -> int:
+        name = self.name
+        while name and not levels.get(name):
+            name = name.rpartition(".")[0]
+        return int(levels[name])
+
+    def _log(
+        self, severity: LoggingSeverity, message: str, *, once: bool = False, throttle_duration_sec: float = 0
+    ) -> bool:
+        """Whether it was said. once, throttle_duration_sec: how often, for each place in the program."""
+        if severity < self.get_effective_level():
+            return False
+        frame = sys._getframe(1)
+        place = (frame.f_code.co_filename, frame.f_lineno)
+        now, last = time.monotonic(), self._places.get(place, float("-inf"))
+        if now - last < throttle_duration_sec or (once and place in self._places):
+            return False
+        if once or throttle_duration_sec:
+            self._places[place] = now
+        stamp = time.time_ns()
+        seconds = f"{stamp // 10**9}.{stamp % 10**9:09d}"
+        print(f"[{severity.name}] [{seconds}] [{self.name}]: {message}", file=sys.stderr, flush=True)
+        if sink := sinks.get(self.name.partition(".")[0]) or sinks.get(self.name):
+            sink(severity, self.name, str(message), stamp, frame)
+        return True
+
+    debug = partialmethod(_log, LoggingSeverity.DEBUG)
+    info = partialmethod(_log, LoggingSeverity.INFO)
+    warning = partialmethod(_log, LoggingSeverity.WARN)
+    error = partialmethod(_log, LoggingSeverity.ERROR)
+    fatal = partialmethod(_log, LoggingSeverity.FATAL)
 
 
 def get_logger(name: str) -> RcutilsLogger:

@@ -2,82 +2,38 @@
 
 from __future__ import annotations
 
-from functools import total_ordering
+from enum import IntEnum
 from typing import Any
 
 from builtin_interfaces.msg import Time as TimeMessage
 
-from .clock_type import ClockType
-from .duration import S_TO_NS, Duration
+from quadvel_dds.errors import Partial, unsupported
+
+from .duration import S_TO_NS
 
 
-@total_ordering
-class Time:
+class ClockType(IntEnum):
+    UNINITIALIZED = 0
+    ROS_TIME = 1
+    SYSTEM_TIME = 2
+    STEADY_TIME = 3
+
+
+class Time(Partial):
     def __init__(
         self, *, seconds: int | float = 0, nanoseconds: int = 0, clock_type: ClockType = ClockType.SYSTEM_TIME
     ) -> None:
-        if not isinstance(clock_type, ClockType):
-            raise TypeError("Clock type must be a ClockType enum")
-        if seconds < 0:
-            raise ValueError("Seconds value must not be negative")
-        if nanoseconds < 0:
-            raise ValueError("Nanoseconds value must not be negative")
-        total = int(seconds * S_TO_NS) + int(nanoseconds)
-        if total >= 2**63:
-            raise OverflowError("Total nanoseconds value is too large to store in C time point.")
-        self._nanoseconds = total
-        self._clock_type = clock_type
+        if seconds < 0 or nanoseconds < 0:
+            raise ValueError("Seconds and nanoseconds values must not be negative")
+        self.nanoseconds = int(seconds * S_TO_NS) + int(nanoseconds)
+        self.clock_type = ClockType(clock_type)
 
-    @property
-    def nanoseconds(self) -> int:
-        return self._nanoseconds
-
-    @property
-    def clock_type(self) -> ClockType:
-        return self._clock_type
-
-    def seconds_nanoseconds(self) -> tuple[int, int]:
-        return divmod(self.nanoseconds, S_TO_NS)
-
-    def __repr__(self) -> str:
-        return f"Time(nanoseconds={self.nanoseconds}, clock_type={self.clock_type.name})"
-
-    def __add__(self, other: object) -> Time:
-        if not isinstance(other, Duration):
-            return NotImplemented
-        return Time(nanoseconds=self.nanoseconds + other.nanoseconds, clock_type=self.clock_type)
-
-    __radd__ = __add__
-
-    def __sub__(self, other: object) -> Any:
-        if isinstance(other, Time):
-            self._check_same_clock(other, "subtract times")
-            return Duration(nanoseconds=self.nanoseconds - other.nanoseconds)
-        if isinstance(other, Duration):
-            return Time(nanoseconds=self.nanoseconds - other.nanoseconds, clock_type=self.clock_type)
-        return NotImplemented
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Time):
-            return NotImplemented
-        self._check_same_clock(other, "compare times")
-        return self.nanoseconds == other.nanoseconds
-
-    def __lt__(self, other: object) -> bool:
-        if not isinstance(other, Time):
-            return NotImplemented
-        self._check_same_clock(other, "compare times")
-        return self.nanoseconds < other.nanoseconds
-
-    def __hash__(self) -> int:
-        return hash((self.nanoseconds, self.clock_type))
-
-    def _check_same_clock(self, other: Time, what: str) -> None:
-        if self.clock_type != other.clock_type:
-            raise TypeError(f"Can't {what} with different clock types")
+    __eq__ = __lt__ = __le__ = __gt__ = __ge__ = unsupported("comparing times")
+    __add__ = __sub__ = unsupported("computing with times")
+    __hash__ = None  # type: ignore[assignment]
 
     def to_msg(self) -> Any:
-        seconds, nanoseconds = self.seconds_nanoseconds()
+        seconds, nanoseconds = divmod(self.nanoseconds, S_TO_NS)
         return TimeMessage(sec=seconds, nanosec=nanoseconds)
 
     @classmethod

@@ -1,6 +1,6 @@
 """Messages out of a recording: an MCAP file, a rosbag2 folder or its .db3. Writing is `quadvel_bringup.recorder`'s.
 
-Definitions come from `STORE`, so a recording is read where no ROS 2 is installed.
+Definitions come from `definitions`, so a recording is read where no ROS 2 is installed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 from rosbags.rosbag2 import Reader
 
 from .cut_off import is_cut_off, kept_messages, what_is_kept
-from .messages import STORE
+from .definitions import STORE
 
 
 class RecordingError(ValueError):

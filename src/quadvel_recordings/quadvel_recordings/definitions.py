@@ -1,0 +1,54 @@
+"""Definitions of the messages and services that quadvel's nodes speak: those of ROS 2 Jazzy that `rosbags` carries, and ours."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+HERE = Path(__file__).parent
+OWN_PACKAGE = "quadvel_msgs"
+# Services of ROS 2 that our nodes need; rosbags carries messages alone.
+SERVICES = {
+    "std_srvs/srv/Empty": "---",
+    "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
+    "std_srvs/srv/Trigger": "---\nbool success\nstring message",
+    "rcl_interfaces/srv/DescribeParameters": "string[] names\n---\nParameterDescriptor[] descriptors",
+    "rcl_interfaces/srv/GetParameterTypes": "string[] names\n---\nuint8[] types",
+    "rcl_interfaces/srv/GetParameters": "string[] names\n---\nParameterValue[] values",
+    "rcl_interfaces/srv/ListParameters": (
+        "uint64 DEPTH_RECURSIVE=0\nstring[] prefixes\nuint64 depth\n---\nListParametersResult result"
+    ),
+    "rcl_interfaces/srv/SetParameters": "Parameter[] parameters\n---\nSetParametersResult[] results",
+    "rcl_interfaces/srv/SetParametersAtomically": "Parameter[] parameters\n---\nSetParametersResult result",
+}
+
+
+def _own_definitions() -> Path:
+    """In `interfaces` where pip installed us, beside us in the source tree, or where colcon installed them."""
+    prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+    shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
+    folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
+    return next(folder for folder in folders if (folder / "msg").is_dir())
+
+
+def _load_store() -> Any:
+    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
+    store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
+    for file in sorted(own_files.glob("msg/*.msg")):
+        store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
+    own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
+    for name, text in {**SERVICES, **own}.items():
+        package, _, short = name.split("/")
+        # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.
+        request, _, response = f"\n{text}\n".partition("\n---\n")
+        for part, definition in {"Request": request, "Response": response}.items():
+            (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
+            store.register({f"{name}_{part}": parsed})
+    return store
+
+
+STORE = _load_store()
+"""All of them by full name ("geometry_msgs/msg/Twist"), as rosbags has it."""
