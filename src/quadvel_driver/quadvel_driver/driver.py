@@ -27,10 +27,9 @@ from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
-from .calibration import Calibration
 from .dry_run import DryRun
 from .health import Health, Level, figures
-from .link import NO_CALIBRATION, SILENCE, UdpLink
+from .link import SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
 from .thinning import Thinning
@@ -51,8 +50,7 @@ class Driver(Node):
         super().__init__("driver")
         self._settings = settings = read_parameters(self, DriverParameters)
         self._dry_run = DryRun() if settings.dry_run else None
-        calibration = Calibration.load(settings.calibration) if settings.calibration else NO_CALIBRATION
-        self._link = UdpLink(settings, self._on_state, calibration, self._dry_run)
+        self._link = UdpLink(settings, self._on_state, settings.correction(), self._dry_run)
         self._health = Health(f"{settings.board_address}:{settings.board_port}")
         self._pilot = RemotePilot(settings)
         self._orders: deque[Order] = deque()
