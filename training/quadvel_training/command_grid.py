@@ -1,0 +1,144 @@
+"""A grid of commands that grows where they are followed: the curriculum of Margolis et al., "Rapid Locomotion", Section III-C.
+
+Cells over vx, vy and yaw rate, those near rest open. A cell's neighbours open once its commands are followed well enough in
+xy and in yaw without a fall. Commands are drawn from open cells alone and held inside `CommandLimits`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import attrs
+import numpy as np
+import torch
+
+from quadvel_policy.observation import CommandLimits
+
+WIDTH = (0.5, 0.4, 0.7)  # of a cell: m/s, m/s, rad/s; about rest lies the middle of one
+FIRST = (1.0, 0.4, 1.05)  # m/s, m/s, rad/s: cells whose middle lies so near to rest are open from the start
+RECENT = 0.3  # weight of the last command in a cell's success
+FOLLOWED = 0.65  # success that opens the neighbours: three commands in a row, or four of five
+
+
+@attrs.frozen
+class GridConfig:
+    """Which commands are drawn in the end, and when one counts as followed."""
+
+    vx: tuple[float, float] = (-3.4, 4.5)  # m/s
+    vy: float = 2.2  # m/s, either way
+    wz: float = 6.3  # rad/s, either way
+    curve: float = 4.0  # m/s^2, of `CommandLimits`
+    stance: float = 0.1  # share of stance commands
+    straight: float = 0.25  # share of commands without turning, the rest may have any
+    spin: float = 0.05  # share of commands that turn on the spot
+    hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
+    error_xy: float = 0.12  # m/s, mean error up to which a command at rest is followed,
+    error_wz: float = 0.12  # rad/s, the same of yaw,
+    error_share: float = 0.06  # and so much more with every m/s and rad/s of the command
+
+    def limits(self) -> CommandLimits:
+        """The commands that belong to the grid."""
+        return CommandLimits((self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve)
+
+
+class CommandGrid:
+    """Draws commands for `VelocityEnv` and learns from how they were followed.
+
+    What is learned of a command holds for its mirror image, too: the policy is symmetric.
+    """
+
+    def __init__(self, config: GridConfig) -> None:
+        self.config = config
+        self._limits = config.limits()
+        back, ahead = (np.abs(end) / WIDTH for end in (self._limits.low, self._limits.high))
+        cells = [np.ceil(np.round(end - 0.5, 6)).astype(int) for end in (back, ahead)]
+        self._first = -cells[0]  # index of the lowest cell on each axis, 0 about rest
+        self.shape = tuple((cells[0] + cells[1] + 1).tolist())
+        index = np.stack(np.meshgrid(*(np.arange(n) for n in self.shape), indexing="ij"), axis=-1)
+        self._middle = (index + self._first) * WIDTH
+        nearest = np.sign(self._middle) * np.maximum(np.abs(self._middle) - 0.5 * np.array(WIDTH), 0.0)
+        self.allowed = np.array([self._inside(c) for c in nearest.reshape(-1, 3)]).reshape(self.shape)
+        self.open = (np.abs(self._middle) <= np.array(FIRST) + 1e-9).all(axis=-1) & self.allowed
+        self.success = np.zeros(self.shape)
+
+    @property
+    def hold(self) -> tuple[float, float]:
+        """For how long a command lasts, s."""
+        return self.config.hold
+
+    def _inside(self, command: np.ndarray) -> bool:
+        return bool(np.allclose(self._limits.held(command.tolist()), command))
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        c = self.config
+        kind = rng.random(n)
+        straight, spin = kind < c.straight, kind > 1.0 - c.spin
+        command = np.zeros((n, 4))
+        command[:, :3] = self._draw_from(self.open, rng, n)
+        command[straight, :3] = self._draw_from(self._plane(2), rng, straight.sum())
+        command[straight, 2] = 0.0
+        command[spin, :3] = self._draw_from(self._plane(0) & self._plane(1), rng, spin.sum())
+        command[spin, :2] = 0.0
+        command[:, :3] = [self._limits.held(one) for one in command[:, :3].tolist()]
+        still = rng.random(n) < c.stance
+        command[still] = [0.0, 0.0, 0.0, 1.0]
+        return command
+
+    def _plane(self, axis: int) -> np.ndarray:
+        """Open cells whose middle is at rest in this axis."""
+        return self.open & (self._middle[..., axis] == 0.0)
+
+    def _draw_from(self, cells: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
+        middles = self._middle[cells]
+        return middles[rng.integers(len(middles), size=n)] + rng.uniform(-0.5, 0.5, (n, 3)) * WIDTH
+
+    def cell_of(self, command: np.ndarray) -> tuple[int, ...]:
+        """The index of the cell that a command (3,) lies in."""
+        cell = np.floor(command / WIDTH + 0.5).astype(int) - self._first
+        return tuple(np.clip(cell, 0, np.array(self.shape) - 1).tolist())
+
+    def note(self, command: np.ndarray, error: np.ndarray, fell: np.ndarray) -> None:
+        """What became of walking commands (n, 4): mean errors (n, 2) in xy (m/s) and yaw (rad/s), whether the robot fell (n,)."""
+        c = self.config
+        speed = np.hypot(command[:, 0], command[:, 1])
+        good = error[:, 0] < c.error_xy + c.error_share * speed
+        good &= error[:, 1] < c.error_wz + c.error_share * np.abs(command[:, 2])
+        good &= ~fell
+        for one, followed in zip(command[:, :3], good, strict=True):
+            for cell in {self.cell_of(one), self.cell_of(one * [1, -1, -1])}:
+                self.success[cell] += RECENT * (followed - self.success[cell])
+                if self.success[cell] > FOLLOWED:
+                    self._open_around(cell)
+
+    def _open_around(self, cell: tuple[int, ...]) -> None:
+        for axis in range(3):
+            for step in (-1, 1):
+                other = list(cell)
+                other[axis] += step
+                if 0 <= other[axis] < self.shape[axis] and self.allowed[tuple(other)]:
+                    self.open[tuple(other)] = True
+
+    def reach(self) -> dict[str, float]:
+        """How far commands are followed along each axis (m/s, rad/s), and the share of cells that are open and followed."""
+        good = self.open & (self.success > FOLLOWED)
+        where = self._middle[good] if good.any() else np.zeros((1, 3))
+        return {
+            "forward": float(where[:, 0].max()),
+            "back": float(where[:, 0].min()),
+            "sideways": float(where[:, 1].max()),
+            "turn": float(where[:, 2].max()),
+            "open": float(self.open.sum() / self.allowed.sum()),
+            "followed": float(good.sum() / self.allowed.sum()),
+        }
+
+    def state(self) -> dict[str, Any]:
+        """For a checkpoint."""
+        return {"open": torch.from_numpy(self.open.copy()), "success": torch.from_numpy(self.success.copy())}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint. Raises ValueError where the grid was another."""
+        if tuple(state["open"].shape) != self.shape:
+            found = tuple(state["open"].shape)
+            raise ValueError(f"checkpoint: command grid of {found} cells, expected {self.shape}")
+        self.open, self.success = state["open"].numpy().copy(), state["success"].numpy().copy()
