@@ -17,6 +17,7 @@ from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import (
     crl,
+    dagger,
     distill,
     env,
     estimator,
@@ -80,6 +81,29 @@ def train_privileged(
     run_folder.describe(out, "privileged", source, config)
     run = privileged.PrivilegedRun(config)
     loop.train(run, config.budget, out / "privileged.pt", privileged.Numbered(run, out))
+
+
+@app.command("dagger")
+def train_dagger(
+    teacher_file: Annotated[
+        Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.")
+    ] = Path("out/training/privileged/privileged.pt"),
+    out: Out = Path("out/training/dagger"),
+    source: Recipe = None,
+    minutes: Minutes = None,
+) -> None:
+    """Stage 2 without a clock: the paper's plain network learns from that teacher while it drives itself.
+
+    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
+    """
+    config = _configured(dagger.DaggerConfig, source, minutes)
+    run_folder.describe(out, "dagger", source, config)
+    run = dagger.DaggerRun(config, teacher_file)
+    checkpoint = out / "dagger.pt"
+    loop.train(run, config.budget, checkpoint)
+    about = run_folder.made_of("dagger", source, config, checkpoint)
+    dagger.export_policy(run.student, run.env, run.grid, out / "policy.onnx", about)
+    print(f"written: {out / 'policy.onnx'}")
 
 
 @app.command("distill")

@@ -122,7 +122,7 @@ class CommandGrid:
     def reach(self) -> dict[str, float]:
         """How far commands are followed along each axis (m/s, rad/s), and the share of cells that are open and followed."""
         good = self.open & (self.success > FOLLOWED)
-        where = self._middle[good] if good.any() else np.zeros((1, 3))
+        where = np.concatenate([np.zeros((1, 3)), self._middle[good]])
         return {
             "forward": float(where[:, 0].max()),
             "back": float(where[:, 0].min()),
