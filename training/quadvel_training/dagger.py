@@ -50,7 +50,6 @@ class DaggerConfig:
     noise: float = 0.09  # of every action, in the network's unit: standard deviation,
     noise_time: float = 0.05  # s, and how long it lasts
     timestep: float = 0.0025  # s, of physics
-    solver: tuple[int, int] = (6, 8)  # see `EnvConfig`
     actuator: str = "eam"
     seed: int = 1
     grid: GridConfig = GridConfig()  # the teacher's; its open cells come with it
@@ -100,7 +99,6 @@ class DaggerRun:
             threads=c.threads,
             seed=c.seed,
             timestep=c.timestep,
-            solver=c.solver,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,

@@ -92,10 +92,6 @@ class EnvConfig:
     seed: int = 0
     period: float = TICK  # s, one sample of the trainer: how long joint targets are held
     timestep: float = 0.0025  # s, of physics
-    solver: tuple[int, int] = (
-        20,
-        20,
-    )  # iterations of Newton and of its line search, at most
     kp: float = robot.KP
     kd: float = robot.KD
     episode: float = 20.0  # s
@@ -105,11 +101,10 @@ class EnvConfig:
     terrain: Terrain = Terrain()
 
 
-def training_model(timestep: float, terrain: Terrain, solver: tuple[int, int] = (20, 20)) -> mujoco.MjModel:
+def training_model(timestep: float, terrain: Terrain) -> mujoco.MjModel:
     """The AlienGo as it is trained on: feet and trunk collide, no sensors."""
     plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
     spec = mjcf.build_spec(plant)
-    spec.option.iterations, spec.option.ls_iterations = solver
     terrain.add_to(spec)
     return spec.compile()
 
@@ -129,7 +124,7 @@ class VelocityEnv:
         """`commands`: where they are drawn instead of the configuration's range."""
         self.config = c = config
         self.commands: Commands = commands or c.commands
-        self.model = training_model(c.timestep, c.terrain, c.solver)
+        self.model = training_model(c.timestep, c.terrain)
         self.substeps = round(c.period / c.timestep)
         self._resend = max(
             1, int(TICK / c.timestep)

@@ -136,7 +136,6 @@ class PrivilegedConfig:
     length: int = 24  # samples a sequence, 0.48 s
     period: float = 0.02  # s a sample
     timestep: float = 0.004  # s, of physics
-    solver: tuple[int, int] = (6, 8)  # see `EnvConfig`
     std: float = 0.7  # of the exploration at first, in the network's unit; an upper bound for it that falls
     final_std: float = 0.22  # to this
     std_samples: float = 2.5e7  # with so many samples
@@ -184,7 +183,6 @@ class PrivilegedRun:
             seed=c.seed,
             period=c.period,
             timestep=c.timestep,
-            solver=c.solver,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
