@@ -9,6 +9,7 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
 from quadvel_description import symmetry  # noqa: E402
+from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged  # noqa: E402
 from quadvel_training.command_grid import FIRST, WIDTH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
@@ -115,6 +116,17 @@ def test_a_robot_whose_physics_blows_up_lies_fallen_and_every_number_stays_finit
     assert all(np.isfinite(value).all() for value in terms.values())
     env.tick(np.tile(env.stand_q, (4, 1)))
     assert np.isfinite(env.batch.qpos).all()
+
+
+def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():
+    ground = Terrain(kind="rough", roughness=0.01, size=8.0)
+    env = VelocityEnv(attrs.evolve(CALM, terrain=ground))
+    env._qpos[:, :2] = 0.0
+    env._qpos[2, 0] = 3.9
+    env._qpos[:, 2] = 0.42
+    env._read()
+    assert env.timed_out.tolist() == [False, False, True, False]
+    assert not env.fallen.any()
 
 
 def test_no_sample_is_worth_more_or_less_than_the_bounds():

@@ -26,6 +26,7 @@ from .randomisation import PlantSampler, Randomisation, sample_actuators
 
 TICK = 0.005  # s, one sample of the policy on the robot
 HEAT = 0.2  # W/(N m)^2, k_r of the paper's energy
+EDGE = 0.6  # m, before the end of rough ground, at which an episode ends as if its time was over
 ABSURD_SPEED = 150.0  # m/s or rad/s of any body or joint: physics that has blown up, or is about to
 STANCE_LENGTH, STANCE_WIDTH = np.ptp(
     foot_positions(robot.NOMINAL_Q)[:, :2], axis=0
@@ -150,6 +151,7 @@ class VelocityEnv:
         self._velocity_drift = np.zeros((n, 3))
         rough = c.terrain.kind == "rough"
         self._spawn_radius = 0.4 * c.terrain.size if rough else 0.0  # m
+        self._edge = 0.5 * c.terrain.size - EDGE if rough else np.inf  # m
         self.reset(np.arange(n))
 
     def reset(self, ids: np.ndarray, posture: np.ndarray = robot.NOMINAL_Q) -> None:
@@ -268,7 +270,8 @@ class VelocityEnv:
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
         self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)
-        self.timed_out = self.time >= self.config.episode
+        left_the_field = np.abs(qpos[:, :2]).max(axis=1) > self._edge
+        self.timed_out = (self.time >= self.config.episode) | left_the_field
 
     def sense(self) -> dict[str, np.ndarray]:
         """Noisy readings under the names of the observation's terms (previous action and command apart)."""

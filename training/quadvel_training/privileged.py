@@ -139,8 +139,9 @@ class PrivilegedConfig:
     std: float = 0.7  # of the exploration at first, in the network's unit; an upper bound for it that falls
     final_std: float = 0.22  # to this
     std_samples: float = 2.5e7  # with so many samples
-    formed: float = 5e6  # samples after which a gait has formed, and from then on
-    formed_rate: float = 5e-4  # the bound of the learning rate
+    formed: float = 6e6  # samples after which a gait has formed;
+    forming_std: float = 0.45  # until then exploration is no less: robots that stand have to stumble upon steps,
+    formed_rate: float = 5e-4  # and from then on the learning rate is no more
     keep: float = 1e6  # samples between numbered checkpoints
     actuator: str = "eam"
     seed: int = 0
@@ -232,9 +233,10 @@ class PrivilegedRun:
 
     def _bound_exploration(self) -> None:
         c = self.config
-        fallen = c.std + (c.final_std - c.std) * min(1.0, self.samples / c.std_samples)
+        most = c.std + (c.final_std - c.std) * min(1.0, self.samples / c.std_samples)
+        least = c.forming_std if self.samples < c.formed else 0.5 * c.final_std
         with torch.no_grad():
-            self.actor.log_std.clamp_(min=float(np.log(0.5 * c.final_std)), max=float(np.log(fallen)))
+            self.actor.log_std.clamp_(min=float(np.log(least)), max=float(np.log(max(most, least))))
 
     def _start_over(self, ids: np.ndarray) -> None:
         if len(ids):

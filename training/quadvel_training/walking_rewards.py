@@ -48,7 +48,7 @@ class WalkingWeights:
     rate: float = 0.012  # fine: change of the action squared
     bend: float = 0.008  # fine: second difference of the action squared
     swing: float = 1.2  # at touchdown: seconds in the air beyond what suits the speed, within -0.25 and 0.1
-    dragging: float = 0.15  # fine for each foot that stays down
+    dragging: float = 0.25  # fine for each foot that stays down
     slip: float = 0.06  # fine, s/m, of each foot on the ground
     stumble: float = 1.5  # fine, s/m^2: clearance missing in swing times the foot's speed
     posture: float = 0.075  # fine in stance, 1/rad, off the nominal posture
