@@ -152,6 +152,32 @@ def test_following_turns_pays_as_following_speeds_does():
     assert total[3] > total[1] + 0.5
 
 
+def test_feet_are_to_step_while_walking_and_to_stay_in_stance():
+    env = VelocityEnv(CALM)
+    rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
+    command = np.array([[0.5, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 1]], float)
+    env.contact[:], past.down[:] = True, 5.0
+    env.contact[[1, 3], 0] = past.down[[1, 3]] = False
+    terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
+    assert terms["dragging"][0] < terms["dragging"][1]
+    assert terms["step"][3] < terms["step"][2]
+    assert (terms["dragging"][2:] == 0.0).all()
+    assert (terms["step"][:2] == 0.0).all()
+
+
+def test_exploration_stays_wide_until_a_gait_has_formed():
+    run = PrivilegedRun(SMALL)
+    with torch.no_grad():
+        run.actor.log_std.fill_(-5.0)
+    run._bound_exploration()
+    assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
+    run.samples = int(SMALL.formed)
+    with torch.no_grad():
+        run.actor.log_std.fill_(-5.0)
+    run._bound_exploration()
+    assert run.actor.log_std.detach().exp().max() < 0.2
+
+
 def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
     first = PrivilegedRun(SMALL)
     first.step(0.0)
