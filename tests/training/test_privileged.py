@@ -62,6 +62,17 @@ def test_neighbours_open_where_both_xy_and_yaw_are_followed(grid):
     assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
 
 
+def test_cells_close_again_where_commands_are_followed_no_more(grid):
+    for ahead in (1.0, 1.5, 2.0):
+        follow(grid, (ahead, 0.0, 0.0), 4)
+    assert grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
+    assert grid.reach()["forward"] == 2.0
+    follow(grid, (2.0, 0.0, 0.0), 5, fell=True)
+    assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
+    assert grid.open[grid.cell_of(np.array((2.0, 0.0, 0.0)))]
+    assert grid.reach()["forward"] == 1.5
+
+
 def test_what_is_followed_to_the_left_is_open_to_the_right(grid):
     left, right = (np.array((0.5, 0.8 * side, 0.7 * side)) for side in (1, -1))
     assert not grid.open[grid.cell_of(left)]
@@ -186,6 +197,7 @@ def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
     second = PrivilegedRun(SMALL)
     second.restore(loop.load(tmp_path / "privileged.pt"))
     assert second.samples == 24
+    assert first.grid.followed.any()
     assert np.array_equal(second.grid.open, first.grid.open)
     assert second.ppo.learning_rate == first.ppo.learning_rate
     second.step(0.0)

@@ -1,7 +1,8 @@
 """A grid of commands that grows where they are followed: the curriculum of Margolis et al., "Rapid Locomotion", Section III-C.
 
-Cells over vx, vy and yaw rate, those near rest open. A cell's neighbours open once its commands are followed well enough in
-xy and in yaw without a fall. Commands are drawn from open cells alone and held inside `CommandLimits`.
+Cells over vx, vy and yaw rate. Open are those near rest, those whose commands are followed well enough in xy and in yaw
+without a fall, and the neighbours of these; they close again where they are followed no more. Commands are drawn from open
+cells alone and held inside `CommandLimits`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from quadvel_policy.observation import CommandLimits
 WIDTH = (0.5, 0.4, 0.7)  # of a cell: m/s, m/s, rad/s; about rest lies the middle of one
 FIRST = (1.0, 0.4, 1.05)  # m/s, m/s, rad/s: cells whose middle lies so near to rest are open from the start
 RECENT = 0.3  # weight of the last command in a cell's success
-FOLLOWED = 0.65  # success that opens the neighbours: three commands in a row, or four of five
+FOLLOWED = 0.65  # success from which on a cell is followed: three commands in a row, or four of five,
+LOST = 0.35  # and below which it is so no more
 
 
 @attrs.frozen
@@ -58,8 +60,10 @@ class CommandGrid:
         self._middle = (index + self._first) * WIDTH
         nearest = np.sign(self._middle) * np.maximum(np.abs(self._middle) - 0.5 * np.array(WIDTH), 0.0)
         self.allowed = np.array([self._inside(c) for c in nearest.reshape(-1, 3)]).reshape(self.shape)
-        self.open = (np.abs(self._middle) <= np.array(FIRST) + 1e-9).all(axis=-1) & self.allowed
+        self._near = (np.abs(self._middle) <= np.array(FIRST) + 1e-9).all(axis=-1) & self.allowed
         self.success = np.zeros(self.shape)
+        self.followed = np.zeros(self.shape, bool)
+        self._open_around_followed()
 
     @property
     def hold(self) -> tuple[float, float]:
@@ -108,20 +112,20 @@ class CommandGrid:
         for one, followed in zip(command[:, :3], good, strict=True):
             for cell in {self.cell_of(one), self.cell_of(one * [1, -1, -1])}:
                 self.success[cell] += RECENT * (followed - self.success[cell])
-                if self.success[cell] > FOLLOWED:
-                    self._open_around(cell)
+        self.followed = (self.success > FOLLOWED) | (self.followed & (self.success > LOST))
+        self._open_around_followed()
 
-    def _open_around(self, cell: tuple[int, ...]) -> None:
+    def _open_around_followed(self) -> None:
+        around = np.pad(self.followed, 1)
+        grown = self.followed | self._near
         for axis in range(3):
             for step in (-1, 1):
-                other = list(cell)
-                other[axis] += step
-                if 0 <= other[axis] < self.shape[axis] and self.allowed[tuple(other)]:
-                    self.open[tuple(other)] = True
+                grown = grown | np.roll(around, step, axis)[1:-1, 1:-1, 1:-1]
+        self.open = grown & self.allowed
 
     def reach(self) -> dict[str, float]:
         """How far commands are followed along each axis (m/s, rad/s), and the share of cells that are open and followed."""
-        good = self.open & (self.success > FOLLOWED)
+        good = self.followed
         where = np.concatenate([np.zeros((1, 3)), self._middle[good]])
         return {
             "forward": float(where[:, 0].max()),
@@ -134,11 +138,13 @@ class CommandGrid:
 
     def state(self) -> dict[str, Any]:
         """For a checkpoint."""
-        return {"open": torch.from_numpy(self.open.copy()), "success": torch.from_numpy(self.success.copy())}
+        held = {"followed": self.followed, "success": self.success}
+        return {name: torch.from_numpy(array.copy()) for name, array in held.items()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint. Raises ValueError where the grid was another."""
-        if tuple(state["open"].shape) != self.shape:
-            found = tuple(state["open"].shape)
+        if tuple(state["followed"].shape) != self.shape:
+            found = tuple(state["followed"].shape)
             raise ValueError(f"checkpoint: command grid of {found} cells, expected {self.shape}")
-        self.open, self.success = state["open"].numpy().copy(), state["success"].numpy().copy()
+        self.followed, self.success = state["followed"].numpy().copy(), state["success"].numpy().copy()
+        self._open_around_followed()

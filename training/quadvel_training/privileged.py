@@ -140,7 +140,9 @@ class PrivilegedConfig:
     final_std: float = 0.22  # to this
     std_samples: float = 2.5e7  # with so many samples
     formed: float = 6e6  # samples after which a gait has formed;
-    forming_std: float = 0.45  # until then exploration is no less: robots that stand have to stumble upon steps,
+    forming_std: float = (
+        0.45  # until then exploration is no less: robots that stand have to stumble upon steps,
+    )
     formed_rate: float = 5e-4  # and from then on the learning rate is no more
     keep: float = 1e6  # samples between numbered checkpoints
     actuator: str = "eam"

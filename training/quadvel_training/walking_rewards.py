@@ -17,7 +17,7 @@ from .env import VelocityEnv
 LOWEST, HIGHEST = -6.0, 4.0  # of a sample's sum of terms, a fall apart: nothing may drown all else
 CARRIED = 0.36  # m, wanted height of the trunk
 LIFT = 0.06  # m, clearance wanted in swing
-LONG_DOWN = 0.6  # s: a foot that is down for longer while walking is being dragged along
+LONG_DOWN = 0.4  # s: a foot that is down for longer while walking is being dragged along
 
 
 class Past(Protocol):
@@ -36,21 +36,21 @@ class WalkingWeights:
     linear_narrow: float = 0.5  # exp(-e^2 / 0.04)
     angular: float = 0.6  # exp(-e^2 / (0.25 rad^2/s^2 (1 + |c| / 4)))
     angular_narrow: float = 0.25  # exp(-e^2 / 0.04)
-    stride_linear: float = 0.6  # fine, s/m, of the error over a stride,
-    stride_angular: float = 0.35  # s/rad, the same of yaw,
+    stride_linear: float = 1.0  # fine, s/m, of the error over a stride,
+    stride_angular: float = 0.5  # s/rad, the same of yaw,
     steady: float = 0.3  # and exp(-(e / 0.06)^2) of it, xy and yaw
     bounce: float = 0.6  # fine: vertical speed squared
     rocking: float = 0.03  # fine: roll and pitch rate squared
     tilt: float = 2.0  # fine: roll and pitch against the ground, squared
     height: float = 30.0  # fine: height off what is wanted, squared
-    power: float = 5e-4  # fine, 1/W; at speed |c| divided by 1 + |c| / 2
+    power: float = 6e-4  # fine, 1/W; at speed |c| divided by 1 + |c| / 2
     acceleration: float = 2e-7  # fine: joint accelerations squared
     rate: float = 0.012  # fine: change of the action squared
     bend: float = 0.008  # fine: second difference of the action squared
     swing: float = 1.2  # at touchdown: seconds in the air beyond what suits the speed, within -0.25 and 0.1
-    dragging: float = 0.25  # fine for each foot that stays down
+    dragging: float = 0.4  # fine for each foot that stays down
     slip: float = 0.06  # fine, s/m, of each foot on the ground
-    stumble: float = 1.5  # fine, s/m^2: clearance missing in swing times the foot's speed
+    stumble: float = 3.0  # fine, s/m^2: clearance missing in swing times the foot's speed
     posture: float = 0.075  # fine in stance, 1/rad, off the nominal posture
     step: float = 0.1  # fine in stance for each foot in the air
     fidget: float = 1e-3  # fine in stance: joint speeds squared
