@@ -76,8 +76,9 @@ def test_who_drives_changes_with_an_episode_alone(run):
     run._start_over(np.array([1, 2]))
     kept = np.delete(np.arange(8), [1, 2])
     assert np.array_equal(run.driven[kept], before[kept])
-    run._start_over(np.arange(8))
-    assert run.driven.mean() > 0.6
+    for _ in range(3):  # however often the student's robots start over
+        run._start_over(np.arange(8))
+        assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
 
 
 def test_the_student_comes_to_do_what_the_teacher_does(run):

@@ -1,8 +1,9 @@
 """Stage 2: a recurrent student learns from the privileged teacher while it drives itself (DAgger).
 
 The student is the paper's plain network on the paper's 48 observations, nothing in front of it and nothing in its memory but
-what it learns. The teacher says everywhere what it would do, at every tick. Who drives a robot is drawn for a whole
-episode: a teacher that takes over from a stumbling student falls far more often than by itself, and its advice is worth little.
+what it learns. The teacher says everywhere what it would do, at every tick. Who drives a robot changes with an episode alone:
+a teacher that takes over from a stumbling student falls far more often than by itself, and its advice is worth little. Who
+drives is a matter of the robot, not drawn anew: else few are left to a student that falls soon.
 """
 
 from __future__ import annotations
@@ -112,7 +113,8 @@ class DaggerRun:
         self._memory: State = self.student.initial_state(c.n)
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
-        self.driven = self.env.rng.random(c.n) < self._share()
+        self._turn = np.random.default_rng(c.seed).permutation(c.n) / c.n  # share at which the student takes a robot
+        self.driven = self._turn < self._share()
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -142,7 +144,7 @@ class DaggerRun:
             return
         self.env.reset(ids)
         self.teacher.reset(ids)
-        self.driven[ids] = self.env.rng.random(len(ids)) < self._share()
+        self.driven[ids] = self._turn[ids] < self._share()
         self._previous[ids] = self._noise[ids] = 0.0
         self._memory = (self._memory[0].clone(), self._memory[1].clone())
         for memory in self._memory:
