@@ -81,6 +81,12 @@ def test_who_drives_changes_with_an_episode_alone(run):
         assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
 
 
+def test_the_student_gets_its_share_as_soon_as_it_grows(run):
+    run.samples = 10**9
+    run.step(0.0)
+    assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
+
+
 def test_the_student_comes_to_do_what_the_teacher_does(run):
     losses = [run.step(0.0)["imitation"] for _ in range(25)]
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:3])

@@ -157,7 +157,8 @@ class DaggerRun:
         start = self._memory
         obs, label, mask, seen = self.collect()
         loss = self.learn(obs, label, mask, start)
-        self._start_over(np.flatnonzero(mask[-1].numpy() == 0.0))
+        handed_over = self.driven != (self._turn < self._share())
+        self._start_over(np.flatnonzero((mask[-1].numpy() == 0.0) | handed_over))
         return {"imitation": loss} | seen
 
     def _act(self, obs: np.ndarray) -> np.ndarray:
