@@ -31,8 +31,9 @@ class GridConfig:
     wz: float = 6.3  # rad/s, either way
     curve: float = 4.0  # m/s^2, of `CommandLimits`
     stance: float = 0.1  # share of stance commands
-    straight: float = 0.25  # share of commands without turning, the rest may have any
-    spin: float = 0.05  # share of commands that turn on the spot
+    straight: float = 0.25  # share of commands without turning,
+    near: float = 0.2  # of commands near rest, with and without turning, which are few among all cells,
+    spin: float = 0.05  # of commands that turn on the spot; the rest may be any
     hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
     error_xy: float = 0.12  # m/s, mean error up to which a command at rest is followed,
     error_wz: float = 0.12  # rad/s, the same of yaw,
@@ -78,10 +79,12 @@ class CommandGrid:
         c = self.config
         kind = rng.random(n)
         straight, spin = kind < c.straight, kind > 1.0 - c.spin
+        near = ~straight & (kind < c.straight + c.near)
         command = np.zeros((n, 4))
         command[:, :3] = self._draw_from(self.open, rng, n)
         command[straight, :3] = self._draw_from(self._plane(2), rng, straight.sum())
-        command[straight, 2] = 0.0
+        command[near, :3] = self._draw_from(self._near, rng, near.sum())
+        command[straight | (near & (rng.random(n) < 0.5)), 2] = 0.0
         command[spin, :3] = self._draw_from(self._plane(0) & self._plane(1), rng, spin.sum())
         command[spin, :2] = 0.0
         command[:, :3] = [self._limits.held(one) for one in command[:, :3].tolist()]

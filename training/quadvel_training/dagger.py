@@ -113,7 +113,9 @@ class DaggerRun:
         self._memory: State = self.student.initial_state(c.n)
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
-        self._turn = np.random.default_rng(c.seed).permutation(c.n) / c.n  # share at which the student takes a robot
+        self._turn = (
+            np.random.default_rng(c.seed).permutation(c.n) / c.n
+        )  # share at which the student takes a robot
         self.driven = self._turn < self._share()
 
     def state(self) -> dict[str, Any]:
