@@ -62,7 +62,11 @@ EXCITE = [
     Step("quadvel excite --after out/identify/report.json"),
     Step("quadvel excite sweep --out sweep.mcap", more="--seconds 0.5"),
     Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
-    Step("quadvel run sim_node --ros-args -p actuator_file:=out/identify/actuator.yaml", served=True),
+    Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
+]
+BOARD = [
+    Step("quadvel up --low-level board", served=True, then=READY),
+    Step("quadvel record low_state --seconds 5 --out standing.mcap", more="--seconds 1"),
 ]
 LOGS = [  # of one leg each
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
@@ -74,14 +78,22 @@ NODES = [
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
+    Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
 ]
-SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
+SESSIONS = {"robot": ROBOT, "board": BOARD, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
     "quadvel up": "as with --terrain",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
+    "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_board.py walks so",
+    "quadvel up --low-level aliengo": "needs the robot",
+    "quadvel run driver": "the same",
+    "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
+    "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "the same",
+    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "needs a robot that hangs; "
+    "tests/quadvel_driver/test_calibration.py has one",
     "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
@@ -112,7 +124,8 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
-    r"(description|dds|eval|recordings|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(description|dds|driver's|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(driver|controller|command_mux):.*": "a part of a parameter file",
 }
 
 

@@ -36,8 +36,10 @@ def _policy(settings: Any) -> object:
 # The shipped networks are as they were shipped; loading them would only take time.
 PARTS = {
     "sim_node": Part("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
-    "board": Part("quadvel_sim.parameters:BoardParameters", lambda settings: settings.config()),
-    "driver": Part("quadvel_driver.parameters:DriverParameters", lambda settings: None),
+    "board": Part(
+        "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
+    ),
+    "driver": Part("quadvel_driver.parameters:DriverParameters", lambda settings: settings.correction()),
     "estimator": Part(
         "quadvel_estimator.estimator:EstimatorParameters",
         lambda settings: settings.make_estimator() if settings.model else None,
