@@ -124,7 +124,7 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
-    r"(description|dds|driver's|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(description|dds|driver's|eval|recordings|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"(driver|controller|command_mux):.*": "a part of a parameter file",
 }
 
