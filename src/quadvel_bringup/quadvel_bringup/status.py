@@ -23,7 +23,7 @@ from .orders import WAY_OUT
 from .session import Session
 
 LISTEN = 2.2
-"""s: every node reports once a second, and is found within the first"""
+"""s: every node reports once a second, and is found within the first; so long again for those that are found later"""
 HEARD = {
     "/diagnostics": DiagnosticArray,
     "controller/state": ControllerState,
@@ -55,7 +55,7 @@ def status() -> int:
     """Print the page; the exit code is 1 where no robot runs, or its controller is in fault."""
     with Session("status") as session:
         heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in HEARD.items()}
-        session.spin(LISTEN)
+        _hear_all(session, heard["/diagnostics"])
     nodes = reported(heard["/diagnostics"])
     if not nodes:
         domain = os.environ.get("ROS_DOMAIN_ID", "0")
@@ -72,8 +72,14 @@ def look() -> dict[str, Node]:
     """The nodes of the robot that runs, by name; none where there is none."""
     with Session("look") as session:
         heard = session.listen(DiagnosticArray, "/diagnostics", keep=100)
-        session.spin(LISTEN)
+        _hear_all(session, heard)
     return reported(heard)
+
+
+def _hear_all(session: Session, heard: deque[Any]) -> None:
+    """Listen until each node that publishes /diagnostics has reported: discovery takes its time on a busy machine."""
+    session.spin(LISTEN)
+    session.spin_until(lambda: len(reported(heard)) >= session.node.count_publishers("/diagnostics"), LISTEN)
 
 
 def reported(arrays: deque[Any]) -> dict[str, Node]:
