@@ -113,15 +113,21 @@ def test_recording_all_takes_topics_as_they_come(node: Node, tmp_path: Path) -> 
     assert not topics & {"/parameter_events", "/rosout"}
 
 
+def publish_while_it_records(node: Node, path: Path) -> Any:
+    """Publish states for a while once the recorder is there, which may find us later than we find it."""
+    publisher = node.create_publisher(LowState, "low_state", 10)
+    spin_until(node, lambda: publisher.get_subscription_count() and path.exists(), "recorder", 60.0)
+    for _ in range(200):
+        publisher.publish(low_state(0))
+        time.sleep(0.01)
+    return publisher
+
+
 def test_ctrl_c_leaves_a_whole_file(node: Node, tmp_path: Path) -> None:
     path = tmp_path / "walk.mcap"
     program = "from quadvel_bringup.__main__ import main; main()"
     recording = subprocess.Popen([sys.executable, "-c", program, "record", "low_state", "--out", str(path)])
-    publisher = node.create_publisher(LowState, "low_state", 10)
-    spin_until(node, lambda: publisher.get_subscription_count() > 0, "recorder", 60.0)
-    for tick in range(20):
-        publisher.publish(low_state(tick))
-        time.sleep(0.01)
+    publish_while_it_records(node, path)
     time.sleep(0.5)
     recording.send_signal(signal.SIGINT)
     recording.send_signal(signal.SIGINT)
@@ -130,7 +136,7 @@ def test_ctrl_c_leaves_a_whole_file(node: Node, tmp_path: Path) -> None:
         summary = make_reader(stream).get_summary()
     assert summary is not None
     assert summary.statistics is not None
-    assert 0 < summary.statistics.message_count <= 20  # a busy machine may not have let it take them all
+    assert summary.statistics.message_count > 0
 
 
 def start_recording(*arguments: str) -> subprocess.Popen[str]:
@@ -143,8 +149,7 @@ def start_recording(*arguments: str) -> subprocess.Popen[str]:
 def test_of_a_recorder_that_was_killed_all_but_the_last_second_is_read(node: Node, tmp_path: Path) -> None:
     path = tmp_path / "walk.mcap"
     recording = start_recording("low_state", "--out", str(path))
-    publisher = node.create_publisher(LowState, "low_state", 10)
-    spin_until(node, lambda: publisher.get_subscription_count() > 0, "recorder", 60.0)
+    publisher = publish_while_it_records(node, path)
     size, ticks = path.stat().st_size, 0
     while path.stat().st_size < size + 20_000 and ticks < 4000:  # two chunks or more
         publisher.publish(low_state(ticks))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -32,12 +31,12 @@ def call(tmp_path: Path) -> Iterator[Call]:
     def ask(kind: Any, service: str, **fields: Any) -> Any:
         client = node.create_client(kind, f"/estimator/{service}")
         assert client.wait_for_service(timeout_sec=60.0)
-        future = client.call_async(kind.Request(**fields))
-        until = time.monotonic() + 30.0
-        while not future.done() and time.monotonic() < until:
-            rclpy.spin_once(node, timeout_sec=0.1)
-        assert future.done()
-        return future.result()
+        for _ in range(10):  # a service that has not found its client yet answers into the void
+            future = client.call_async(kind.Request(**fields))
+            rclpy.spin_until_future_complete(node, future, timeout_sec=3.0)
+            if future.done():
+                return future.result()
+        raise AssertionError(f"{service} does not answer")
 
     yield ask
     node.destroy_node()

@@ -135,7 +135,8 @@ def test_ctrl_c_ends_it_with_status_0_even_when_it_comes_twice(start: Start, pee
     simulation.interrupt()
     status, text = simulation.end()
     assert status == 0
-    assert all(line.startswith("[INFO]") for line in text.splitlines()), text
+    # A slow start may have it say that nobody answers.
+    assert all(line.startswith(("[INFO]", "[WARN]")) for line in text.splitlines()), text
 
 
 def test_a_diverged_simulation_ends_the_node_with_one_sentence(
