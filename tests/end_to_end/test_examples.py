@@ -43,12 +43,19 @@ class Step:
 
 
 ROBOT = [
+    Step(
+        "quadvel excite creep --seconds 60 --low-level external --out hung.mcap",
+        more="--low-level sim --seconds 4",
+    ),
     Step("quadvel up --terrain rough", served=True, then=READY),
+    Step("quadvel record low_state --seconds 5 --out standing.mcap"),
+    Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
+    Step("quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml"),
     Step("quadvel status"),
     Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
     Step("quadvel drive --vx 0.5"),
-    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 12", served=True),
-    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 2"),
+    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 15", served=True),
+    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 6"),
     Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
     Step("quadvel push --fy 60"),
     Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
@@ -62,7 +69,7 @@ EXCITE = [
     Step("quadvel excite --after out/identify/report.json"),
     Step("quadvel excite sweep --out sweep.mcap", more="--seconds 0.5"),
     Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
-    Step("quadvel run sim_node --ros-args -p actuator_file:=out/identify/actuator.yaml", served=True),
+    Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
 LOGS = [  # of one leg each
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
@@ -81,6 +88,11 @@ SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
     "quadvel up": "as with --terrain",
+    "quadvel up --low-level board": "tests/end_to_end/test_board.py",
+    "quadvel demo --low-level board --loss 0.02 --jitter 2": "the same",
+    "quadvel up --low-level aliengo": "speaks to an AlienGo",
+    "quadvel run driver": "the same; tests/quadvel_driver run it on loopback",
+    "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
     "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
@@ -111,8 +123,9 @@ LEFT_OUT_KINDS = {
     r"ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
+    r"(driver|controller|command_mux):.*": "docs/robot.md: lines of a parameter file",
     r"torchrun .*": "the same",
-    r"(description|dds|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(description|driver's packets|dds|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
 }
 
 
