@@ -43,14 +43,7 @@ class Step:
 
 
 ROBOT = [
-    Step(
-        "quadvel excite creep --seconds 60 --low-level external --out hung.mcap",
-        more="--low-level sim --seconds 4",
-    ),
     Step("quadvel up --terrain rough", served=True, then=READY),
-    Step("quadvel record low_state --seconds 5 --out standing.mcap"),
-    Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
-    Step("quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml"),
     Step("quadvel status"),
     Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
     Step("quadvel drive --vx 0.5"),
@@ -71,6 +64,15 @@ EXCITE = [
     Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
+BOARD = [
+    Step(
+        "quadvel excite creep --seconds 60 --low-level external --out hung.mcap",
+        more="--low-level sim --seconds 4",
+    ),
+    Step("quadvel up --low-level board", served=True, then=READY),
+    Step("quadvel record low_state --seconds 5 --out standing.mcap"),
+    Step("quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml"),
+]
 LOGS = [  # of one leg each
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
     Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
@@ -81,23 +83,24 @@ NODES = [
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
+    Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
 ]
-SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
+SESSIONS = {"robot": ROBOT, "board": BOARD, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
     "quadvel up": "as with --terrain",
-    "quadvel up --low-level board": "tests/end_to_end/test_board.py",
-    "quadvel demo --low-level board --loss 0.02 --jitter 2": "the same",
-    "quadvel up --low-level aliengo": "speaks to an AlienGo",
-    "quadvel run driver": "the same; tests/quadvel_driver run it on loopback",
-    "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
+    "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_board.py walks so",
+    "quadvel up --low-level aliengo": "needs the robot",
+    "quadvel run driver": "the same",
+    "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
     "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
+    "quadvel eval --grid quick --policy out/training/dagger/policy.onnx --out out/eval": "the same",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
@@ -123,9 +126,10 @@ LEFT_OUT_KINDS = {
     r"ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
-    r"(driver|controller|command_mux):.*": "docs/robot.md: lines of a parameter file",
     r"torchrun .*": "the same",
-    r"(description|driver's packets|dds|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"mkdir -p out/training/.*": "copies a checkpoint that a training goes on from",
+    r"(description|dds|recordings|driver's|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"(driver|controller|command_mux):.*": "a part of a parameter file",
 }
 
 

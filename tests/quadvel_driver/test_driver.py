@@ -206,11 +206,14 @@ def test_the_rate_of_states_is_a_parameter(
 def test_without_a_board_it_says_what_to_look_at(
     start: Start, board: TestBoard, controller: Controller
 ) -> None:
-    start()
+    process = start()
     controller.spin_until(lambda: "no state from 127.0.0.1" in controller.diagnosed()[0])
     assert "yet: is the robot on and in low-level mode" in controller.diagnosed()[0]
     board.send(bytes(684))
     controller.spin_until(lambda: "684 bytes, the state of firmware 3.1" in controller.diagnosed()[0])
+    controller.spin_until(lambda: len(controller.heard["/diagnostics"]) > 4)
+    process.send_signal(signal.SIGINT)
+    assert "no state from 127.0.0.1" in process.communicate(timeout=40.0)[1]  # in the log too
 
 
 def test_a_controller_that_dies_leaves_the_joints_damped(
@@ -291,7 +294,7 @@ def test_a_dry_run_sends_nothing_and_shows_what_it_would_send(
     message = LowCmd()
     write_low_cmd(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 55.0)), message)
 
-    controller.spin_until(lambda: controller.node.count_subscribers("low_cmd") > 0)
+    controller.spin_until(lambda: controller._low_cmd.get_subscription_count() > 0)
     until = time.monotonic() + 2.5
     while time.monotonic() < until:
         controller._low_cmd.publish(message)
@@ -327,6 +330,7 @@ def test_ctrl_c_ends_it_cleanly_and_leaves_the_joints_damped(
     [
         ({"board_address": "300.1.1.1"}, "no link from any address:0 to 300.1.1.1:"),
         ({"interface": "nosuch0"}, "no link from any address:0 on nosuch0 to 127.0.0.1:"),
+        ({"calibration": "/nowhere.yaml"}, "cannot read /nowhere.yaml: No such file"),
         ({"state_rate": 2000}, "state_rate is 2000 Hz, expected 50 to 1000"),
         ({"command_timeout": 2.0}, "'command_timeout' must be <= 0.5: 2.0"),
     ],

@@ -10,9 +10,9 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_training import clock, gait, student  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.networks import Mlp  # noqa: E402
+from quadvel_training.networks import Mlp, torch_mirror  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
-from quadvel_training.teacher import RESIDUAL, GaitState, torch_mirror  # noqa: E402
+from quadvel_training.teacher import RESIDUAL, GaitState  # noqa: E402
 
 STANCE = torch.tensor([0.0, 0.0, 0.0, 1.0])
 

@@ -8,9 +8,8 @@ import pytest
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
 from quadvel_description import symmetry  # noqa: E402
-from quadvel_training.networks import Gaussian, Mlp, Recurrent  # noqa: E402
+from quadvel_training.networks import Gaussian, Mlp, Recurrent, torch_mirror  # noqa: E402
 from quadvel_training.ppo import Ppo, PpoConfig, Rollout, select  # noqa: E402
-from quadvel_training.teacher import torch_mirror  # noqa: E402
 
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
 

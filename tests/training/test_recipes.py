@@ -11,6 +11,8 @@ pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[
 from quadvel_actuator import ActuatorModel
 from quadvel_training import loop, recipe, stage3
 from quadvel_training.crl import CrlConfig
+from quadvel_training.dagger import DaggerConfig
+from quadvel_training.privileged import PrivilegedConfig
 from quadvel_training.randomisation import actuator, sample_actuators
 
 
@@ -37,6 +39,16 @@ def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
         )
         == free.randomisation
     )
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("privileged", PrivilegedConfig), ("privileged_rough", PrivilegedConfig), ("dagger", DaggerConfig)],
+)
+def test_the_recipes_without_a_clock_share_robots_and_commands(name, kind):
+    config = recipe.read(kind, stage3.RECIPES / f"{name}.yaml")
+    assert config.randomisation.payload == (-2.0, 5.0)
+    assert config.grid == recipe.read(PrivilegedConfig, stage3.RECIPES / "privileged.yaml").grid
 
 
 def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):

@@ -15,7 +15,20 @@ from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
-from . import crl, distill, env, estimator, kalman_tuning, loop, recipe, run_folder, stage3, teacher
+from . import (
+    crl,
+    dagger,
+    distill,
+    env,
+    estimator,
+    kalman_tuning,
+    loop,
+    privileged,
+    recipe,
+    run_folder,
+    stage3,
+    teacher,
+)
 from .card import card
 
 app = typer.Typer(
@@ -54,6 +67,43 @@ def train_teacher(
     config = _configured(teacher.TeacherConfig, source, minutes)
     run_folder.describe(out, "teacher", source, config)
     loop.train(teacher.TeacherRun(config), config.budget, out / "teacher.pt")
+
+
+@app.command("privileged")
+def train_privileged(
+    out: Out = Path("out/training/privileged"), source: Recipe = None, minutes: Minutes = None
+) -> None:
+    """Stage 1 without a clock: a memoryless teacher finds its gait from random weights, by rewards alone.
+
+    Numbered checkpoints go to DIR/kept; any of them, copied to DIR/privileged.pt, is where the same command goes on from.
+    """
+    config = _configured(privileged.PrivilegedConfig, source, minutes)
+    run_folder.describe(out, "privileged", source, config)
+    run = privileged.PrivilegedRun(config)
+    loop.train(run, config.budget, out / "privileged.pt", privileged.Numbered(run, out))
+
+
+@app.command("dagger")
+def train_dagger(
+    teacher_file: Annotated[
+        Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.")
+    ] = Path("out/training/privileged/privileged.pt"),
+    out: Out = Path("out/training/dagger"),
+    source: Recipe = None,
+    minutes: Minutes = None,
+) -> None:
+    """Stage 2 without a clock: the paper's plain network learns from that teacher while it drives itself.
+
+    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
+    """
+    config = _configured(dagger.DaggerConfig, source, minutes)
+    run_folder.describe(out, "dagger", source, config)
+    run = dagger.DaggerRun(config, teacher_file)
+    checkpoint = out / "dagger.pt"
+    loop.train(run, config.budget, checkpoint)
+    about = run_folder.made_of("dagger", source, config, checkpoint)
+    dagger.export_policy(run.student, run.env, run.grid, out / "policy.onnx", about)
+    print(f"written: {out / 'policy.onnx'}")
 
 
 @app.command("distill")

@@ -21,9 +21,8 @@ from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import student
 from .crl import PRIVILEGED, CrlConfig, CrlRun
-from .networks import Gaussian, Mlp
+from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, Rollout
-from .teacher import torch_mirror
 
 try:
     import cusrl  # type: ignore[import-not-found,import-untyped,unused-ignore]

@@ -22,11 +22,10 @@ from .command_map import CommandMap
 from .distill import map_student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares
-from .networks import Gaussian, Mlp, Recurrent, State
+from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
-from .teacher import torch_mirror
 
 PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
 PRIVILEGED = 8 + 3 + 4 + 1 + 12 + 12  # plant, true velocity, contacts, height, torque, exploration under way

@@ -24,9 +24,9 @@ from . import student, teacher
 from .command_map import CommandCorrection, CommandMap, MapFit, Tracking, fit_command_map, held_commands
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .loop import Budget, cosine, load, set_rate
-from .networks import Gaussian, Mlp, Recurrent, State, select
+from .networks import Gaussian, Mlp, Recurrent, State, select, torch_mirror
 from .randomisation import Randomisation
-from .teacher import GaitState, torch_mirror
+from .teacher import GaitState
 
 FAR = 0.5  # of the network's unit: what the teacher asks of a robot that is about to fall must not drown all else
 

@@ -1,11 +1,13 @@
 """The batched walking environment: MuJoCo's batch, the actuator model, randomisation and sensing, at 200 Hz.
 
 It knows no reward and no gait: trainers read `VelocityEnv`'s arrays. Frames and joint order as everywhere in quadvel.
+A robot whose physics has blown up is put down as fallen at once, so that no trainer ever sees a number that is none.
 """
 
 from __future__ import annotations
 
 import os
+from typing import Protocol
 
 import attrs
 import mujoco
@@ -22,7 +24,10 @@ from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
 
-TICK = 0.005  # s, one policy sample
+TICK = 0.005  # s, one sample of the policy on the robot
+HEAT = 0.2  # W/(N m)^2, k_r of the paper's energy
+EDGE = 0.6  # m, before the end of rough ground, at which an episode ends as if its time was over
+ABSURD_SPEED = 150.0  # m/s or rad/s of any body or joint: physics that has blown up, or is about to
 STANCE_LENGTH, STANCE_WIDTH = np.ptp(
     foot_positions(robot.NOMINAL_Q)[:, :2], axis=0
 )  # m, between nominal feet
@@ -66,6 +71,19 @@ class CommandRange:
         return command
 
 
+class Commands(Protocol):
+    """Where velocity commands come from."""
+
+    @property
+    def hold(self) -> tuple[float, float]:
+        """For how long a command lasts, from and to, s."""
+        ...
+
+    def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
+        """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        ...
+
+
 @attrs.frozen
 class EnvConfig:
     """One batch of environments."""
@@ -73,6 +91,7 @@ class EnvConfig:
     n: int = 512
     threads: int = attrs.field(factory=cores)
     seed: int = 0
+    period: float = TICK  # s, one sample of the trainer: how long joint targets are held
     timestep: float = 0.0025  # s, of physics
     kp: float = robot.KP
     kd: float = robot.KD
@@ -92,28 +111,39 @@ def training_model(timestep: float, terrain: Terrain) -> mujoco.MjModel:
 
 
 class VelocityEnv:
-    """`n` robots. After every `tick` the arrays below describe the new state; `reset(ids)` starts some over.
+    """`n` robots. After every `tick`, a sample of `config.period`, the arrays below describe the new state; `reset(ids)`
+    starts some over.
 
     command (n, 4); q, dq, torque (n, 12); quaternion (n, 4); velocity, angular_velocity, acceleration (n, 3) in the body
     frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
-    contact (n, 4) bool; height (n,) of the trunk above ground; fallen, timed_out (n,) bool; changed (n,) bool: command
-    is new.
+    contact (n, 4) bool; height (n,) of the trunk above ground; power (n,) of the joints by the paper's energy term, mean of
+    the sample, W; fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
+    command is new.
     """
 
-    def __init__(self, config: EnvConfig) -> None:
+    def __init__(self, config: EnvConfig, commands: Commands | None = None) -> None:
+        """`commands`: where they are drawn instead of the configuration's range."""
         self.config = c = config
+        self.commands: Commands = commands or c.commands
         self.model = training_model(c.timestep, c.terrain)
-        self.substeps = round(TICK / c.timestep)
+        self.substeps = round(c.period / c.timestep)
+        self._resend = max(
+            1, int(TICK / c.timestep)
+        )  # steps between packets: the controller sends every TICK
         self.rng = np.random.default_rng(c.seed)
         self.batch = Batch(self.model, c.n, c.threads)
         self.plants = PlantSampler(self.batch, c.randomisation, self.rng)
         self.actuators = ActuatorModel(c.actuator, (c.n, 12), c.timestep, seed=c.seed + 1)
-        self._qpos, self._qvel, self._ctrl = (self.batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
+        self._qpos, self._qvel, self._ctrl, self._clock = (
+            self.batch.bind(name) for name in ("qpos", "qvel", "ctrl", "time")
+        )
         self.stand_q = robot.NOMINAL_Q + mjcf.gravity_torque(self.model) / c.kp
 
         n = c.n
         self.command = np.zeros((n, 4))
         self.changed = np.zeros(n, bool)
+        self.broken = np.zeros(n, bool)
+        self.power = np.zeros(n)
         self.torque = np.zeros((n, 12))
         self.acceleration = np.zeros((n, 3))
         self.time = np.zeros(n)
@@ -121,6 +151,7 @@ class VelocityEnv:
         self._velocity_drift = np.zeros((n, 3))
         rough = c.terrain.kind == "rough"
         self._spawn_radius = 0.4 * c.terrain.size if rough else 0.0  # m
+        self._edge = 0.5 * c.terrain.size - EDGE if rough else np.inf  # m
         self.reset(np.arange(n))
 
     def reset(self, ids: np.ndarray, posture: np.ndarray = robot.NOMINAL_Q) -> None:
@@ -139,6 +170,7 @@ class VelocityEnv:
         feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
         self._qpos[ids], self._qvel[ids] = qpos, qvel
+        self._clock[ids] = self.config.period  # not 0, which MuJoCo's own starting over would not differ from
         self.time[ids] = rng.uniform(0, 0.2, n) * self.config.episode
         self._velocity_drift[ids] = 0.0
         self._new_commands(ids)
@@ -147,8 +179,8 @@ class VelocityEnv:
         self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
 
     def _new_commands(self, ids: np.ndarray) -> None:
-        self.command[ids] = self.config.commands.draw(self.rng, len(ids))
-        self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.config.commands.hold, len(ids))
+        self.command[ids] = self.commands.draw(self.rng, len(ids))
+        self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.commands.hold, len(ids))
         self.changed[ids] = True
 
     def tick(
@@ -158,28 +190,50 @@ class VelocityEnv:
         kp: np.ndarray | None = None,
         kd: np.ndarray | None = None,
     ) -> None:
-        """One policy sample (5 ms) with the joint targets (n, 12) sent at its start; other gains (n, 12) if given.
+        """One sample with the joint targets (n, 12) sent from its start on; other gains (n, 12) if given.
 
         Targets beyond the range of commands are sent as the controller sends them.
         """
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
-        target, push = within_range(target, gains[0], self.q)
         self.changed[:] = False
+        self.power[:] = 0.0
         self._push()
+        end = self._clock.ravel() + self.config.period
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
         for step in range(self.substeps):
+            if step % self._resend == 0:
+                sent, push = within_range(target, gains[0], q)
             if step == self.substeps - 1:
                 before = self._qvel[:, :3].copy()
-            self.torque = self.actuators.step(q, dq, target, *gains, target_speed, push)
+            self.torque = self.actuators.step(q, dq, sent, *gains, target_speed, push)
             self._ctrl[:] = self.torque
             self.batch.step()
-        self.time += TICK
+            self.power += np.maximum(HEAT * self.torque**2 + self.torque * dq, 0.0).sum(axis=1)
+        self.power /= self.substeps
+        self.time += self.config.period
+        self._put_down_broken(end, before)
         self._read()
         proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, robot.GRAVITY]
         self.acceleration = rotate_inverse(self.quaternion, proper)
         due = np.flatnonzero(self.time >= self._next_command)
         if len(due):
             self._new_commands(due)
+
+    def _put_down_broken(self, end: np.ndarray, before: np.ndarray) -> None:
+        """Lay robots with states that are no numbers, or absurd, on their backs at rest.
+
+        end (n,): MuJoCo's clock as it should be; it starts such simulations over by itself. before (n, 3): the last velocities.
+        """
+        state = np.concatenate([self._qpos, self._qvel, self.torque, self.power[:, None]], axis=1)
+        absurd = np.abs(self._qvel).max(axis=1) > ABSURD_SPEED
+        started_over = self._clock.ravel() < end - 0.5 * self.config.timestep
+        self.broken = absurd | started_over | ~np.isfinite(state).all(axis=1)
+        ids = np.flatnonzero(self.broken)
+        if len(ids):
+            self._qpos[ids, :3], self._qpos[ids, 3:7] = 0.0, [0.0, 1.0, 0.0, 0.0]
+            self._qpos[ids, 7:], self._qvel[ids] = robot.NOMINAL_Q, 0.0
+            self.torque[ids], self.power[ids], before[ids] = 0.0, 0.0, 0.0
+            self.actuators.reset(ids)
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
         return self.config.terrain.height(points[..., 0], points[..., 1])
@@ -194,7 +248,7 @@ class VelocityEnv:
 
     def _push(self) -> None:
         r = self.config.randomisation
-        hit = np.flatnonzero(self.rng.random(self.config.n) < TICK / r.push_interval)
+        hit = np.flatnonzero(self.rng.random(self.config.n) < self.config.period / r.push_interval)
         if len(hit) and (r.push_velocity or r.push_turn):
             self._qvel[hit, :2] += self.rng.uniform(-1, 1, (len(hit), 2)) * r.push_velocity
             self._qvel[hit, 3:6] += self.rng.uniform(-1, 1, (len(hit), 3)) * r.push_turn
@@ -215,15 +269,14 @@ class VelocityEnv:
         self.clearance = self.feet[..., 2] - self._ground(self.feet) - robot.FOOT_RADIUS
         self.contact = self.clearance < 0.001
         self.height = qpos[:, 2] - self._ground(qpos)
-        self.fallen = (
-            (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9) | ~np.isfinite(self.height)
-        )
-        self.timed_out = self.time >= self.config.episode
+        self.fallen = (self.height < 0.18) | (np.abs(self.roll_pitch).max(axis=1) > 0.9)
+        left_the_field = np.abs(qpos[:, :2]).max(axis=1) > self._edge
+        self.timed_out = (self.time >= self.config.episode) | left_the_field
 
     def sense(self) -> dict[str, np.ndarray]:
         """Noisy readings under the names of the observation's terms (previous action and command apart)."""
         r, rng, n = self.config.randomisation, self.rng, self.config.n
-        decay = np.exp(-TICK / 0.5)
+        decay = np.exp(-self.config.period / 0.5)
         self._velocity_drift *= decay
         self._velocity_drift += rng.normal(0, r.drift_velocity * np.sqrt(1 - decay**2), (n, 3))
         noise = rng.standard_normal((n, 32), dtype=np.float32)

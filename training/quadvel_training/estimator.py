@@ -18,10 +18,10 @@ from quadvel_description.robot import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
-from . import student
 from .env import TICK, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State, select
+from .onnx_file import commit, export
 from .walks import Walks, both_grounds
 
 MEMORY = 128
@@ -190,10 +190,8 @@ class EstimatorRun:
 
     def export(self, path: Path, recipe: dict[str, Any]) -> None:
         """Write the estimator file."""
-        metadata = features.metadata((1, 1, MEMORY + 3), recipe, student.commit())
-        student.export(
-            self.network, features.DEFAULT_LAYOUT.size, path, list(features.OUTPUTS), json.dumps(metadata)
-        )
+        metadata = features.metadata((1, 1, MEMORY + 3), recipe, commit())
+        export(self.network, features.DEFAULT_LAYOUT.size, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:
         """One sequence on each ground, and steps of the optimiser for mini-batches of both."""

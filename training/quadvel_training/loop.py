@@ -155,7 +155,10 @@ class _Journal:
             seen = seen | self._keeper.keep()
         for key, value in seen.items():
             self._curves.add_scalar(f"{self._checkpoint.stem}/{key}", value, samples)
-        note = "  ".join(f"{key} {value:.3g}" for key, value in seen.items())
+        told = {
+            key: value for key, value in seen.items() if "/" not in key
+        }  # parts of a figure are for the curves
+        note = "  ".join(f"{key} {value:.3g}" for key, value in told.items())
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()
         if now - self._saved > SAVE_EVERY:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
+
+from quadvel_description.symmetry import Mirror
 
 State = tuple[Tensor, Tensor]
 
@@ -13,6 +16,15 @@ State = tuple[Tensor, Tensor]
 def select(state: State, ids: Tensor) -> State:
     """The state of some environments."""
     return state[0][:, ids].contiguous(), state[1][:, ids].contiguous()
+
+
+def torch_mirror(
+    mirror: Mirror, device: torch.device | None = None
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """The same mirror on tensors of `device`."""
+    index = torch.as_tensor(mirror.index, device=device)
+    sign = torch.as_tensor(mirror.sign, dtype=torch.float32, device=device)
+    return lambda x: x[..., index] * sign
 
 
 def mlp(sizes: list[int]) -> nn.Sequential:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import attrs
+import mujoco
 import numpy as np
 from mujoco.batch import Batch
 
@@ -23,6 +24,13 @@ class Randomisation:
     joint_friction_scale: tuple[float, float] = (0.2, 1.5)
     joint_damping_scale: tuple[float, float] = (0.2, 1.5)
     armature_scale: tuple[float, float] = (0.8, 1.2)
+    contact_time: tuple[float, float] = (0.01, 0.01)  # s, of the feet's contact spring: stiff to soft ground
+    contact_damping: tuple[float, float] = (1.0, 1.0)  # of critical
+    grip: tuple[float, float] = (
+        10.0,
+        10.0,
+    )  # MuJoCo's impratio: how little a foot creeps below the cone's edge
+    pyramidal: float = 0.0  # share of robots with a pyramidal friction cone instead of an elliptic one
     transmission_delay: tuple[float, float] = (0.0, 0.002)  # s, on top of the actuator's own input delay
     noise_q: float = 0.01  # rad
     noise_dq: float = 0.1  # rad/s
@@ -42,7 +50,24 @@ class Randomisation:
     def none(cls) -> Randomisation:
         """The nominal plant without noise or pushes."""
         one, nil = (1.0, 1.0), (0.0, 0.0)
-        return cls((0.8, 0.8), nil, 0.0, one, one, one, one, nil, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 8.0, 0.0, 0.0)
+        return cls(
+            foot_friction=(0.8, 0.8),
+            payload=nil,
+            com_shift=0.0,
+            mass_scale=one,
+            joint_friction_scale=one,
+            joint_damping_scale=one,
+            armature_scale=one,
+            transmission_delay=nil,
+            noise_q=0.0,
+            noise_dq=0.0,
+            noise_roll_pitch=0.0,
+            noise_angular_velocity=0.0,
+            noise_velocity=0.0,
+            drift_velocity=0.0,
+            push_velocity=0.0,
+            push_turn=0.0,
+        )
 
     @classmethod
     def calm(cls) -> Randomisation:
@@ -60,6 +85,7 @@ class PlantSampler:
         "body_inertia",
         "body_ipos",
         "geom_friction",
+        "geom_solref",
         "dof_frictionloss",
         "dof_damping",
         "dof_armature",
@@ -70,6 +96,7 @@ class PlantSampler:
         model = batch.model
         self._nominal = {name: getattr(model, name).copy() for name in self.FIELDS}
         self._fields = {name: batch.expand(name) for name in self.FIELDS}
+        self._cone, self._impratio = batch.expand("opt.cone"), batch.expand("opt.impratio")
         self._feet = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith("_foot")])
         self._trunk = model.body("trunk").id
         self.drawn = np.zeros((batch.nsim, 8))  # 4 frictions, payload, com shift (3)
@@ -80,6 +107,13 @@ class PlantSampler:
         uniform = rng.uniform
         friction = uniform(*r.foot_friction, (n, len(self._feet)))
         f["geom_friction"][ids[:, None], self._feet, 0] = friction
+        f["geom_solref"][ids[:, None], self._feet, 0] = uniform(*r.contact_time, (n, 1))
+        f["geom_solref"][ids[:, None], self._feet, 1] = uniform(*r.contact_damping, (n, 1))
+        self._impratio[ids] = uniform(*r.grip, self._impratio[ids].shape)
+        cones = np.where(
+            rng.random(n) < r.pyramidal, mujoco.mjtCone.mjCONE_PYRAMIDAL, mujoco.mjtCone.mjCONE_ELLIPTIC
+        )
+        self._cone[ids] = cones.reshape(self._cone[ids].shape)
 
         scale = uniform(*r.mass_scale, (n, self._batch.model.nbody))
         scale[:, : self._trunk + 1] = 1.0

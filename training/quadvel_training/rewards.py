@@ -5,9 +5,7 @@ from __future__ import annotations
 import attrs
 import numpy as np
 
-from .env import TICK, VelocityEnv
-
-HEAT = 0.2  # k_r of the energy term, W/(N m)^2
+from .env import HEAT, TICK, VelocityEnv
 
 
 @attrs.frozen

@@ -18,6 +18,7 @@ from quadvel_eval.walk import Setup
 
 from . import loop, student
 from .crl import CrlRun
+from .onnx_file import commit
 from .randomisation import ACTUATORS, actuator
 
 COMMANDS = cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and wz: a minute of one core
@@ -26,7 +27,7 @@ COMMANDS = cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and w
 def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
     """Write run.json: what this directory's run is; where it is resumed, what it is from now on."""
     folder.mkdir(parents=True, exist_ok=True)
-    about = {"stage": stage, "recipe": recipe.stem if recipe else None, "commit": student.commit()}
+    about = {"stage": stage, "recipe": recipe.stem if recipe else None, "commit": commit()}
     write_json(folder / "run.json", about | {"configuration": cattrs.unstructure(config)})
 
 

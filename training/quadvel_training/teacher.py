@@ -5,7 +5,6 @@ Why not the recurrent student at once: see docs/decisions/0003-teacher-then-stud
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import attrs
@@ -21,7 +20,7 @@ from .command_map import Tracking
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .legs import columns
 from .loop import Budget
-from .networks import Gaussian, Mlp
+from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout
 
 HOLD = 4  # ticks a residual is held
@@ -37,15 +36,6 @@ OBSERVATION_MIRROR = symmetry.stack(
     [symmetry.OBSERVATION, _signs(-1, -1), symmetry.JOINTS, symmetry.FEET, _signs(1)]
 )
 CRITIC_MIRROR_FREE = 8 + 6  # plant draws, low-passed errors: seen by the critic alone
-
-
-def torch_mirror(
-    mirror: Mirror, device: torch.device | None = None
-) -> Callable[[torch.Tensor], torch.Tensor]:
-    """The same mirror on tensors of `device`."""
-    index = torch.as_tensor(mirror.index, device=device)
-    sign = torch.as_tensor(mirror.sign, dtype=torch.float32, device=device)
-    return lambda x: x[..., index] * sign
 
 
 class GaitState:

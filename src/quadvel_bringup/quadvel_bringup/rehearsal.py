@@ -33,17 +33,13 @@ def _policy(settings: Any) -> object:
     return PolicyFile(Path(settings.policy)) if settings.policy else None
 
 
-def _calibration(settings: Any) -> object:
-    from quadvel_driver.calibration import Calibration
-
-    return Calibration.load(settings.calibration) if settings.calibration else None
-
-
 # The shipped networks are as they were shipped; loading them would only take time.
 PARTS = {
     "sim_node": Part("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
-    "board": Part("quadvel_sim.parameters:BoardParameters", lambda settings: settings.config()),
-    "driver": Part("quadvel_driver.parameters:DriverParameters", _calibration),
+    "board": Part(
+        "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
+    ),
+    "driver": Part("quadvel_driver.parameters:DriverParameters", lambda settings: settings.correction()),
     "estimator": Part(
         "quadvel_estimator.estimator:EstimatorParameters",
         lambda settings: settings.make_estimator() if settings.model else None,

@@ -21,16 +21,15 @@ from std_srvs.srv import SetBool
 
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.diagnostics import diagnostics
+from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
-from .calibration import Calibration
 from .dry_run import DryRun
-from .health import Health, figures
-from .link import NO_CALIBRATION, SILENCE, UdpLink
+from .health import Health, Level, figures
+from .link import SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
 from .thinning import Thinning
@@ -38,6 +37,7 @@ from .wire import BoardState
 
 OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_teleop
 LOCK_EVERY = 5  # of these periods: a stop is said again, to whoever came later
+GRACE = 3  # reports, one a second, in which a board may be silent that is only being started
 VIEW_RATE = 50  # Hz, of what `RobotView` publishes
 # Standard deviations of the IMU, rad, rad/s, m/s^2: of its class; those of the AlienGo's own are not known.
 ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION = 0.002, 0.01, 0.1
@@ -50,8 +50,7 @@ class Driver(Node):
         super().__init__("driver")
         self._settings = settings = read_parameters(self, DriverParameters)
         self._dry_run = DryRun() if settings.dry_run else None
-        calibration = Calibration.load(settings.calibration) if settings.calibration else NO_CALIBRATION
-        self._link = UdpLink(settings, self._on_state, calibration, self._dry_run)
+        self._link = UdpLink(settings, self._on_state, settings.correction(), self._dry_run)
         self._health = Health(f"{settings.board_address}:{settings.board_port}")
         self._pilot = RemotePilot(settings)
         self._orders: deque[Order] = deque()
@@ -60,6 +59,7 @@ class Driver(Node):
         self._system_time = SystemTime()
         self._thinning, self._view_thinning = Thinning(settings.state_rate), Thinning(VIEW_RATE)
         self._operator_ticks = 0
+        self._reports = 0
         self._passive_wanted = False
         self._said = ""
         self._failure = ""
@@ -202,6 +202,9 @@ class Driver(Node):
         values = {**figures(report, self._newest), "stopped": self._pilot.stopped, **self._refusals.values()}
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), bytes([level]), summary, values))
+        self._reports += 1
+        if level > Level.OK and self._reports > GRACE:
+            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
 
 
 def main(args: list[str] | None = None) -> None:

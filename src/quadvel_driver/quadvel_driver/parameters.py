@@ -6,7 +6,8 @@ import attrs
 
 from quadvel_nodes.scheduling import Scheduling
 
-from .link import LinkConfig
+from .calibration import Calibration
+from .link import NO_CALIBRATION, LinkConfig
 from .remote import RemoteConfig
 
 FASTEST = 1000  # Hz, of a board's states
@@ -32,3 +33,7 @@ class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
     def _is_rate(self, attribute: object, value: int) -> None:
         if not 50 <= value <= FASTEST:
             raise ValueError(f"state_rate is {value} Hz, expected 50 to {FASTEST}")
+
+    def correction(self) -> Calibration:
+        """What states and commands are set right by. CalibrationError names the file that is none."""
+        return Calibration.load(self.calibration) if self.calibration else NO_CALIBRATION

@@ -1,0 +1,114 @@
+"""Stage 2 without a clock: the student, its teacher at every tick, and the policy file that is the network and no more."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_policy.policy_file import PolicyFile  # noqa: E402
+from quadvel_training import dagger, loop  # noqa: E402
+from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
+from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun  # noqa: E402
+
+SMALL = DaggerConfig(n=8, threads=1, length=6, mini_batches=2, learning_rate=3e-3)
+
+
+@pytest.fixture(scope="module")
+def teacher_file(tmp_path_factory):
+    path = tmp_path_factory.mktemp("teacher") / "privileged.pt"
+    run = PrivilegedRun(PrivilegedConfig(n=4, threads=1, length=2))
+    followed = [(0.5, 0, 0), (1.0, 0, 0), (1.5, 0, 0), (2.0, 0, 0), (0, 0.4, 0), (0, 0, 0.7)]
+    for command in followed:
+        run.grid.note(np.tile([*command, 0.0], (4, 1)), np.zeros((4, 2)), np.zeros(4, bool))
+    loop.save(run.state(), path)
+    return path
+
+
+@pytest.fixture
+def run(teacher_file):
+    return DaggerRun(SMALL, teacher_file)
+
+
+def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
+    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+    model = onnx.load(tmp_path / "policy.onnx")
+    assert len(model.graph.node) <= 40
+    sizes = {x.name: [d.dim_value for d in x.type.tensor_type.shape.dim] for x in model.graph.input}
+    assert sizes == {"obs": [1, 48], "h_in": [1, 1, 256], "c_in": [1, 1, 256]}
+    weights = sum(np.prod(w.dims) for w in model.graph.initializer)
+    layers = 304 * 1024 + 1024 + 256 * 192 + 192 + 192 * 128 + 128 + 128 * 12 + 12
+    assert layers <= weights < layers + 50
+
+
+def test_the_file_does_what_the_network_does(run, tmp_path):
+    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+    policy = PolicyFile(tmp_path / "policy.onnx")
+    obs = np.random.default_rng(0).normal(size=(50, 48)).astype(np.float32)
+    with torch.no_grad():
+        expected, _ = run.student(torch.from_numpy(obs[:, None]), run.student.initial_state(1))
+    found = np.array([policy.step(one).copy() for one in obs])
+    assert np.abs(found - expected[:, 0].numpy()).max() < 1e-4
+
+
+def test_the_file_answers_the_commands_that_its_teacher_followed(run, tmp_path):
+    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+    metadata = PolicyFile(tmp_path / "policy.onnx").metadata
+    assert metadata.command_limits["vx"] == (0.0, 2.0)
+    assert metadata.command_limits["wz"] == pytest.approx((-0.7, 0.7))
+    assert metadata.curve_limit == 4.0
+
+
+def test_the_teacher_knows_what_was_done_20_ms_ago(run):
+    teacher, seen = run.teacher, []
+    for i in range(6):
+        seen.append(teacher._executed[0][0, 0])
+        teacher.advance(run.env.command, np.full((8, 12), i, np.float32))
+    assert seen == [0, 0, 0, 0, 0, 1]
+    assert PrivilegedConfig().period == dagger.AGO * dagger.TICK
+
+
+def test_who_drives_changes_with_an_episode_alone(run):
+    before = run.driven.copy()
+    run.samples = 10**9  # the student is to drive nearly all
+    run._start_over(np.array([1, 2]))
+    kept = np.delete(np.arange(8), [1, 2])
+    assert np.array_equal(run.driven[kept], before[kept])
+    for _ in range(3):  # however often the student's robots start over
+        run._start_over(np.arange(8))
+        assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
+
+
+def test_the_student_gets_its_share_as_soon_as_it_grows(run):
+    run.samples = 10**9
+    run.step(0.0)
+    assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
+
+
+def test_the_student_comes_to_do_what_the_teacher_does(run):
+    losses = [run.step(0.0)["imitation"] for _ in range(25)]
+    assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:3])
+
+
+def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
+    run.env._qpos[3, 2] = 0.05
+    _, _, mask, _ = run.collect()
+    assert mask[0, 3] == 1.0
+    assert (mask[1:, 3] == 0.0).all()
+    memory = [part.clone() for part in run._memory]
+    run._start_over(np.flatnonzero(mask[-1].numpy() == 0.0))
+    assert (run._memory[0][0, 3] == 0.0).all()
+    assert torch.equal(run._memory[0][0, 0], memory[0][0, 0])
+    assert not run.env.fallen[3]
+
+
+def test_a_killed_run_goes_on(run, teacher_file, tmp_path):
+    run.step(0.0)
+    loop.save(run.state(), tmp_path / "dagger.pt")
+    other = DaggerRun(SMALL, teacher_file)
+    other.restore(loop.load(tmp_path / "dagger.pt"))
+    assert other.samples == run.samples == 48
+    for one, two in zip(run.student.parameters(), other.student.parameters(), strict=True):
+        assert torch.equal(one, two)

@@ -1,0 +1,240 @@
+"""Stage 1 without a clock: the grid of commands, the rewards, and a run that survives broken physics and being killed."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_description import symmetry  # noqa: E402
+from quadvel_sim.terrain import Terrain  # noqa: E402
+from quadvel_training import loop, privileged  # noqa: E402
+from quadvel_training.command_grid import FIRST, WIDTH, CommandGrid, GridConfig  # noqa: E402
+from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.privileged import Numbered, Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.randomisation import Randomisation  # noqa: E402
+from quadvel_training.walking_rewards import HIGHEST, LOWEST, WalkingRewards, WalkingWeights  # noqa: E402
+
+SMALL = PrivilegedConfig(n=6, threads=1, length=4)
+CALM = EnvConfig(n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+
+
+@pytest.fixture
+def grid():
+    return CommandGrid(GridConfig())
+
+
+def follow(grid, command, times, error=(0.0, 0.0), fell=False):
+    for _ in range(times):
+        grid.note(np.array([[*command, 0.0]]), np.array([error]), np.array([fell]))
+
+
+def test_commands_begin_near_rest_and_lie_within_the_limits(grid):
+    drawn = grid.draw(np.random.default_rng(0), 2000)
+    assert (np.abs(drawn[:, :3]) <= np.array(FIRST) + 0.5 * np.array(WIDTH)).all()
+    grid.open[:] = grid.allowed
+    limits = grid.config.limits()
+    drawn = grid.draw(np.random.default_rng(0), 2000)
+    assert np.allclose([limits.held(one) for one in drawn[:, :3].tolist()], drawn[:, :3])
+    assert drawn[:, 0].max() > 3.9
+    assert drawn[:, 2].max() > 5.5
+    assert (drawn[drawn[:, 3] == 1, :3] == 0).all()
+
+
+def test_slow_commands_stay_frequent_however_large_the_grid(grid):
+    grid.open[:] = grid.allowed
+    drawn = grid.draw(np.random.default_rng(0), 4000)
+    slow = (np.abs(drawn[:, :3]) <= np.array(FIRST) + 0.5 * np.array(WIDTH)).all(axis=1) & (drawn[:, 3] == 0)
+    assert np.mean(slow) > 0.2
+    assert 0.2 < np.mean(drawn[slow, 2] == 0.0) < 0.8
+
+
+def test_running_commands_turn_too(grid):
+    grid.open[:] = grid.allowed
+    drawn = grid.draw(np.random.default_rng(0), 4000)
+    running = drawn[np.abs(drawn[:, 0]) > 2.0]
+    assert np.mean(np.abs(running[:, 2]) > 0.3) > 0.15
+
+
+def test_neighbours_open_where_both_xy_and_yaw_are_followed(grid):
+    edge, beyond = (1.0, 0.0, 0.0), (1.5, 0.0, 0.0)
+    assert grid.open[grid.cell_of(np.array(edge))]
+    follow(grid, edge, 8, error=(0.0, 0.5))
+    follow(grid, edge, 8, error=(0.5, 0.0))
+    follow(grid, edge, 8, fell=True)
+    assert not grid.open[grid.cell_of(np.array(beyond))]
+    follow(grid, edge, 4)
+    assert grid.open[grid.cell_of(np.array(beyond))]
+    assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
+
+
+def test_cells_close_again_where_commands_are_followed_no_more(grid):
+    for ahead in (1.0, 1.5, 2.0):
+        follow(grid, (ahead, 0.0, 0.0), 4)
+    assert grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
+    assert grid.reach()["forward"] == 2.0
+    follow(grid, (2.0, 0.0, 0.0), 5, fell=True)
+    assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
+    assert grid.open[grid.cell_of(np.array((2.0, 0.0, 0.0)))]
+    assert grid.reach()["forward"] == 1.5
+
+
+def test_what_is_followed_to_the_left_is_open_to_the_right(grid):
+    left, right = (np.array((0.5, 0.8 * side, 0.7 * side)) for side in (1, -1))
+    assert not grid.open[grid.cell_of(left)]
+    follow(grid, (0.5, 0.4, 0.7), 4)
+    assert grid.open[grid.cell_of(left)]
+    assert grid.open[grid.cell_of(right)]
+
+
+def test_the_teachers_mirror_undoes_itself():
+    x = np.random.default_rng(0).normal(size=(3, privileged.SIZE))
+    assert np.array_equal(privileged.MIRROR(privileged.MIRROR(x)), x)
+
+
+def test_the_mirrored_robot_observes_the_mirror_image():
+    env = VelocityEnv(attrs.evolve(CALM, n=2))
+    env.command[:] = [[0.7, 0.2, -0.4, 0.0], [0.7, -0.2, 0.4, 0.0]]
+    past = Past(env)
+    joints = np.random.default_rng(0).normal(0, 0.1, 12)
+    for ids, mirror in ((0, lambda x: x), (1, symmetry.JOINTS)):
+        env._qpos[ids, 3:7] = [1.0, 0.0, 0.0, 0.0]
+        env._qpos[ids, 2] = 0.4
+        env._qpos[ids, 7:] = mirror(joints) + privileged.robot.NOMINAL_Q
+        env._qvel[ids, 6:] = mirror(3 * joints)
+        env._qvel[ids, :6] = [0.5, (0.1, -0.1)[ids], 0.0, (0.2, -0.2)[ids], 0.3, (0.4, -0.4)[ids]]
+    env._read()
+    past.advance(env.command)
+    one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
+    assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
+
+
+def test_a_sample_of_20_ms_is_four_ticks_of_5():
+    slow, fast = VelocityEnv(CALM), VelocityEnv(attrs.evolve(CALM, period=0.005, timestep=0.0025))
+    starts = [env._clock.copy() for env in (slow, fast)]
+    slow.tick(np.tile(slow.stand_q, (4, 1)))
+    for _ in range(4):
+        fast.tick(np.tile(fast.stand_q, (4, 1)))
+    for env, start in zip((slow, fast), starts, strict=True):
+        assert (env._clock - start).ravel() == pytest.approx(np.full(4, 0.02))
+
+
+@pytest.mark.parametrize("speed", [np.nan, np.inf, 1e4])
+def test_a_robot_whose_physics_blows_up_lies_fallen_and_every_number_stays_finite(speed):
+    env = VelocityEnv(CALM)
+    env._qvel[1, 7] = speed
+    env.tick(np.tile(env.stand_q, (4, 1)))
+    assert env.broken.tolist() == [False, True, False, False]
+    assert env.fallen[1]
+    past = Past(env)
+    past.advance(env.command)
+    assert np.isfinite(privileged.observe(env, past, np.zeros((4, 12)))).all()
+    terms = WalkingRewards(env, WalkingWeights()).terms(env.command, past, past.air, np.zeros((3, 4, 12)))
+    assert all(np.isfinite(value).all() for value in terms.values())
+    env.tick(np.tile(env.stand_q, (4, 1)))
+    assert np.isfinite(env.batch.qpos).all()
+
+
+def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():
+    ground = Terrain(kind="rough", roughness=0.01, size=8.0)
+    env = VelocityEnv(attrs.evolve(CALM, terrain=ground))
+    env._qpos[:, :2] = 0.0
+    env._qpos[2, 0] = 3.9
+    env._qpos[:, 2] = 0.42
+    env._read()
+    assert env.timed_out.tolist() == [False, False, True, False]
+    assert not env.fallen.any()
+
+
+def test_no_sample_is_worth_more_or_less_than_the_bounds():
+    env = VelocityEnv(CALM)
+    rewards = WalkingRewards(env, WalkingWeights(scale=1.0, fall=0.0))
+    awful, great = {"one": np.full(4, -1e9)}, {"one": np.full(4, 1e9)}
+    assert (rewards.total(awful, np.zeros(4, bool)) == LOWEST).all()
+    assert (rewards.total(great, np.zeros(4, bool)) == HIGHEST).all()
+
+
+def test_following_turns_pays_as_following_speeds_does():
+    env = VelocityEnv(CALM)
+    rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
+    command = np.array(
+        [[0.8, 0.0, 0.0, 0.0], [0.0, 0.0, 0.8, 0.0], [0.8, 0.0, 0.0, 0.0], [0.0, 0.0, 0.8, 0.0]]
+    )
+    env.velocity[:], env.angular_velocity[:] = 0.0, 0.0
+    env.velocity[2, 0] = env.angular_velocity[3, 2] = 0.8
+    past.advance(command)
+    terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
+    total = sum(terms[name] for name in ("linear", "angular", "stride", "steady"))
+    assert total[2] > total[0] + 0.5
+    assert total[3] > total[1] + 0.5
+
+
+def test_feet_are_to_step_while_walking_and_to_stay_in_stance():
+    env = VelocityEnv(CALM)
+    rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
+    command = np.array([[0.5, 0, 0, 0], [0.5, 0, 0, 0], [0, 0, 0, 1], [0, 0, 0, 1]], float)
+    env.contact[:], past.down[:] = True, 5.0
+    env.contact[[1, 3], 0] = past.down[[1, 3]] = False
+    terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
+    assert terms["dragging"][0] < terms["dragging"][1]
+    assert terms["step"][3] < terms["step"][2]
+    assert (terms["dragging"][2:] == 0.0).all()
+    assert (terms["step"][:2] == 0.0).all()
+
+
+def test_exploration_stays_wide_until_a_gait_has_formed():
+    run = PrivilegedRun(SMALL)
+    with torch.no_grad():
+        run.actor.log_std.fill_(-5.0)
+    run._bound_exploration()
+    assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
+    run.samples = int(SMALL.formed)
+    with torch.no_grad():
+        run.actor.log_std.fill_(-5.0)
+    run._bound_exploration()
+    assert run.actor.log_std.detach().exp().max() < 0.2
+
+
+def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
+    first = PrivilegedRun(SMALL)
+    first.step(0.0)
+    follow(first.grid, (1.0, 0.0, 0.0), 4)
+    loop.save(first.state(), tmp_path / "privileged.pt")
+    second = PrivilegedRun(SMALL)
+    second.restore(loop.load(tmp_path / "privileged.pt"))
+    assert second.samples == 24
+    assert first.grid.followed.any()
+    assert np.array_equal(second.grid.open, first.grid.open)
+    assert second.ppo.learning_rate == first.ppo.learning_rate
+    second.step(0.0)
+    third = PrivilegedRun(SMALL)
+    third.restore(loop.load(tmp_path / "privileged.pt"))
+    third.step(0.0)
+    for one, other in zip(second.actor.parameters(), third.actor.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():
+    state = PrivilegedRun(SMALL).state()
+    other = PrivilegedRun(attrs.evolve(SMALL, grid=GridConfig(vy=0.7)))
+    with pytest.raises(ValueError, match=r"command grid of .* cells, expected"):
+        other.restore(state)
+
+
+def test_the_learning_rate_is_bounded_once_a_gait_has_formed():
+    run = PrivilegedRun(attrs.evolve(SMALL, formed=0.0, formed_rate=1e-5))
+    run.step(0.0)
+    assert run.ppo.learning_rate == 1e-5
+    assert run.ppo.actor_optimiser.param_groups[0]["lr"] == 1e-5
+
+
+def test_numbered_checkpoints_are_kept(tmp_path):
+    run = PrivilegedRun(attrs.evolve(SMALL, keep=1000.0))
+    keeper = Numbered(run, tmp_path)
+    assert not keeper.due(900)
+    assert keeper.due(1100)
+    run.samples = 1100
+    keeper.keep()
+    assert loop.load(tmp_path / "kept" / "000001k.pt")["samples"] == 1100

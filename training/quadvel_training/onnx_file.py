@@ -1,0 +1,93 @@
+"""A recurrent network as an ONNX file of one time step, with the metadata that says how to run it."""
+
+from __future__ import annotations
+
+import copy
+import subprocess
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+
+import onnx
+import torch
+from torch import Tensor, nn
+
+from quadvel_description.recurrent_network import METADATA_KEY
+
+from .networks import Recurrent, State
+
+
+class _Cell(nn.Module):
+    """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
+
+    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
+    """
+
+    def __init__(self, lstm: nn.LSTM) -> None:
+        super().__init__()
+        weight = torch.cat([lstm.weight_ih_l0, lstm.weight_hh_l0], dim=1)
+        self.weight = nn.Parameter(weight.detach().T.contiguous())
+        self.bias = nn.Parameter((lstm.bias_ih_l0 + lstm.bias_hh_l0).detach())
+
+    def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
+        h, c = state
+        gates = torch.addmm(self.bias, torch.cat([x, h], dim=1), self.weight)
+        admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
+        memory = forget.sigmoid() * c + admit.sigmoid() * candidate.tanh()
+        hidden = release.sigmoid() * memory.tanh()
+        return hidden, (hidden, memory)
+
+
+class _Step(nn.Module):
+    """One time step with the signature of the policy file."""
+
+    def __init__(self, network: Recurrent, outputs: int) -> None:
+        super().__init__()
+        self.network, self.outputs = copy.deepcopy(network), outputs
+        self.network.lstm = _Cell(network.lstm)
+
+    def forward(self, obs: Tensor, h: Tensor, c: Tensor) -> tuple[Tensor, ...]:
+        y, (hidden, memory) = self.network(obs, (h.flatten(0, 1), c.flatten(0, 1)))
+        outputs = y.split(y.shape[-1] // self.outputs, dim=1) if self.outputs > 1 else (y,)
+        return (*outputs, hidden[None], memory[None])
+
+
+def export(
+    network: Recurrent,
+    size: int,
+    path: Path,
+    outputs: Sequence[str],
+    metadata: str,
+) -> None:
+    """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
+
+    obs has the shape (1, size).
+    """
+    state = network.initial_state(1)
+    part = path.with_suffix(".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter(
+            "ignore", torch.jit.TracerWarning
+        )  # one step has one length, and constants are constants
+        torch.onnx.export(
+            _Step(network, len(outputs)).eval(),
+            (torch.zeros(1, size), *state),
+            str(part),
+            input_names=["obs", "h_in", "c_in"],
+            output_names=[*outputs, "h_out", "c_out"],
+            opset_version=17,
+            dynamo=False,
+        )
+    model = onnx.load(part)
+    onnx.helper.set_model_props(model, {METADATA_KEY: metadata})
+    onnx.save(model, part)
+    part.replace(path)
+
+
+def commit() -> str:
+    """The commit that a file was made at, or "unknown" outside a checkout."""
+    result = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
+    )
+    return result.stdout.strip() or "unknown"
