@@ -47,8 +47,8 @@ ROBOT = [
     Step("quadvel status"),
     Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
     Step("quadvel drive --vx 0.5"),
-    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 12", served=True),
-    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 2"),
+    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 15", served=True),
+    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 6"),
     Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
     Step("quadvel push --fy 60"),
     Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
@@ -65,8 +65,13 @@ EXCITE = [
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
 BOARD = [
+    Step(
+        "quadvel excite creep --seconds 60 --low-level external --out hung.mcap",
+        more="--low-level sim --seconds 4",
+    ),
     Step("quadvel up --low-level board", served=True, then=READY),
-    Step("quadvel record low_state --seconds 5 --out standing.mcap", more="--seconds 1"),
+    Step("quadvel record low_state --seconds 5 --out standing.mcap"),
+    Step("quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml"),
 ]
 LOGS = [  # of one leg each
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
@@ -91,13 +96,11 @@ LEFT_OUT = {
     "quadvel up --low-level aliengo": "needs the robot",
     "quadvel run driver": "the same",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
-    "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "the same",
-    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "needs a robot that hangs; "
-    "tests/quadvel_driver/test_calibration.py has one",
     "quadvel twin dry_gears --out out/twin": "minutes; tests/end_to_end/test_twin.py runs a shorter script",
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
+    "quadvel eval --grid quick --policy out/training/dagger/policy.onnx --out out/eval": "the same",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
@@ -124,7 +127,8 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
-    r"(description|dds|driver's|eval|recordings|all of these) .*": "docs/architecture.md: no command, but who may import whom",
+    r"mkdir -p out/training/.*": "copies a checkpoint that a training goes on from",
+    r"(description|dds|recordings|driver's|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"(driver|controller|command_mux):.*": "a part of a parameter file",
 }
 

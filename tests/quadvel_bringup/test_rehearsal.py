@@ -64,6 +64,7 @@ def test_a_wrong_name_or_file_is_refused_before_anything_starts(
             "simnode:\n  ros__parameters: {payload: 1.0}",
             "found a section for '/simnode', expected one of sim_node,",
         ),
+        ("driver:\n  ros__parameters: {calibration: nowhere.yaml}", r"driver: .*nowhere\.yaml"),
         ("sim_node: [", "p.yaml' is not valid YAML"),
         (
             "sim_node:\n  ros__parameters: 5",
@@ -75,8 +76,9 @@ def test_a_wrong_name_or_file_is_refused_before_anything_starts(
 def test_a_wrong_parameter_file_is_refused_before_anything_starts(
     tmp_path: Path, text: str, sentence: str
 ) -> None:
+    low_level = "board" if text.startswith("driver") else "sim"
     with pytest.raises(ValueError, match=sentence) as refusal:
-        up.up(Stack(parameters=written(tmp_path / "p.yaml", text)))
+        up.up(Stack(low_level=low_level, parameters=written(tmp_path / "p.yaml", text)))
     assert "\n" not in str(refusal.value)
 
 
