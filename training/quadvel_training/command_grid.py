@@ -131,10 +131,10 @@ class CommandGrid:
         good = self.followed
         where = np.concatenate([np.zeros((1, 3)), self._middle[good]])
         return {
-            "forward": float(where[:, 0].max()),
-            "back": float(where[:, 0].min()),
-            "sideways": float(where[:, 1].max()),
-            "turn": float(where[:, 2].max()),
+            "forward": round(float(where[:, 0].max()), 3),
+            "back": round(float(where[:, 0].min()), 3),
+            "sideways": round(float(where[:, 1].max()), 3),
+            "turn": round(float(where[:, 2].max()), 3),
             "open": float(self.open.sum() / self.allowed.sum()),
             "followed": float(good.sum() / self.allowed.sum()),
         }
