@@ -1,7 +1,8 @@
 """The robot behind the AlienGo's interface: `quadvel up --low-level board`, driven by its remote alone.
 
 Board, driver, estimator, controller and mux are processes; packets go over UDP on loopback, the rest over DDS. The operator's
-remote is a joystick at the board, so that all it does comes through the packets. Times are long, for a machine that is busy.
+remote is a joystick at the board, so that all it does comes through the packets. A board waits for nobody, so this wants a
+machine with time to spare: pytest -m realtime.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ from quadvel_bringup.stack import PARAMETERS  # noqa: E402
 from quadvel_driver.remote import BUTTONS, Order  # noqa: E402
 from quadvel_driver.wire import Button  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
+
+pytestmark = pytest.mark.realtime
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 NO_BUTTON = Button(0)

@@ -64,15 +64,6 @@ EXCITE = [
     Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
-BOARD = [
-    Step(
-        "quadvel excite creep --seconds 60 --low-level external --out hung.mcap",
-        more="--low-level sim --seconds 4",
-    ),
-    Step("quadvel up --low-level board", served=True, then=READY),
-    Step("quadvel record low_state --seconds 5 --out standing.mcap"),
-    Step("quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml"),
-]
 LOGS = [  # of one leg each
     Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
     Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
@@ -87,12 +78,16 @@ NODES = [
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
 ]
-SESSIONS = {"robot": ROBOT, "board": BOARD, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
+SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
     "quadvel up": "as with --terrain",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
-    "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_board.py walks so",
+    "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_walk_behind_network.py",
+    "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "needs the robot",
+    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "tests/quadvel_driver/test_calibration.py",
+    "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
+    "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level aliengo": "needs the robot",
     "quadvel run driver": "the same",
     "quadvel run driver --ros-args -p calibration:=calibration.yaml": "the same",
