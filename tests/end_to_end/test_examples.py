@@ -85,7 +85,7 @@ LEFT_OUT = {
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
     "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_walk_behind_network.py",
     "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "needs the robot",
-    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "tests/quadvel_driver/test_calibration.py",
+    "quadvel calibrate --hung hung.mcap --standing standing.mcap --out calibration.yaml": "test_calibration.py has one",
     "quadvel up --low-level board": "a board waits for nobody; tests/end_to_end/test_board.py, on a machine with time to spare",
     "quadvel record low_state --seconds 5 --out standing.mcap": "as the other recordings",
     "quadvel up --low-level aliengo": "needs the robot",
