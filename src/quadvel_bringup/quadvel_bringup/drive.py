@@ -55,8 +55,6 @@ class Drive:
         self._wait(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
         # The mux commands zero all the time, which a robot that has just stood up waits for.
         self._wait(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
-        if not self._states[-1].rate_hz:
-            return "the controller hears no robot: is the simulator paused?"
         return self.refusal()
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
@@ -68,6 +66,8 @@ class Drive:
         state = self._states[-1]
         if state.mode_name == "fault":
             return f"the robot is in fault: {state.reason}\nonce the cause is gone: {WAY_OUT}"
+        if not state.rate_hz:  # over the last second
+            return "the controller hears no robot: is the simulator paused?"
         return str(state.walk_refusal)
 
     def send(self) -> None:
