@@ -149,10 +149,12 @@ from std_msgs.msg import Empty, String
 rclpy.init(args=[])
 node = rclpy.create_node("echo")
 latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-answers = node.create_publisher(String, "answers", latched)
-node.create_subscription(String, "best_effort", answers.publish, qos_profile_sensor_data)
+# A topic of its own for each: the last answer alone is kept for a watcher that finds us late.
+of_latched = node.create_publisher(String, "latched/answer", latched)
+of_best_effort = node.create_publisher(String, "best_effort/answer", latched)
+node.create_subscription(String, "best_effort", of_best_effort.publish, qos_profile_sensor_data)
 print("ready", flush=True)
-node.create_subscription(String, "latched", answers.publish, latched)
+node.create_subscription(String, "latched", of_latched.publish, latched)
 node.create_subscription(Empty, "end", lambda _: rclpy.shutdown(), 10)
 while rclpy.ok():
     rclpy.spin_once(node, timeout_sec=0.5)
@@ -166,7 +168,8 @@ def test_a_latched_message_and_a_best_effort_one_cross_both_ways(graph: Any) -> 
     graph.node.create_publisher(String, "latched", latched).publish(String(data="before"))
     best_effort = graph.node.create_publisher(String, "best_effort", qos_profile_sensor_data)
     heard: list[Any] = []
-    graph.node.create_subscription(String, "answers", heard.append, latched)
+    for topic in ("latched/answer", "best_effort/answer"):
+        graph.node.create_subscription(String, topic, heard.append, latched)
     number = itertools.count()
 
     def both() -> bool:
