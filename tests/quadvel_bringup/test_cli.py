@@ -75,6 +75,10 @@ def test_help_loads_no_simulator_and_no_middleware() -> None:
     ("arguments", "sentence"),
     [
         (["run", "pilot"], "quadvel: there is no node 'pilot'; known are sim_node"),
+        (
+            ["run", "sim_node", "terrain:=rough", "--actuator", "mine.yaml"],
+            "quadvel: unexpected argument 'terrain:=rough'; parameters go as --ros-args",
+        ),
         (["run", "sim_node", "--fast"], "quadvel: unexpected argument '--fast'; parameters go as --ros-args"),
         (["up", "--low-level", "spot"], "'spot' is not one of 'sim', 'board'"),
         (["fly"], "No such command 'fly'"),

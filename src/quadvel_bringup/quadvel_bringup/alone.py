@@ -26,7 +26,7 @@ def ensure_alone(node: Any) -> None:
     while time.monotonic() < until:
         if node.count_publishers(TOPIC):
             raise NotAlone(
-                f"{TOPIC}: somebody publishes it already on ROS domain {_domain(os.environ)}: {_who()}. Stop it, or set "
+                f"{TOPIC}: somebody publishes it already on ROS domain {ros_domain()}: {_who()}. Stop it, or set "
                 "ROS_DOMAIN_ID to another number"
             )
         time.sleep(0.02)
@@ -45,7 +45,7 @@ def servers() -> dict[int, str]:
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         name = next((word for word in SERVERS if word in _words(folder)), None)
-        if name and int(folder.name) != os.getpid() and _domain(_environment(folder)) == _domain(os.environ):
+        if name and int(folder.name) != os.getpid() and ros_domain(_environment(folder)) == ros_domain():
             found[int(folder.name)] = name.rpartition(".")[2]
     return found
 
@@ -68,7 +68,8 @@ def _environment(folder: Path) -> dict[str, str]:
     return dict(pair.partition("=")[::2] for pair in pairs)
 
 
-def _domain(environment: Mapping[str, str]) -> str:
+def ros_domain(environment: Mapping[str, str] = os.environ) -> str:
+    """The number of the ROS domain that a process with this environment is on."""
     return environment.get("ROS_DOMAIN_ID") or "0"
 
 
@@ -88,13 +89,7 @@ def _starter(pid: int) -> str:
 def look_for_others() -> None:
     """The same for a command that has no node of its own."""
     quadvel_dds.install()
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
+    from .session import Session
 
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("look_for_others")
-    try:
-        ensure_alone(node)
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
+    with Session("look_for_others") as session:
+        ensure_alone(session.node)

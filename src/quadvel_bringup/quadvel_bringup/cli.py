@@ -98,12 +98,8 @@ def run(
 
     arguments = [*context.args]
     if actuator is not None:
-        arguments = [
-            "--ros-args",
-            *arguments[1:],
-            "-p",
-            f"actuator_file:={json.dumps(str(actuator.resolve()))}",
-        ]
+        file = json.dumps(str(actuator.resolve()))
+        arguments = [*(arguments or ["--ros-args"]), "-p", f"actuator_file:={file}"]
     nodes.run(node, arguments)
 
 

@@ -25,7 +25,6 @@ PERIOD = 0.05  # s, between two messages; the command mux forgets a source after
 SETTLING = 0.5  # s after the command is in full effect until the measured velocity counts
 SAME = 1e-3  # m/s, rad/s, within which two commands are the same
 ESTIMATES = 10_000  # kept for the mean: 50 s of them
-UNITS = "vx {:+.2f} m/s, vy {:+.2f} m/s, wz {:+.2f} rad/s"
 
 Array = NDArray[np.float64]
 
@@ -73,7 +72,7 @@ class Drive:
     def send(self) -> None:
         """The velocity once more, and note whether all of it is in effect by now."""
         self._publisher.publish(_twist(self._asked))
-        before, self._in_effect = self._in_effect, _planar(self._states[-1].command)
+        before, self._in_effect = self._in_effect, planar(self._states[-1].command)
         steady = np.abs(self._in_effect - before).max() < SAME
         followed = self._in_effect.any() == self._asked.any()
         if self._full_effect is None and steady and followed:
@@ -88,18 +87,17 @@ class Drive:
 
     def report(self) -> int:
         """Print what was commanded, what was in effect, what was measured; the exit code."""
-        print(f"commanded  {UNITS.format(*self._asked)}")
+        print(f"commanded  {velocity_text(self._asked)}")
         if np.abs(self._in_effect - self._asked).max() > SAME:
-            why = "" if self._full_effect else ", still on its way: it changes no faster than the mux lets it"
-            print(
-                f"in effect  {UNITS.format(*self._in_effect)}{why or ', cut to the limits of mux and policy'}"
-            )
+            on_its_way = "still on its way: it changes no faster than the mux lets it"
+            why = "cut to the limits of mux and policy" if self._full_effect else on_its_way
+            print(f"in effect  {velocity_text(self._in_effect)}, {why}")
         if source := self._other_source():
             print(f"not followed: {source} commands the robot")
             return 1
         if self._full_effect and self._estimates:
             velocity = _mean(self._estimates)
-            print(f"measured   {UNITS.format(*velocity)}, mean of {len(self._estimates)} estimates")
+            print(f"measured   {velocity_text(velocity)}, mean of {len(self._estimates)} estimates")
         else:
             print("measured   nothing: too short for the robot to settle; drive for some seconds more")
         return 0
@@ -142,10 +140,16 @@ def _twist(velocity: Array) -> Any:
     return message
 
 
-def _planar(twist: Any) -> Array:
+def planar(twist: Any) -> Array:
+    """vx, vy (m/s) and wz (rad/s) of a geometry_msgs/Twist, (3,)."""
     return np.array([twist.linear.x, twist.linear.y, twist.angular.z])
 
 
+def velocity_text(velocity: Array) -> str:
+    """Such a velocity for people."""
+    return "vx {:+.2f} m/s, vy {:+.2f} m/s, wz {:+.2f} rad/s".format(*velocity)
+
+
 def _mean(estimates: deque[Any]) -> Array:
-    mean: Array = np.mean([_planar(estimate.twist.twist) for estimate in estimates], axis=0)
+    mean: Array = np.mean([planar(estimate.twist.twist) for estimate in estimates], axis=0)
     return mean

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -13,6 +12,7 @@ from rich.console import Console
 import quadvel_dds
 from quadvel_eval.output import output_file
 
+from .alone import ros_domain
 from .processes import StopSignals
 
 LOOK = 0.5  # s, between two looks for new topics
@@ -27,33 +27,27 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         raise FileExistsError(f"{path} exists already; name another file")
     output_file(path)
     quadvel_dds.install()
-    import rclpy
-    from rclpy.executors import SingleThreadedExecutor
-    from rclpy.signals import SignalHandlerOptions
-
     from .recorder import Recorder
+    from .session import Session
 
     console = Console(stderr=True, soft_wrap=True)
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-    node = rclpy.create_node("recorder")
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     wanted = [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
     ends = float("inf") if seconds is None else time.monotonic() + seconds
-    with StopSignals() as signals, console.status("recording; Ctrl-C stops") as status:
-        with Recorder(node, path) as recorder:
-            while not signals.received and (left := ends - time.monotonic()) > 0.0:
-                recorder.record_all(wanted)
-                recorder.serve(executor, min(LOOK, left))
-                status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
-        node.destroy_node()
-        rclpy.try_shutdown()
+    with (
+        StopSignals() as signals,
+        console.status("recording; Ctrl-C stops") as status,
+        Session("recorder") as session,
+        Recorder(session.node, path) as recorder,
+    ):
+        while not signals.received and (left := ends - time.monotonic()) > 0.0:
+            recorder.record_all(wanted)
+            recorder.serve(session.executor, min(LOOK, left))
+            status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
     if not recorder.counts:
         path.unlink()
         sought = ", ".join(wanted) or "any topic"
-        domain = os.environ.get("ROS_DOMAIN_ID", "0")
         console.print(
-            f"nothing came on {sought} on ROS domain {domain}, so there is no {path}; is a robot up?"
+            f"nothing came on {sought} on ROS domain {ros_domain()}, so there is no {path}; is a robot up?"
         )
         return 0
     for topic in wanted:

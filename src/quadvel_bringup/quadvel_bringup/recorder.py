@@ -29,9 +29,8 @@ LATCHED = ("/tf_static", "/robot_description")
 """Topics that are published once and kept for those who come later."""
 HIDDEN = ("/parameter_events", "/rosout")
 BATCH = 0.05  # s
-CHUNK = (
-    1.0  # s, after which what was written so far goes to the disk: a recorder that is killed loses no more
-)
+CHUNK = 1.0
+"""s, after which what was written so far goes to the disk: a recorder that is killed loses no more"""
 OTHERS = 4  # callbacks that may come between two of ours although messages wait
 
 

@@ -27,7 +27,7 @@ class NobodyThere(ConnectionError):
 
 
 class Session:
-    """A node and what it heard. To be entered: outside of that it does not exist."""
+    """A node and the executor that serves it. To be entered: outside of that they do not exist."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -35,14 +35,14 @@ class Session:
     def __enter__(self) -> Session:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
         self.node: Any = rclpy.create_node(self._name)
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(self.node)
+        self.executor = SingleThreadedExecutor()
+        self.executor.add_node(self.node)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._executor.shutdown()
+        self.executor.shutdown()
         self.node.destroy_node()
         rclpy.try_shutdown()
 
@@ -60,7 +60,7 @@ class Session:
             left = until - time.monotonic()
             if left <= 0.0:
                 return False
-            self._executor.spin_once(timeout_sec=min(left, 0.05))
+            self.executor.spin_once(timeout_sec=min(left, 0.05))
         return True
 
     def spin(self, seconds: float) -> None:

@@ -16,9 +16,8 @@ PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 
 Parameters = Mapping[str, bool | str | int | float]
 
-BOARD_PORT = (
-    8007  # of the AlienGo's board; the simulated one adds the number of the ROS domain, as nobody shares one
-)
+BOARD_PORT = 8007
+"""UDP port of the AlienGo's board; the simulated one adds the number of the ROS domain, as nobody shares one"""
 
 
 @attrs.frozen

@@ -5,7 +5,6 @@ Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -18,7 +17,9 @@ from rich.console import Console
 
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 
+from .alone import ros_domain
 from .doctor import FILES
+from .drive import planar, velocity_text
 from .orders import WAY_OUT
 from .session import Session
 
@@ -58,8 +59,9 @@ def status() -> int:
         _hear_all(session, heard["/diagnostics"])
     nodes = reported(heard["/diagnostics"])
     if not nodes:
-        domain = os.environ.get("ROS_DOMAIN_ID", "0")
-        print(f"no robot runs on ROS domain {domain} as far as this machine hears; start one: quadvel up")
+        print(
+            f"no robot runs on ROS domain {ros_domain()} as far as this machine hears; start one: quadvel up"
+        )
         return 1
     console = Console(soft_wrap=True, highlight=False)
     for name, text in [*_nodes(nodes), *_lines(heard), *_equipment(nodes)]:
@@ -103,13 +105,16 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
         if state.mode_name == "fault":
             yield "way out", f"once the cause is gone: {WAY_OUT}"
         yield "walking", state.walk_refusal or "ready: a velocity makes it walk"
-        yield "command", f"{_planar(state.command)}, from {commands[-1].source if commands else 'nobody'}"
+        yield (
+            "command",
+            f"{velocity_text(planar(state.command))}, from {commands[-1].source if commands else 'nobody'}",
+        )
         loop = f"p99 of its period {state.period_p99_ms:.2f} ms, {state.compute_p50_us:.0f} us from state to command"
         yield "loop", f"{state.rate_hz:.0f} Hz, {loop}, {state.overruns} deadlines missed"
     else:
         yield "mode", "[red]no controller runs"
     if estimates:
-        yield "estimate", _planar(estimates[-1].twist.twist)
+        yield "estimate", velocity_text(planar(estimates[-1].twist.twist))
     if heard["odom"]:
         position = heard["odom"][-1].pose.pose.position
         yield (
@@ -133,7 +138,3 @@ def _rate(messages: deque[Any]) -> float:
     stamps = [message.stamp if hasattr(message, "stamp") else message.header.stamp for message in messages]
     times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
     return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0
-
-
-def _planar(twist: Any) -> str:
-    return f"vx {twist.linear.x:+.2f} m/s, vy {twist.linear.y:+.2f} m/s, wz {twist.angular.z:+.2f} rad/s"

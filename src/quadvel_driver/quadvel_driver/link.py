@@ -22,6 +22,7 @@ from attrs.validators import ge, gt, le
 
 from quadvel_description.robot import COMMAND_LOWER, COMMAND_UPPER, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_nodes.messages import QUATERNION_TOLERANCE
 
 from . import wire
 from .board_clock import BoardClock
@@ -33,7 +34,6 @@ FAREWELL = 10  # packets of damping at the end: some may be lost
 MAX_AGE = 100  # ms, of the state that a command answers
 MAX_DATAGRAMS = 256  # taken in at once, so that a flood does not keep the link from sending
 SILENCE = 0.1  # s without a new state, after which the board counts as silent
-UNIT_TOLERANCE = 0.05  # by which the length of a quaternion may be off one
 _WRAP = 2**32
 
 
@@ -336,7 +336,7 @@ def _check(robot: RobotState) -> None:
     if robot.tick == 0:
         raise WireError("state: tick is 0, expected a counter that runs: the board has not started")
     length = math.hypot(*robot.quaternion.tolist())
-    if abs(length - 1.0) > UNIT_TOLERANCE:
+    if abs(length - 1.0) > QUATERNION_TOLERANCE:
         zeros = ", and all joints are at 0" if not robot.q.any() else ""
         raise WireError(f"state: quaternion has length {length:.3g}, expected 1{zeros}")
 

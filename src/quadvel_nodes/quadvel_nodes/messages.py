@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from quadvel_description.state import JointCommand, RobotState
 
-QUATERNION_TOLERANCE = 0.05
+QUATERNION_TOLERANCE = 0.05  # by which the length of a quaternion may be off one
 LOW_STATE = {
     "q": 12,
     "dq": 12,

@@ -6,6 +6,7 @@ How the robot is driven and what it reports is the matter of those that stand on
 from __future__ import annotations
 
 import gc
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from threading import Thread
 from typing import Any, Generic, TypeVar
@@ -35,7 +36,7 @@ VIEW_PERIOD = 20  # ms, of what people look at
 Settings = TypeVar("Settings", bound=PlantParameters)
 
 
-class SimulationNode(Node, Generic[Settings]):
+class SimulationNode(Node, ABC, Generic[Settings]):
     """Services and ground truth around a SimulationLoop, which runs in a thread of its own once `begin` is called."""
 
     def __init__(
@@ -77,17 +78,17 @@ class SimulationNode(Node, Generic[Settings]):
 
     # For those that stand on this.
 
+    @abstractmethod
     def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
         """One sample, in the simulation's thread. view: whether people are to see it."""
-        raise NotImplementedError
 
+    @abstractmethod
     def figures(self) -> dict[str, object]:
         """What else /diagnostics shows."""
-        raise NotImplementedError
 
+    @abstractmethod
     def worry(self, report: LoopReport) -> str:
         """What was wrong in the last second beyond the loop, in a few words, or ""."""
-        raise NotImplementedError
 
     def stamp(self, instant: float) -> Any:
         """The instant of a sample as a message; in real time in the time of the system clock."""
