@@ -47,7 +47,7 @@ def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any
     ]
     assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]
     assert not list(run.announcements.waiting())
-    run.supervisor.fail("a test")
+    run.supervisor.fail("a test", "test")
     assert run.tick(FORWARD, 20) == [
         (True, "fault: a test; the joints are damped until passive is requested, then stand_up")
     ]

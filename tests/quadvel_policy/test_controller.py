@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import signal
 import subprocess
 import sys
@@ -22,11 +23,12 @@ from std_srvs.srv import SetBool
 from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
-from quadvel_msgs.msg import ControllerState, LowCmd, LowState, VelocityCommand
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
-from quadvel_policy.controller import Controller, ControllerParameters, _fresh
+from quadvel_policy.control_loop import _fresh
+from quadvel_policy.controller import Controller, ControllerParameters
 
 PERIOD = 0.005
 
@@ -177,15 +179,35 @@ def test_a_robot_whose_commands_stop_stands_still(robot: Robot) -> None:
     assert robot.report("walk").stance
 
 
-def test_walking_on_an_old_velocity_is_a_fault(robot: Robot) -> None:
+def test_without_a_fresh_velocity_it_walks_on_the_kalman_filters_and_says_so(robot: Robot) -> None:
     walk(robot)
     robot.velocity = None
     robot.step(16)
-    assert robot.report("fault").reason == "there is no fresh velocity estimate"
-    assert robot.step().mode == MODE_DAMPING
-    status = robot.graph.diagnosed("fault: there is no fresh velocity estimate")
+    report = robot.report("walk")
+    assert (report.fault, list(report.findings)) == ("", ["there is no fresh velocity estimate"])
+    assert robot.step().mode == MODE_SERVO
+    robot.velocity = 0.0
+    robot.graph.wait(lambda: robot.step() and not robot.reports[-1].findings)
+
+
+def test_a_fault_is_told_by_name_and_in_words(robot: Robot) -> None:
+    walk(robot)
+    lying_on_its_side = np.array([math.cos(0.7), math.sin(0.7), 0.0, 0.0])
+    robot.state.quaternion = lying_on_its_side
+    assert robot.step(5).mode == MODE_DAMPING
+    report = robot.report("fault")
+    assert (report.fault, report.reason) == ("tilted", "the trunk is tilted by 1.40 rad, limit 1.05")
+    status = robot.graph.diagnosed("fault: the trunk is tilted by 1.40 rad, limit 1.05")
     assert status.level == DiagnosticStatus.ERROR
     assert status.name == "controller"
+
+
+def test_a_hot_motor_makes_the_robot_stand(robot: Robot) -> None:
+    walk(robot)
+    motors = robot.graph.speak(MotorStatus, "motor_status")
+    robot.graph.wait(lambda: motors.get_subscription_count())
+    motors.publish(MotorStatus(temperature=np.full(12, 91.0, np.float32), dropped_out=[False] * 12))
+    robot.graph.wait(lambda: robot.step() and robot.reports[-1].fault == "motor_hot")
 
 
 def test_a_simulated_robot_waits_for_the_estimator_but_not_for_ever(robot: Robot) -> None:

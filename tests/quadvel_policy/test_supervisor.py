@@ -1,4 +1,4 @@
-"""The controller's modes: what follows what, what is refused, and what ends in latched damping."""
+"""The controller's modes: what follows what, what is refused, and how a fault is left."""
 
 from __future__ import annotations
 
@@ -8,78 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import attrs
 import numpy as np
 import pytest
+from rig import FORWARD, STILL, Rig, assert_damping
 
 from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
-from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_description.state import MODE_SERVO
 from quadvel_policy.observation import PolicyMetadata
-from quadvel_policy.supervisor import MODES, Supervisor, SupervisorConfig
-
-PERIOD = 0.005
-STILL = (0.0, 0.0, 0.0, 1.0)
-FORWARD = (0.5, 0.0, 0.0, 0.0)
-
-
-class Rig:
-    """A robot whose joints follow their targets at once, driven at 200 Hz."""
-
-    def __init__(self, policy: Any, **config: Any) -> None:
-        self.policy = policy
-        self.supervisor = Supervisor(policy, SupervisorConfig(**config))
-        zeros = np.zeros(12)
-        upright, down = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, 9.81])
-        self.state = RobotState(
-            100.0, 0, LIE_Q.copy(), zeros, zeros, upright, np.zeros(3), down, np.full(4, 60.0)
-        )
-        self.velocity: Any = np.zeros(3)
-        self.asked = JointCommand.damping()
-
-    @property
-    def mode(self) -> str:
-        return self.supervisor.mode
-
-    def tick(
-        self, command: Any = STILL, age: float = 0.0, step: float = PERIOD, **changes: Any
-    ) -> JointCommand:
-        """One tick with the state changed for it alone."""
-        time, tick = self.state.time + step, self.state.tick + round(1e3 * step)
-        self.state = attrs.evolve(self.state, time=time, tick=tick)
-        seen = attrs.evolve(self.state, **changes)
-        self.asked = self.supervisor.tick(time + age, seen, self.velocity, command)
-        if self.asked.kp.any():
-            self.state.q = self.asked.q.copy()
-        return self.asked
-
-    def run(self, seconds: float, command: Any = STILL) -> None:
-        for _ in range(round(seconds / PERIOD)):
-            self.tick(command)
-
-    def stand(self) -> Rig:
-        self.tick()
-        assert self.supervisor.request("stand_up") == (True, "mode is stand_up")
-        self.run(2.5)
-        assert self.mode == "stance", self.supervisor.reason
-        return self
-
-    def walk(self) -> Rig:
-        self.stand()
-        self.run(0.3, FORWARD)
-        assert self.mode == "walk", self.supervisor.reason
-        return self
+from quadvel_policy.supervisor import MODES, SupervisorConfig
 
 
 @pytest.fixture
 def rig(policy: Any) -> Rig:
     return Rig(policy)
-
-
-def assert_damping(command: JointCommand) -> None:
-    assert command.mode == MODE_DAMPING
-    np.testing.assert_array_equal(command.kp, np.zeros(12))
-    np.testing.assert_array_equal(command.tau, np.zeros(12))
-    assert (command.kd > 0).all()
 
 
 def test_the_modes_have_the_numbers_of_the_message() -> None:
@@ -234,7 +175,7 @@ def test_on_a_robot_the_operator_allows_walking_first(policy: Any) -> None:
 def test_the_permission_to_walk_ends_with_passive_and_with_a_fault(policy: Any) -> None:
     rig = Rig(policy, require_operator=True).stand()
     rig.supervisor.enable_walking(True)
-    rig.supervisor.fail("a test")
+    rig.supervisor.fail("a test", "test")
     assert "in fault" in rig.supervisor.walk_refusal
     rig.supervisor.enable_walking(True)
     rig.supervisor.request("passive")
@@ -262,7 +203,7 @@ def test_a_velocity_counts_only_after_a_zero_one_was_commanded_to_the_standing_r
 
 def test_after_a_fault_a_velocity_that_is_still_commanded_does_not_count(rig: Rig) -> None:
     rig.walk()
-    rig.supervisor.fail("a test")
+    rig.supervisor.fail("a test", "test")
     rig.tick(FORWARD)
     rig.supervisor.request("passive")
     rig.supervisor.request("stand_up")
@@ -360,69 +301,6 @@ def test_a_stale_state_refuses_standing_up(rig: Rig) -> None:
     assert message == "the state is 200 ms old, limit 50 ms"
 
 
-NOT_A_NUMBER = np.full(12, np.nan)
-OUTSIDE = np.where(np.arange(12) == 5, UPPER + 0.5, NOMINAL_Q)
-FAULTS: dict[str, tuple[dict[str, Any], str]] = {
-    "stale state": ({"age": 0.06}, "the state is 60 ms old, limit 50 ms"),
-    "gap": ({"step": 0.08}, "no state came for 80 ms, limit 50 ms"),
-    "back in time": ({"step": -0.01}, "the state's time went back by 10 ms"),
-    "q not finite": ({"q": NOT_A_NUMBER}, "the state's q is not finite"),
-    "dq not finite": ({"dq": NOT_A_NUMBER}, "the state's dq is not finite"),
-    "gyro not finite": (
-        {"angular_velocity": np.full(3, np.inf)},
-        "the state's angular_velocity is not finite",
-    ),
-    "no quaternion": ({"quaternion": np.zeros(4)}, "the state's quaternion has length 0.00, expected 1"),
-    "tilt": (
-        {"quaternion": np.array([math.cos(0.6), 0.0, math.sin(0.6), 0.0])},
-        "the trunk is tilted by 1.20 rad, limit 1.05",
-    ),
-    "joint outside": ({"q": OUTSIDE}, "FL_calf_joint is at -0.15 rad, its range is -2.78 to -0.65"),
-    "joint too fast": ({"dq": np.full(12, 50.0)}, "FR_hip_joint moves at 50 rad/s, limit 40"),
-}
-
-
-@pytest.mark.parametrize("mode", ["stand_up", "stance", "walk", "lie_down"])
-@pytest.mark.parametrize("fault", FAULTS)
-def test_what_is_unsafe_latches_damping_with_its_reason(rig: Rig, mode: str, fault: str) -> None:
-    if mode == "walk":
-        rig.walk()
-    else:
-        rig.stand()
-        if mode != "stance":
-            rig.supervisor.request("passive" if mode == "stand_up" else mode)
-            rig.supervisor.request(mode)
-    rig.tick()
-    assert rig.mode == mode
-    changes, reason = FAULTS[fault]
-    assert_damping(rig.tick(**changes))
-    assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
-    rig.run(0.1, FORWARD)
-    assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
-    assert_damping(rig.asked)
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_passive_robot_may_be_handled_in_any_way(rig: Rig, fault: str) -> None:
-    rig.tick()
-    assert_damping(rig.tick(**FAULTS[fault][0]))
-    assert rig.mode == "passive"
-
-
-@pytest.mark.parametrize(
-    ("velocity", "reason"),
-    [
-        (None, "there is no fresh velocity estimate"),
-        (np.array([np.nan, 0.0, 0.0]), "the velocity estimate is not finite"),
-    ],
-)
-def test_walking_without_a_velocity_is_a_fault(rig: Rig, velocity: Any, reason: str) -> None:
-    rig.walk()
-    rig.velocity = velocity
-    assert_damping(rig.tick(FORWARD))
-    assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
-
-
 def test_walking_does_not_start_without_a_velocity(rig: Rig) -> None:
     rig.velocity = None
     rig.stand()
@@ -437,16 +315,6 @@ def test_an_action_that_is_not_finite_is_a_fault(rig: Rig) -> None:
     assert_damping(rig.tick(FORWARD))
     assert rig.mode == "fault"
     assert "not finite" in rig.supervisor.reason
-
-
-def test_a_standing_robot_that_is_put_elsewhere_at_once_is_a_fault(rig: Rig) -> None:
-    """As a simulator's reset does: targets of the stance would throw it over."""
-    rig.stand()
-    rig.state.q = LIE_Q.copy()
-    answer = rig.tick()
-    assert rig.mode == "fault"
-    assert re.match(r"FR_calf_joint moved by -\d\.\d\d rad in 5 ms, limit 0\.40", rig.supervisor.reason)
-    assert answer.mode == MODE_DAMPING
 
 
 def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
@@ -465,15 +333,15 @@ def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
 
 def test_a_fault_from_outside_is_latched_and_the_first_reason_stays(rig: Rig) -> None:
     rig.walk()
-    rig.supervisor.fail("20 deadlines were missed in a row")
-    rig.supervisor.fail("another")
+    rig.supervisor.fail("a test", "test")
+    rig.supervisor.fail("another", "another")
     assert_damping(rig.tick(FORWARD))
-    assert rig.supervisor.reason == "20 deadlines were missed in a row"
+    assert rig.supervisor.reason == "a test"
 
 
 def test_a_limp_robot_is_not_brought_into_fault(rig: Rig) -> None:
     rig.tick()
-    rig.supervisor.fail("20 deadlines were missed in a row")
+    rig.supervisor.fail("a test", "test")
     assert rig.mode == "passive"
 
 
@@ -504,23 +372,26 @@ def test_the_policy_forgets_on_entry_on_a_fault_and_after_a_gap(rig: Rig) -> Non
 
 
 def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) -> None:
-    rig = Rig(make_policy(nominal_q=tuple(UPPER + 0.1)), max_posture_error=9.0, joint_margin=9.0)
-    rig.stand()
-    rig.run(0.4)
-    np.testing.assert_array_equal(rig.asked.q, COMMAND_UPPER)
+    rig = Rig(make_policy(nominal_q=tuple(UPPER)), max_posture_error=9.0, max_encoder_error=9.0)
+    rig.tick()
+    rig.supervisor.request("stand_up")
+    for _ in range(500):
+        assert (rig.tick().q <= COMMAND_UPPER).all()
+    assert rig.mode == "stance"
 
 
-def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(rig: Rig) -> None:
-    rig.walk()
+def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(policy: Any) -> None:
+    rig = Rig(policy, max_encoder_error=9.0).walk()
     rig.run(0.2)
     rig.policy.action = np.full(12, 4.0, np.float32)
     wanted = rig.policy.metadata.action.targets(rig.policy.action)
-    rig.tick(FORWARD)
-    np.testing.assert_array_equal(rig.asked.q, np.minimum(wanted, COMMAND_UPPER))
+    for _ in range(4):  # torque grows by 30 N m a tick
+        rig.tick(FORWARD, q=NOMINAL_Q)
+    np.testing.assert_allclose(rig.asked.q, np.minimum(wanted, COMMAND_UPPER), rtol=1e-12)
     np.testing.assert_allclose(rig.asked.target, wanted)
     rig.policy.action = np.full(12, 1e6, np.float32)
-    rig.tick(FORWARD)
-    np.testing.assert_array_equal(rig.asked.q, COMMAND_UPPER)
+    rig.run(0.02, FORWARD)
+    np.testing.assert_array_less(rig.asked.q, COMMAND_UPPER + 1e-9)
     np.testing.assert_array_less(rig.asked.tau, TORQUE_LIMIT + 1e-9)
 
 

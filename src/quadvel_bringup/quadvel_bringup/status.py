@@ -102,6 +102,8 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
     if states:
         state = states[-1]
         yield "mode", f"{state.mode_name}: {state.reason}"
+        for finding in state.findings:
+            yield "finding", finding
         if state.mode_name == "fault":
             yield "way out", f"once the cause is gone: {WAY_OUT}"
         yield "walking", state.walk_refusal or "ready: a velocity makes it walk"

@@ -12,6 +12,7 @@ from collections import deque
 from threading import Thread
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist
 from rclpy.clock import Clock, ClockType
@@ -19,7 +20,7 @@ from rclpy.node import Node
 from std_msgs.msg import Bool
 from std_srvs.srv import SetBool
 
-from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_msgs.msg import LowCmd, LowState, MotorStatus
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
@@ -28,7 +29,7 @@ from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
 from .dry_run import DryRun
-from .health import Health, Level, figures
+from .health import DROPPED_OUT, Health, Level, figures
 from .link import SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
@@ -39,6 +40,7 @@ OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_te
 LOCK_EVERY = 5  # of these periods: a stop is said again, to whoever came later
 GRACE = 3  # reports, one a second, in which a board may be silent that is only being started
 VIEW_RATE = 50  # Hz, of what `RobotView` publishes
+MOTOR_RATE = 10  # Hz, of temperatures and of what the board switched off
 # Standard deviations of the IMU, rad, rad/s, m/s^2: of its class; those of the AlienGo's own are not known.
 ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION = 0.002, 0.01, 0.1
 
@@ -58,6 +60,7 @@ class Driver(Node):
         self._refusals = Refusals()
         self._system_time = SystemTime()
         self._thinning, self._view_thinning = Thinning(settings.state_rate), Thinning(VIEW_RATE)
+        self._motor_thinning = Thinning(MOTOR_RATE)
         self._operator_ticks = 0
         self._reports = 0
         self._passive_wanted = False
@@ -86,6 +89,7 @@ class Driver(Node):
 
     def _create_publishers(self) -> None:
         self._low_state = self.create_publisher(LowState, "low_state", 10)
+        self._motors = self.create_publisher(MotorStatus, "motor_status", 1)
         self._view = RobotView(self, ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION)
         self._teleop = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._lock = self.create_publisher(Bool, "command_lock", 10)
@@ -117,6 +121,8 @@ class Driver(Node):
             self._low_state.publish(message)
         if self._view_thinning.passes(robot.tick):
             self._view.publish(stamp, robot)
+        if self._motor_thinning.passes(robot.tick):
+            self._motors.publish(motor_status(stamp, state))
 
     # In the executor's thread.
 
@@ -205,6 +211,15 @@ class Driver(Node):
         self._reports += 1
         if level > Level.OK and self._reports > GRACE:
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+
+
+def motor_status(stamp: Any, state: BoardState) -> Any:
+    """The message."""
+    return MotorStatus(
+        stamp=stamp,
+        temperature=state.temperature.astype(np.float32),
+        dropped_out=(state.motor_mode == DROPPED_OUT).tolist(),
+    )
 
 
 def main(args: list[str] | None = None) -> None:

@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.kinematics import rotate, yaw
+from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
@@ -85,7 +86,7 @@ def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalm
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
-        Supervisor(PolicyFile(setup.policy)),
+        Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator()),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
         beside={name: make_estimator(name, simulator, setup.estimator_file) for name in beside},
     )

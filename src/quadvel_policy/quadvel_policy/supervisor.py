@@ -1,23 +1,26 @@
-"""The controller's modes and its safety: what may follow what, and when damping is the only answer.
+"""The controller's modes and its safety: what may follow what, and what is done about the faults that `guards` finds.
 
-Plain arrays and times in, joint commands out; it knows no ROS. `modes` holds what each mode does.
+Plain arrays and times in, joint commands out; it knows no ROS. `modes` holds what each mode does, `command_limits` what
+no command may ask for.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterable
 
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike
 
-from quadvel_description.command_range import within_range
-from quadvel_description.robot import JOINT_NAMES, LIE_Q, LOWER, UPPER
+from quadvel_description.robot import JOINT_NAMES, LIE_Q
 from quadvel_description.state import JointCommand, RobotState
 
+from .backup_velocity import BackupVelocity, Estimator
+from .command_limits import CommandLimits, CommandLimitsConfig
+from .guards import GUARDS, WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Obstacle, Sight, Watch
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
+from .settings import setting
 
 MODES = ("passive", "stand_up", "stance", "walk", "lie_down", "fault")
 """In the order of the numbers in quadvel_msgs/ControllerState."""
@@ -32,19 +35,36 @@ FOLLOWS = {
 FOLLOWING = ("stance", "walk")
 """In which modes a velocity is followed"""
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
+MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
+PATIENCE_IN_BRAKING = 2.0  # times `brake_time`, after which a robot that still moves is put into its posture
+
+OTHER_FAULTS: dict[str, tuple[Level, tuple[str, ...], str]] = {
+    "stand_up_failed": (
+        Level.DAMPING,
+        ("stand_up",),
+        "Standing up ended more than `max_posture_error` from the nominal posture.",
+    ),
+    "policy_not_finite": (Level.DAMPING, WALK, "The policy's output is not finite."),
+    "command_stale": (Level.LIMIT, WALK, "There is no fresh command: the robot stands still on its policy."),
+    "command_not_finite": (
+        Level.LIMIT,
+        WALK,
+        "A command is not finite: the robot stands still on its policy.",
+    ),
+    "command_out_of_range": (
+        Level.LIMIT,
+        WALK,
+        "A command is beyond what the policy can follow: it is held within that.",
+    ),
+}
+"""What the supervisor notices itself: name, level, modes, and what is noticed"""
 
 Following = tuple[str, str] | None  # the next mode and the reason
 
 
-def setting(default: Any, description: str, positive: bool = True) -> Any:
-    """A field of a configuration that becomes a node parameter with this description."""
-    validator = attrs.validators.gt(0.0) if positive else None
-    return attrs.field(default=default, validator=validator, metadata={"description": description})
-
-
 @attrs.frozen(kw_only=True)
-class SupervisorConfig:
-    """Gains and times of the modes, and the limits beyond which the robot goes to damping."""
+class SupervisorConfig(GuardConfig, CommandLimitsConfig):
+    """Gains and times of the modes; the limits of guards and commands."""
 
     auto_stand: bool = setting(
         False, "stand up once, by itself, as soon as the robot reports", positive=False
@@ -60,31 +80,33 @@ class SupervisorConfig:
     settle_time: float = setting(0.3, "from walking back to the nominal posture, s")
     lie_down_time: float = setting(1.0, "from standing to the lying posture, s")
     blend_time: float = setting(0.15, "over which the policy's torques fade in, s")
-    max_state_age: float = setting(0.05, "oldest state, and longest time without one, before a fault, s")
     reset_gap: float = setting(0.02, "time without a state after which the policy's memory is reset, s")
-    max_tilt: float = setting(1.05, "largest angle between the trunk's and the world's vertical, rad")
-    max_joint_speed: float = setting(40.0, "largest measured joint speed, rad/s")
-    joint_margin: float = setting(0.2, "how far a measured angle may lie outside the mechanical range, rad")
     max_posture_error: float = setting(0.35, "largest joint error at which the robot counts as standing, rad")
     max_standing_speed: float = setting(0.3, "largest speed at which walking may end in a posture, m/s")
+    brake_time: float = setting(0.6, "in which the policy brings the robot to a stand after a fault, s")
 
 
 class Supervisor:
-    """Runs one mode at a time and latches damping where something is unsafe.
+    """Runs one mode at a time and answers the faults that its guards find.
 
-    policy: what drives in walk; its metadata gives limits and the nominal posture. After each tick: `mode`
-    (one of MODES), `reason` (one sentence), `command` (4,) in effect, `walk_refusal`, `inference_seconds`
-    (nan where no network ran). `obstacle`: what somebody else found that forbids moving, a sentence, or None.
+    policy: what drives in walk; its metadata gives limits and the nominal posture. backup: filter whose velocity is followed
+    where the estimator's is missing or wrong. guards: all of them but in tests. After each tick: `mode` (one of MODES),
+    `reason` (one sentence), `fault` (the name of what made the robot stop, "" where nothing did), `findings` (what is wrong
+    now), `limits` (how often each limit of commands acted), `command` (4,) in effect, `walk_refusal`, `inference_seconds` (nan
+    where no network ran). Set from outside: `obstacle` (what forbids moving, a sentence, or None), `overruns` (deadlines missed
+    in a row), `motors`.
     """
 
-    def __init__(self, policy: Policy, config: SupervisorConfig = SupervisorConfig()) -> None:
+    def __init__(
+        self,
+        policy: Policy,
+        config: SupervisorConfig = SupervisorConfig(),
+        backup: Estimator | None = None,
+        guards: Iterable[type[Guard]] = GUARDS,
+    ) -> None:
         self.config = c = config
         nominal = np.array(policy.metadata.nominal_q)
-        self._limits = policy.metadata.limits
-        low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
-        speed, any_number = np.full(12, c.max_joint_speed), np.full(7, np.finfo(float).max)
-        self._middle = np.concatenate((0.5 * (low + high), np.zeros(19)))
-        self._reach = np.concatenate((0.5 * (high - low), speed, any_number))
+        self._command_limits = policy.metadata.limits
         self._walk = Walk(policy, c.blend_time)
         self._stance = Posture([(c.settle_time, nominal)], c.stand_kp, c.stand_kd)
         self._stand_up = Posture([(c.fold_time, LIE_Q), (c.rise_time, nominal)], c.stand_kp, c.stand_kd)
@@ -102,17 +124,28 @@ class Supervisor:
             "passive": self._after_passive,
             "stand_up": self._after_stand_up,
             "stance": self._after_stance,
+            "walk": self._after_walk,
             "lie_down": self._after_lie_down,
         }
-        self.mode, self.reason = "passive", "waits for an order"
+        self._watch = Watch(guards)
+        self._backup, self._backup_is_behind = BackupVelocity(backup), False
+        self._limiter = CommandLimits(c)
+        self.limits = self._limiter.counts
+        self.mode, self.reason, self.fault = "passive", "waits for an order", ""
+        self.findings: list[Finding] = []
+        self._found: list[Finding] = []  # in whatever mode
         self.command = STILL.copy()
         self.inference_seconds = float("nan")
         self.obstacle: str | None = None
+        self.overruns = 0
+        self.motors: MotorStatus | None = None
         self._auto_stand = c.auto_stand
         self._enabled = False
         self._zero_seen = False  # a command to stand still came since a velocity could have been followed
+        self._held: Finding | None = None  # what made the robot stop and stand
+        self._held_since = 0.0  # s, on the clock of the states
+        self._velocity = np.zeros(3)  # the last that was known
         self._last: Tick | None = None
-        self._age = 0.0
         self._entered: float | None = None  # None: at the next tick
         self._previous = JointCommand.damping(c.damping_kd)
 
@@ -123,6 +156,8 @@ class Supervisor:
             return "the robot is in fault: request passive, then stand_up"
         if self.mode not in FOLLOWING:
             return f"the robot is in mode {self.mode}, expected {' or '.join(FOLLOWING)}"
+        if self._held:
+            return f"the robot was stopped ({self._held.sentence}): request stance when that is mended"
         if not self._operator_agrees:
             return "walking is not allowed yet: call ~/enable_walking"
         if not self._zero_seen:
@@ -144,7 +179,11 @@ class Supervisor:
         return True, "a command may start walking" if self._operator_agrees else "the robot stands still"
 
     def request(self, mode: str) -> tuple[bool, str]:
-        """Ask for a mode; (taken or not, a sentence). "passive" is always taken and clears a fault."""
+        """Ask for a mode; (taken or not, a sentence).
+
+        "passive" is always taken and clears a fault. "stance" lets a robot walk again that was stopped and stands, where the
+        cause is gone.
+        """
         if mode not in MODES or mode == "fault":
             return False, f"mode is '{mode}', expected one of {', '.join(MODES[:-1])}"
         refusal = self._refusal(mode)
@@ -153,12 +192,16 @@ class Supervisor:
         self._auto_stand = False
         if mode != self.mode:
             self._switch(mode, "was asked for")
+        elif mode == "stance" and self._held:
+            self._held, self.fault = None, ""
+            self.reason = "was asked for"
         return True, f"mode is {mode}"
 
-    def fail(self, reason: str) -> None:
+    def fail(self, reason: str, fault: str) -> None:
         """Latch damping until "passive" is requested. The first reason stays; a limp robot stays as it is."""
         if self.mode not in LIMP:
             self._switch("fault", reason)
+            self.fault = fault
 
     def tick(
         self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
@@ -171,24 +214,82 @@ class Supervisor:
         it never walks off on an order that was given to another run of the controller.
         """
         self.inference_seconds = float("nan")
-        self.command = self._limited(command)
-        self._age = now - state.time
-        speed = None if velocity is None else np.asarray(velocity, float)
-        gap = 0.0 if self._last is None else state.time - self._last.state.time
-        seen = self._seen(state, speed)
-        if self.mode not in LIMP:
-            self._check(seen, gap)
+        if self._backup_is_behind:
+            self._follow()
+        self.command, unfit = self._limited(command)
+        sight = self._look(now, state, None if velocity is None else np.asarray(velocity, float))
+        if unfit and self.mode == "walk":
+            self.findings.append(Finding(unfit, *OTHER_FAULTS[unfit]))
+        self._act_on(self.findings, state.time)
+        seen = self._seen(state, self._velocity_in_effect(sight))
+        if 0.0 <= sight.gap <= self.config.max_state_age and sight.gap > self.config.reset_gap:
+            self._walk.forget()
         if self.mode in self._after and (following := self._after[self.mode](seen)):
             self._switch(*following)
         answer = self._answer(seen)
         answer.tick = state.tick
-        self._last, self._previous = seen, answer
+        self._last, self._previous, self._backup_is_behind = seen, answer, True
         return answer
 
     def prepare(self) -> None:
         """Between two ticks, what can be done ahead of the next one, so that its answer comes sooner; may be left out."""
         if self.mode == "walk":
             self._walk.prepare()
+        if self._backup_is_behind:
+            self._follow()
+
+    def _follow(self) -> None:
+        """Let the backup see the state of the last tick; it rests while the robot does."""
+        self._backup_is_behind = False
+        if self.mode in LIMP or self._last is None:
+            self._backup.forget()
+        else:
+            self._backup.follow(self._last.state)
+
+    def _look(self, now: float, state: RobotState, velocity: Array | None) -> Sight:
+        """Let the guards look at this tick; `findings` are those that matter in this mode."""
+        before = self._last.state if self._last else None
+        sight = Sight(
+            config=self.config,
+            mode=self.mode,
+            state=state,
+            before=before,
+            age=now - state.time,
+            gap=state.time - before.time if before else 0.0,
+            asked=self._previous,
+            velocity=velocity,
+            backup=self._backup.velocity,
+            moves=self.mode == "walk" and not self.command[3],
+            overruns=self.overruns,
+            motors=self.motors,
+            obstacle=self.obstacle,
+        )
+        self._found = self._watch.look(sight)
+        self.findings = [finding for finding in self._found if self.mode in finding.modes]
+        return sight
+
+    def _act_on(self, findings: list[Finding], time: float) -> None:
+        """Latch damping, or let the robot stop and stand, for the first finding that asks for it."""
+        for finding in findings:
+            if finding.level is Level.DAMPING:
+                self.fail(finding.sentence, finding.name)
+                return
+        for finding in findings:
+            if finding.level is Level.STANCE and self._held is None:
+                self._held, self._held_since = finding, time
+                self.reason, self.fault = finding.sentence, finding.name
+                self._zero_seen = False
+                self.command = STILL.copy()
+
+    def _velocity_in_effect(self, sight: Sight) -> Array | None:
+        """The estimate, the backup's where that is missing or wrong, and what is left of the last one for a robot that brakes."""
+        distrusted = any(finding.name in ("estimate_stale", "estimate_wrong") for finding in self.findings)
+        velocity = sight.backup if distrusted else sight.velocity
+        if velocity is not None:
+            self._velocity = velocity
+        elif self.mode == "walk":
+            velocity = self._velocity = self._velocity * math.exp(-max(sight.gap, 0.0) / MEMORY_OF_VELOCITY)
+        return velocity
 
     def _answer(self, seen: Tick) -> JointCommand:
         mode = self._modes[self.mode]
@@ -199,29 +300,34 @@ class Supervisor:
         try:
             answer = mode.tick(seen)
         except FloatingPointError as error:
-            self.fail(str(error))
+            self.fail(str(error), "policy_not_finite")
             return JointCommand.damping(self.config.damping_kd)
         if self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
-        answer.q, torque = within_range(answer.q, answer.kp, seen.state.q)
-        answer.tau = answer.tau + torque
+        self._limiter.apply(answer, self._previous, seen.state)
         return answer
 
     def _seen(self, state: RobotState, velocity: Array | None) -> Tick:
         elapsed = 0.0 if self._entered is None else state.time - self._entered
         return Tick(elapsed, state, velocity, self.command, self._previous)
 
-    def _limited(self, command: ArrayLike | None) -> Array:
-        """The command in effect: stand still where there is none, where it says so, is not finite, or is refused."""
+    def _limited(self, command: ArrayLike | None) -> tuple[Array, str]:
+        """The command in effect, and which of OTHER_FAULTS it has.
+
+        Stand still where there is none, where it says so, is not finite, or is refused.
+        """
         if command is None:
-            return STILL.copy()
+            return STILL.copy(), "command_stale"
         numbers = np.asarray(command, float).tolist()
+        if not _finite(numbers):
+            return STILL.copy(), "command_not_finite"
         stands = numbers[3] >= 0.5 or not any(numbers[:3])
-        if stands and self._operator_agrees and self.mode in FOLLOWING:
+        if stands and self._operator_agrees and not self._held and self.mode in FOLLOWING:
             self._zero_seen = True
-        if numbers[3] >= 0.5 or not _finite(numbers) or not (self._zero_seen and self._operator_agrees):
-            return STILL.copy()
-        return np.array([*self._limits.held(numbers[:3]), 0.0])
+        if numbers[3] >= 0.5 or not (self._zero_seen and self._operator_agrees):
+            return STILL.copy(), ""
+        held = self._command_limits.held(numbers[:3])
+        return np.array([*held, 0.0]), "" if np.array_equal(held, numbers[:3]) else "command_out_of_range"
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
@@ -230,98 +336,50 @@ class Supervisor:
             self._zero_seen = False
         if mode in LIMP:
             self._enabled = False
+            self._held, self.fault = None, ""
             self._walk.forget()
 
-    def _check(self, seen: Tick, gap: float) -> None:
-        """Latch the first problem of this tick; a short gap only costs the policy its memory."""
-        problem = next(self._problems(seen, gap), None) or self._jump(seen.state, gap)
-        if problem:
-            self.fail(problem)
-        elif gap > self.config.reset_gap:
-            self._walk.forget()
-
-    def _problems(self, seen: Tick, gap: float = 0.0) -> Iterator[str]:
-        """Every reason to go to damping, as sentences. gap: s since the state before."""
-        c, state = self.config, seen.state
-        if self.obstacle:
-            yield self.obstacle
-        sound = self._is_sound(state)
-        if not sound:
-            yield from self._not_finite(state)
-        if self._age > c.max_state_age:
-            yield f"the state is {1e3 * self._age:.0f} ms old, limit {1e3 * c.max_state_age:.0f} ms"
-        if gap < 0.0:
-            yield f"the state's time went back by {-1e3 * gap:.0f} ms"
-        if gap > c.max_state_age:
-            yield f"no state came for {1e3 * gap:.0f} ms, limit {1e3 * c.max_state_age:.0f} ms"
-        yield from self._attitude_problems(state.quaternion)
-        if not sound:
-            yield from self._joint_problems(state)
-        if self.mode == "walk" and seen.velocity is None:
-            yield "there is no fresh velocity estimate"
-        if seen.velocity is not None and not _finite(seen.velocity.tolist()):
-            yield "the velocity estimate is not finite"
-
-    def _jump(self, state: RobotState, gap: float) -> str | None:
-        """A sentence where joints that a posture holds are elsewhere at once: a robot put back, or an encoder at fault."""
-        if self._last is None or not isinstance(self._modes[self.mode], Posture):
-            return None
-        moved = state.q - self._last.state.q
-        i = int(np.argmax(np.abs(moved)))
-        limit = self.config.max_joint_speed * gap + self.config.joint_margin
-        if abs(moved[i]) <= limit:
-            return None
-        return f"{JOINT_NAMES[i]} moved by {moved[i]:+.2f} rad in {1e3 * gap:.0f} ms, limit {limit:.2f}"
-
-    def _is_sound(self, state: RobotState) -> bool:
-        """Whether every number is finite and every joint within its limits: all in one look, as it mostly is."""
-        numbers = np.concatenate((state.q, state.dq, state.quaternion, state.angular_velocity))
-        return np.count_nonzero(np.abs(numbers - self._middle) <= self._reach) == len(numbers)
-
-    def _not_finite(self, state: RobotState) -> Iterator[str]:
-        for name in ("q", "dq", "quaternion", "angular_velocity"):
-            if not np.isfinite(getattr(state, name)).all():
-                yield f"the state's {name} is not finite"
-
-    def _attitude_problems(self, quaternion: Array) -> Iterator[str]:
-        w, x, y, z = quaternion.tolist()
-        length = math.hypot(w, x, y, z)
-        if abs(length - 1.0) > 0.05:
-            yield f"the state's quaternion has length {length:.2f}, expected 1"
-        tilt = math.acos(max(-1.0, min(1.0 - 2.0 * (x * x + y * y), 1.0)))
-        if tilt > self.config.max_tilt:
-            yield f"the trunk is tilted by {tilt:.2f} rad, limit {self.config.max_tilt:.2f}"
-
-    def _joint_problems(self, state: RobotState) -> Iterator[str]:
-        c = self.config
-        outside = np.maximum(LOWER - state.q, state.q - UPPER)
-        for i in np.flatnonzero(outside > c.joint_margin):
-            limits = f"{LOWER[i]:.2f} to {UPPER[i]:.2f}"
-            yield f"{JOINT_NAMES[i]} is at {state.q[i]:.2f} rad, its range is {limits}"
-        for i in np.flatnonzero(np.abs(state.dq) > c.max_joint_speed):
-            yield f"{JOINT_NAMES[i]} moves at {state.dq[i]:.0f} rad/s, limit {c.max_joint_speed:.0f}"
+    def _forbids(self, mode: str) -> str | None:
+        """What would end `mode` at once, a sentence: the obstacle that is there now, or what the last tick found."""
+        found = (
+            finding.sentence
+            for finding in self._found
+            if finding.level is Level.DAMPING and mode in finding.modes and finding.name != Obstacle.name()
+        )
+        return self.obstacle or next(found, None)
 
     def _refusal(self, mode: str) -> str | None:
         """Why this mode can't be had now; None where it can."""
-        if mode in ("passive", self.mode):
+        if mode == "passive":
             return None
+        if mode == self.mode:
+            return self._refusal_to_go_on() if mode == "stance" else None
         if self.mode == "fault":
             return f"is in fault ({self.reason}), request passive first"
         if self._last is None:
             return "the robot has not reported yet"
         if self.mode not in FOLLOWS[mode]:
             return f"{mode} can't follow {self.mode}, expected {' or '.join(FOLLOWS[mode])}"
-        return next(self._problems(self._last), None) or self._refusal_of_move(mode, self._last)
+        return self._forbids(mode) or self._refusal_of_move(mode, self._last)
+
+    def _refusal_to_go_on(self) -> str | None:
+        """Why a robot that was stopped and stands is not let go; None where it is, or was not stopped."""
+        if self._held and any(finding.name == self._held.name for finding in self._found):
+            return f"what stopped the robot is still there: {self._held.sentence}"
+        return None
 
     def _refusal_of_move(self, mode: str, last: Tick) -> str | None:
-        if mode == "walk" and not self._operator_agrees:
-            return "walking is not allowed yet: call ~/enable_walking"
-        if mode == "walk" and last.velocity is None:
-            return "there is no fresh velocity estimate"
+        if mode == "walk":
+            if self._held:
+                return self.walk_refusal
+            if not self._operator_agrees:
+                return "walking is not allowed yet: call ~/enable_walking"
+            if last.velocity is None:
+                return "there is no fresh velocity estimate"
         if self.mode == "passive" and mode == "stance":
             return self._posture_error(last)
         if self.mode == "walk":
-            speed = 0.0 if last.velocity is None else float(np.linalg.norm(last.velocity))
+            speed = float(np.linalg.norm(self._velocity))
             if not last.command[3] or speed > self.config.max_standing_speed:
                 return f"the robot walks ({speed:.2f} m/s), command stance first"
         return None
@@ -336,7 +394,7 @@ class Supervisor:
         return f"{JOINT_NAMES[i]} is {error[i]:+.2f} rad off the nominal posture, limit {limit:.2f}"
 
     def _after_passive(self, seen: Tick) -> Following:
-        if self._auto_stand and next(self._problems(seen), None) is None:
+        if self._auto_stand and self._forbids("stand_up") is None:
             self._auto_stand = False
             return "stand_up", "stands up by itself at the start"
         return None
@@ -345,13 +403,26 @@ class Supervisor:
         if not self._stand_up.done(seen.elapsed):
             return None
         error = self._posture_error(seen)
-        return ("fault", f"standing up failed: {error}") if error else ("stance", "stood up")
+        if error:
+            self.fail(f"standing up failed: {error}", "stand_up_failed")
+            return None
+        return "stance", self._held.sentence if self._held else "stood up"
 
     def _after_stance(self, seen: Tick) -> Following:
         asked = not seen.command[3] and seen.command[:3].any()
         if asked and seen.velocity is not None and self._stance.done(seen.elapsed):
             return "walk", "a velocity was commanded"
         return None
+
+    def _after_walk(self, seen: Tick) -> Following:
+        """A robot that is stopped brakes on its policy, then stands."""
+        if self._held is None:
+            return None
+        braked, c = seen.state.time - self._held_since, self.config
+        still = float(np.linalg.norm(self._velocity)) <= c.max_standing_speed
+        if braked < c.brake_time or not (still or braked >= PATIENCE_IN_BRAKING * c.brake_time):
+            return None
+        return "stance", self._held.sentence
 
     def _after_lie_down(self, seen: Tick) -> Following:
         return ("passive", "lies") if self._lie_down.done(seen.elapsed) else None
