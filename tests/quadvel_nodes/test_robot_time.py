@@ -51,6 +51,16 @@ def test_a_long_standstill_counts() -> None:
     assert time.follow(8.065, 45, longest=0.05) == 8.065
 
 
+def test_a_clock_that_was_set_is_no_event_in_the_robots_life() -> None:
+    time = RobotTime()
+    time.follow(8.0, 40)
+    for change in (5.0, -7.0):
+        time.clock_was_set(change)
+        before = time.stalled
+        assert time.follow(8.005 + before, 45) == pytest.approx(8.005)
+        assert time.stalled == before
+
+
 def test_stamps_that_were_set_back_are_followed() -> None:
     np.testing.assert_allclose(lived((8.0, 40), (3.0, 45), (3.005, 50)), [8.0, 3.0, 3.005])
 

@@ -36,6 +36,13 @@ class RobotTime:
         self._last = stamp, tick
         return stamp - self.stalled
 
+    def clock_was_set(self, change: float) -> None:
+        """The clock of the stamps was set by `change` (s), which is no event in the robot's life."""
+        self.stalled += change
+        self._stalled_before += change
+        if self._last is not None:
+            self._last = self._last[0] + change, self._last[1]
+
     def at(self, stamp: float) -> float:
         """The robot's time at any stamp (s) since the standstill before the last one.
 

@@ -42,6 +42,9 @@ LONGEST = 0.5
 HELD_UP = 10
 """Simulated states that wait for a command, one after the other, where none comes any more"""
 
+CLOCK_STEP = 0.02
+"""s by which a clock has to run away from the steady one at once to have been set"""
+
 Stamped = tuple[float, Array]
 """Time (s) and value"""
 
@@ -64,7 +67,8 @@ class ControlConfig(SupervisorConfig, Scheduling):
 class ControlLoop:
     """One supervisor in time. `answer` is called with each command; `clock` (s) is that of the stamps.
 
-    sim_time: whether that clock is a simulator's in lockstep, which waits for the answer to each of its states.
+    sim_time: whether that clock is a simulator's in lockstep, which waits for the answer to each of its states. steady: a clock
+    (s) that nobody sets, by which one learns that the other one was set; None where that one cannot be.
     """
 
     def __init__(
@@ -74,12 +78,15 @@ class ControlLoop:
         answer: Callable[[JointCommand], None],
         clock: Callable[[], float],
         sim_time: bool = False,
+        steady: Callable[[], float] | None = None,
     ) -> None:
         self.supervisor = supervisor
         self.stats = LoopStats()
         self.pauses = Pauses(WATCH_PERIOD, PERIOD)
         self.state: RobotState | None = None
-        self._config, self._publish, self._clock, self._sim_time = config, answer, clock, sim_time
+        self._config, self._publish, self._sim_time = config, answer, sim_time
+        self._clock, self._steady = clock, steady or clock
+        self._ahead_of_steady = self._clock() - self._steady()
         self._patience = (
             math.inf if config.robot_waits else 0.0
         )  # s by which a velocity may be late as nobody ran
@@ -136,6 +143,10 @@ class ControlLoop:
     def _now(self, stamp: float = 0.0) -> float:
         """The clock of the stamps, s. Simulated time may reach this node after what was stamped with it."""
         now = self._clock()
+        ahead = now - self._steady()
+        if abs(ahead - self._ahead_of_steady) > CLOCK_STEP:
+            self._robot_time.clock_was_set(ahead - self._ahead_of_steady)
+            self._ahead_of_steady = ahead
         return max(now, stamp) if self._sim_time else now
 
     def _accept(self, topic: str, stamp: float) -> float:

@@ -60,7 +60,12 @@ class Controller(Node):
         self._supervisor = Supervisor(policy, self._settings, KalmanEstimator())
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._loop = ControlLoop(
-            self._supervisor, self._settings, self._publish, self._now, sim_time=self._sim_time
+            self._supervisor,
+            self._settings,
+            self._publish,
+            self._now,
+            self._sim_time,
+            None if self._sim_time else time.monotonic,
         )
         self._refusals, self._message = Refusals(), LowCmd()
         self._refused_before = self._overruns_before = self._pauses_before = 0

@@ -1,0 +1,236 @@
+"""The campaign: each fault in each mode where it matters, from random seeds, against what has to follow and how soon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
+from quadvel_description.state import MODE_DAMPING
+from quadvel_estimator.learned import LearnedEstimator
+from quadvel_policy.policy_file import PolicyFile
+from quadvel_sim.config import SimulatorConfig
+from quadvel_sim.simulator import DT, Simulator
+
+from ..pool import Call, in_parallel
+from .cases import CASES, Case
+from .injection import injection
+from .stack import Stack
+
+SCHEMA = 1
+AFTERWARDS = 2.5  # s that a run goes on after the fault began
+VELOCITIES = (
+    (0.5, 0.0, 0.0),
+    (1.0, 0.0, 0.0),
+    (-0.5, 0.0, 0.0),
+    (0.0, 0.4, 0.0),
+    (0.5, 0.0, 0.8),
+    (0.0, 0.0, 1.0),
+)
+STANDS = 0.1  # m/s, slower than which a robot stands
+
+
+@attrs.define
+class Run:
+    """What came of one fault from one seed. Times in s since the fault began, None where it did not come."""
+
+    component: str
+    kind: str
+    mode: str
+    seed: int
+    fault: str = ""
+    """the name of what made the robot stop"""
+    findings: list[str] = attrs.Factory(list)
+    """every name that was found, in order"""
+    named_after: float | None = None
+    """until one of the right names was found"""
+    safe_after: float | None = None
+    """until the robot was as it has to end: damped, or standing"""
+    ended: str = ""
+    fell: bool = False
+    torque: float = 0.0
+    """largest torque, as a share of the drive's limit"""
+    speed: float = 0.0
+    """largest joint speed, as a share of the drive's"""
+    beyond: float = 0.0
+    """how far a joint was beyond its mechanical range, rad"""
+    wrong: list[str] = attrs.Factory(list)
+    """what is against the oracle, as sentences"""
+
+
+def campaign(
+    seeds: int, only: str | None = None, progress: Callable[[int, int], None] = lambda done, of: None
+) -> list[Run]:
+    """Every case from seeds 0, 1, ...; `only`: those whose "component kind mode" holds this text. ValueError where none does."""
+    cases = [case for case in CASES if only is None or only in case.name]
+    if not cases:
+        raise ValueError(f"no case holds '{only}'; there are {', '.join(case.name for case in CASES)}")
+    calls: list[Call] = [(run, case, seed) for case in cases for seed in range(seeds)]
+    runs: list[Run | None] = [None] * len(calls)
+    for done, (i, answer) in enumerate(in_parallel(calls), 1):
+        runs[i] = answer
+        progress(done, len(calls))
+    return [one for one in runs if one is not None]
+
+
+@cache
+def _networks() -> tuple[PolicyFile, LearnedEstimator]:
+    return PolicyFile(), LearnedEstimator()
+
+
+def run(case: Case, seed: int) -> Run:
+    """One fault from one seed."""
+    rng = np.random.default_rng([seed, *map(ord, case.name)])
+    stack = _prepared(case.mode, rng, seed)
+    result = Run(case.component, case.kind, case.mode, seed)
+    healthy = [*stack.supervisor.findings]
+    if healthy or stack.supervisor.fault:
+        result.wrong.append(f"before the fault: {stack.supervisor.fault or healthy[0].name}")
+    injection(case.component, case.kind).begin(stack, rng)
+    began = stack.now
+    for _ in range(round(AFTERWARDS / DT)):
+        try:
+            stack.step()
+        except FloatingPointError as error:
+            result.wrong.append(str(error))
+            break
+        _observe(stack, case, (stack.now - began) * DT, result)
+    result.ended, result.fell = stack.supervisor.mode, stack.simulator.fallen
+    result.wrong += _judge(case, result, stack)
+    return result
+
+
+def _prepared(mode: str, rng: np.random.Generator, seed: int) -> Stack:
+    """A robot in the midst of `mode`, at a random instant of it."""
+    simulator = Simulator(SimulatorConfig(seed=seed))
+    simulator.reset("lie" if mode == "stand_up" else "stand")
+    policy, estimator = _networks()
+    policy.reset()
+    estimator.reset()
+    stack = Stack(simulator, policy, estimator)
+    for _ in _order(stack, "stand_up" if mode == "stand_up" else "stance", 0.6):
+        pass
+    if mode == "stand_up":
+        _let(stack, rng.uniform(0.0, 1.0))
+    elif mode == "stance":
+        _let(stack, rng.uniform(0.0, 0.5))
+    elif mode == "lie_down":
+        _request(stack, "lie_down")
+        _let(stack, rng.uniform(0.2, 0.7))
+    else:
+        stack.velocity = np.array(VELOCITIES[int(rng.integers(len(VELOCITIES)))])
+        _let(stack, rng.uniform(1.2, 2.0))
+    return stack
+
+
+def _order(stack: Stack, mode: str, seconds: float) -> Iterator[None]:
+    """Ask for a mode after the first states, and let it last."""
+    _let(stack, 0.05)
+    _request(stack, mode)
+    _let(stack, seconds)
+    yield
+
+
+def _request(stack: Stack, mode: str) -> None:
+    taken, sentence = stack.supervisor.request(mode)
+    if not taken:
+        raise RuntimeError(f"the supervisor refused {mode}: {sentence}")
+
+
+def _let(stack: Stack, seconds: float) -> None:
+    for _ in range(round(seconds / DT)):
+        stack.step()
+
+
+def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
+    """Take down what is seen at one millisecond."""
+    data, supervisor = stack.simulator.data, stack.supervisor
+    result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
+    q, dq = data.qpos[7:], data.qvel[6:]
+    result.speed = max(result.speed, float((np.abs(dq) / VELOCITY_LIMIT).max()))
+    result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
+    for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
+        if name and name not in result.findings:
+            result.findings.append(name)
+    result.fault = result.fault or supervisor.fault
+    if result.named_after is None and set(result.findings) & set(case.named):
+        result.named_after = time
+    if result.safe_after is None and case.ends != "goes on" and _is_safe(stack, case.ends):
+        result.safe_after = time
+
+
+def _is_safe(stack: Stack, ends: str) -> bool:
+    if ends == "damping":
+        return stack.simulator.braking or stack.held_mode == MODE_DAMPING
+    if ends == "stance":
+        return stack.supervisor.mode == "stance"
+    return float(np.linalg.norm(stack.simulator.data.qvel[:2])) < STANDS
+
+
+def _judge(case: Case, result: Run, stack: Stack) -> Iterator[str]:
+    """What is against the oracle."""
+    if case.named and result.named_after is None:
+        found = ", ".join(result.findings) or "nothing"
+        yield f"found {found}, expected {' or '.join(case.named)}"
+    elif result.named_after is not None and result.named_after > case.named_within:
+        yield f"named after {result.named_after:.3f} s, expected {case.named_within:.3f} s"
+    if case.ends != "goes on" and case.ends != "any":
+        if result.safe_after is None:
+            yield f"ended in {result.ended}, expected {case.ends}"
+        elif result.safe_after > case.safe_within:
+            yield f"{case.ends} after {result.safe_after:.3f} s, expected {case.safe_within:.3f} s"
+    if case.ends in ("goes on", "stands") and (result.fault or result.fell):
+        yield f"stopped by {result.fault or 'a fall'}, expected to go on"
+    if case.ends == "stance" and result.fell:
+        yield "fell on the way to a stand"
+    if case.ends == "any" and result.fell and not result.fault:
+        yield "fell, and no fault was named"
+    if result.torque > 1.0 + 1e-6:
+        yield f"a torque of {result.torque:.2f} times the drive's limit"
+    if result.speed > MAX_SPEED:
+        yield f"a joint speed of {result.speed:.2f} times the drive's limit"
+    if result.beyond > MAX_BEYOND:
+        yield f"a joint {result.beyond:.2f} rad beyond its mechanical range"
+
+
+MAX_SPEED = 1.0
+"""Largest joint speed, as a share of what the drive can do"""
+MAX_BEYOND = 0.05
+"""rad that a joint may press into its mechanical stop, which yields"""
+
+
+def summary(runs: Sequence[Run]) -> list[dict[str, Any]]:
+    """One entry a case."""
+    entries = []
+    for case in CASES:
+        own = [
+            one
+            for one in runs
+            if (one.component, one.kind, one.mode) == (case.component, case.kind, case.mode)
+        ]
+        if own:
+            entries.append(_entry(case, own))
+    return entries
+
+
+def _entry(case: Case, runs: list[Run]) -> dict[str, Any]:
+    named = [one.named_after for one in runs if one.named_after is not None]
+    safe = [one.safe_after for one in runs if one.safe_after is not None]
+    return {
+        "case": case.name,
+        "ends": case.ends,
+        "named": sorted({name for one in runs for name in one.findings if name in case.named}),
+        "runs": len(runs),
+        "as_expected": sum(not one.wrong for one in runs),
+        "named_after": [float(np.median(named)), max(named)] if named else None,
+        "safe_after": [float(np.median(safe)), max(safe)] if safe else None,
+        "falls": sum(one.fell for one in runs),
+        "torque": max(one.torque for one in runs),
+        "speed": max(one.speed for one in runs),
+        "beyond": max(one.beyond for one in runs),
+        "wrong": sorted({sentence for one in runs for sentence in one.wrong}),
+    }
