@@ -72,6 +72,24 @@ def test_the_critic_takes_its_steps_for_one_of_the_actor(steps):
     assert float(ppo.critic.value.detach()) == pytest.approx(1e-3 * steps, rel=0.01)  # Adam's rate a step
 
 
+def test_an_action_that_has_become_all_but_impossible_leaves_the_weights_finite():
+    ppo = learner(epochs=2, mini_batches=1)
+    one = rollout([[1.0], [-1.0]] * 3)
+    one.action[:] = 500.0  # far from the mean, as where an action was held to its bounds
+    one.mean[:] = 499.0
+    ppo.update(one)
+    assert all(torch.isfinite(weight).all() for weight in ppo.actor.parameters())
+
+
+def test_a_run_ends_before_it_spoils_its_weights():
+    ppo = learner()
+    one = rollout(1.0)
+    one.obs[0] = torch.nan
+    with pytest.raises(FloatingPointError, match="gradient is not finite"):
+        ppo.update(one)
+    assert all(torch.isfinite(weight).all() for weight in ppo.actor.parameters())
+
+
 def test_masked_samples_have_no_advantage():
     mask = torch.ones(6, 1)
     mask[3:] = 0.0

@@ -17,6 +17,7 @@ from . import parallel
 from .loop import set_rate
 from .networks import Gaussian, State, select
 
+LOG_RATIO_BOUND = 10.0  # of the likelihoods now and when it was drawn; the clip of PPO lies far inside
 ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
 
 
@@ -180,7 +181,10 @@ class Ppo:
     ) -> dict[str, float]:
         c, actor = self.config, self.actor
         mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
-        ratio = (self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob).exp()
+        log_ratio = self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob
+        ratio = log_ratio.clamp(
+            -LOG_RATIO_BOUND, LOG_RATIO_BOUND
+        ).exp()  # one that overflows spoils all weights
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
         surrogate = -_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
         variance = (2 * actor.log_std).exp().detach()
@@ -206,7 +210,11 @@ class Ppo:
         optimiser.zero_grad()
         loss.backward()
         parallel.share_gradients(module)
-        torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
+        norm = torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
+        if not torch.isfinite(norm):
+            raise FloatingPointError(
+                "the gradient is not finite: the run ends before it spoils its weights; go on from its checkpoint"
+            )
         optimiser.step()
 
     def _adapt_rate(self, kl: float, target: float) -> None:
