@@ -53,7 +53,7 @@ class GuardConfig:
 
     max_state_age: float = setting(0.05, "oldest state, and longest time without one, before a fault, s")
     max_tilt: float = setting(1.05, "largest angle between the trunk's and the world's vertical, rad")
-    max_joint_speed: float = setting(40.0, "largest measured joint speed, rad/s")
+    max_joint_speed: float = setting(25.0, "largest measured joint speed, rad/s")
     joint_margin: float = setting(0.2, "how far a measured angle may lie outside the mechanical range, rad")
     max_encoder_error: float = setting(
         0.35, "by how much a joint's angle may be off what its speed adds up to over 0.1 s, rad"
@@ -75,7 +75,6 @@ class GuardConfig:
     max_velocity_error: float = setting(
         0.8, "by how much the velocity estimate may be off the Kalman filter's, m/s"
     )
-    velocity_error_time: float = setting(0.1, "after which an estimate that is off by more is left, s")
     velocity_trust_time: float = setting(
         1.0, "after which an estimate that is right again is followed again, s"
     )
@@ -473,26 +472,27 @@ class EstimateStale(Guard):
 
 
 class EstimateWrong(Guard):
-    """The velocity estimate is off the Kalman filter's by more than `max_velocity_error` for `velocity_error_time`: the
-    Kalman filter's is followed until they have agreed for `velocity_trust_time`."""
+    """The velocity estimate is off the Kalman filter's by more than `max_velocity_error`: the Kalman filter's is followed
+    until they have agreed for `velocity_trust_time`."""
 
     level = Level.LIMIT
     modes = WALK
 
     def __init__(self) -> None:
-        self._wrong = self._right = 0.0
+        self._right = 0.0
         self._found: str | None = None
 
     def look(self, see: Sight) -> str | None:
         if see.velocity is None or see.backup is None:
             return self._found
         c, error = see.config, math.dist(see.velocity.tolist(), see.backup.tolist())
-        off = not error <= c.max_velocity_error
-        self._wrong, self._right = (self._wrong + see.gap, 0.0) if off else (0.0, self._right + see.gap)
-        if self._wrong > c.velocity_error_time:
+        if not error <= c.max_velocity_error:
+            self._right = 0.0
             self._found = f"the velocity estimate is {error:.1f} m/s off the Kalman filter's, limit {c.max_velocity_error:.1f}"
-        elif self._right > c.velocity_trust_time:
-            self._found = None
+        else:
+            self._right += see.gap
+            if self._right > c.velocity_trust_time:
+                self._found = None
         return self._found
 
 

@@ -18,7 +18,21 @@ from quadvel_description.state import JointCommand, RobotState
 
 from .backup_velocity import BackupVelocity, Estimator
 from .command_limits import CommandLimits, CommandLimitsConfig
-from .guards import GUARDS, WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Obstacle, Sight, Watch
+from .guards import (
+    GUARDS,
+    WALK,
+    AccelerometerImplausible,
+    EstimateStale,
+    EstimateWrong,
+    Finding,
+    Guard,
+    GuardConfig,
+    Level,
+    MotorStatus,
+    Obstacle,
+    Sight,
+    Watch,
+)
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
 from .settings import setting
 
@@ -37,6 +51,9 @@ FOLLOWING = ("stance", "walk")
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
 PATIENCE_IN_BRAKING = 2.0  # times `brake_time`, after which a robot that still moves is put into its posture
+
+SPOIL_THE_ESTIMATE = {guard.name() for guard in (EstimateStale, EstimateWrong, AccelerometerImplausible)}
+"""With any of these the backup's velocity is followed"""
 
 OTHER_FAULTS: dict[str, tuple[Level, tuple[str, ...], str]] = {
     "stand_up_failed": (
@@ -283,7 +300,7 @@ class Supervisor:
 
     def _velocity_in_effect(self, sight: Sight) -> Array | None:
         """The estimate, the backup's where that is missing or wrong, and what is left of the last one for a robot that brakes."""
-        distrusted = any(finding.name in ("estimate_stale", "estimate_wrong") for finding in self.findings)
+        distrusted = any(finding.name in SPOIL_THE_ESTIMATE for finding in self._found)
         velocity = sight.backup if distrusted else sight.velocity
         if velocity is not None:
             self._velocity = velocity

@@ -31,7 +31,7 @@ VELOCITIES = (
     (0.5, 0.0, 0.8),
     (0.0, 0.0, 1.0),
 )
-STANDS = 0.1  # m/s, slower than which a robot stands
+STANDS, TURNS_NOT = 0.1, 0.3  # m/s, rad/s, slower than which a robot stands
 
 
 @attrs.define
@@ -55,7 +55,7 @@ class Run:
     torque: float = 0.0
     """largest torque, as a share of the drive's limit"""
     speed: float = 0.0
-    """largest joint speed, as a share of the drive's"""
+    """largest speed of a joint that its drive moves on, as a share of what it can do"""
     beyond: float = 0.0
     """how far a joint was beyond its mechanical range, rad"""
     wrong: list[str] = attrs.Factory(list)
@@ -151,7 +151,8 @@ def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
     data, supervisor = stack.simulator.data, stack.supervisor
     result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
     q, dq = data.qpos[7:], data.qvel[6:]
-    result.speed = max(result.speed, float((np.abs(dq) / VELOCITY_LIMIT).max()))
+    driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
+    result.speed = max(result.speed, float(driven.max()))
     result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
     for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
         if name and name not in result.findings:
@@ -168,7 +169,8 @@ def _is_safe(stack: Stack, ends: str) -> bool:
         return stack.simulator.braking or stack.held_mode == MODE_DAMPING
     if ends == "stance":
         return stack.supervisor.mode == "stance"
-    return float(np.linalg.norm(stack.simulator.data.qvel[:2])) < STANDS
+    velocity = stack.simulator.data.qvel
+    return float(np.linalg.norm(velocity[:2])) < STANDS and abs(velocity[5]) < TURNS_NOT
 
 
 def _judge(case: Case, result: Run, stack: Stack) -> Iterator[str]:
@@ -193,14 +195,14 @@ def _judge(case: Case, result: Run, stack: Stack) -> Iterator[str]:
         yield f"a torque of {result.torque:.2f} times the drive's limit"
     if result.speed > MAX_SPEED:
         yield f"a joint speed of {result.speed:.2f} times the drive's limit"
-    if result.beyond > MAX_BEYOND:
+    if result.beyond > (MAX_BEYOND_IN_A_FALL if result.fell else MAX_BEYOND):
         yield f"a joint {result.beyond:.2f} rad beyond its mechanical range"
 
 
-MAX_SPEED = 1.0
-"""Largest joint speed, as a share of what the drive can do"""
-MAX_BEYOND = 0.05
-"""rad that a joint may press into its mechanical stop, which yields"""
+MAX_SPEED = 1.25
+"""Largest speed of a joint that its drive still moves on, as a share of what the drive can do: where the guard acts"""
+MAX_BEYOND, MAX_BEYOND_IN_A_FALL = 0.05, 0.2
+"""rad that a joint may press into its mechanical stop, which yields; in a fall the ground does it"""
 
 
 def summary(runs: Sequence[Run]) -> list[dict[str, Any]]:
