@@ -264,8 +264,8 @@ class PrivilegedRun:
             critic_obs = self._critic_obs(obs)
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
-            action = mean + std * env.rng.standard_normal(mean.shape, dtype=np.float32)
-            action = action.clip(-ACTION_BOUND, ACTION_BOUND)
+            drawn = mean + std * env.rng.standard_normal(mean.shape, dtype=np.float32)
+            action = drawn.clip(-ACTION_BOUND, ACTION_BOUND)
             command = env.command.copy()
             touched = self.past.air.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
@@ -275,7 +275,7 @@ class PrivilegedRun:
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.stack([action, self._actions[0]])
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
-            for name, value in zip(names, (obs, critic_obs, action, mean, reward, fell, late), strict=True):
+            for name, value in zip(names, (obs, critic_obs, drawn, mean, reward, fell, late), strict=True):
                 keep[name].append(value)
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length

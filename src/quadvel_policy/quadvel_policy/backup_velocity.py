@@ -29,8 +29,9 @@ class Estimator(Protocol):
 class BackupVelocity:
     """Follows the states with a filter of its own, beside the estimator and independent of it, and of the accelerometer.
 
-    The filter is told that the trunk does not accelerate, within the noise that it ascribes to the accelerometer: legs alone
-    give the velocity to within 0.02 m/s of what they give with it. velocity: (3,) m/s, body frame, at the newest state that was followed; None where there is none.
+    The filter is told that the trunk does not accelerate, within the noise that it ascribes to the accelerometer: the legs
+    alone give the velocity to within 0.02 m/s of what they give with it.
+    velocity: (3,) m/s, body frame, at the newest state that was followed; None where there is none.
     """
 
     def __init__(self, filter: Estimator | None) -> None:
