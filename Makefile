@@ -18,7 +18,7 @@ BUILD_INTERFACES := ros_ws/wheels/build_interfaces.py
 INTERFACES := $(BUILD_INTERFACES) $(wildcard src/quadvel_msgs/*/* ros_ws/wheels/*/*/*)
 INSTALL = -m pip install --quiet --disable-pip-version-check --constraint requirements.lock --editable
 
-.PHONY: help setup ros demo close-the-loop paper test ros-tests test-ros lint format bench lock clean
+.PHONY: help setup ros demo close-the-loop paper faults test ros-tests test-ros lint format bench lock clean
 
 help:  ## say what there is
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' Makefile
@@ -52,6 +52,9 @@ lint: $(VENV)/.lint  ## ruff and mypy
 format: $(VENV)/.lint  ## let ruff repair what it can
 	$(VENV)/bin/ruff check --fix
 	$(VENV)/bin/ruff format
+
+faults: setup  ## let things go wrong in a simulated robot and measure what it does; results in out/faults
+	$(VENV)/bin/quadvel faults --out out/faults
 
 bench: setup  ## measure this machine; results in out/bench.json
 	$(VENV)/bin/quadvel bench --out out/bench.json

@@ -1,4 +1,4 @@
-"""The commands `quadvel eval`, `compare` and `bench`, as functions for a typer application."""
+"""The commands `quadvel eval`, `faults`, `compare` and `bench`, as functions for a typer application."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from . import bench
 from .compare import comparison_table, read_evaluation
+from .faults.campaign import campaign
+from .faults.report import campaign_table, total, write_campaign
 from .grid import evaluate
 from .output import output_file, output_folder
 from .report import evaluation_table, write_evaluation, write_json
@@ -80,6 +82,30 @@ def walks_bar() -> Progress:
     """A bar for walks, on stderr."""
     columns = (TextColumn("walks"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=Console(stderr=True))
+
+
+def faults_command(
+    out: Annotated[Path, typer.Option(help="Folder for faults.json, faults.md and faults.png.")] = Path("out/faults"),
+    seeds: Annotated[int, typer.Option(min=1, help="Runs of each case, with seeds 0, 1, ...")] = 20,
+    only: Annotated[
+        str | None,
+        typer.Option(help="Cases whose 'component kind mode' holds this text.", show_default="all of them"),
+    ] = None,
+) -> None:
+    """Let things go wrong in a simulated robot, and measure what it does and how soon: exit code 1 where that is not as expected."""
+    folder = output_folder(out)
+    with walks_bar() as bar:
+        task = bar.add_task("walks", total=None)
+        runs = campaign(seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
+    cases = write_campaign(folder, runs)["cases"]
+    console = Console()
+    bad = any(case["as_expected"] < case["runs"] for case in cases)
+    if bad:
+        console.print(campaign_table(cases))
+    console.print(total(cases), highlight=False)
+    console.print(f"written: {folder}/faults.json, faults.md, faults.png")
+    if bad:
+        raise typer.Exit(1)
 
 
 def compare_command(
