@@ -17,7 +17,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-PATIENCE = 6.0
+PATIENCE = 4.0
 """s to find out whether somebody is there: on a busy machine discovery takes a second, and where Fast DDS has missed the first
 announcements the next ones come 3 s later"""
 ANSWER = 10.0
