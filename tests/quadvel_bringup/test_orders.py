@@ -70,7 +70,7 @@ def test_a_robot_that_nobody_simulates_is_not_pushed(monkeypatch: pytest.MonkeyP
     assert driver.stdout is not None
     assert driver.stdout.readline() == "ready\n"
     try:
-        with pytest.raises(session.NobodyThere, match="a real robot can not be given this order"):
+        with pytest.raises(session.NobodyThere, match="a real one can not be given this order"):
             orders.push((0.0, 60.0, 0.0), 0.2, "trunk")
     finally:
         driver.communicate("\n", timeout=40.0)
