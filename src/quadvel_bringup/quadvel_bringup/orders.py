@@ -87,7 +87,9 @@ def _to_simulation(order: str, kind: Any, repeats: bool = True, **fields: Any) -
 
 def _no_simulation(session: Session) -> str:
     if session.node.count_publishers("low_state"):
-        return "the robot that is there is not simulated by quadvel, and a real one can not be given this order"
+        return (
+            "the robot that is there is not simulated by quadvel, and a real one can not be given this order"
+        )
     return "there is no simulator; start one: quadvel up"
 
 
