@@ -42,7 +42,7 @@ test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
 ros-tests: $(ROS_VENV)/.test
 
 test-ros: $(ROS_VENV)/.test  ## run the tests of the nodes on ROS 2's own rclpy, and beside embedded nodes
-	$(ROS_PY) -m pytest -n 2 --dist loadfile @tests/on_rclpy.txt
+	$(ROS_PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder @tests/on_rclpy.txt
 
 lint: $(VENV)/.lint  ## ruff and mypy
 	$(VENV)/bin/ruff check

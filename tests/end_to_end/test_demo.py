@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -28,6 +29,8 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
     command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(out)]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=240)
     assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert re.search(r"^ *controller \| stance: stood up$", ended.stdout, re.MULTILINE), ended.stdout
+    assert "refused mode" not in ended.stdout
     summary = json.loads((out / "summary.json").read_text())
     assert sorted(summary) == [
         *("estimator", "falls", "loop", "max_error_xy", "mean_error_xy", "realtime_factor", "segments"),

@@ -82,7 +82,10 @@ def test_a_node_that_ends_by_itself_is_a_fault_even_with_exit_code_0(monkeypatch
     assert up.up(Stack()) == 1
 
 
-def test_beside_another_simulator_it_does_not_start(capfd: pytest.CaptureFixture[str]) -> None:
+def test_beside_another_simulator_it_does_not_start(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    use_programs(monkeypatch, lambda name: "raise SystemExit(3)")
     program = [
         sys.executable,
         "-m",

@@ -27,6 +27,7 @@ from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 
 from .alone import ensure_alone
+from .node_output import PrefixedOutput
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 from .stack import PARAMETERS
@@ -229,16 +230,18 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
     columns = (TextColumn("{task.completed:5.1f} of {task.total:.1f} s"), BarColumn(), TimeElapsedColumn())
     bar = Progress(*columns, console=console)
 
-    def say(name: str, line: str) -> None:
-        console.print(f"{name} | {line}", markup=False, highlight=False)
-
     rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
     clock = [Parameter("use_sim_time", value=bool(nodes))]
     node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:
         if nodes:
             ensure_alone(node)
-        with StopSignals() as signals, bar, replacing(path) as draft, ProcessGroup(say) as group:
+        with (
+            StopSignals() as signals,
+            bar,
+            replacing(path) as draft,
+            ProcessGroup(PrefixedOutput(nodes, console)) as group,
+        ):
             for name, line in nodes.items():
                 group.start(name, line)
             session = _Session(node, recorder, player, simulated=bool(nodes))

@@ -16,10 +16,12 @@ from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import Push, ResetSim, SetMode, StepSim
 
 from .session import NobodyThere, Session
+from .stack import LOW_LEVELS
 
 CONTROLLER = "start the robot first: quadvel up"
+SIMULATIONS = tuple(dict.fromkeys(level.simulation for level in LOW_LEVELS.values() if level.simulation))
+"""The nodes of which one simulates the robot; they offer the same services"""
 WAY_OUT = "quadvel mode passive, then quadvel mode stand_up"
-SIMULATOR = "there is no simulator; start one: quadvel up"
 PASSING = {"stand_up": "stance", "lie_down": "passive"}
 """Modes that end by themselves, and the one that follows"""
 LONGEST = 10.0
@@ -30,7 +32,7 @@ def mode(wanted: str) -> int:
     """Ask the controller for a mode; where that takes a while, wait until it is done."""
     with Session("mode") as session:
         states = session.listen(ControllerState, "controller/state")
-        response = session.call(SetMode, "controller/set_mode", CONTROLLER, mode=wanted)
+        response = session.call(SetMode, ["controller/set_mode"], lambda: CONTROLLER, mode=wanted)
         print(response.message)
         if not response.success:
             if session.spin_until(lambda: states, 1.0) and states[-1].mode_name == "fault":
@@ -50,33 +52,48 @@ def mode(wanted: str) -> int:
 
 def enable(enabled: bool) -> int:
     """Allow walking, as a robot wants it from its operator, or forbid it."""
-    return _order("enable", SetBool, "controller/enable_walking", CONTROLLER, data=enabled)
+    with Session("enable") as session:
+        return _told(session.call(SetBool, ["controller/enable_walking"], lambda: CONTROLLER, data=enabled))
 
 
 def reset(keyframe: str) -> int:
     """Put the simulated robot back."""
-    return _order("reset", ResetSim, "sim_node/reset", SIMULATOR, keyframe=keyframe)
+    return _to_simulation("reset", ResetSim, keyframe=keyframe)
 
 
 def pause(paused: bool) -> int:
     """Let simulated time stand still, or go on."""
-    return _order("pause", SetBool, "sim_node/pause", SIMULATOR, data=paused)
+    return _to_simulation("pause", SetBool, data=paused)
 
 
 def step(milliseconds: int) -> int:
     """Let a paused simulation run on for a while."""
-    return _order("step", StepSim, "sim_node/step", SIMULATOR, steps=milliseconds)
+    return _to_simulation("step", StepSim, repeats=False, steps=milliseconds)
 
 
 def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
     """Push the simulated robot with a force (N, world frame)."""
     x, y, z = force
     wrench = Wrench(force=Vector3(x=x, y=y, z=z))
-    return _order("push", Push, "sim_node/push", SIMULATOR, body=body, wrench=wrench, duration=seconds)
+    return _to_simulation("push", Push, repeats=False, body=body, wrench=wrench, duration=seconds)
 
 
-def _order(name: str, kind: Any, service: str, serves: str, **fields: Any) -> int:
-    with Session(name) as session:
-        response = session.call(kind, service, serves, **fields)
+def _to_simulation(order: str, kind: Any, repeats: bool = True, **fields: Any) -> int:
+    """Whichever node simulates the robot carries it out. repeats: whether twice is as good as once."""
+    services = [f"{node}/{order}" for node in SIMULATIONS]
+    with Session(order) as session:
+        return _told(session.call(kind, services, lambda: _no_simulation(session), repeats, **fields))
+
+
+def _no_simulation(session: Session) -> str:
+    if session.node.count_publishers("low_state"):
+        return (
+            "the robot that is there is not simulated by quadvel, and a real one can not be given this order"
+        )
+    return "there is no simulator; start one: quadvel up"
+
+
+def _told(response: Any) -> int:
+    """Print what came of an order; the exit code."""
     print(response.message)
     return 0 if response.success else 1

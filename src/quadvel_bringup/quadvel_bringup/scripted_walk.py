@@ -14,6 +14,7 @@ import quadvel_dds
 from quadvel_eval.script import SCRIPTS
 
 from .alone import ensure_alone
+from .node_output import PrefixedOutput
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 
@@ -56,6 +57,7 @@ class ScriptedWalk:
         self._steps = [step.name for step in SCRIPTS[script]]
         columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=console)
+        self._say = PrefixedOutput([*nodes, "planner"], console)
         self._task = self._bar.add_task("start", total=len(self._steps))
 
     def run(self) -> str:
@@ -113,6 +115,3 @@ class ScriptedWalk:
 
     def _on_step(self, message: Any) -> None:
         self._bar.update(self._task, completed=self._steps.index(message.data), description=message.data)
-
-    def _say(self, name: str, line: str) -> None:
-        self._bar.console.print(f"{name} | {line}", markup=False, highlight=False)

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import repeat
 from types import TracebackType
 from typing import Any
 
@@ -16,10 +17,13 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
-PATIENCE = 3.0
-"""s to find out whether somebody is there: discovery takes a second on a busy machine"""
+PATIENCE = 4.0
+"""s to find out whether somebody is there: on a busy machine discovery takes a second, and where Fast DDS has missed the first
+announcements the next ones come 3 s later"""
 ANSWER = 10.0
 """s within which a service answers that is there"""
+AGAIN = 1.0
+"""s after which an order without an answer is given again"""
 
 
 class NobodyThere(ConnectionError):
@@ -67,12 +71,26 @@ class Session:
         """Serve for so long (s)."""
         self.spin_until(lambda: False, seconds)
 
-    def call(self, kind: Any, service: str, serves: str, **fields: Any) -> Any:
-        """The response of a service. Raises NobodyThere with `serves`, what should be running, where none comes."""
-        client = self.node.create_client(kind, service)
-        if not self.spin_until(client.service_is_ready, PATIENCE):
-            raise NobodyThere(f"{service}: nobody answers; {serves}")
-        future = client.call_async(kind.Request(**fields))
-        if not self.spin_until(future.done, ANSWER):
-            raise NobodyThere(f"{service}: no answer within {ANSWER:g} s; {serves}")
-        return future.result()
+    def call(
+        self,
+        kind: Any,
+        services: Sequence[str],
+        absent: Callable[[], str],
+        repeats: bool = True,
+        **fields: Any,
+    ) -> Any:
+        """The response of the first of these services that is there.
+
+        repeats: whether the order may be given again, which it is where no answer comes: one is lost where the server has not
+        found us yet, although we have found it. Raises NobodyThere, with what `absent` says where no service is there.
+        """
+        clients = [self.node.create_client(kind, service) for service in services]
+        if not self.spin_until(lambda: any(client.service_is_ready() for client in clients), PATIENCE):
+            raise NobodyThere(f"{' or '.join(services)}: nobody answers; {absent()}")
+        client = next(client for client in clients if client.service_is_ready())
+        asked: list[Any] = []
+        for wait in repeat(AGAIN, round(ANSWER / AGAIN)) if repeats else (ANSWER,):
+            asked.append(client.call_async(kind.Request(**fields)))
+            if self.spin_until(lambda: any(future.done() for future in asked), wait):
+                return next(future.result() for future in asked if future.done())
+        raise NobodyThere(f"{client.service_name}: no answer within {ANSWER:g} s, though somebody offers it")

@@ -21,10 +21,10 @@ from .alone import ros_domain
 from .doctor import FILES
 from .drive import planar, velocity_text
 from .orders import WAY_OUT
-from .session import Session
+from .session import PATIENCE, Session
 
 LISTEN = 2.2
-"""s: every node reports once a second, and is found within the first; so long again for those that are found later"""
+"""s, since another node was found: each reports once a second"""
 HEARD = {
     "/diagnostics": DiagnosticArray,
     "controller/state": ControllerState,
@@ -79,9 +79,13 @@ def look() -> dict[str, Node]:
 
 
 def _hear_all(session: Session, heard: deque[Any]) -> None:
-    """Listen until each node that publishes /diagnostics has reported: discovery takes its time on a busy machine."""
-    session.spin(LISTEN)
-    session.spin_until(lambda: len(reported(heard)) >= session.node.count_publishers("/diagnostics"), LISTEN)
+    """Listen until each node that publishes /diagnostics has reported; on a busy machine some are found late."""
+    session.spin_until(lambda: heard, PATIENCE)
+    known = 0
+    while known < (now := session.node.count_publishers("/diagnostics")):
+        known = now
+        session.spin(LISTEN)
+    session.spin_until(lambda: len(reported(heard)) >= known, LISTEN)
 
 
 def reported(arrays: deque[Any]) -> dict[str, Node]:

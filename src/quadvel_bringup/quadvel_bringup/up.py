@@ -2,40 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-import re
-import threading
-
 from rich.console import Console
-from rich.text import Text
 
 from .alone import look_for_others
+from .node_output import PrefixedOutput
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 from .rehearsal import rehearse
 from .stack import Stack
-
-COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
-LOGGED = re.compile(r"\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]+\]: (.*)")
-"""A line of a node's log: its level and what it says"""
-STYLES = {"WARN": "yellow", "ERROR": "bold red", "FATAL": "bold red"}
-
-
-class PrefixedOutput:
-    """Prints each line behind the name of the process that wrote it, a colour each; of a log what it says."""
-
-    def __init__(self, names: list[str]) -> None:
-        self._console = Console(soft_wrap=True, highlight=False)
-        self._width = max(map(len, names))
-        self._colours = dict(zip(names, itertools.cycle(COLOURS), strict=False))
-        self._lock = threading.Lock()
-
-    def __call__(self, name: str, line: str) -> None:
-        label = Text(f"{name:>{self._width}} | ", style=self._colours[name])
-        logged = LOGGED.fullmatch(line)
-        said = Text(logged[2], style=STYLES.get(logged[1], "")) if logged else Text.from_ansi(line)
-        with self._lock:
-            self._console.print(label + said)
 
 
 def up(stack: Stack) -> int:
@@ -49,7 +23,7 @@ def up(stack: Stack) -> int:
     if stack.brings_robot:
         look_for_others()
     nodes = stack.arguments()
-    say = PrefixedOutput(["quadvel", *nodes])
+    say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
         for name, arguments in nodes.items():

@@ -24,12 +24,6 @@ FORMATS = {
     "bool": "?", "byte": "b", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H",
     "int32": "i", "uint32": "I", "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
 }  # fmt: skip
-ZEROS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}  # the others: 0
-# Default values, which the definitions carried by rosbags leave out.
-DEFAULTS = {
-    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
-    ("sensor_msgs/msg/NavSatStatus", "status"): -2,
-}
 
 STORE = get_typestore(Stores.EMPTY)
 """All definitions, with our classes in the place of those that rosbags would make."""
@@ -228,8 +222,8 @@ def _default(typename: str, field: str, description: Description) -> Callable[[]
     if kind == Nodetype.NAME:
         return message_class(detail)
     if kind == Nodetype.BASE:
-        zero = Octet(1) if detail[0] == "byte" else ZEROS.get(detail[0], 0)
-        value = DEFAULTS.get((typename, field), zero)
+        zero = Octet(1) if detail[0] == "byte" else definitions.ZEROS.get(detail[0], 0)
+        value = definitions.DEFAULTS.get((typename, field), zero)
         return lambda: value
     item, count = _default(typename, field, detail[0]), detail[1] if kind == Nodetype.ARRAY else 0
     convert = _converter(description) or list

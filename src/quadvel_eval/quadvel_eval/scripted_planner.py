@@ -46,7 +46,9 @@ class ScriptedPlanner(Node):
         self.create_timer(PERIOD, self._update)
 
     def _on_state(self, message: Any) -> None:
-        self._mode, self._reason = message.mode_name, message.reason
+        """What the controller is in; nothing before it has heard the robot, as it refuses all orders until then."""
+        if self._mode or message.rate_hz:
+            self._mode, self._reason = message.mode_name, message.reason
 
     def _update(self) -> None:
         try:

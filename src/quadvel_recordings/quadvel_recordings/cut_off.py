@@ -1,6 +1,6 @@
 """What can be read of an MCAP file whose recorder was killed: the chunks that reached the disk whole.
 
-Such a file has no summary and no end, and perhaps half a chunk. Needs mcap alone.
+Such a file has no summary and no end, and perhaps half a chunk.
 """
 
 from __future__ import annotations
@@ -12,14 +12,16 @@ import attrs
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
+from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 
 @attrs.frozen
 class Kept:
-    """A message of a cut-off file: its topic, its type's name, when it was written (ns), and its bytes."""
+    """A message of a cut-off file: its topic, its type's name and definition, when it was written (ns), and its bytes."""
 
     topic: str
     typename: str
+    definition: MessageDefinition
     time: int
     data: bytes
 
@@ -45,7 +47,15 @@ def kept_messages(path: Path) -> Iterator[Kept]:
             channels[record.id] = record
         elif isinstance(record, Message):
             channel = channels[record.channel_id]
-            yield Kept(channel.topic, schemas[channel.schema_id].name, record.log_time, record.data)
+            schema = schemas[channel.schema_id]
+            yield Kept(channel.topic, schema.name, _definition(schema), record.log_time, record.data)
+
+
+def _definition(schema: Schema) -> MessageDefinition:
+    """As rosbags has it; that of an IDL file is left out, as nobody reads it."""
+    if schema.encoding != "ros2msg":
+        return MessageDefinition(MessageDefinitionFormat.NONE, "")
+    return MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode(errors="replace"))
 
 
 def what_is_kept(path: Path) -> str:

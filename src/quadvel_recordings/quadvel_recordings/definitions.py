@@ -24,6 +24,13 @@ SERVICES = {
     "rcl_interfaces/srv/SetParameters": "Parameter[] parameters\n---\nSetParametersResult[] results",
     "rcl_interfaces/srv/SetParametersAtomically": "Parameter[] parameters\n---\nSetParametersResult result",
 }
+ZEROS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
+"""Default values of fields by their type; those of all others are 0."""
+DEFAULTS = {
+    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
+    ("sensor_msgs/msg/NavSatStatus", "status"): -2,
+}
+"""Default values of single fields, which the definitions carried by rosbags leave out."""
 
 
 def _own_definitions() -> Path:

@@ -1,6 +1,6 @@
 """Messages out of a recording: an MCAP file, a rosbag2 folder or its .db3. Writing is `quadvel_bringup.recorder`'s.
 
-Definitions come from `definitions`, so a recording is read where no ROS 2 is installed.
+Definitions come from the recording or from `definitions`, so it is read where no ROS 2 is installed.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 from rosbags.rosbag2 import Reader
 
 from .cut_off import is_cut_off, kept_messages, what_is_kept
-from .definitions import STORE
+from .recorded import is_known, read
 
 
 class RecordingError(ValueError):
@@ -40,11 +40,11 @@ def read_messages(
             chosen = [
                 channel
                 for channel in reader.connections
-                if wanted(channel.topic, channel.msgtype) and channel.msgtype in STORE.fielddefs
+                if wanted(channel.topic, channel.msgtype) and is_known(channel.msgtype, channel.msgdef)
             ]
             # Without any chosen channel the reader would give all messages.
             for channel, time, data in reader.messages(chosen) if chosen else ():
-                yield channel.topic, time, STORE.deserialize_cdr(data, channel.msgtype)
+                yield channel.topic, time, read(data, channel.msgtype, channel.msgdef)
     except PermissionError:
         raise
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
@@ -65,5 +65,5 @@ def _kept(
     else:
         tell(text)
     for one in kept_messages(path):
-        if wanted(one.topic, one.typename) and one.typename in STORE.fielddefs:
-            yield one.topic, one.time, STORE.deserialize_cdr(one.data, one.typename)
+        if wanted(one.topic, one.typename) and is_known(one.typename, one.definition):
+            yield one.topic, one.time, read(one.data, one.typename, one.definition)

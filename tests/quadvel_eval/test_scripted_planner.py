@@ -1,0 +1,68 @@
+"""The planner's node and a controller that it orders about, in this process."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+import quadvel_dds
+
+quadvel_dds.install()
+
+import rclpy  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+
+from quadvel_eval.script import RETRY  # noqa: E402
+from quadvel_eval.scripted_planner import ScriptedPlanner  # noqa: E402
+from quadvel_msgs.msg import ControllerState  # noqa: E402
+from quadvel_msgs.srv import SetMode  # noqa: E402
+
+
+class Controller:
+    """Passive, at a rate of its loop that is told, and asked for modes."""
+
+    def __init__(self) -> None:
+        rclpy.init(args=["test"])
+        self.node, self._planner = rclpy.create_node("controller"), ScriptedPlanner()
+        self._executor = SingleThreadedExecutor()
+        for node in (self.node, self._planner):
+            self._executor.add_node(node)
+        self.asked: list[str] = []
+        self._state = self.node.create_publisher(ControllerState, "controller/state", 10)
+        self.node.create_service(SetMode, "controller/set_mode", self._on_set_mode)
+
+    def _on_set_mode(self, request: Any, response: Any) -> Any:
+        self.asked.append(request.mode)
+        return response
+
+    def say_until(self, rate: float, is_so: Callable[[], Any]) -> None:
+        """Publish states (rate: Hz of the loop) until the predicate holds."""
+        until = time.monotonic() + 20.0
+        while not is_so():
+            assert time.monotonic() < until, f"asked for {self.asked}"
+            self._state.publish(ControllerState(mode_name="passive", rate_hz=rate))
+            self._executor.spin_once(timeout_sec=0.01)
+
+    def close(self) -> None:
+        self._executor.shutdown()
+        for node in (self.node, self._planner):
+            node.destroy_node()
+        rclpy.try_shutdown()
+
+
+@pytest.fixture
+def controller() -> Iterator[Controller]:
+    controller = Controller()
+    yield controller
+    controller.close()
+
+
+def test_nothing_is_ordered_before_the_controller_has_heard_the_robot(controller: Controller) -> None:
+    until = time.monotonic() + 3.0 * RETRY
+    controller.say_until(0.0, lambda: time.monotonic() > until)
+    assert controller.asked == []
+    controller.say_until(200.0, lambda: controller.asked)
+    assert controller.asked[0] == "stand_up"
