@@ -26,10 +26,7 @@ FORMATS = {
 }  # fmt: skip
 ZEROS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}  # the others: 0
 # Default values, which the definitions carried by rosbags leave out.
-DEFAULTS = {
-    ("geometry_msgs/msg/Quaternion", "w"): 1.0,
-    ("sensor_msgs/msg/NavSatStatus", "status"): -2,
-}
+DEFAULTS = {("geometry_msgs/msg/Quaternion", "w"): 1.0, ("sensor_msgs/msg/NavSatStatus", "status"): -2}
 
 STORE = get_typestore(Stores.EMPTY)
 """All definitions, with our classes in the place of those that rosbags would make."""
