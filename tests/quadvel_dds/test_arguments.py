@@ -103,7 +103,7 @@ def test_later_arguments_win(tmp_path: Path) -> None:
         ),
         ("[" * 400, "is not valid YAML"),
         ("a: " + "9" * 5000, "is not valid YAML"),
-        ("\udcff", "expected node names"),
+        ("\udcff", "is not text"),
     ],
 )
 def test_faults_of_a_file_are_named(tmp_path: Path, content: str | None, fault: str) -> None:

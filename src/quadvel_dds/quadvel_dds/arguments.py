@@ -145,10 +145,10 @@ def read_parameter_file(path: Path) -> list[ParameterOverride]:
     """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
     where = f"parameter file '{path}'"
     try:
-        text = path.read_text(errors="replace")
-    except OSError as error:
-        raise InvalidROSArgsError(f"{where} cannot be read: {error.strerror}") from error
-    document = _load(where, text)
+        document = _load(where, path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        fault = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is not text"
+        raise InvalidROSArgsError(f"{where} {fault}") from error
     return [] if document is None else list(_walk_nodes(where, "", document))
 
 
