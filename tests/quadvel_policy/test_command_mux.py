@@ -162,7 +162,8 @@ def test_bounds_that_make_no_sense_are_refused_by_name(value: Any) -> None:
 
 SPEED = st.floats(-10.0, 10.0) | st.floats(allow_nan=True, allow_infinity=True) | st.just(0.0)
 VELOCITY = st.tuples(SPEED, SPEED, SPEED)
-WAIT = st.floats(0.0, 0.4) | st.just(0.0) | st.floats(-100.0, 100.0)  # s; now and then the clock is set
+# s, in whole nanoseconds as ROS counts them; now and then the clock is set.
+WAIT = (st.floats(0.0, 0.4) | st.just(0.0) | st.floats(-100.0, 100.0)).map(lambda wait: round(wait, 9))
 SPEAKS = st.tuples(st.sampled_from([TELEOP, PLANNER]), VELOCITY)
 STOPS = st.tuples(st.sampled_from(["lock", "other lock", "stance"]), st.booleans())
 EVENTS = st.lists(st.tuples(WAIT, SPEAKS | STOPS), max_size=40)
