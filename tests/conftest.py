@@ -36,6 +36,13 @@ os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_STEP * int(RUN) + WORKER % DOMAIN_STEP)
 HAS_ROS = "AMENT_PREFIX_PATH" in os.environ or "QUADVEL_ROS_SETUP" in os.environ
 collect_ignore = [*([] if HAS_ROS else ["ros"]), *([] if find_spec("rclpy") else ["mixed"])]
 
+# What Hypothesis tries is the same in every run, and takes as long as it takes.
+if find_spec("hypothesis"):
+    from hypothesis import settings
+
+    settings.register_profile("seeded", deadline=None, derandomize=True)
+    settings.load_profile("seeded")
+
 # A run in the background ignores Ctrl-C, and so would what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

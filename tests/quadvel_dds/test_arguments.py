@@ -95,12 +95,21 @@ def test_later_arguments_win(tmp_path: Path) -> None:
         ("/**: {ros__parameters: {gain: [1, two]}}", "'gain': found [1, 'two']"),
         ("/**: {ros__parameters: 3}", "expected names and values"),
         (None, "cannot be read: No such file"),
+        ("/**: {ros__parameters: {a: &x [1], b: *x}}", "found an alias, expected values in full"),
+        ("a: &x {b: *x}", "found an alias"),
+        (
+            "/**: {ros__parameters: {a: !!python/object/apply:os.getcwd []}}",
+            "could not determine a constructor",
+        ),
+        ("[" * 400, "is not valid YAML"),
+        ("a: " + "9" * 5000, "is not valid YAML"),
+        ("\udcff", "is not text"),
     ],
 )
 def test_faults_of_a_file_are_named(tmp_path: Path, content: str | None, fault: str) -> None:
     file = tmp_path / "parameters.yaml"
     if content is not None:
-        file.write_text(content)
+        file.write_text(content, errors="surrogateescape")
     with pytest.raises(arguments.InvalidROSArgsError, match=re.escape(fault)) as caught:
         overrides("--params-file", str(file))
     assert str(file) in str(caught.value)

@@ -99,3 +99,16 @@ def test_both_parts_together_are_the_network(model: ModelProto) -> None:
 )
 def test_a_network_without_a_product_of_both_kinds_stays_whole(model: ModelProto) -> None:
     assert cut(model, "obs") is None
+
+
+def test_products_of_deeply_nested_parts_are_followed() -> None:
+    """Deeper than Python calls functions within each other."""
+    model = network()
+    joining = next(i for i, node in enumerate(model.graph.node) if node.op_type == "Concat")
+    model.graph.node[joining].output[0] = "joined0"
+    deep = [helper.make_node("Concat", [f"joined{i}"], [f"joined{i + 1}"], axis=1) for i in range(1500)]
+    deep[-1].output[0] = "joined"
+    nodes = [*model.graph.node[: joining + 1], *deep, *model.graph.node[joining + 1 :]]
+    del model.graph.node[:]
+    model.graph.node.extend(nodes)
+    assert cut(model, "obs") is not None

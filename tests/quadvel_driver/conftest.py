@@ -10,17 +10,12 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from hypothesis import settings
 
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_driver.link import LinkConfig, UdpLink
 from quadvel_driver.wire import BoardState, Remote
-
-settings.register_profile("seeded", deadline=None, derandomize=True)
-settings.load_profile("seeded")
-
 
 NO_REMOTE = Remote()
 

@@ -233,6 +233,62 @@ def test_a_packet_with_any_one_bit_flipped_is_refused(decode, packet: bytes) -> 
             decode(bytes(flipped))
 
 
+NUMBER = st.floats(allow_nan=False, allow_infinity=False)
+LARGEST = float(np.finfo(np.float32).max)
+
+
+@st.composite
+def states(draw: st.DrawFn, number: st.SearchStrategy[float] = NUMBER) -> BoardState:
+    """Any that is made of such numbers, whatever a robot can do."""
+    state = some_state(draw(st.integers(0, 1000)))
+    for field in ("q", "dq", "tau", "quaternion", "angular_velocity", "linear_acceleration", "foot_force"):
+        values = getattr(state.robot, field)
+        values[:] = draw(st.lists(number, min_size=len(values), max_size=len(values)))
+    return state
+
+
+@pytest.mark.filterwarnings("error")
+@settings(max_examples=40)
+@given(states())
+def test_any_finite_state_comes_back_clamped_to_what_its_fields_hold(state: BoardState) -> None:
+    sent, got = state.robot, wire.decode_state(wire.encode_state(state)).robot
+    for field in ("q", "dq", "quaternion", "angular_velocity", "linear_acceleration"):
+        expected = np.clip(getattr(sent, field), -LARGEST, LARGEST)
+        np.testing.assert_allclose(getattr(got, field), expected, rtol=1e-6, atol=1e-40)
+    np.testing.assert_allclose(got.tau, np.clip(sent.tau, -128.0, 127.996), atol=1 / 256 + 1e-9)
+    np.testing.assert_allclose(got.foot_force, np.clip(sent.foot_force, -(2.0**15), 2.0**15 - 1), atol=1.0)
+
+
+@settings(max_examples=100)
+@given(states(st.floats(-10, 10)), st.integers(0, 8 * wire.STATE_BYTES - 1))
+def test_whatever_the_state_a_flipped_bit_is_noticed(state: BoardState, bit: int) -> None:
+    packet = bytearray(wire.encode_state(state))
+    packet[bit // 8] ^= 1 << bit % 8
+    with pytest.raises(WireError, match=r"CRC|reserve"):
+        wire.decode_state(bytes(packet))
+
+
+@pytest.mark.filterwarnings("error")
+@settings(max_examples=200)
+@given(st.data(), st.sampled_from([COMMAND_PACKET, STATE_PACKET]))
+def test_any_bytes_with_the_right_crc_are_finite_numbers_or_refused(
+    data: st.DataObject, packet: bytes
+) -> None:
+    """What the CRC cannot tell: that whoever computed it meant well."""
+    length = len(packet) - 12
+    start = data.draw(st.integers(0, length))
+    forged = bytearray(packet)
+    forged[start:length] = data.draw(st.binary(min_size=length - start, max_size=length - start))
+    decode = wire.decode_command if packet is COMMAND_PACKET else wire.decode_state
+    try:
+        record = decode(sealed(forged))
+    except WireError as error:
+        assert "expected" in str(error)  # noqa: PT017
+        return
+    robot = getattr(record, "robot", record)
+    assert np.isfinite((robot.q, robot.dq, robot.tau)).all()
+
+
 @settings(max_examples=200)
 @given(st.sampled_from([COMMAND_PACKET, STATE_PACKET]), st.data())
 def test_a_packet_with_some_bytes_changed_is_refused(packet: bytes, data: st.DataObject) -> None:

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
-from quadvel_description.recurrent_network import NetworkFileError
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_estimator import features

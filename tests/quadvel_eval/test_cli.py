@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_description.recurrent_network import NetworkFileError
+from quadvel_description.network_file import NetworkFileError
 from quadvel_eval import bench
 from quadvel_eval.cli import bench_command, eval_command
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
+from quadvel_policy.command_mux import LONGEST_STEP, CommandMux, MuxConfig, MuxInput, MuxOutput
 
 TELEOP, PLANNER = MuxInput("teleop", 100, 0.5), MuxInput("planner", 10, 0.3)
 FORWARD, BACK = (1.0, 0.0, 0.0), (-0.5, 0.0, 0.0)
@@ -133,6 +133,17 @@ def test_a_clock_that_is_set_back_makes_every_input_silent(mux: CommandMux) -> N
     assert run(mux, 5.0, 1.0).stance
 
 
+def test_what_was_heard_before_the_clock_was_set_back_is_not_followed_when_its_time_comes_again(
+    mux: CommandMux,
+) -> None:
+    run(mux, 100.0, 1.0, teleop=FORWARD)
+    mux.update(5.0)
+    for now in np.arange(5.0, 102.0, PERIOD):
+        output = mux.update(now)
+        assert output.source == "none"
+    assert output.stance
+
+
 @pytest.mark.parametrize(
     "inputs", [[], [TELEOP, MuxInput("teleop", 1, 1.0)], [TELEOP, MuxInput("a", 100, 1.0)]]
 )
@@ -149,25 +160,102 @@ def test_bounds_that_make_no_sense_are_refused_by_name(value: Any) -> None:
         MuxInput("teleop", 1, 0.0)
 
 
-VELOCITY = st.tuples(*[st.floats(-10, 10)] * 3)
-EVENT = st.tuples(st.floats(0.0, 0.4), st.sampled_from(["teleop", "planner", "lock", "free"]), VELOCITY)
+SPEED = st.floats(-10.0, 10.0) | st.floats(allow_nan=True, allow_infinity=True) | st.just(0.0)
+VELOCITY = st.tuples(SPEED, SPEED, SPEED)
+# s, in whole nanoseconds as ROS counts them; now and then the clock is set.
+WAIT = (st.floats(0.0, 0.4) | st.just(0.0) | st.floats(-100.0, 100.0)).map(lambda wait: round(wait, 9))
+SPEAKS = st.tuples(st.sampled_from([TELEOP, PLANNER]), VELOCITY)
+STOPS = st.tuples(st.sampled_from(["lock", "other lock", "stance"]), st.booleans())
+EVENTS = st.lists(st.tuples(WAIT, SPEAKS | STOPS), max_size=40)
 
 
-@given(st.lists(EVENT, max_size=40))
-@settings(max_examples=60, deadline=None)
-def test_whatever_happens_the_command_is_bounded_and_stance_means_zero(events: list[Any]) -> None:
-    mux, now, last = CommandMux([TELEOP, PLANNER], BRISK), 0.0, np.zeros(3)
-    for wait, kind, velocity in events:
-        now += wait
-        if kind in ("teleop", "planner"):
-            mux.receive(kind, now, velocity)
+class Told:
+    """A mux, and what it was told, kept in a simpler way: to hold what it says against."""
+
+    def __init__(self) -> None:
+        self.mux = CommandMux([TELEOP, PLANNER], BRISK)
+        self.now, self.last = 0.0, self.mux.update(0.0)
+        self.heard: dict[MuxInput, float] = {}
+
+    def tell(self, event: tuple[Any, Any]) -> None:
+        who, what = event
+        if isinstance(who, MuxInput):
+            if np.isfinite(what).all():
+                self.mux.receive(who.name, self.now, what)
+                self.heard[who] = self.now
+            else:
+                with pytest.raises(ValueError, match="expected finite numbers"):
+                    self.mux.receive(who.name, self.now, what)
+        elif who == "stance":
+            self.mux.stance_requested = what
         else:
-            mux.locks = {"lock"} if kind == "lock" else set()
-        output = mux.update(now)
+            (self.mux.locks.add if what else self.mux.locks.discard)(who)
+
+    @property
+    def stopped(self) -> bool:
+        return bool(self.mux.locks) or self.mux.stance_requested
+
+    def winner(self) -> str:
+        """By what was told: the first that is fresh, in the order of priority."""
+        self.heard = {one: at for one, at in self.heard.items() if at <= self.now}
+        fresh = [one.name for one, at in self.heard.items() if self.now - at <= one.timeout]
+        return "none" if self.stopped or not fresh else "teleop" if "teleop" in fresh else "planner"
+
+    def check(self, wait: float) -> MuxOutput:
+        """One update after `wait` s, and all that holds of every one."""
+        output = self.mux.update(self.now)
+        limit = BRISK.stop_acceleration if output.source == "none" else BRISK.acceleration
+        step = np.multiply(limit, np.clip(wait, 0.0, LONGEST_STEP))
+        assert np.isfinite(output.velocity).all()
         assert (np.abs(output.velocity) <= BRISK.max_velocity).all()
-        assert (np.abs(output.velocity - last) <= np.multiply(BRISK.acceleration, wait) + 1e-9).all()
+        assert (np.abs(output.velocity - self.last.velocity) <= step + 1e-9).all()
+        assert output.source == self.winner()
         assert not (output.stance and output.velocity.any())
-        assert not (mux.locks and output.source != "none")
-        last = output.velocity
-    silent = [mux.update(now + wait) for wait in np.arange(0.05, 4.0, 0.05)]
-    assert silent[-1].stance
+        self.last = output
+        return output
+
+    def pass_time(self, seconds: float, *events: tuple[Any, Any]) -> MuxOutput:
+        """Updates at 50 Hz, each after `events`."""
+        for _ in range(round(seconds / PERIOD)):
+            self.now += PERIOD
+            for event in events:
+                self.tell(event)
+            output = self.check(PERIOD)
+        return output
+
+
+@given(EVENTS, st.sampled_from(["silence", "lock", "stance"]))
+@settings(max_examples=100)
+def test_whatever_happens_the_command_is_bounded_and_can_be_stopped(events: list[Any], stop: str) -> None:
+    told = Told()
+    for wait, event in events:
+        told.now += wait
+        told.tell(event)
+        told.check(wait)
+    ramp = max(np.divide(BRISK.max_velocity, BRISK.stop_acceleration))
+    if stop == "silence":
+        output = told.pass_time(TELEOP.timeout + ramp + 2 * PERIOD)
+    else:
+        told.tell((stop, True))
+        output = told.pass_time(ramp + 2 * PERIOD, (TELEOP, (1.0, -1.0, 1.0)))
+    assert (output.stance, output.source) == (True, "none")
+    assert not output.velocity.any()
+
+
+@given(EVENTS, st.tuples(*[st.floats(-10.0, 10.0)] * 3))
+@settings(max_examples=50)
+def test_whatever_happened_the_highest_priority_is_followed_once_nothing_stops_it(
+    events: list[Any], velocity: tuple[float, ...]
+) -> None:
+    told = Told()
+    for wait, event in events:
+        told.now += wait
+        told.tell(event)
+        told.check(wait)
+    told.mux.locks.clear()
+    told.mux.stance_requested = False
+    output = told.pass_time(4.0, (TELEOP, velocity), (PLANNER, (1.0, 0.0, 0.0)))
+    followed = np.clip(velocity, np.negative(BRISK.max_velocity), BRISK.max_velocity)
+    expected = followed if (np.abs(velocity) >= BRISK.dead_zone).any() else np.zeros(3)
+    np.testing.assert_allclose(output.velocity, expected)
+    assert output.stance == (not expected.any())

@@ -20,7 +20,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped
 from rclpy.qos import qos_profile_sensor_data
 from std_srvs.srv import SetBool
 
-from quadvel_description.recurrent_network import NetworkFileError
+from quadvel_description.network_file import NetworkFileError
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand

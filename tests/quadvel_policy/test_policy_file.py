@@ -11,7 +11,7 @@ import onnx
 import pytest
 
 from quadvel_description.ahead import cut
-from quadvel_description.recurrent_network import NetworkFileError
+from quadvel_description.network_file import NetworkFileError
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 

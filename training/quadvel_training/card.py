@@ -11,8 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import onnx
-
+from quadvel_description.network_file import read_network
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_estimator.features import KIND
 from quadvel_eval.compare import figures, read_evaluation
@@ -53,9 +52,7 @@ ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, en
 
 
 def _metadata(network: Path) -> dict[str, Any]:
-    if not network.is_file():
-        raise FileNotFoundError(f"{network}: no such file, expected a policy or an estimator")
-    texts = {entry.key: entry.value for entry in onnx.load(network).metadata_props}
+    texts = {entry.key: entry.value for entry in read_network(network).metadata_props}
     if METADATA_KEY not in texts:
         raise ValueError(f"{network}: no metadata {METADATA_KEY}, expected a policy or an estimator")
     found: dict[str, Any] = json.loads(texts[METADATA_KEY])

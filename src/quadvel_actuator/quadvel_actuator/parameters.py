@@ -199,7 +199,7 @@ class ActuatorParameters:
             parameters: ActuatorParameters = _record(cls, yaml.safe_load(Path(path).read_text()))
         except UnicodeDecodeError:
             raise ValueError(f"{path}: no text, expected a YAML file of actuator parameters") from None
-        except yaml.YAMLError as error:
+        except (yaml.YAMLError, RecursionError) as error:
             raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None

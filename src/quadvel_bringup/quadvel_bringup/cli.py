@@ -307,6 +307,12 @@ def compare(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
+def faults(context: typer.Context) -> None:
+    """Let things go wrong in a simulated robot, and measure what it does."""
+    _hand_on(context, "quadvel_eval.cli:faults_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
 def paper(context: typer.Context) -> None:
     """Measure what the paper's figures show: a page, pictures, tables."""
     _hand_on(context, "quadvel_eval.paper.cli:paper_command")

@@ -62,8 +62,6 @@ def _check_names(file: Path) -> None:
     """That each section of the parameter file is meant for one of our nodes."""
     try:
         overrides = read_parameter_file(file)
-    except UnicodeDecodeError:
-        raise ValueError(f"parameter file '{file}' is not text, expected YAML") from None
     except ValueError as error:
         raise ValueError(" ".join(str(error).split())) from None  # YAML tells its errors in several lines
     for pattern in dict.fromkeys(override.pattern for override in overrides):

@@ -11,14 +11,7 @@ import attrs
 import yaml
 
 SCOPE_KEY = "ros__parameters"
-FLAGS = {
-    "-p": "-p",
-    "--param": "-p",
-    "-r": "-r",
-    "--remap": "-r",
-    "--params-file": "file",
-    "--log-level": "log",
-}
+FLAGS = {"-p": "p", "--param": "p", "-r": "r", "--remap": "r", "--params-file": "file", "--log-level": "log"}
 IGNORED_FLAGS = {f"--{on}-{what}" for on in ("enable", "disable") for what in ("rosout-logs", "stdout-logs")}
 
 
@@ -88,12 +81,12 @@ def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None
     value = next(following, None)
     if value is None:
         raise InvalidROSArgsError(f"argument {flag} needs a value")
-    if FLAGS[flag] == "-p":
+    if FLAGS[flag] == "p":
         rule = parse_rule(flag, value)
         pattern = f"/**/{rule.node}" if rule.node else "/**"
         parsed = parse_value(f"{flag} {value}", rule.value)
         found.overrides.append(ParameterOverride(pattern, rule.name, parsed))
-    elif FLAGS[flag] == "-r":
+    elif FLAGS[flag] == "r":
         found.remappings.append(parse_rule(flag, value))
     elif FLAGS[flag] == "file":
         found.overrides += read_parameter_file(Path(value))
@@ -130,8 +123,11 @@ def parse_value(where: str, text: str) -> Any:
 
 def _load(where: str, text: str) -> Any:
     try:
+        aliases = (token for token in yaml.scan(text) if isinstance(token, yaml.AliasToken))
+        if any(aliases):  # a few could fill the memory
+            raise yaml.YAMLError("found an alias, expected values in full, as in ROS 2")
         return yaml.load(text, _Loader)
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InvalidROSArgsError(f"{where} is not valid YAML: {error}") from error
 
 
@@ -149,10 +145,10 @@ def read_parameter_file(path: Path) -> list[ParameterOverride]:
     """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
     where = f"parameter file '{path}'"
     try:
-        text = path.read_text()
-    except OSError as error:
-        raise InvalidROSArgsError(f"{where} cannot be read: {error.strerror}") from error
-    document = _load(where, text)
+        document = _load(where, path.read_text())
+    except (OSError, UnicodeDecodeError) as error:
+        fault = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is not text"
+        raise InvalidROSArgsError(f"{where} {fault}") from error
     return [] if document is None else list(_walk_nodes(where, "", document))
 
 

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import struct
 import uuid
 from collections.abc import Iterator
+from functools import cache
 from typing import Any
 
 from cyclonedds import builtin, core
@@ -29,38 +31,49 @@ from quadvel_dds import idl, messages
 ANY = core.SampleState.Any | core.ViewState.Any | InstanceState.Any
 REQUEST_HEADER = struct.Struct("<Qq")
 MAX_PARTICIPANTS = 32  # on one host, as rmw_cyclonedds sets it
-# Cyclone drops what comes over other interfaces than these, and ROS 2 looks for nodes of its host on this one.
-LOOPBACK = '<Interfaces><NetworkInterface name="lo"/></Interfaces>'
-# How often participants introduce themselves to their peers: ROS 2 may start later, and by default it calls
-# over multicast alone, which nodes that stay on this host do not hear.
+# Cyclone drops what nodes elsewhere say of themselves, and ROS 2 looks for nodes of its host on this one.
+LOOPBACK = '<General><Interfaces><NetworkInterface name="lo"/></Interfaces><AllowMulticast>false</AllowMulticast></General>'
+# How often participants introduce themselves: ROS 2 may start later, and it calls over multicast, which is not heard here.
 ANNOUNCEMENT = "2 s"
 REACHES = ("LOCALHOST", "SUBNET", "SYSTEM_DEFAULT", "OFF")
-_domains: dict[int, Domain] = {}
 
 
 def domain_configuration() -> str:
     """Cyclone's settings for ROS_AUTOMATIC_DISCOVERY_RANGE (default here: LOCALHOST) and ROS_STATIC_PEERS."""
     reach = os.environ.get("ROS_AUTOMATIC_DISCOVERY_RANGE") or "LOCALHOST"
-    peers = [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
     if reach not in REACHES:
         raise ValueError(f"ROS_AUTOMATIC_DISCOVERY_RANGE is '{reach}', expected {', '.join(REACHES)}")
-    general = discovery = ""
-    if reach == "LOCALHOST":
-        peers.insert(0, "localhost")
-        general = LOOPBACK
-    if reach in ("LOCALHOST", "OFF"):
-        general = f"<General>{general}<AllowMulticast>false</AllowMulticast></General>"
+    discovery, general = "", LOOPBACK if reach in ("LOCALHOST", "OFF") else ""
     if reach == "OFF":
         discovery = f"<ParticipantIndex>none</ParticipantIndex><Tag>ros_discovery_off_{os.getpid()}</Tag>"
     elif reach != "SYSTEM_DEFAULT":
+        peers = ["localhost"] if reach == "LOCALHOST" else []
+        peers += [peer for peer in os.environ.get("ROS_STATIC_PEERS", "").split(";") if peer]
         addresses = "".join(f'<Peer address="{peer}" pruneDelay="inf"/>' for peer in peers)
         discovery = (
-            "<ParticipantIndex>auto</ParticipantIndex>"
-            f"<MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
+            f"<ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>{MAX_PARTICIPANTS}</MaxAutoParticipantIndex>"
             f"<SPDPInterval>{ANNOUNCEMENT}</SPDPInterval><Peers>{addresses}</Peers>"
         )
     own = f"<CycloneDDS><Domain>{general}<Discovery>{discovery}</Discovery></Domain></CycloneDDS>"
     return ",".join(filter(None, [own, os.environ.get("CYCLONEDDS_URI")]))
+
+
+@cache
+def _join(domain_id: int) -> Domain:
+    """The domain. Without settings of the user's own its sockets, open to all in Cyclone, hear the loopback interface alone."""
+    settings, before = domain_configuration(), _sockets()
+    domain = Domain(domain_id, settings)
+    if LOOPBACK in settings and not os.environ.get("CYCLONEDDS_URI"):
+        for name in _sockets().keys() - before.keys():
+            with socket.socket(fileno=os.dup(_sockets()[name])) as one:
+                one.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, b"lo")
+    return domain
+
+
+def _sockets() -> dict[str, int]:
+    """The descriptors of this process's sockets, by names that no two have."""
+    files = {os.path.realpath(f"/proc/self/fd/{one}"): int(one) for one in os.listdir("/proc/self/fd")}
+    return {name: descriptor for name, descriptor in files.items() if "/socket:" in name}
 
 
 def delete(entity: core.Entity) -> None:
@@ -72,8 +85,7 @@ class Participant:
     """One process on the domain: makes readers and writers and tells who else is there."""
 
     def __init__(self, domain_id: int) -> None:
-        if domain_id not in _domains:
-            _domains[domain_id] = Domain(domain_id, domain_configuration())
+        _join(domain_id)
         self.dds = DomainParticipant(domain_id, qos=Qos(Policy.Userdata(b"enclave=/;")))
         self.gid = self.dds.guid.bytes
         self._topics: dict[tuple[str, str], Topic[Any]] = {}
@@ -92,8 +104,7 @@ class Participant:
         key = (topic, typename)
         if key not in self._topics:
             self._topics[key] = Topic(self.dds, topic, idl.struct(typename))
-        type_hash = f"typehash={messages.type_hash(typename)};"
-        return self._topics[key], to_dds_qos(profile, user_data + type_hash)
+        return self._topics[key], to_dds_qos(profile, f"{user_data}typehash={messages.type_hash(typename)};")
 
     def endpoints(self, kind: str) -> Iterator[Any]:
         """All writers ("publication") or readers ("subscription") on the domain, our own included."""

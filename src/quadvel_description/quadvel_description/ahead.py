@@ -102,10 +102,16 @@ def _terms(graph: GraphProto, node: NodeProto) -> list[Term]:
 
 def _joined(graph: GraphProto, name: str) -> list[str]:
     """The values that `name` is put together of, by one Concat or several nested ones; else itself."""
-    maker = next((one for one in graph.node if name in one.output), None)
-    if maker is None or maker.op_type != "Concat":
-        return [name]
-    return [part for one in maker.input for part in _joined(graph, one)]
+    joins = {output: node.input for node in graph.node if node.op_type == "Concat" for output in node.output}
+    parts: list[str] = []
+    waiting = [name]
+    while waiting:
+        one = waiting.pop()
+        if one in joins:
+            waiting += reversed(joins[one])
+        else:
+            parts.append(one)
+    return parts
 
 
 def _product(graph: GraphProto, terms: Sequence[Term], added: Sequence[str], output: str) -> list[NodeProto]:

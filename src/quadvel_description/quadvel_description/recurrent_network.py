@@ -19,28 +19,28 @@ from typing import Any
 import numpy as np
 import onnxruntime
 from numpy.typing import NDArray
+from onnx import ModelProto
 
+from . import ahead
+from .network_file import NetworkFileError, read_network
 from .robot import JOINT_NAMES
 
 METADATA_KEY = "quadvel"
 SCHEMA = 1
+LONGEST = 10_000  # numbers, of one input
 MEMORY_INPUTS = ("h_in", "c_in")
 MEMORY_OUTPUTS = ("h_out", "c_out")
 
 
-class NetworkFileError(ValueError):
-    """A network file that is missing, unreadable or not what was asked for, in one sentence with its name."""
-
-
-def _session(model: str | bytes) -> onnxruntime.InferenceSession:
-    """A network, by its file's path or as the file's bytes, to be run on one thread."""
+def _options() -> onnxruntime.SessionOptions:
+    """Of sessions that run on one thread."""
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     options.inter_op_num_threads = 1
     # At batch size one, weights are streamed as they lie; packed for larger products they are slower by a tenth.
     options.add_session_config_entry("session.disable_prepacking", "1")
     options.log_severity_level = 4  # what goes wrong is raised, not printed
-    return onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
+    return options
 
 
 class _Run:
@@ -72,7 +72,8 @@ class RecurrentNetwork:
 
     def __init__(self, path: str | Path, outputs: Mapping[str, int], fields: Sequence[str] = ()) -> None:
         self.path = Path(path)
-        self._session = self._open()
+        self._model = read_network(self.path)
+        self._session = self._open(self._model)
         self.metadata = self._read_metadata(("schema", "joint_names", "state_shape", *fields))
         self._require("metadata field schema", self.metadata["schema"], SCHEMA)
         self._require("metadata field joint_names", self.metadata["joint_names"], list(JOINT_NAMES))
@@ -129,14 +130,10 @@ class RecurrentNetwork:
     @cached_property
     def _halves(self) -> tuple[list[_Run], list[_Run]] | None:
         """What runs ahead of an observation and what runs on it, or None where the network has no such parts."""
-        import onnx  # here, as those in no hurry need neither it nor `ahead`
-
-        from . import ahead
-
-        models = ahead.cut(onnx.load(self.path), "obs")
+        models = ahead.cut(self._model, "obs")
         if models is None:
             return None
-        before, after = (_session(model.SerializeToString()) for model in models)
+        before, after = map(self._open, models)
         handed_over = {end.name: np.zeros(end.shape, np.float32) for end in before.get_outputs()}
         return self._runs(before, handed_over), self._runs(after, handed_over)
 
@@ -170,7 +167,13 @@ class RecurrentNetwork:
         """One run on zeros: shows the true shapes of the outputs, and is the slow first run of the session."""
         memory = self.metadata["state_shape"]
         zeros = {name: np.zeros(memory, np.float32) for name in MEMORY_INPUTS}
-        results = self._session.run(None, {"obs": np.zeros((1, self.input_size), np.float32), **zeros})
+        inputs = {"obs": np.zeros((1, self.input_size), np.float32), **zeros}
+        try:
+            results = self._session.run(None, inputs)
+        except Exception as error:  # onnxruntime's exceptions share no other base
+            raise NetworkFileError(
+                f"{self.path}: does not run on an input of zeros: {str(error)[:200]}"
+            ) from error
         expected = {name: (1, size) for name, size in self._outputs.items()}
         expected |= dict.fromkeys(MEMORY_OUTPUTS, tuple(memory))
         for (name, shape), result in zip(expected.items(), results, strict=True):
@@ -182,11 +185,12 @@ class RecurrentNetwork:
         if found != expected:
             raise self.refuse(what, found, expected)
 
-    def _open(self) -> onnxruntime.InferenceSession:
-        if not self.path.is_file():
-            raise NetworkFileError(f"{self.path}: no such file, expected an ONNX network")
+    def _open(self, model: ModelProto) -> onnxruntime.InferenceSession:
+        """The network, or a part of it, ready to run."""
         try:
-            return _session(str(self.path))
+            return onnxruntime.InferenceSession(
+                model.SerializeToString(), _options(), providers=["CPUExecutionProvider"]
+            )
         except Exception as error:  # onnxruntime's exceptions share no other base
             raise NetworkFileError(
                 f"{self.path}: is not an ONNX network that onnxruntime can read"
@@ -200,7 +204,7 @@ class RecurrentNetwork:
             )
         try:
             metadata = json.loads(text)
-        except ValueError:
+        except (ValueError, RecursionError):
             metadata = None
         if not isinstance(metadata, dict):
             raise NetworkFileError(
@@ -218,6 +222,10 @@ class RecurrentNetwork:
         self._require("types of the inputs", {i.type for i in inputs}, {"tensor(float)"})
         for memory in inputs[1:]:
             self._require(f"shape of input {memory.name}", memory.shape, self.metadata["state_shape"])
+        for end in inputs:
+            lengths = [length for length in end.shape if isinstance(length, int) and length > 0]
+            if len(lengths) < len(end.shape) or math.prod(lengths) > LONGEST:
+                raise self.refuse(f"shape of input {end.name}", end.shape, f"at most {LONGEST} numbers")
         shape = inputs[0].shape
-        if len(shape) != 2 or shape[0] != 1 or not isinstance(shape[1], int):
+        if len(shape) != 2 or shape[0] != 1:
             raise self.refuse("shape of input obs", shape, [1, "n"])

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import zlib
 from enum import IntFlag
+from itertools import accumulate
 from typing import Any, Final
 
 import attrs
@@ -90,6 +91,16 @@ _COUNTS = 2**15  # that a field holds, and one less upwards: beyond that it woul
 _LOW = np.array([[-100.0], [-1000.0], [-_COUNTS / _TAU], [0.0], [0.0]])
 _HIGH = np.array([[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU, _KP, _KD))])
 _LAW = ("q", "dq", "tau", "kp", "kd")
+_LARGEST = float(np.finfo(np.float32).max)
+_STATE_LENGTHS = {
+    **dict.fromkeys(("q", "dq", "tau"), JOINTS),
+    **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
+}
+# Where each field's numbers are, all of them side by side.
+_STATE_PLACES = {
+    field: slice(end - length, end)
+    for (field, length), end in zip(_STATE_LENGTHS.items(), accumulate(_STATE_LENGTHS.values()), strict=True)
+}
 
 _AXES = ("w", "x", "y", "z")
 _BITS_REVERSED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
@@ -199,19 +210,20 @@ def decode_command(data: bytes) -> JointCommand:
 def encode_state(state: BoardState) -> bytes:
     """The packet of a state, clamped to what its fields hold. Raises WireError where a number is not finite."""
     robot = state.robot
-    fields = ("q", "dq", "tau", "quaternion", "angular_velocity", "linear_acceleration", "foot_force")
-    numbers = {field: getattr(robot, field) for field in fields}
-    if not all(np.isfinite(values).all() for values in numbers.values()):
-        raise _not_finite("state", numbers)
+    numbers = np.concatenate([getattr(robot, field) for field in _STATE_PLACES])
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
+        raise _not_finite("state", {field: getattr(robot, field) for field in _STATE_PLACES})
+    numbers = np.minimum(np.maximum(numbers, -_LARGEST), _LARGEST)
+    held = {field: numbers[place] for field, place in _STATE_PLACES.items()}
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
-        packet[field] = numbers[field]
-    packet["foot_force"] = _counts(robot.foot_force)
+        packet[field] = held[field]
+    packet["foot_force"] = _counts(held["foot_force"])
     packet["imu_temperature"] = state.imu_temperature
     packet["tick"] = robot.tick
     packet["remote"] = _remote_bytes(state.remote)
     motors = packet["motors"][0, :JOINTS]
-    motors["q"], motors["dq"], motors["tau"] = robot.q, robot.dq, _counts(_TAU * robot.tau)
+    motors["q"], motors["dq"], motors["tau"] = held["q"], held["dq"], _counts(_TAU * held["tau"])
     motors["mode"], motors["error"], motors["temperature"] = (
         state.motor_mode,
         state.motor_error,

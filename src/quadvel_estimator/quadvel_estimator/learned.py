@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.network_file import NetworkFileError
 from quadvel_description.network_input import InputLayout
-from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
+from quadvel_description.recurrent_network import RecurrentNetwork
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
 

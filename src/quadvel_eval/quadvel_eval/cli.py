@@ -85,14 +85,19 @@ def walks_bar() -> Progress:
 
 
 def faults_command(
-    out: Annotated[Path, typer.Option(help="Folder for faults.json, faults.md and faults.png.")] = Path("out/faults"),
+    out: Annotated[Path, typer.Option(help="Folder for faults.json, faults.md and faults.png.")] = Path(
+        "out/faults"
+    ),
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each case, with seeds 0, 1, ...")] = 20,
     only: Annotated[
         str | None,
         typer.Option(help="Cases whose 'component kind mode' holds this text.", show_default="all of them"),
     ] = None,
 ) -> None:
-    """Let things go wrong in a simulated robot, and measure what it does and how soon: exit code 1 where that is not as expected."""
+    """Let things go wrong in a simulated robot, and measure what it does and how soon.
+
+    The exit code is 1 where that is not as expected.
+    """
     folder = output_folder(out)
     with walks_bar() as bar:
         task = bar.add_task("walks", total=None)

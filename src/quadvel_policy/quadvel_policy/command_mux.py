@@ -95,6 +95,8 @@ class CommandMux:
 
     def update(self, now: float) -> MuxOutput:
         """What to track at `now` (s): at most a step away from the update before; stance once at zero."""
+        # What was heard before the clock was set back would be fresh once more when its time comes again.
+        self._heard = {name: heard for name, heard in self._heard.items() if heard[0] <= now}
         source = self._winner(now)
         if source is None or self.locks or self.stance_requested:
             source, target, limit = None, np.zeros(3), self._config.stop_acceleration
@@ -107,9 +109,9 @@ class CommandMux:
         return MuxOutput(self._velocity.copy(), stance, source.name if source else "none")
 
     def _winner(self, now: float) -> MuxInput | None:
-        """The first that is fresh; one heard in the future (the clock was set back) is not."""
+        """The first that is fresh."""
         for source in self._inputs:
-            if source.name in self._heard and 0.0 <= now - self._heard[source.name][0] <= source.timeout:
+            if source.name in self._heard and now - self._heard[source.name][0] <= source.timeout:
                 return source
         return None
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.recurrent_network import NetworkFileError, RecurrentNetwork
+from quadvel_description.network_file import NetworkFileError
+from quadvel_description.recurrent_network import RecurrentNetwork
 
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 

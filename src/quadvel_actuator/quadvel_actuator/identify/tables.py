@@ -5,9 +5,11 @@ Sizes are looked at before anything is read: an archive may promise more than me
 
 from __future__ import annotations
 
+import math
 import re
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from itertools import islice
 from pathlib import Path
@@ -68,7 +70,7 @@ def read_npz(path: Path) -> Log:
         with zipfile.ZipFile(path) as archive:
             shapes = dict(_headers(path, archive))
             _check_size(path, {name: shape for name, (shape, _) in shapes.items()})
-            dtype = precision(sum(int(np.prod(shape)) for shape, _ in shapes.values()))
+            dtype = precision(sum(math.prod(shape) for shape, _ in shapes.values()))
             unknown = [
                 name
                 for name in (one.removesuffix(".npy") for one in archive.namelist())
@@ -92,7 +94,7 @@ def _headers(
     """Field, shape and type of the archive's arrays that belong to a log, without reading one."""
     for member in archive.namelist():
         name = member.removesuffix(".npy")
-        if name not in FIELDS:
+        if name not in FIELDS or member == name:
             continue
         with archive.open(member) as file:
             try:
@@ -105,14 +107,19 @@ def _headers(
         if dtype.kind not in kinds:
             expected = "text" if name == "joint_names" else "numbers"
             raise LogError(f"{path}: {name}: found the type {dtype}, expected {expected}")
-        if dtype.kind in "US" and int(np.prod(shape)) * dtype.itemsize > LONGEST_LINE:
+        if min(shape, default=0) < 0:
+            raise LogError(f"{path}: {name}: found shape {shape}, expected no length below 0")
+        if dtype.kind in "US" and math.prod(shape) * dtype.itemsize > LONGEST_LINE:
             raise LogError(f"{path}: {name}: found {shape} names, expected one a joint")
         yield name, (shape, dtype)
 
 
 def _array(archive: zipfile.ZipFile, name: str, dtype: DTypeLike | None) -> Any:
     with archive.open(f"{name}.npy") as file:
-        values = npy.read_array(file, allow_pickle=False)
+        try:
+            values = npy.read_array(file, allow_pickle=False)
+        except ValueError as error:
+            raise EOFError(f"{name}: {error}") from None
     return values if dtype is None else values.astype(dtype, copy=False)
 
 
@@ -120,7 +127,7 @@ def _check_size(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
     for name in NEEDED:
         if name not in shapes:
             raise LogError(f"{path}: {name}: the field is missing, found {', '.join(shapes) or 'none'}")
-    size = {name: int(np.prod(shape)) for name, shape in shapes.items()}
+    size = {name: math.prod(shape) for name, shape in shapes.items()}
     total = sum(size.values())
     if total > LARGEST:
         largest = max(size, key=lambda name: size[name])
@@ -139,8 +146,8 @@ def read_csv(path: Path) -> Log:
                 f"{path}: the first line is no header, expected the columns t, q/FR_hip_joint, ..."
             )
         columns = [cell.strip().strip('"') for cell in header.strip().lstrip("\ufeff").split(",")]
-        for column in columns:
-            if columns.count(column) > 1:
+        for column, times in Counter(columns).items():
+            if times > 1:
                 raise LogError(f"{path}: {column}: the column stands there twice")
         if "t" not in columns:
             raise LogError(

@@ -22,7 +22,6 @@ from .timer import Timer
 
 __getattr__ = module_getattr(__name__)
 
-
 FOREVER = 2**63 - 1  # ns
 LONGEST_WAIT = 200_000_000  # ns: Python runs its handlers of signals only between two waits
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import attrs
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from rich.table import Table
 
@@ -24,7 +23,12 @@ def write_campaign(folder: Path, runs: Sequence[Run]) -> dict[str, Any]:
     entries = summary(runs)
     result = {
         "schema": SCHEMA,
-        "limits": {"torque": 1.0, "speed": MAX_SPEED, "beyond": MAX_BEYOND, "beyond_in_a_fall": MAX_BEYOND_IN_A_FALL},
+        "limits": {
+            "torque": 1.0,
+            "speed": MAX_SPEED,
+            "beyond": MAX_BEYOND,
+            "beyond_in_a_fall": MAX_BEYOND_IN_A_FALL,
+        },
         "cases": entries,
         "runs": [attrs.asdict(run) for run in runs],
     }
@@ -32,7 +36,7 @@ def write_campaign(folder: Path, runs: Sequence[Run]) -> dict[str, Any]:
     with replacing(folder / "faults.md") as draft:
         draft.write_text(markdown(entries))
     with replacing(folder / "faults.png") as draft:
-        FigureCanvasAgg(figure(entries)).print_png(str(draft))
+        figure(entries).savefig(draft, dpi=150)
     return result
 
 
@@ -51,7 +55,9 @@ def campaign_table(entries: Entries) -> Table:
     table = Table("case", "as expected", "instead", title="not as expected")
     for entry in entries:
         if entry["as_expected"] < entry["runs"]:
-            table.add_row(entry["case"], f"{entry['as_expected']} of {entry['runs']}", "; ".join(entry["wrong"]))
+            table.add_row(
+                entry["case"], f"{entry['as_expected']} of {entry['runs']}", "; ".join(entry["wrong"])
+            )
     return table
 
 
@@ -80,7 +86,9 @@ def _times(times: list[float] | None) -> str:
 
 def figure(entries: Entries) -> Figure:
     """How soon each case is named and how soon the robot is safe, medians and largest."""
-    timed = [entry for entry in entries if entry["named_after"] or (entry["safe_after"] and entry["ends"] != "any")]
+    timed = [
+        entry for entry in entries if entry["named_after"] or (entry["safe_after"] and entry["ends"] != "any")
+    ]
     picture = Figure(figsize=(9.0, 1.2 + 0.17 * len(timed)), layout="constrained")
     axes = picture.add_subplot()
     y = np.arange(len(timed))
