@@ -93,7 +93,7 @@ def figure(entries: Entries) -> Figure:
     axes = picture.add_subplot()
     y = np.arange(len(timed))
     for name, colour, label in (("named_after", "C0", "named"), ("safe_after", "C3", "safe")):
-        times = np.array([entry[name] or (np.nan, np.nan) for entry in timed])
+        times = np.array([entry[name] or (np.nan, np.nan) for entry in timed]).reshape(-1, 2)
         axes.hlines(y, times[:, 0], times[:, 1], color=colour, linewidth=1.0)
         axes.plot(times[:, 0], y, "o", color=colour, markersize=3.5, label=label)
     axes.set_yticks(y, [entry["case"] for entry in timed], fontsize=6)

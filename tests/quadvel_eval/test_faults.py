@@ -1,0 +1,116 @@
+"""The fault campaign: what makes no sense is refused, what is found is judged, and a missing guard shows."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import attrs
+import pytest
+from typer.testing import CliRunner
+
+from quadvel_bringup.cli import app
+from quadvel_eval.faults import campaign as campaigns
+from quadvel_eval.faults.campaign import campaign, run, summary
+from quadvel_eval.faults.cases import CASES, Case
+from quadvel_eval.faults.injection import COMPONENTS, KINDS, WHY_NOT, injection
+from quadvel_eval.faults.report import markdown, write_campaign
+from quadvel_eval.faults.stack import Stack
+from quadvel_policy.guards import GUARDS, DriveDoesNotAnswer, StateFrozen
+
+
+def case(name: str) -> Case:
+    return next(one for one in CASES if one.name == name)
+
+
+@pytest.mark.parametrize("component", COMPONENTS)
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_makes_no_sense_is_refused_in_words(component: str, kind: str) -> None:
+    if kind in COMPONENTS[component]:
+        assert injection(component, kind).kind == kind
+        return
+    with pytest.raises(
+        ValueError, match=f"^{component} can't be {kind}: expected one of .*; {WHY_NOT[component]}$"
+    ):
+        injection(component, kind)
+
+
+@pytest.mark.parametrize(("component", "kind"), [("wheel", "off"), ("imu", "purple")])
+def test_unknown_names_are_refused(component: str, kind: str) -> None:
+    with pytest.raises(ValueError, match="expected one of"):
+        injection(component, kind)
+
+
+def test_the_campaign_is_large_and_each_of_its_cases_can_be_brought_about() -> None:
+    kinds = {(one.component, one.kind) for one in CASES}
+    assert len(kinds) >= 40
+    assert len({one.name for one in CASES}) == len(CASES)
+    assert kinds == {(component, kind) for component in COMPONENTS for kind in COMPONENTS[component]}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "low_state off stance",
+        "low_state stuck walk",
+        "encoder wrong lie_down",
+        "estimator off walk",
+        "controller off stand_up",
+    ],
+)
+def test_it_is_as_expected(name: str) -> None:
+    result = run(case(name), seed=3)
+    assert result.wrong == []
+    assert result.torque <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "guard", "sentence"),
+    [
+        ("low_state stuck stance", StateFrozen, "expected state_frozen"),
+        ("torque wrong stance", DriveDoesNotAnswer, "expected drive_does_not_answer"),
+    ],
+)
+def test_a_missing_guard_shows(monkeypatch: pytest.MonkeyPatch, name: str, guard: Any, sentence: str) -> None:
+    def without(*arguments: Any) -> Stack:
+        return Stack(*arguments, guards=tuple(one for one in GUARDS if one is not guard))
+
+    monkeypatch.setattr(campaigns, "Stack", without)
+    wrong = "; ".join(run(case(name), seed=0).wrong)
+    assert sentence in wrong
+
+
+def test_equal_seeds_give_equal_runs() -> None:
+    first, again, other = (run(case("imu stuck walk"), seed) for seed in (1, 1, 2))
+    assert attrs.asdict(first) == attrs.asdict(again)
+    assert attrs.asdict(first) != attrs.asdict(other)
+
+
+def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None:
+    runs = [run(case("clock wrong stance"), seed=0), run(case("imu off stance"), seed=0)]
+    runs[0].wrong.append("a test")
+    write_campaign(tmp_path, runs)
+    kept = json.loads((tmp_path / "faults.json").read_text())
+    assert [one["component"] for one in kept["runs"]] == ["clock", "imu"]
+    assert [(one["case"], one["as_expected"]) for one in summary(runs)] == [
+        ("imu off stance", 1),
+        ("clock wrong stance", 0),
+    ]
+    assert "| imu off stance | 1 of 1 | state_stale |" in markdown(kept["cases"])
+    assert (tmp_path / "faults.png").stat().st_size > 1000
+
+
+def test_cases_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ValueError, match="no case holds 'wheel'"):
+        campaign(1, "wheel")
+
+
+def test_the_command_says_what_is_not_as_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = run(case("clock wrong stance"), seed=0)
+    bad.wrong.append("it is purple")
+    monkeypatch.setattr("quadvel_eval.cli.campaign", lambda *_: [bad])
+    answer = CliRunner().invoke(app, ["faults", "--out", str(tmp_path)])
+    assert answer.exit_code == 1
+    assert "0 of 1" in answer.output
+    assert "it is purple" in answer.output
