@@ -13,7 +13,7 @@ from rich.table import Table
 
 from ..output import replacing
 from ..report import write_json
-from .campaign import MAX_BEYOND, MAX_BEYOND_IN_A_FALL, MAX_SPEED, SCHEMA, Run, summary
+from .campaign import AFTERWARDS, MAX_BEYOND, MAX_BEYOND_IN_A_FALL, MAX_SPEED, SCHEMA, Run, summary
 
 Entries = Sequence[dict[str, Any]]
 
@@ -98,6 +98,7 @@ def figure(entries: Entries) -> Figure:
         axes.plot(times[:, 0], y, "o", color=colour, markersize=3.5, label=label)
     axes.set_yticks(y, [entry["case"] for entry in timed], fontsize=6)
     axes.invert_yaxis()
+    axes.set_xlim(1e-3, AFTERWARDS)
     axes.set_xscale("log")
     axes.set_xlabel("s since the fault began (dot: median, line: to the largest)")
     axes.grid(axis="x", alpha=0.3)
