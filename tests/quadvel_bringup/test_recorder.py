@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import resource
 import signal
 import subprocess
 import sys
@@ -165,9 +167,31 @@ def test_of_a_recorder_that_was_killed_all_but_the_last_second_is_read(node: Nod
     assert len(found) > 50
 
 
+def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
+    node: Node, tmp_path: Path
+) -> None:
+    path = tmp_path / "full.mcap"
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # what the recorder inherits
+    recording = start_recording("low_state", "--out", str(path))
+    resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    publisher = publish_while_it_records(node, path)
+    for tick in range(4000):
+        publisher.publish(low_state(tick))
+        time.sleep(0.01)
+        if recording.poll() is not None:
+            break
+    _, said = recording.communicate(timeout=60)
+    assert recording.returncode == 2
+    assert re.search(r"full\.mcap: the recording ended after .* can be read: File too large", said)
+    assert "Traceback" not in said
+    with pytest.warns(UserWarning, match="it was cut off"):
+        assert len(list(read_messages(path, lambda topic, typename: True))) > 50
+
+
 def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> None:
     recording = start_recording("low_state", "--out", str(tmp_path / "walk.mcap"), "--seconds", "0.5")
     _, said = recording.communicate(timeout=60)
-    assert recording.returncode == 1
+    assert recording.returncode == 2
     assert "nothing came on /low_state on ROS domain" in said
     assert list(tmp_path.iterdir()) == []

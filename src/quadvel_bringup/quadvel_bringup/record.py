@@ -39,10 +39,14 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         Session("recorder") as session,
         Recorder(session.node, path) as recorder,
     ):
-        while not signals.received and (left := ends - time.monotonic()) > 0.0:
-            recorder.record_all(wanted)
-            recorder.serve(session.executor, min(LOOK, left))
-            status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
+        try:
+            while not signals.received and (left := ends - time.monotonic()) > 0.0:
+                recorder.record_all(wanted)
+                recorder.serve(session.executor, min(LOOK, left))
+                status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
+        except OSError as error:
+            written = f"after {_summary(recorder.counts)}, of which all but the last second or so can be read"
+            raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
     if not recorder.counts:
         path.unlink()
         sought = ", ".join(wanted) or "any topic"

@@ -10,6 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import nullcontext, suppress
 from importlib import import_module
 from pathlib import Path
 from types import TracebackType
@@ -38,7 +39,7 @@ class Recorder:
     """Writes what the given node receives on some topics until it is closed.
 
     The file has its index only then; where it never comes to that, `quadvel_recordings.reading` reads all but the last
-    CHUNK.
+    CHUNK. Writing raises OSError where the disk is full.
     """
 
     def __init__(self, node: Node, path: Path) -> None:
@@ -118,16 +119,20 @@ class Recorder:
         if self._synced is None or self._synced.done():
             self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
-    def close(self) -> None:
-        """Finish the file. A second call does nothing."""
+    def close(self, finish: bool = True) -> None:
+        """Finish the file, or leave it as it is where it cannot be written any more. A second call does nothing."""
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
         if self._open:
             self._open = False
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._disk.shutdown()
-            self._file.close()
+            try:
+                if finish:
+                    self._writer.finish()  # type: ignore[no-untyped-call]
+            finally:
+                self._disk.shutdown()
+                with nullcontext() if finish else suppress(OSError):
+                    self._file.close()
 
     def __enter__(self) -> Recorder:
         return self
@@ -135,7 +140,7 @@ class Recorder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        self.close(finish=not isinstance(error, OSError))
 
     def _schema(self, typename: str) -> int:
         if typename not in self._schemas:
