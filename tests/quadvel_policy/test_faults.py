@@ -151,7 +151,7 @@ CASES: dict[str, Case] = {
     "tilted": Case(lambda rig, k: {"quaternion": np.array([math.cos(0.6), 0.0, math.sin(0.6), 0.0])}),
     "joint_out_of_range": Case(lambda rig, k: {"q": np.where(np.arange(12) == 5, UPPER + 0.5, rig.state.q)}),
     "joint_too_fast": Case(lambda rig, k: {"dq": np.full(12, 50.0)}),
-    "encoder_inconsistent": Case(moved(5, 0.4)),
+    "encoder_inconsistent": Case(moved(5, 0.4), 2 * PERIOD),
     "encoder_frozen": Case(stuck_encoder, 0.15),
     "imu_inconsistent": Case(
         lambda rig, k: {

@@ -130,12 +130,14 @@ class Sight:
 
 
 class Guard:
-    """Finds one kind of fault. `modes`: in which it acts; it looks in every mode.
+    """Finds one kind of fault. `modes`: in which it acts; it looks in every mode. `at_once`: whether it looks before the
+    tick is answered; one that compares over a time does so after that, and acts at the next tick, 5 ms later.
 
     The docstring of each is its row in the table of faults.
     """
 
     level = Level.DAMPING
+    at_once = True
     modes: tuple[str, ...] = MOVING
 
     def look(self, see: Sight) -> str | None:
@@ -250,6 +252,8 @@ class EncoderInconsistent(Guard):
     """A joint's angle is off what its speed adds up to by more than `max_encoder_error`: a jump, a slip, a reading that is
     stuck, or a robot that was put elsewhere."""
 
+    at_once = False
+
     def __init__(self) -> None:
         self._error = np.zeros(12)
 
@@ -277,6 +281,8 @@ class EncoderInconsistent(Guard):
 class EncoderFrozen(Guard):
     """Angle and speed of a joint repeat themselves to the bit for `frozen_time` while it is asked to move and others do."""
 
+    at_once = False
+
     def __init__(self) -> None:
         self._time, self._asked, self._others = np.zeros(12), np.zeros(12), np.zeros(12)
 
@@ -299,6 +305,8 @@ class EncoderFrozen(Guard):
 class ImuInconsistent(Guard):
     """The orientation is off what the gyroscope adds up to by more than `max_attitude_error`."""
 
+    at_once = False
+
     def __init__(self) -> None:
         self._error = np.zeros(3)
 
@@ -319,6 +327,7 @@ class ImuFrozen(Guard):
     """Orientation and angular velocity, which is not zero, repeat themselves to the bit for `frozen_time` while the joints
     move."""
 
+    at_once = False
     level = Level.STANCE
 
     def __init__(self) -> None:
@@ -344,6 +353,7 @@ class AccelerometerImplausible(Guard):
     """The accelerometer shows more than `max_acceleration_error` on the mean of half a second: no robot on legs does that.
     One that shows zeros alone is not judged."""
 
+    at_once = False
     level = Level.STANCE
 
     def __init__(self) -> None:
@@ -367,6 +377,8 @@ class DriveDoesNotAnswer(Guard):
     """A drive's torque is off the one asked for by more than `max_torque_error` on the mean: it has dropped out, commands
     do not reach it, or it reports nonsense. A robot that reports no torque at any joint is not judged."""
 
+    at_once = False
+
     def __init__(self) -> None:
         self._asked, self._told = np.zeros(12), np.zeros(12)
 
@@ -388,6 +400,8 @@ class DriveDoesNotAnswer(Guard):
 
 class JointStuck(Guard):
     """A joint has pushed with more than `stuck_torque` of what its drive can for `stuck_time` and did not move."""
+
+    at_once = False
 
     def __init__(self) -> None:
         self._time, self._place = np.zeros(12), np.zeros(12)
@@ -429,6 +443,7 @@ class MotorHot(Guard):
 class FootForceFrozen(Guard):
     """The force of a foot does not change for `frozen_foot_time` while the robot walks. Nothing that drives uses it."""
 
+    at_once = False
     level = Level.NOTICE
     modes = WALK
 
@@ -549,16 +564,27 @@ class Watch:
     """All guards over one robot."""
 
     def __init__(self, guards: Iterable[type[Guard]] = GUARDS) -> None:
-        self._guards = [guard() for guard in guards]
+        made = [guard() for guard in guards]
+        self._at_once = [guard for guard in made if guard.at_once]
+        self._later = [guard for guard in made if not guard.at_once]
+        self._found_later: list[Finding] = []
 
     def look(self, see: Sight) -> list[Finding]:
-        """What is wrong now, in the order of the table, whatever the mode."""
-        found = []
-        for guard in self._guards:
-            sentence = guard.look(see)
-            if sentence:
-                found.append(Finding(guard.name(), guard.level, guard.modes, sentence))
-        return found
+        """What is wrong now, and what `look_again` found at the tick before, whatever the mode."""
+        return _findings(self._at_once, see) + self._found_later
+
+    def look_again(self, see: Sight) -> None:
+        """After the answer: let those look at the same tick that take their time."""
+        self._found_later = _findings(self._later, see)
+
+
+def _findings(guards: Iterable[Guard], see: Sight) -> list[Finding]:
+    found = []
+    for guard in guards:
+        sentence = guard.look(see)
+        if sentence:
+            found.append(Finding(guard.name(), guard.level, guard.modes, sentence))
+    return found
 
 
 def torque_of(command: JointCommand, state: RobotState) -> Array:

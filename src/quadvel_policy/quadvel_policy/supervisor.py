@@ -145,7 +145,8 @@ class Supervisor:
             "lie_down": self._after_lie_down,
         }
         self._watch = Watch(guards)
-        self._backup, self._backup_is_behind = BackupVelocity(backup), False
+        self._backup = BackupVelocity(backup)
+        self._sight: Sight | None = None  # of the last tick, while the rest of it is still to be looked at
         self._limiter = CommandLimits(c)
         self.limits = self._limiter.counts
         self.mode, self.reason, self.fault = "passive", "waits for an order", ""
@@ -231,8 +232,7 @@ class Supervisor:
         it never walks off on an order that was given to another run of the controller.
         """
         self.inference_seconds = float("nan")
-        if self._backup_is_behind:
-            self._follow()
+        self._finish()
         self.command, unfit = self._limited(command)
         sight = self._look(now, state, None if velocity is None else np.asarray(velocity, float))
         if unfit and self.mode == "walk":
@@ -245,23 +245,25 @@ class Supervisor:
             self._switch(*following)
         answer = self._answer(seen)
         answer.tick = state.tick
-        self._last, self._previous, self._backup_is_behind = seen, answer, True
+        self._last, self._previous, self._sight = seen, answer, sight
         return answer
 
     def prepare(self) -> None:
         """Between two ticks, what can be done ahead of the next one, so that its answer comes sooner; may be left out."""
         if self.mode == "walk":
             self._walk.prepare()
-        if self._backup_is_behind:
-            self._follow()
+        self._finish()
 
-    def _follow(self) -> None:
-        """Let the backup see the state of the last tick; it rests while the robot does."""
-        self._backup_is_behind = False
-        if self.mode in LIMP or self._last is None:
+    def _finish(self) -> None:
+        """What of the last tick could wait until it was answered: the slower guards, and the backup, which rests with the robot."""
+        if self._sight is None:
+            return
+        self._watch.look_again(self._sight)
+        if self.mode in LIMP:
             self._backup.forget()
         else:
-            self._backup.follow(self._last.state)
+            self._backup.follow(self._sight.state)
+        self._sight = None
 
     def _look(self, now: float, state: RobotState, velocity: Array | None) -> Sight:
         """Let the guards look at this tick; `findings` are those that matter in this mode."""
