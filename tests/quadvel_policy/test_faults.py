@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 
-from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER
+from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, CommandLimits
@@ -401,7 +401,7 @@ LIMIT_CASES: dict[str, tuple[float, Changes]] = {
     "target_out_of_range": (4.0, {}),
     "torque_jumps": (-4.0, {}),
     "torque_too_large": (40.0, {}),
-    "joint_at_speed_limit": (6.0, {"dq": np.full(12, 25.0)}),
+    "joint_at_speed_limit": (6.0, {"dq": 1.2 * VELOCITY_LIMIT}),
     "power_too_large": (8.0, {"dq": np.full(12, 14.0)}),
 }
 """What the policy answers, and what is changed of the state"""
@@ -423,7 +423,7 @@ def check_limit(policy: Any, name: str) -> None:
         assert np.abs(torque).max() <= TORQUE_LIMIT.max() + 1e-9
         assert (np.abs(torque) <= TORQUE_LIMIT + 1e-9).all()
         assert power <= 1800.0 + 1e-6
-        assert not ((np.abs(rig.seen.dq) > 20.0) & (torque * rig.seen.dq > 1e-9)).any()
+        assert not ((np.abs(rig.seen.dq) > VELOCITY_LIMIT) & (torque * rig.seen.dq > 1e-9)).any()
         assert (command.q >= command_limits.held(command.q) - 1e-12).all()
         if k:
             assert command.mode == before.mode

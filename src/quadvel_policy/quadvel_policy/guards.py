@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description.kinematics import rotate
-from quadvel_description.robot import GRAVITY, JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER
+from quadvel_description.robot import GRAVITY, JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
 from .settings import setting
@@ -53,7 +53,9 @@ class GuardConfig:
 
     max_state_age: float = setting(0.05, "oldest state, and longest time without one, before a fault, s")
     max_tilt: float = setting(1.05, "largest angle between the trunk's and the world's vertical, rad")
-    max_joint_speed: float = setting(25.0, "largest measured joint speed, rad/s")
+    max_joint_speed: float = setting(
+        1.25, "largest measured joint speed, as a share of what the drive can do"
+    )
     joint_margin: float = setting(0.2, "how far a measured angle may lie outside the mechanical range, rad")
     max_encoder_error: float = setting(
         0.35, "by how much a joint's angle may be off what its speed adds up to over 0.1 s, rad"
@@ -124,7 +126,7 @@ class Sight:
         low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
         return bool(
             np.count_nonzero((state.q >= low) & (state.q <= high)) == 12
-            and np.count_nonzero(np.abs(state.dq) <= c.max_joint_speed) == 12
+            and np.count_nonzero(np.abs(state.dq) <= c.max_joint_speed * VELOCITY_LIMIT) == 12
             and all(map(math.isfinite, (*state.quaternion.tolist(), *state.angular_velocity.tolist())))
         )
 
@@ -237,14 +239,14 @@ class JointOutOfRange(Guard):
 
 
 class JointTooFast(Guard):
-    """A joint moves faster than `max_joint_speed`."""
+    """A joint moves faster than `max_joint_speed` of what its drive can do."""
 
     def look(self, see: Sight) -> str | None:
         if see.is_sound:
             return None
-        limit = see.config.max_joint_speed
+        limit = see.config.max_joint_speed * VELOCITY_LIMIT
         for i in np.flatnonzero(np.abs(see.state.dq) > limit):
-            return f"{JOINT_NAMES[i]} moves at {see.state.dq[i]:.0f} rad/s, limit {limit:.0f}"
+            return f"{JOINT_NAMES[i]} moves at {see.state.dq[i]:.0f} rad/s, limit {limit[i]:.0f}"
         return None
 
 
@@ -266,7 +268,7 @@ class EncoderInconsistent(Guard):
             unexplained = moved - 0.5 * see.gap * (see.state.dq + see.before.dq)
         else:  # too long to know the way in between; what no joint can do is wrong all the same
             unexplained = np.sign(moved) * np.maximum(
-                np.abs(moved) - see.config.max_joint_speed * see.gap, 0.0
+                np.abs(moved) - see.config.max_joint_speed * VELOCITY_LIMIT * see.gap, 0.0
             )
         self._error = self._error * math.exp(-see.gap / ENCODER_MEMORY) + unexplained
         i = int(np.argmax(np.abs(self._error)))

@@ -56,6 +56,8 @@ class Run:
     """largest torque, as a share of the drive's limit"""
     speed: float = 0.0
     """largest speed of a joint that its drive moves on, as a share of what it can do"""
+    too_fast: float = 0.0
+    """longest time in which a drive moved a joint on that was beyond MAX_SPEED, s"""
     beyond: float = 0.0
     """how far a joint was beyond its mechanical range, rad"""
     wrong: list[str] = attrs.Factory(list)
@@ -153,6 +155,8 @@ def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
     q, dq = data.qpos[7:], data.qvel[6:]
     driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
     result.speed = max(result.speed, float(driven.max()))
+    stack.too_fast = np.where(driven > MAX_SPEED, stack.too_fast + DT, 0.0)
+    result.too_fast = max(result.too_fast, float(stack.too_fast.max()))
     result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
     for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
         if name and name not in result.findings:
@@ -167,8 +171,8 @@ def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
 def _is_safe(stack: Stack, ends: str) -> bool:
     if ends == "damping":
         return stack.simulator.braking or stack.held_mode == MODE_DAMPING
-    if ends == "stance":
-        return stack.supervisor.mode == "stance"
+    if ends in ("stance", "stopped"):
+        return stack.supervisor.mode in ("stance", "fault")[: 1 + (ends == "stopped")]
     velocity = stack.simulator.data.qvel
     return float(np.linalg.norm(velocity[:2])) < STANDS and abs(velocity[5]) < TURNS_NOT
 
@@ -193,14 +197,16 @@ def _judge(case: Case, result: Run, stack: Stack) -> Iterator[str]:
         yield "fell, and no fault was named"
     if result.torque > 1.0 + 1e-6:
         yield f"a torque of {result.torque:.2f} times the drive's limit"
-    if result.speed > MAX_SPEED:
-        yield f"a joint speed of {result.speed:.2f} times the drive's limit"
+    if result.too_fast > REACTION:
+        yield f"a joint driven on beyond {MAX_SPEED} times its drive's speed for {result.too_fast:.3f} s"
     if result.beyond > (MAX_BEYOND_IN_A_FALL if result.fell else MAX_BEYOND):
         yield f"a joint {result.beyond:.2f} rad beyond its mechanical range"
 
 
 MAX_SPEED = 1.25
-"""Largest speed of a joint that its drive still moves on, as a share of what the drive can do: where the guard acts"""
+"""Speed of a joint, as a share of what its drive can do, beyond which the drive must not move it on"""
+REACTION = 0.02
+"""s in which it may: until the next tick sees it and the drive has heard of it"""
 MAX_BEYOND, MAX_BEYOND_IN_A_FALL = 0.05, 0.2
 """rad that a joint may press into its mechanical stop, which yields; in a fall the ground does it"""
 
@@ -233,6 +239,7 @@ def _entry(case: Case, runs: list[Run]) -> dict[str, Any]:
         "falls": sum(one.fell for one in runs),
         "torque": max(one.torque for one in runs),
         "speed": max(one.speed for one in runs),
+        "too_fast": max(one.too_fast for one in runs),
         "beyond": max(one.beyond for one in runs),
         "wrong": sorted({sentence for one in runs for sentence in one.wrong}),
     }

@@ -115,6 +115,7 @@ class Stack:
         self.simulator = simulator
         self.now = 0  # ms
         self.held_mode = MODE_DAMPING
+        self.too_fast = np.zeros(12)  # s, by joint, for those who watch
         self.clock_offset = self.late = 0.0
         self.velocity = np.zeros(3)
         self.sensors: Callable[[int, RobotState], RobotState] | None = None
