@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import attrs
@@ -13,7 +14,9 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from quadvel_follow.clusters import NUMBERS
+from quadvel_follow.clusters import NUMBERS, WINDOW
+from quadvel_follow.leg_detector import LegDetector
+from quadvel_follow.measure import Recording, labelled, persons
 
 from .leg_examples import Examples, from_file, simulated
 from .onnx_file import commit
@@ -26,7 +29,7 @@ class LegConfig:
     scenes: int = 1000
     share_real: float = 0.7
     share_legs: float = 0.5
-    steps: int = 6000
+    steps: int = 2500
     batch: int = 1024
     learning_rate: float = 2e-3
     hidden: tuple[int, ...] = (64, 32)
@@ -80,45 +83,52 @@ def train(config: LegConfig, real: Sequence[Examples], made: Examples) -> LegNet
 
 
 class _Draws:
-    """Batches, half of them mirrored."""
+    """Batches: as many legs as other things of each source, half of all mirrored."""
 
     def __init__(
         self, config: LegConfig, real: Sequence[Examples], made: Examples, rng: np.random.Generator
     ) -> None:
-        self._config, self._rng = config, rng
-        self._made = made
-        self._real = list(real)
+        self._rng = rng
+        share = config.share_real if real else 0.0
+        # What to draw from, which of it, and how many: legs and other things of the real files, then of the simulated.
+        self._pools: list[tuple[Examples, np.ndarray, int]] = []
+        for legs, part in ((True, config.share_legs), (False, 1.0 - config.share_legs)):
+            having = [source for source in real if (source.legs == legs).any()]
+            for source, size in [(source, share / len(having)) for source in having] + [(made, 1.0 - share)]:
+                self._pools.append(
+                    (source, np.flatnonzero(source.legs == legs), int(config.batch * part * size))
+                )
 
     def batch(self) -> tuple[np.ndarray, np.ndarray]:
-        size = self._config.batch
-        from_real = int(size * self._config.share_real) if self._real else 0
-        for_legs = int(from_real * self._config.share_legs)
-        parts = [
-            *self._drawn([e for e in self._real if e.legs.any()], True, for_legs),
-            *self._drawn([e for e in self._real if not e.legs.all()], False, from_real - for_legs),
-            *self._drawn([self._made], True, int((size - from_real) * self._config.share_legs)),
-            *self._drawn([self._made], False, int((size - from_real) * (1 - self._config.share_legs))),
-        ]
-        things, legs = np.concatenate([p.things for p in parts]), np.concatenate([p.legs for p in parts])
+        """Things and whether they are legs."""
+        drawn = [(source, self._rng.choice(which, count)) for source, which, count in self._pools]
+        things = np.concatenate([source.things[which] for source, which in drawn])
+        legs = np.concatenate([source.legs[which] for source, which in drawn])
         turned = self._rng.random(len(things)) < 0.5
-        things[turned, : NUMBERS - 4] = things[turned, NUMBERS - 5 :: -1]
+        things[turned, : WINDOW.size] = things[turned, WINDOW.size - 1 :: -1]
         return things, legs
 
-    def _drawn(self, sources: list[Examples], legs: bool, count: int) -> list[Examples]:
-        """Some of the sources' legs, or of what is none."""
-        parts = []
-        for source in sources:
-            which = self._rng.choice(self._where(source, legs), count // len(sources))
-            parts.append(Examples(source.things[which], source.legs[which]))
-        return parts
 
-    def _where(self, source: Examples, legs: bool) -> np.ndarray:
-        if not hasattr(self, "_index"):
-            self._index: dict[tuple[int, bool], np.ndarray] = {}
-        key = (id(source), legs)
-        if key not in self._index:
-            self._index[key] = np.flatnonzero(source.legs == legs)
-        return self._index[key]
+def read_examples(config: LegConfig, folder: Path) -> tuple[dict[Path, Examples], Examples]:
+    """Of the files legs_*.npz of real scans in a folder, and of simulated scenes. Raises FileNotFoundError."""
+    files = sorted(folder.glob("legs_*.npz"))
+    if not files:
+        raise FileNotFoundError(f"{folder}: has no file legs_*.npz, expected scans with and without people")
+    rng = np.random.default_rng(config.seed)
+    return {file: from_file(file, rng) for file in files}, simulated(config.scenes, rng)
+
+
+def cross_validate(
+    config: LegConfig, real: Mapping[Path, Examples], made: Examples
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """What `quadvel people` says of each file, with a network that has seen the others alone."""
+    for left_out in real:
+        network = train(config, [examples for file, examples in real.items() if file != left_out], made)
+        with TemporaryDirectory() as folder:
+            export(network, Path(folder) / "legs.onnx", {})
+            detector = LegDetector(Path(folder) / "legs.onnx")
+        recording = Recording.load(left_out)
+        yield left_out.stem, (persons if recording.legs is None else labelled)(recording, detector)
 
 
 def export(network: LegNetwork, path: Path, about: dict[str, Any]) -> None:

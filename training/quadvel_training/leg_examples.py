@@ -70,7 +70,9 @@ def _labelled(content: dict[str, Any], step: int, rng: np.random.Generator) -> I
         clusters = find_clusters(scan)
         labels = labels[np.isfinite(labels[:, 0])]
         named = _nearest(clusters.centre, labels) < SAME
-        yield _kept(scan, named, named | (fixed(clusters.centre) & (_nearest(clusters.centre, labels) > WIDEST)))
+        yield _kept(
+            scan, named, named | (fixed(clusters.centre) & (_nearest(clusters.centre, labels) > WIDEST))
+        )
 
 
 def _empty(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
@@ -132,7 +134,9 @@ def _scene(rng: np.random.Generator) -> Iterator[Examples]:
             walker.step(rng.uniform(0.05, 0.4))
         legs = np.asarray(circles(people))
         pose = (*rng.uniform(-0.5, 0.5, 2), rng.uniform(-np.pi, np.pi))
-        scan = Scan.checked(laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment)
+        scan = Scan.checked(
+            laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment
+        )
         clusters = find_clusters(scan)
         named = _nearest(_to_world(clusters.centre, pose), legs[:, :2]) < SAME
         named &= clusters.width < WIDEST
@@ -205,7 +209,9 @@ def _rectangle(rng: np.random.Generator, a: float, b: float) -> Array:
     along = _direction(rng)
     across = np.array([-along[1], along[0]])
     centre = rng.uniform(0.4, 9.0) * _direction(rng)
-    return np.array([centre + s * a / 2 * along + t * b / 2 * across for s, t in ((1, 1), (1, -1), (-1, -1), (-1, 1))])
+    return np.array(
+        [centre + s * a / 2 * along + t * b / 2 * across for s, t in ((1, 1), (1, -1), (-1, -1), (-1, 1))]
+    )
 
 
 def _closed(corners: Array) -> list[Array]:
@@ -221,6 +227,10 @@ def _wall_with_doors(rng: np.random.Generator) -> list[Array]:
     while at < 8.0:
         length, frame = rng.uniform(0.3, 2.5), rng.uniform(0.02, 0.15)
         a, b = begin + at * along, begin + (at + length) * along
-        pieces += [np.r_[a, b], np.r_[a - frame * across, a + frame * across], np.r_[b - frame * across, b + frame * across]]
+        pieces += [
+            np.r_[a, b],
+            np.r_[a - frame * across, a + frame * across],
+            np.r_[b - frame * across, b + frame * across],
+        ]
         at += length + rng.uniform(0.1, 1.2)
     return pieces

@@ -18,14 +18,18 @@ Array = NDArray[np.float64]
 class World:
     """What a ray may hit: circles (N, 3), each x, y, radius; segments (M, 4), each x, y of both ends; all m."""
 
-    circles: Array = attrs.field(factory=lambda: np.zeros((0, 3)), converter=lambda x: np.reshape(np.asarray(x, float), (-1, 3)))
+    circles: Array = attrs.field(
+        factory=lambda: np.zeros((0, 3)), converter=lambda x: np.reshape(np.asarray(x, float), (-1, 3))
+    )
     segments: Array = attrs.field(
         factory=lambda: np.zeros((0, 4)), converter=lambda x: np.reshape(np.asarray(x, float), (-1, 4))
     )
 
     def with_circles(self, circles: ArrayLike) -> World:
         """This world with more circles in it."""
-        return World(np.vstack([self.circles, np.reshape(np.asarray(circles, float), (-1, 3))]), self.segments)
+        return World(
+            np.vstack([self.circles, np.reshape(np.asarray(circles, float), (-1, 3))]), self.segments
+        )
 
     def cast(self, origin: ArrayLike, angles: Array) -> Array:
         """How far rays from `origin` (2,) at `angles` (rays,) go, (rays,) in m; inf where they hit nothing."""

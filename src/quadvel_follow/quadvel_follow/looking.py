@@ -15,7 +15,9 @@ from .clusters import LEG, Scan
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-SIDEWAYS = np.array([-0.15, -0.075, 0.0, 0.075, 0.15])  # m, what is looked at to the left and the right of a place
+SIDEWAYS = np.array(
+    [-0.15, -0.075, 0.0, 0.075, 0.15]
+)  # m, what is looked at to the left and the right of a place
 DEPTH = 0.25  # m, before and behind a place, to what is taken to be in it
 MEMORY = 1.6  # s, that scans are kept for
 EVERY = 0.15  # s, from one that is kept to the next, at least
@@ -70,7 +72,9 @@ class Past:
         looks = [(scan, then) for made, scan, then in self._kept if time - made >= AGE]
         if not looks:
             return np.zeros(len(points)), np.zeros(len(points))
-        empty, taken = np.array([look(scan, to_sensor(points, then)) for scan, then in looks]).sum(0, dtype=float)
+        empty, taken = np.array([look(scan, to_sensor(points, then)) for scan, then in looks]).sum(
+            0, dtype=float
+        )
         local = to_sensor(points, pose)
         distance, bearing = np.hypot(*local.T), np.arctan2(local[:, 1], local[:, 0])
         same = np.mean([np.abs(scan.at(bearing) - distance) < FIXED for scan, _ in looks], axis=0)

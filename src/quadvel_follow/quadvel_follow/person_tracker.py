@@ -25,12 +25,17 @@ Array = NDArray[np.float64]
 
 GATE = 13.8  # squared Mahalanobis distance in the plane that one leg in 1000 exceeds
 NOBODYS = 9.0  # cost at which a leg rather belongs to none
-STANDING = 4.0  # cost of a leg that was there before, for one who walks
+PERSONS = 3.0  # by which it costs less that a leg is a person's than that it is something else's
+UNLIKE_IT = (
+    4.0  # cost of a leg that was there before, for one who walks, and of one that came, for what stands
+)
+STANDING = 3.0  # looks more that found it in its place than not, for what stands
 WALKING = 0.4  # m/s, from which somebody walks
 FORBIDDEN = 1e6  # cost of an assignment beyond the gate
 SECOND_LEG = 2.0  # cost of a second leg: two legs between two persons are one of each
 MERGED = 0.25  # m, width from which a thing is two legs beside each other
 STRIDE = 0.5  # m, between the legs of a person, as far as they are made one
+RECENT = 1.0  # s
 BELIEVING = 2.0  # s, over which what was found out about a hypothesis counts
 SWING = 0.2  # s, for which the error of a person's middle is the same
 PERSON = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])  # m, from the middle of a person to its sides
@@ -56,6 +61,8 @@ class TrackerConfig:
     walked: m, from where it was first seen, after which a hypothesis may be a person
     moved: share of the looks at its places, then and now, that found them empty, from which it may be one
     steady: share of the scans in which it was seen, from which it may be one
+    surprise: m, from where it is expected to the middle of its legs, up to which it may be one
+    pairs: share of scans with both legs, from which it may be one
     belief: mean probability of its legs, from which it may be one
     watched, sightings: s since it was first seen, and scans in which it was, from which it may be one
     patience: s, for which a person who is hidden is waited for
@@ -63,14 +70,16 @@ class TrackerConfig:
     forgotten: s, without a leg, after which a hypothesis is given up
     """
 
-    acceleration: float = _positive(0.2)
+    acceleration: float = _positive(0.15)
     both_legs: float = _positive(0.1)
-    one_leg: float = _positive(0.25)
+    one_leg: float = _positive(0.3)
     first_speed: float = _positive(0.8)
     reach: float = _positive(0.9)
     possible: float = _positive(0.15)
     walked: float = _positive(0.5)
     moved: float = _positive(0.5)
+    surprise: float = _positive(0.22)
+    pairs: float = _positive(0.25)
     belief: float = _positive(0.6)
     watched: float = _positive(1.0)
     sightings: int = _positive(6)
@@ -125,6 +134,8 @@ class _Hypothesis:
     scans: int = 0  # since it began
     sightings: int = 1
     confirmed: bool = False
+    surprise: float = 0.1  # m, from where it was expected to the middle of its legs, of late
+    pairs: float = 0.5  # share of scans with both its legs, of late
     empty: float = 0.0  # looks at its places that found them empty before it came or after it left
     taken: float = 0.0  # looks that found something there
     trail: deque[tuple[float, Array]] = attrs.field(factory=deque)  # when its legs were seen where
@@ -183,17 +194,23 @@ class PersonTracker:
         if self._before is None:
             return 0.0
         if time <= self._before[0]:
-            raise ValueError(f"time is {time}, expected a later one than that of the scan before, {self._before[0]}")
+            raise ValueError(
+                f"time is {time}, expected a later one than that of the scan before, {self._before[0]}"
+            )
         return time - self._before[0]
 
     def _checked_pose(self, pose: Sequence[float] | None, scan: Scan) -> Array:
         """The sensor's pose: as it is given, or after what it moved since the scan before."""
         if self._given is not None and self._given != (pose is not None):
-            raise ValueError(f"sensor_pose is {pose}, expected {'one' if self._given else 'None'} as for the scans before")
+            raise ValueError(
+                f"sensor_pose is {pose}, expected {'one' if self._given else 'None'} as for the scans before"
+            )
         if pose is not None:
             found = np.asarray(pose, float)
             if found.shape != (3,) or not np.isfinite(found).all():
-                raise ValueError(f"sensor_pose is {pose}, expected x, y (m) and yaw (rad), three finite numbers")
+                raise ValueError(
+                    f"sensor_pose is {pose}, expected x, y (m) and yaw (rad), three finite numbers"
+                )
             return found
         if self._before is None:
             return np.zeros(3)
@@ -238,12 +255,15 @@ class PersonTracker:
         unseen = np.array([time - h.seen for h in self._hypotheses])
         reach = self.config.reach + self.config.first_speed * np.maximum(unseen - self.config.forgotten, 0.0)
         near = (squared < GATE) & (np.hypot(off[..., 0], off[..., 1]) < reach[:, None])
-        # Against a leg that belongs to none of them; a person's looks like one, and comes to a place that was empty.
+        # Against a leg that belongs to none of them; a person's looks like one, and a leg is rather a person's.
         cost = squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] - NOBODYS
         unlike = np.log((1.0 - legs.probability + 0.02) / (legs.probability + 0.02))
-        resting = STANDING * ((legs.taken > 0.0) & (legs.empty == 0.0))
-        walks = np.array([h.confirmed * np.hypot(*h.state[2:]) > WALKING for h in self._hypotheses])
-        cost += np.where([[h.confirmed] for h in self._hypotheses], unlike, 0.0) + walks[:, None] * resting
+        cost += np.where([[h.confirmed] for h in self._hypotheses], unlike - PERSONS, 0.0)
+        # Who walks comes to places that were empty, and what stands about does not.
+        walks = np.array([h.confirmed and np.hypot(*h.state[2:]) > WALKING for h in self._hypotheses])
+        stands = np.array([not h.confirmed and h.taken > h.empty + STANDING for h in self._hypotheses])
+        rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
+        cost += UNLIKE_IT * (walks[:, None] * rested + stands[:, None] * came)
         cost = np.where(near, cost, FORBIDDEN)
         twice = np.concatenate([cost, cost + SECOND_LEG])
         rows, columns = linear_sum_assignment(np.hstack([twice, np.zeros((len(twice), len(twice)))]))
@@ -258,10 +278,15 @@ class PersonTracker:
             if not pair:
                 continue
             # Legs swing: what the middle of a person is off by stays nearly the same from one quick scan to the next.
-            variance = self._deviation(legs, pair) ** 2 * max(1.0, SWING / dt)
+            both = len(pair) == 2 or bool(legs.merged[pair[0]])
+            variance = self._deviation(both) ** 2 * max(1.0, SWING / dt)
             spread = hypothesis.covariance[:2, :2] + variance * np.eye(2)
             gain = hypothesis.covariance[:, :2] @ np.linalg.inv(spread)
-            hypothesis.state = hypothesis.state + gain @ (legs.position[pair].mean(0) - hypothesis.state[:2])
+            off = legs.position[pair].mean(0) - hypothesis.state[:2]
+            recent = min(1.0, dt / RECENT)
+            hypothesis.surprise += recent * (float(np.hypot(*off)) - hypothesis.surprise)
+            hypothesis.pairs += recent * (float(both) - hypothesis.pairs)
+            hypothesis.state = hypothesis.state + gain @ off
             covariance = hypothesis.covariance - gain @ hypothesis.covariance[:2]
             hypothesis.covariance = 0.5 * (covariance + covariance.T)
             share = dt / (dt + min(time - hypothesis.born, BELIEVING))
@@ -272,8 +297,7 @@ class PersonTracker:
             hypothesis.empty += legs.empty[pair[0]]
             hypothesis.taken += legs.taken[pair[0]]
 
-    def _deviation(self, legs: _Legs, pair: Sequence[int]) -> float:
-        both = len(pair) == 2 or legs.merged[pair[0]]
+    def _deviation(self, both: bool) -> float:
         return self.config.both_legs if both else self.config.one_leg
 
     def _begin(self, time: float, legs: _Legs, theirs: list[list[int]]) -> None:
@@ -287,7 +311,7 @@ class PersonTracker:
                 if distances.min() < STRIDE:
                     pair.append(left.pop(int(distances.argmin())))
             position = legs.position[pair].mean(0)
-            deviations = [self._deviation(legs, pair)] * 2 + [self.config.first_speed] * 2
+            deviations = [self._deviation(len(pair) == 2)] * 2 + [self.config.first_speed] * 2
             self._hypotheses.append(
                 _Hypothesis(
                     self._next_id,
@@ -336,13 +360,17 @@ class PersonTracker:
                     np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.walked
                     and hypothesis.moved > config.moved
                     and hypothesis.belief > config.belief
+                    and hypothesis.surprise < config.surprise
+                    and hypothesis.pairs > config.pairs
                     and time - hypothesis.born > config.watched
                     and hypothesis.sightings >= max(config.sightings, config.steady * hypothesis.scans)
                 )
             patience = config.patience_in_view if visible else config.patience
             if time - hypothesis.seen <= (patience if hypothesis.confirmed else config.forgotten):
                 kept.append(hypothesis)
-        self._hypotheses = [h for h in kept if h.confirmed or not any(self._is_leg_of(h, other) for other in kept)]
+        self._hypotheses = [
+            h for h in kept if h.confirmed or not any(self._is_leg_of(h, other) for other in kept)
+        ]
 
     def _is_leg_of(self, hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
         """Whether it is but the other leg of one who walks: it is beside, came later, and was not there before."""
@@ -360,7 +388,9 @@ class PersonTracker:
         """In the frame of the pose that was given, or in the sensor's."""
         state, covariance = hypothesis.state.copy(), hypothesis.covariance.copy()
         if not self._given:
-            turn = np.kron(np.eye(2), [[np.cos(pose[2]), np.sin(pose[2])], [-np.sin(pose[2]), np.cos(pose[2])]])
+            turn = np.kron(
+                np.eye(2), [[np.cos(pose[2]), np.sin(pose[2])], [-np.sin(pose[2]), np.cos(pose[2])]]
+            )
             state[:2] -= pose[:2]
             state, covariance = turn @ state, turn @ covariance @ turn.T
         age, seen = time - hypothesis.born, hypothesis.seen

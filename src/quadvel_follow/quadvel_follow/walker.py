@@ -38,7 +38,9 @@ class Walker:
     def step(self, dt: float) -> None:
         """Walk on for `dt` s."""
         self.time += dt
-        standing = any(begin <= self.time < end for begin, end in self.stops) or self.travelled >= self._length
+        standing = (
+            any(begin <= self.time < end for begin, end in self.stops) or self.travelled >= self._length
+        )
         speed = 0.0 if standing else self.speed * (1.0 + self.pace * np.sin(1.3 * self.time))
         self.travelled += speed * dt
         period = 1.5 - 0.3 * min(speed, 2.0)  # s a stride
@@ -72,7 +74,9 @@ class Walker:
         left = np.array([-ahead[1], ahead[0]])
         along = SHIN * self.swing * _swing(np.array([self.phase, (self.phase + 0.5) % 1.0]))
         side = 0.5 * self.apart * np.array([1.0, -1.0])
-        return np.column_stack([body + along[:, None] * ahead + side[:, None] * left, np.full(2, self.radius)])
+        return np.column_stack(
+            [body + along[:, None] * ahead + side[:, None] * left, np.full(2, self.radius)]
+        )
 
 
 def _swing(phase: Array) -> Array:
