@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from quadvel_follow.clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
 from quadvel_follow.laser import Laser, World
+from quadvel_follow.looking import to_frame
 from quadvel_follow.walker import Walker, circles
 
 Array = NDArray[np.float64]
@@ -132,22 +133,16 @@ def _scene(rng: np.random.Generator) -> Iterator[Examples]:
     for _ in range(10):
         for walker in people:
             walker.step(rng.uniform(0.05, 0.4))
-        legs = np.asarray(circles(people))
-        pose = (*rng.uniform(-0.5, 0.5, 2), rng.uniform(-np.pi, np.pi))
+        legs = circles(people)
+        pose = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-np.pi, np.pi)])
         scan = Scan.checked(
             laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment
         )
         clusters = find_clusters(scan)
-        named = _nearest(_to_world(clusters.centre, pose), legs[:, :2]) < SAME
+        named = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < SAME
         named &= clusters.width < WIDEST
-        unclear = _nearest(_to_world(clusters.centre, pose), legs[:, :2]) < WIDEST
+        unclear = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < WIDEST
         yield _kept(scan, named, named | ~unclear)
-
-
-def _to_world(points: Array, pose: Sequence[float]) -> Array:
-    x, y, yaw = pose
-    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
-    return points @ turn.T + [x, y]
 
 
 def _laser(rng: np.random.Generator) -> Laser:

@@ -5,8 +5,6 @@ For tests, training and as the measure of other simulated lasers; not for dynami
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,22 +12,24 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 
+def _circles(values: ArrayLike) -> Array:
+    return np.reshape(np.asarray(values, float), (-1, 3))
+
+
+def _segments(values: ArrayLike) -> Array:
+    return np.reshape(np.asarray(values, float), (-1, 4))
+
+
 @attrs.frozen
 class World:
     """What a ray may hit: circles (N, 3), each x, y, radius; segments (M, 4), each x, y of both ends; all m."""
 
-    circles: Array = attrs.field(
-        factory=lambda: np.zeros((0, 3)), converter=lambda x: np.reshape(np.asarray(x, float), (-1, 3))
-    )
-    segments: Array = attrs.field(
-        factory=lambda: np.zeros((0, 4)), converter=lambda x: np.reshape(np.asarray(x, float), (-1, 4))
-    )
+    circles: Array = attrs.field(default=(), converter=_circles)
+    segments: Array = attrs.field(default=(), converter=_segments)
 
     def with_circles(self, circles: ArrayLike) -> World:
         """This world with more circles in it."""
-        return World(
-            np.vstack([self.circles, np.reshape(np.asarray(circles, float), (-1, 3))]), self.segments
-        )
+        return World(np.vstack([self.circles, _circles(circles)]), self.segments)
 
     def cast(self, origin: ArrayLike, angles: Array) -> Array:
         """How far rays from `origin` (2,) at `angles` (rays,) go, (rays,) in m; inf where they hit nothing."""
@@ -79,9 +79,9 @@ class Laser:
     @property
     def angles(self) -> Array:
         """Of its rays, (rays,)."""
-        return self.angle_min + self.angle_increment * np.arange(self.rays)
+        return self.angle_min + self.angle_increment * np.arange(self.rays, dtype=float)
 
-    def scan(self, world: World, pose: Sequence[float], rng: np.random.Generator) -> Array:
+    def scan(self, world: World, pose: Array, rng: np.random.Generator) -> Array:
         """Ranges (rays,) in m, from a pose x, y, yaw."""
         ranges = np.minimum(world.cast(pose[:2], self.angles + pose[2]), 2.0 * self.range_max)
         behind = np.maximum(np.roll(ranges, 1), np.roll(ranges, -1))

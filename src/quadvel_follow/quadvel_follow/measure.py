@@ -25,7 +25,7 @@ APART = 1.5  # m, from any person to what is no person's track
 
 @attrs.frozen
 class Recording:
-    """Real scans: ranges (N, rays) in m, inf where there is none; stamp (N,) in s; legs (N, K, 2) in m, NaN where fewer, or None."""
+    """Real scans: ranges (N, rays) in m, inf where there is none; stamp (N,) in s; legs (N, K, 2) in m, NaN if fewer, or None."""
 
     name: str
     ranges: Array
@@ -73,9 +73,9 @@ def labelled(recording: Recording, detector: LegDetector) -> dict[str, float]:
         labels = labels[np.isfinite(labels[:, 0])]
         legs = detector.detect(ranges, recording.angle_min, recording.angle_increment)
         near = np.linalg.norm(legs[:, None] - labels[None], axis=2) < FOUND
-        missed += np.count_nonzero(~near.any(0))
-        right += np.count_nonzero(near.any(1))
-        wrong += np.count_nonzero(~near.any(1) & ((low < legs) & (legs < high)).all(1))
+        missed += int((~near.any(0)).sum())
+        right += int(near.any(1).sum())
+        wrong += int((~near.any(1) & ((low < legs) & (legs < high)).all(1)).sum())
     return {"recall": 1.0 - missed / len(every), "precision": right / max(right + wrong, 1)}
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Mapping
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .laser import Laser, World
 from .walker import Walker, circles
@@ -122,9 +122,9 @@ SCENES: Mapping[str, Callable[[int], Scene]] = {
 }
 
 
-def _walker(rng: np.random.Generator, way: object, speed: float) -> Walker:
+def _walker(rng: np.random.Generator, way: ArrayLike, speed: float) -> Walker:
     return Walker(
-        way=way,  # type: ignore[arg-type]
+        way=way,
         speed=speed,
         pace=rng.uniform(0.0, 0.1),
         radius=rng.uniform(0.05, 0.08),

@@ -15,6 +15,10 @@ SHIN = 0.75  # swing of a shin, where it is measured, by that of its foot
 SETTLING = 0.2  # s, in which the swing follows a change of pace
 
 
+def _points(values: ArrayLike) -> Array:
+    return np.asarray(values, float)
+
+
 @attrs.define
 class Walker:
     """A person on a way of straight pieces.
@@ -24,7 +28,7 @@ class Walker:
     the legs from each other sideways.
     """
 
-    way: Array = attrs.field(converter=lambda x: np.asarray(x, float))
+    way: Array = attrs.field(converter=_points)
     speed: float = 1.2
     stops: Sequence[tuple[float, float]] = ()
     pace: float = 0.0
@@ -85,6 +89,6 @@ def _swing(phase: Array) -> Array:
     return np.where(phase < STANCE, 1.0 - 2.0 * phase / STANCE, -np.cos(np.pi * air))
 
 
-def circles(walkers: Sequence[Walker]) -> ArrayLike:
+def circles(walkers: Sequence[Walker]) -> Array:
     """The legs of all, (2 n, 3)."""
     return np.concatenate([walker.legs for walker in walkers]) if walkers else np.zeros((0, 3))
