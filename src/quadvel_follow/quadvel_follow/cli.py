@@ -25,7 +25,7 @@ HEADS = {
     "kept": "right person kept",
     "rms": "position, m RMS",
     "ghosts": "ghosts a scene",
-    "ms": "ms a scan",
+    "ms": "CPU ms a scan",
 }
 
 

@@ -146,6 +146,15 @@ class _Hypothesis:
         return self.empty / (self.empty + self.taken + 2.0)
 
 
+def _is_leg_of(hypothesis: _Hypothesis, walker: _Hypothesis) -> bool:
+    """Whether it is but the other leg of one who walks: it is beside, came later, and was not there before."""
+    return (
+        walker.id < hypothesis.id
+        and hypothesis.taken <= hypothesis.empty
+        and bool(np.hypot(*(walker.state[:2] - hypothesis.state[:2])) < STRIDE)
+    )
+
+
 class PersonTracker:
     """Takes one scan after the other."""
 
@@ -368,18 +377,10 @@ class PersonTracker:
             patience = config.patience_in_view if visible else config.patience
             if time - hypothesis.seen <= (patience if hypothesis.confirmed else config.forgotten):
                 kept.append(hypothesis)
+        walkers = [h for h in kept if h.confirmed or h.moved > config.moved]
         self._hypotheses = [
-            h for h in kept if h.confirmed or not any(self._is_leg_of(h, other) for other in kept)
+            h for h in kept if h.confirmed or not any(_is_leg_of(h, other) for other in walkers)
         ]
-
-    def _is_leg_of(self, hypothesis: _Hypothesis, other: _Hypothesis) -> bool:
-        """Whether it is but the other leg of one who walks: it is beside, came later, and was not there before."""
-        return (
-            other.id < hypothesis.id
-            and (other.confirmed or other.moved > self.config.moved)
-            and bool(np.hypot(*(other.state[:2] - hypothesis.state[:2])) < STRIDE)
-            and hypothesis.taken <= hypothesis.empty
-        )
 
     def _tells(self, hypothesis: _Hypothesis) -> bool:
         return hypothesis.sightings > 2 and hypothesis.belief > self.config.belief
