@@ -24,7 +24,7 @@ def draw_tracks(recording: Recording, detector: LegDetector, path: Path) -> None
         for track in tracks:
             if track.confirmed:
                 ways.setdefault(track.id, []).append(track.position)
-    for identity, way in ways.items():
+    for identity, way in sorted(ways.items()):
         (line,) = axes.plot(*np.array(way).T, linewidth=1.5, label=f"person {identity}", zorder=2)
         axes.plot(*way[-1], "o", color=line.get_color(), zorder=3)
     axes.plot(0.0, 0.0, "k^", markersize=9, label="laser")
