@@ -2,7 +2,7 @@
 
 Everything in a scan that may be a leg belongs to some hypothesis, a table's as well as a person's, so that what stands
 about keeps its own readings and none of them draws a person away. A hypothesis is confirmed as a person when the
-detector has believed in its legs and it has walked. Each is a Kalman filter of constant velocity.
+detector has believed in its legs and it has walked. Each hypothesis is a Kalman filter of constant velocity.
 """
 
 from __future__ import annotations
@@ -26,16 +26,15 @@ Array = NDArray[np.float64]
 GATE = 13.8  # squared Mahalanobis distance in the plane that one leg in 1000 exceeds
 NOBODYS = 9.0  # cost at which a leg rather belongs to none
 PERSONS = 3.0  # by which it costs less that a leg is a person's than that it is something else's
-UNLIKE_IT = (
-    4.0  # cost of a leg that was there before, for one who walks, and of one that came, for what stands
-)
+UNLIKE_IT = 4.0  # cost of a leg that was there before, for one who walks; of one that came, for what stands
+UNSURE = 0.02  # by which a probability may be wrong
 STANDING = 3.0  # looks more that found it in its place than not, for what stands
 WALKING = 0.4  # m/s, from which somebody walks
 FORBIDDEN = 1e6  # cost of an assignment beyond the gate
 SECOND_LEG = 2.0  # cost of a second leg: two legs between two persons are one of each
 MERGED = 0.25  # m, width from which a thing is two legs beside each other
 STRIDE = 0.5  # m, between the legs of a person, as far as they are made one
-RECENT = 1.0  # s
+RECENT = 1.0  # s, that is of late
 BELIEVING = 2.0  # s, over which what was found out about a hypothesis counts
 SWING = 0.2  # s, for which the error of a person's middle is the same
 PERSON = np.array([-0.2, -0.1, 0.0, 0.1, 0.2])  # m, from the middle of a person to its sides
@@ -140,6 +139,13 @@ class _Hypothesis:
     taken: float = 0.0  # looks that found something there
     trail: deque[tuple[float, Array]] = attrs.field(factory=deque)  # when its legs were seen where
 
+    def correct(self, position: Array, variance: float) -> None:
+        """The Kalman filter's correction by a measured position (2,), m, whose coordinates have this variance, m^2."""
+        gain = self.covariance[:, :2] @ np.linalg.inv(self.covariance[:2, :2] + variance * np.eye(2))
+        self.state = self.state + gain @ (position - self.state[:2])
+        covariance = self.covariance - gain @ self.covariance[:2]
+        self.covariance = 0.5 * (covariance + covariance.T)
+
     @property
     def moved(self) -> float:
         """The share of looks that found its places empty, when it was not there."""
@@ -215,12 +221,11 @@ class PersonTracker:
                 f"sensor_pose is {pose}, expected {'one' if self._given else 'None'} as for the scans before"
             )
         if pose is not None:
-            found = np.asarray(pose, float)
-            if found.shape != (3,) or not np.isfinite(found).all():
+            if np.shape(pose) != (3,) or not np.isfinite(np.asarray(pose, float)).all():
                 raise ValueError(
                     f"sensor_pose is {pose}, expected x, y (m) and yaw (rad), three finite numbers"
                 )
-            return found
+            return np.asarray(pose, float)
         if self._before is None:
             return np.zeros(3)
         _, before, pose_before = self._before
@@ -264,15 +269,7 @@ class PersonTracker:
         unseen = np.array([time - h.seen for h in self._hypotheses])
         reach = self.config.reach + self.config.first_speed * np.maximum(unseen - self.config.forgotten, 0.0)
         near = (squared < GATE) & (np.hypot(off[..., 0], off[..., 1]) < reach[:, None])
-        # Against a leg that belongs to none of them; a person's looks like one, and a leg is rather a person's.
-        cost = squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] - NOBODYS
-        unlike = np.log((1.0 - legs.probability + 0.02) / (legs.probability + 0.02))
-        cost += np.where([[h.confirmed] for h in self._hypotheses], unlike - PERSONS, 0.0)
-        # Who walks comes to places that were empty, and what stands about does not.
-        walks = np.array([h.confirmed and np.hypot(*h.state[2:]) > WALKING for h in self._hypotheses])
-        stands = np.array([not h.confirmed and h.taken > h.empty + STANDING for h in self._hypotheses])
-        rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
-        cost += UNLIKE_IT * (walks[:, None] * rested + stands[:, None] * came)
+        cost = squared + np.log(np.linalg.det(spread) / self.config.one_leg**4)[:, None] + self._liking(legs)
         cost = np.where(near, cost, FORBIDDEN)
         twice = np.concatenate([cost, cost + SECOND_LEG])
         rows, columns = linear_sum_assignment(np.hstack([twice, np.zeros((len(twice), len(twice)))]))
@@ -281,30 +278,39 @@ class PersonTracker:
                 theirs[row % len(theirs)].append(int(column))
         return theirs
 
+    def _liking(self, legs: _Legs) -> Array:
+        """Cost (hypotheses, legs) by what both are, against a leg that belongs to none of them.
+
+        A leg is rather a person's, and looks like one. Who walks comes to places that were empty; what stands does not.
+        """
+        confirmed = np.array([h.confirmed for h in self._hypotheses])
+        walks = confirmed & np.array([np.hypot(*h.state[2:]) > WALKING for h in self._hypotheses])
+        stands = ~confirmed & np.array([h.taken > h.empty + STANDING for h in self._hypotheses])
+        unlike = np.log((1.0 - legs.probability + UNSURE) / (legs.probability + UNSURE))
+        rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
+        cost: Array = np.where(confirmed[:, None], unlike - PERSONS, 0.0) - NOBODYS
+        return cost + UNLIKE_IT * (walks[:, None] & rested) + UNLIKE_IT * (stands[:, None] & came)
+
     def _correct(self, time: float, dt: float, theirs: list[list[int]], legs: _Legs) -> None:
-        """The Kalman filter's correction by the middle of the legs."""
+        """Correct each hypothesis by the middle of its legs, and keep what they tell of it."""
+        recent = min(1.0, dt / RECENT)
         for hypothesis, pair in zip(self._hypotheses, theirs, strict=True):
             if not pair:
                 continue
-            # Legs swing: what the middle of a person is off by stays nearly the same from one quick scan to the next.
             both = len(pair) == 2 or bool(legs.merged[pair[0]])
-            variance = self._deviation(both) ** 2 * max(1.0, SWING / dt)
-            spread = hypothesis.covariance[:2, :2] + variance * np.eye(2)
-            gain = hypothesis.covariance[:, :2] @ np.linalg.inv(spread)
-            off = legs.position[pair].mean(0) - hypothesis.state[:2]
-            recent = min(1.0, dt / RECENT)
-            hypothesis.surprise += recent * (float(np.hypot(*off)) - hypothesis.surprise)
+            middle, leg = legs.position[pair].mean(0), pair[0]
+            off = float(np.hypot(*(middle - hypothesis.state[:2])))
+            # Legs swing: what the middle of a person is off by stays nearly the same from one quick scan to the next.
+            hypothesis.correct(middle, self._deviation(both) ** 2 * max(1.0, SWING / dt))
+            hypothesis.surprise += recent * (off - hypothesis.surprise)
             hypothesis.pairs += recent * (float(both) - hypothesis.pairs)
-            hypothesis.state = hypothesis.state + gain @ off
-            covariance = hypothesis.covariance - gain @ hypothesis.covariance[:2]
-            hypothesis.covariance = 0.5 * (covariance + covariance.T)
             share = dt / (dt + min(time - hypothesis.born, BELIEVING))
-            hypothesis.belief += share * (legs.probability[pair].max() - hypothesis.belief)
+            hypothesis.belief += share * (float(legs.probability[pair].max()) - hypothesis.belief)
+            hypothesis.empty += float(legs.empty[leg])
+            hypothesis.taken += float(legs.taken[leg])
             hypothesis.seen = time
             hypothesis.sightings += 1
-            hypothesis.trail.append((time, legs.position[pair[0]]))
-            hypothesis.empty += legs.empty[pair[0]]
-            hypothesis.taken += legs.taken[pair[0]]
+            hypothesis.trail.append((time, legs.position[leg]))
 
     def _deviation(self, both: bool) -> float:
         return self.config.both_legs if both else self.config.one_leg
@@ -360,27 +366,31 @@ class PersonTracker:
         """Confirm who has walked, give up who is gone, and what is a person's other leg."""
         if not self._hypotheses:
             return
-        config, kept = self.config, []
+        kept = []
         places = np.array([h.state[:2] for h in self._hypotheses])
         in_view = look(scan, to_sensor(places, pose), PERSON)[0]
         for hypothesis, visible in zip(self._hypotheses, in_view, strict=True):
-            if not hypothesis.confirmed:
-                hypothesis.confirmed = (
-                    np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.walked
-                    and hypothesis.moved > config.moved
-                    and hypothesis.belief > config.belief
-                    and hypothesis.surprise < config.surprise
-                    and hypothesis.pairs > config.pairs
-                    and time - hypothesis.born > config.watched
-                    and hypothesis.sightings >= max(config.sightings, config.steady * hypothesis.scans)
-                )
-            patience = config.patience_in_view if visible else config.patience
-            if time - hypothesis.seen <= (patience if hypothesis.confirmed else config.forgotten):
+            hypothesis.confirmed = hypothesis.confirmed or self._has_walked(hypothesis, time)
+            patience = self.config.patience_in_view if visible else self.config.patience
+            if time - hypothesis.seen <= (patience if hypothesis.confirmed else self.config.forgotten):
                 kept.append(hypothesis)
-        walkers = [h for h in kept if h.confirmed or h.moved > config.moved]
+        walkers = [h for h in kept if h.confirmed or h.moved > self.config.moved]
         self._hypotheses = [
             h for h in kept if h.confirmed or not any(_is_leg_of(h, other) for other in walkers)
         ]
+
+    def _has_walked(self, hypothesis: _Hypothesis, time: float) -> bool:
+        """As a person does: on legs, steadily, to places that were empty."""
+        config = self.config
+        return (
+            hypothesis.moved > config.moved
+            and hypothesis.belief > config.belief
+            and hypothesis.surprise < config.surprise
+            and hypothesis.pairs > config.pairs
+            and time - hypothesis.born > config.watched
+            and hypothesis.sightings >= max(config.sightings, config.steady * hypothesis.scans)
+            and bool(np.hypot(*(hypothesis.state[:2] - hypothesis.origin)) > config.walked)
+        )
 
     def _tells(self, hypothesis: _Hypothesis) -> bool:
         return hypothesis.sightings > 2 and hypothesis.belief > self.config.belief
@@ -395,4 +405,4 @@ class PersonTracker:
             state[:2] -= pose[:2]
             state, covariance = turn @ state, turn @ covariance @ turn.T
         age, seen = time - hypothesis.born, hypothesis.seen
-        return Track(hypothesis.id, state[:2], state[2:], covariance, age, seen, bool(hypothesis.confirmed))
+        return Track(hypothesis.id, state[:2], state[2:], covariance, age, seen, hypothesis.confirmed)
