@@ -25,7 +25,7 @@ def detector() -> LegDetector:
 
 def walk(way: list[list[float]], duration: float, still: bool = True, **changes: object) -> Scene:
     """A person on a way, before a scanner at 20 Hz that stands, or drives sideways and turns."""
-    moving = iter(np.linspace(0.0, 1.0, 2000))
+    moving = iter(np.linspace(0.0, 1.0, 200))
 
     def pose(_: np.ndarray) -> np.ndarray:
         s = 0.0 if still else next(moving)

@@ -19,7 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from .clusters import Scan
 from .leg_detector import LegDetector
 from .looking import AGE, MEMORY, Past, look, to_frame, to_sensor
-from .scan_motion import motion
+from .scan_motion import ScanOdometry
 
 Array = NDArray[np.float64]
 
@@ -69,7 +69,7 @@ class TrackerConfig:
     forgotten: s, without a leg, after which a hypothesis is given up
     """
 
-    acceleration: float = _positive(0.15)
+    acceleration: float = _positive(0.1)
     both_legs: float = _positive(0.1)
     one_leg: float = _positive(0.3)
     first_speed: float = _positive(0.8)
@@ -81,7 +81,7 @@ class TrackerConfig:
     pairs: float = _positive(0.3)
     belief: float = _positive(0.6)
     watched: float = _positive(1.0)
-    sightings: int = _positive(6)
+    sightings: int = _positive(8)
     steady: float = _positive(0.7)
     patience: float = _positive(3.0)
     patience_in_view: float = _positive(1.5)
@@ -169,7 +169,8 @@ class PersonTracker:
         self._detector = detector or LegDetector()
         self._hypotheses: list[_Hypothesis] = []
         self._past = Past()
-        self._before: tuple[float, Scan, Array] | None = None  # time, scan and pose of the last update
+        self._odometry = ScanOdometry()
+        self._time: float | None = None  # s, of the last scan
         self._given: bool | None = None  # whether the sensor's pose comes from outside
         self._next_id = 1
 
@@ -191,7 +192,7 @@ class PersonTracker:
         scan = Scan.checked(ranges, angle_min, angle_increment)
         dt = self._checked_step(time)
         pose = self._checked_pose(sensor_pose, scan)
-        self._before, self._given = (time, scan, pose), sensor_pose is not None
+        self._time, self._given = time, sensor_pose is not None
         legs = self._legs(time, scan, pose)
         self._predict(time, dt, scan, pose)
         theirs = self._assign(time, legs)
@@ -206,13 +207,13 @@ class PersonTracker:
     def _checked_step(self, time: float) -> float:
         if not np.isfinite(time):
             raise ValueError(f"time is {time}, expected a finite time, s")
-        if self._before is None:
+        if self._time is None:
             return 0.0
-        if time <= self._before[0]:
+        if time <= self._time:
             raise ValueError(
-                f"time is {time}, expected a later one than that of the scan before, {self._before[0]}"
+                f"time is {time}, expected a later one than that of the scan before, {self._time}"
             )
-        return time - self._before[0]
+        return time - self._time
 
     def _checked_pose(self, pose: Sequence[float] | None, scan: Scan) -> Array:
         """The sensor's pose: as it is given, or after what it moved since the scan before."""
@@ -226,11 +227,7 @@ class PersonTracker:
                     f"sensor_pose is {pose}, expected x, y (m) and yaw (rad), three finite numbers"
                 )
             return np.asarray(pose, float)
-        if self._before is None:
-            return np.zeros(3)
-        _, before, pose_before = self._before
-        moved = motion(before, scan)
-        return np.array([*to_frame(moved[None, :2], pose_before)[0], pose_before[2] + moved[2]])
+        return self._odometry.follow(scan)
 
     def _legs(self, time: float, scan: Scan, pose: Array) -> _Legs:
         found = self._detector.find(scan)

@@ -1,4 +1,4 @@
-"""How a scanner moved from one scan to the next, by the scans alone, for where nobody knows its pose.
+"""Where a scanner is, by the scans alone, for where nobody knows its pose.
 
 Point-to-line matching (Censi: "An ICP variant using a point-to-line metric", 2008), begun at the rotation in which the
 ranges agree best. Not a localisation: what it adds up to drifts.
@@ -11,16 +11,34 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from .clusters import Scan
+from .looking import to_frame
 
 Array = NDArray[np.float64]
 
 RESTING = 0.7  # share of rays that read the same, from which a scanner has not moved
-SAME = 0.06  # m, the most by which these differ
+SAME, SAME_SHARE = 0.06, 0.01  # m, and the share of the range, by which these differ at most
+ELSEWHERE = 0.05  # m and rad, from which a scanner is at another place
+FEWEST = 30  # readings without which nothing is told
 WIDEST_TURN = 0.6  # rad between two scans
 POINTS = 240  # readings that are matched, at most
 ROUNDS = 12
 CORRESPONDING = (1.0, 0.15)  # m, from a point to its partner, in the first round and in the last
-SETTLED = 1e-4  # m and rad, by which the last round may move it
+
+
+class ScanOdometry:
+    """Adds up how a scanner moved, each time from the last scan at which it was at another place."""
+
+    def __init__(self) -> None:
+        self._pose = np.zeros(3)  # of the scan to which others are matched
+        self._scan: Scan | None = None
+
+    def follow(self, scan: Scan) -> Array:
+        """Pose x, y (m), yaw (rad) of the scanner in the frame of the first scan."""
+        moved = np.zeros(3) if self._scan is None else motion(self._scan, scan)
+        pose = np.array([*to_frame(moved[None, :2], self._pose)[0], self._pose[2] + moved[2]])
+        if self._scan is None or np.hypot(*moved[:2]) > ELSEWHERE or abs(moved[2]) > ELSEWHERE:
+            self._scan, self._pose = scan, pose
+        return pose
 
 
 def motion(before: Scan, now: Scan) -> Array:
@@ -28,11 +46,10 @@ def motion(before: Scan, now: Scan) -> Array:
     if before.ranges.size != now.ranges.size:
         return np.zeros(3)
     seen = np.isfinite(before.ranges) & np.isfinite(now.ranges)
-    change = np.abs(np.where(seen, now.ranges, 0.0) - np.where(seen, before.ranges, 0.0))
-    if seen.sum() < 30 or np.mean(change[seen] < SAME + 0.01 * now.ranges[seen]) > RESTING:
+    change = np.abs(now.ranges[seen] - before.ranges[seen])
+    if seen.sum() < FEWEST or np.mean(change < SAME + SAME_SHARE * now.ranges[seen]) > RESTING:
         return np.zeros(3)
-    pose = np.array([0.0, 0.0, _turn(before, now)])
-    return _matched(before, now, pose)
+    return _matched(before, now, np.array([0.0, 0.0, _turn(before, now)]))
 
 
 def _turn(before: Scan, now: Scan) -> float:
@@ -50,15 +67,14 @@ def _matched(before: Scan, now: Scan, pose: Array) -> Array:
     target, normal = _surfaces(before)
     points = now.points(np.flatnonzero(np.isfinite(now.ranges)))
     points = points[:: max(1, len(points) // POINTS)]
-    if len(target) < 30 or len(points) < 30:
+    if len(target) < FEWEST or len(points) < FEWEST:
         return np.zeros(3)
     tree = cKDTree(target)
     for reach in np.geomspace(*CORRESPONDING, ROUNDS):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        placed = points @ np.array([[c, s], [-s, c]]) + pose[:2]
+        placed = to_frame(points, pose)
         distance, partner = tree.query(placed, distance_upper_bound=reach)
         used = np.isfinite(distance)
-        if used.sum() < 20:
+        if used.sum() < FEWEST // 2:
             return np.zeros(3)
         q, n, p = target[partner[used]], normal[partner[used]], placed[used]
         lever = n[:, 1] * (p[:, 0] - pose[0]) - n[:, 0] * (p[:, 1] - pose[1])
