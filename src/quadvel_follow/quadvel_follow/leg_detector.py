@@ -14,7 +14,7 @@ from .clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
 Array = NDArray[np.float64]
 
 SHIPPED_MODEL = Path(__file__).parent / "models" / "legs.onnx"
-SURE = 0.6  # probability from which `detect` names a thing
+SURE = 0.55  # probability from which `detect` names a thing
 INWARD = 0.045  # m, from the readings on a leg's near side to its axis
 
 
