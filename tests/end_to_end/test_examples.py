@@ -75,12 +75,16 @@ NODES = [
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
+    Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
+    Step("quadvel people --out out/people", more="--runs 1"),
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
 ]
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
+    "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
+    "tests/quadvel_follow takes them where they are",
     "quadvel up": "as with --terrain",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
     "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_walk_behind_network.py",

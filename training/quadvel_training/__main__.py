@@ -22,6 +22,7 @@ from . import (
     env,
     estimator,
     kalman_tuning,
+    leg_classifier,
     loop,
     privileged,
     recipe,
@@ -268,6 +269,31 @@ def tune_kalman(
         print(f"{name}: RMSE flat {error[0].round(3)}, rough {error[1].round(3)} m/s")
     for name in tuned.bounds():
         print(f"{name}: {getattr(tuned, name):.3g}")
+
+
+Scans = Annotated[Path, typer.Option(help="Folder with files legs_*.npz of real scans.", file_okay=False)]
+
+
+@app.command("legs")
+def train_legs(scans: Scans, out: Out = Path("out/training/legs"), source: Recipe = None) -> None:
+    """The network that tells legs in laser scans, on real and simulated ones: DIR/legs.onnx; minutes."""
+    config = recipe.read(leg_classifier.LegConfig, source)
+    run_folder.describe(out, "legs", source, config)
+    real, made = leg_classifier.read_examples(config, scans)
+    network = leg_classifier.train(config, list(real.values()), made)
+    about = {"files": [file.name for file in real], "configuration": attrs.asdict(config)}
+    leg_classifier.export(network, out / "legs.onnx", about)
+    print(f"written: {out / 'legs.onnx'}")
+
+
+@app.command("legs-left-out")
+def cross_validate_legs(scans: Scans, source: Recipe = None) -> None:
+    """How well that network does on each file of scans when it has learned from the others alone."""
+    config = recipe.read(leg_classifier.LegConfig, source)
+    for name, figures in leg_classifier.cross_validate(config, *leg_classifier.read_examples(config, scans)):
+        print(
+            f"{name}: " + ", ".join(f"{figure} {value:.3g}" for figure, value in figures.items()), flush=True
+        )
 
 
 @app.command("card")

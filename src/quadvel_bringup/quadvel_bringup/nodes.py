@@ -32,6 +32,7 @@ NODES = {
     "estimator": NodeEntry("quadvel_estimator.estimator", "linear velocity from IMU and encoders"),
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
+    "person_tracker": NodeEntry("quadvel_follow.person_tracker_node", "persons in the scans of a 2-D laser"),
     "planner": NodeEntry(
         "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
     ),

@@ -1,0 +1,63 @@
+"""The command `quadvel people`, as a function for a typer application."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from .figure import draw_tracks
+from .leg_detector import SHIPPED_MODEL, LegDetector
+from .measure import Recording, measure_files, measure_scenes
+
+Figures = Mapping[str, Mapping[str, float]]
+HEADS = {
+    "recall": "recall",
+    "precision": "precision",
+    "persons": "persons",
+    "persons_per_minute": "a minute",
+    "switches_per_minute": "switches a minute",
+    "kept": "right person kept",
+    "rms": "position, m RMS",
+    "ghosts": "ghosts a scene",
+    "ms": "CPU ms a scan",
+}
+
+
+def people_command(
+    out: Annotated[Path, typer.Option(help="Folder for people.json and a picture of each file.")],
+    scans: Annotated[
+        Path | None, typer.Option(help="Folder with files legs_*.npz of real scans.", show_default="none")
+    ] = None,
+    runs: Annotated[int, typer.Option(min=0, help="Simulated scenes of each kind.")] = 100,
+    model: Annotated[
+        Path, typer.Option(help="ONNX file that knows legs.", show_default="the shipped one")
+    ] = SHIPPED_MODEL,
+) -> None:
+    """Measure how well persons are found and tracked in laser scans, real and simulated."""
+    detector, console = LegDetector(model), Console()
+    found: dict[str, Figures] = {}
+    out.mkdir(parents=True, exist_ok=True)
+    if scans is not None:
+        found["scans"] = measure_files(scans, detector)
+        console.print(_table("real scans", found["scans"]))
+        for path in sorted(scans.glob("legs_*.npz")):
+            draw_tracks(Recording.load(path), detector, out / f"{path.stem}.png")
+    if runs:
+        found["scenes"] = measure_scenes(runs, detector)
+        console.print(_table(f"simulated, {runs} each", found["scenes"]))
+    (out / "people.json").write_text(json.dumps(found, indent=1))
+    console.print(f"written: {out}/people.json{', pictures' if scans is not None else ''}")
+
+
+def _table(title: str, figures: Figures) -> Table:
+    heads = [head for head in HEADS if any(head in row for row in figures.values())]
+    table = Table(title, *(HEADS[head] for head in heads))
+    for name, row in figures.items():
+        table.add_row(name, *(f"{row[head]:.3g}" if head in row else "" for head in heads))
+    return table

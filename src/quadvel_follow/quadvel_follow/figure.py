@@ -1,0 +1,34 @@
+"""A picture of tracks over the scans that they were made of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from .leg_detector import LegDetector
+from .measure import Recording
+
+
+def draw_tracks(recording: Recording, detector: LegDetector, path: Path) -> None:
+    """From above, in the frame of a sensor that stands: all readings, and the way of each confirmed person."""
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    axes = figure.subplots()
+    angles = recording.angle_min + recording.angle_increment * np.arange(recording.ranges.shape[1])
+    ahead = np.column_stack([np.cos(angles), np.sin(angles)])
+    ways: dict[int, list[np.ndarray]] = {}
+    for _, ranges, tracks in recording.tracked(detector):
+        seen = np.isfinite(ranges) & (ranges > 0.0)
+        axes.plot(*(ranges[seen, None] * ahead[seen]).T, ".", color="0.75", markersize=1.0, zorder=1)
+        for track in tracks:
+            if track.confirmed:
+                ways.setdefault(track.id, []).append(track.position)
+    for identity, way in sorted(ways.items()):
+        (line,) = axes.plot(*np.array(way).T, linewidth=1.5, label=f"person {identity}", zorder=2)
+        axes.plot(*way[-1], "o", color=line.get_color(), zorder=3)
+    axes.plot(0.0, 0.0, "k^", markersize=9, label="laser")
+    axes.set(xlabel="x, m", ylabel="y, m", title=recording.name, aspect="equal")
+    axes.legend(loc="upper right")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)

@@ -1,0 +1,92 @@
+"""A simulated plane of the world and a laser scanner in it: rays against circles and segments, with a scanner's faults.
+
+For tests, training and as the measure of other simulated lasers; not for dynamics.
+"""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+def _circles(values: ArrayLike) -> Array:
+    return np.reshape(np.asarray(values, float), (-1, 3))
+
+
+def _segments(values: ArrayLike) -> Array:
+    return np.reshape(np.asarray(values, float), (-1, 4))
+
+
+@attrs.frozen
+class World:
+    """What a ray may hit: circles (N, 3), each x, y, radius; segments (M, 4), each x, y of both ends; all m."""
+
+    circles: Array = attrs.field(default=(), converter=_circles)
+    segments: Array = attrs.field(default=(), converter=_segments)
+
+    def with_circles(self, circles: ArrayLike) -> World:
+        """This world with more circles in it."""
+        return World(np.vstack([self.circles, _circles(circles)]), self.segments)
+
+    def cast(self, origin: ArrayLike, angles: Array) -> Array:
+        """How far rays from `origin` (2,) at `angles` (rays,) go, (rays,) in m; inf where they hit nothing."""
+        ahead = np.column_stack([np.cos(angles), np.sin(angles)])
+        start = np.asarray(origin, float)
+        return np.minimum(self._to_circles(start, ahead), self._to_segments(start, ahead))
+
+    def _to_circles(self, start: Array, ahead: Array) -> Array:
+        """|start + t ahead - centre| = radius, the lesser t."""
+        if not len(self.circles):
+            return np.full(len(ahead), np.inf)
+        to_centre = self.circles[:, :2] - start
+        along = ahead @ to_centre.T
+        root = self.circles[:, 2] ** 2 - (to_centre**2).sum(1) + along**2
+        hit = along - np.sqrt(np.maximum(root, 0.0))
+        return np.where((root >= 0.0) & (hit > 0.0), hit, np.inf).min(1)
+
+    def _to_segments(self, start: Array, ahead: Array) -> Array:
+        """start + t ahead = a + s (b - a), with s from 0 to 1."""
+        if not len(self.segments):
+            return np.full(len(ahead), np.inf)
+        to_end, side = self.segments[:, :2] - start, self.segments[:, 2:] - self.segments[:, :2]
+        cross = ahead[:, :1] * side[:, 1] - ahead[:, 1:] * side[:, 0]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (to_end[:, 0] * side[:, 1] - to_end[:, 1] * side[:, 0]) / cross
+            s = (to_end[:, 0] * ahead[:, 1:] - to_end[:, 1] * ahead[:, :1]) / cross
+        return np.where((t > 0.0) & (s >= 0.0) & (s <= 1.0), t, np.inf).min(1)
+
+
+@attrs.frozen
+class Laser:
+    """A scanner. angle_min and angle_increment in rad; noise: standard deviation of a range, m, of which `noise_share`
+    grows with it; lost: share of rays without a reading; mixed: share of the rays at an edge that read something between
+    the thing and what is behind it; nothing: what it says where there was nothing.
+    """
+
+    rays: int = 720
+    angle_min: float = -np.pi
+    angle_increment: float = np.deg2rad(0.5)
+    range_max: float = 12.0
+    noise: float = 0.01
+    noise_share: float = 0.001
+    lost: float = 0.002
+    mixed: float = 0.3
+    nothing: float = np.inf
+
+    @property
+    def angles(self) -> Array:
+        """Of its rays, (rays,)."""
+        return self.angle_min + self.angle_increment * np.arange(self.rays, dtype=float)
+
+    def scan(self, world: World, pose: Array, rng: np.random.Generator) -> Array:
+        """Ranges (rays,) in m, from a pose x, y, yaw."""
+        ranges = np.minimum(world.cast(pose[:2], self.angles + pose[2]), 2.0 * self.range_max)
+        behind = np.maximum(np.roll(ranges, 1), np.roll(ranges, -1))
+        at_edge = (behind - ranges > 0.1) & (rng.random(self.rays) < self.mixed)
+        ranges = np.where(at_edge, ranges + rng.random(self.rays) * (behind - ranges), ranges)
+        ranges += (self.noise + self.noise_share * ranges) * rng.standard_normal(self.rays)
+        silent = (ranges >= self.range_max) | (rng.random(self.rays) < self.lost)
+        return np.where(silent, self.nothing, np.maximum(ranges, 0.0))

@@ -1,0 +1,151 @@
+"""Training of the network that tells legs from other things in a scan, and its file for `quadvel_follow.LegDetector`."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import attrs
+import numpy as np
+import onnx
+import torch
+from torch import Tensor, nn
+
+from quadvel_follow.clusters import NUMBERS, WINDOW
+from quadvel_follow.leg_detector import LegDetector
+from quadvel_follow.measure import Recording, labelled, persons
+
+from .leg_examples import Examples, from_file, simulated
+from .onnx_file import commit
+
+
+@attrs.frozen
+class LegConfig:
+    """One run. scenes: simulated ones; share_real: of a batch, where there are real scans."""
+
+    scenes: int = 1000
+    share_real: float = 0.7
+    share_legs: float = 0.5
+    steps: int = 2500
+    batch: int = 1024
+    learning_rate: float = 2e-3
+    hidden: tuple[int, ...] = (64, 32)
+    dropout: float = 0.1
+    seed: int = 7
+
+
+class LegNetwork(nn.Module):
+    """Things (N, NUMBERS) to the probability (N,) that each is a leg or a pair of legs."""
+
+    def __init__(self, config: LegConfig) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(NUMBERS))
+        self.register_buffer("scale", torch.ones(NUMBERS))
+        layers: list[nn.Module] = []
+        size = NUMBERS
+        for width in config.hidden:
+            layers += [nn.Linear(size, width), nn.SiLU(), nn.Dropout(config.dropout)]
+            size = width
+        self.body = nn.Sequential(*layers, nn.Linear(size, 1))
+
+    def logit(self, things: Tensor) -> Tensor:
+        """Of that probability."""
+        return self.body((things - self.mean) / self.scale)[:, 0]
+
+    def forward(self, things: Tensor) -> Tensor:
+        return self.logit(things).sigmoid()
+
+
+def train(config: LegConfig, real: Sequence[Examples], made: Examples) -> LegNetwork:
+    """A network from real files, each of which counts alike, and simulated scenes."""
+    torch.manual_seed(config.seed)
+    rng = np.random.default_rng(config.seed)
+    network = LegNetwork(config)
+    every = Examples.joined([*real, made]).things
+    network.mean.copy_(torch.from_numpy(every.mean(0)))
+    network.scale.copy_(torch.from_numpy(every.std(0) + 1e-3))
+    optimiser = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=1e-2)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, config.steps)
+    draws = _Draws(config, real, made, rng)
+    for _ in range(config.steps):
+        things, legs = draws.batch()
+        loss = nn.functional.binary_cross_entropy_with_logits(
+            network.logit(torch.from_numpy(things)), torch.from_numpy(0.02 + 0.96 * legs.astype(np.float32))
+        )
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        schedule.step()
+    return network.eval()
+
+
+class _Draws:
+    """Batches: as many legs as other things of each source, half of all mirrored."""
+
+    def __init__(
+        self, config: LegConfig, real: Sequence[Examples], made: Examples, rng: np.random.Generator
+    ) -> None:
+        self._rng = rng
+        share = config.share_real if real else 0.0
+        # What to draw from, which of it, and how many: legs and other things of the real files, then of the simulated.
+        self._pools: list[tuple[Examples, np.ndarray, int]] = []
+        for legs, part in ((True, config.share_legs), (False, 1.0 - config.share_legs)):
+            having = [source for source in real if (source.legs == legs).any()]
+            for source, size in [(source, share / len(having)) for source in having] + [(made, 1.0 - share)]:
+                self._pools.append(
+                    (source, np.flatnonzero(source.legs == legs), int(config.batch * part * size))
+                )
+
+    def batch(self) -> tuple[np.ndarray, np.ndarray]:
+        """Things and whether they are legs."""
+        drawn = [(source, self._rng.choice(which, count)) for source, which, count in self._pools]
+        things = np.concatenate([source.things[which] for source, which in drawn])
+        legs = np.concatenate([source.legs[which] for source, which in drawn])
+        turned = self._rng.random(len(things)) < 0.5
+        things[turned, : WINDOW.size] = things[turned, WINDOW.size - 1 :: -1]
+        return things, legs
+
+
+def read_examples(config: LegConfig, folder: Path) -> tuple[dict[Path, Examples], Examples]:
+    """Of the files legs_*.npz of real scans in a folder, and of simulated scenes. Raises FileNotFoundError."""
+    files = sorted(folder.glob("legs_*.npz"))
+    if not files:
+        raise FileNotFoundError(f"{folder}: has no file legs_*.npz, expected scans with and without people")
+    rng = np.random.default_rng(config.seed)
+    return {file: from_file(file, rng) for file in files}, simulated(config.scenes, rng)
+
+
+def cross_validate(
+    config: LegConfig, real: Mapping[Path, Examples], made: Examples
+) -> Iterator[tuple[str, dict[str, float]]]:
+    """What `quadvel people` says of each file, with a network that has seen the others alone."""
+    for left_out in real:
+        network = train(config, [examples for file, examples in real.items() if file != left_out], made)
+        with TemporaryDirectory() as folder:
+            export(network, Path(folder) / "legs.onnx", {})
+            detector = LegDetector(Path(folder) / "legs.onnx")
+        recording = Recording.load(left_out)
+        yield left_out.stem, (persons if recording.legs is None else labelled)(recording, detector)
+
+
+def export(network: LegNetwork, path: Path, about: dict[str, Any]) -> None:
+    """Write the network as ONNX, things (N, NUMBERS) to probability (N,), whole or not at all."""
+    part = path.with_suffix(".part")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    torch.onnx.export(
+        network.eval(),
+        (torch.zeros(2, NUMBERS),),
+        str(part),
+        input_names=["things"],
+        output_names=["probability"],
+        dynamic_axes={"things": {0: "n"}, "probability": {0: "n"}},
+        opset_version=17,
+        dynamo=False,
+    )
+    model = onnx.load(part)
+    onnx.helper.set_model_props(model, {"quadvel": json.dumps(about | {"kind": "legs", "commit": commit()})})
+    onnx.save(model, part)
+    part.replace(path)
