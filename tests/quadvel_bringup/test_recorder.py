@@ -172,13 +172,13 @@ def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
 ) -> None:
     path = tmp_path / "full.mcap"
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, limits[1]))  # what the recorder inherits
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))  # what the recorder inherits
     recording = start_recording("low_state", "--out", str(path))
     resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     publisher = publish_while_it_records(node, path)
     for tick in range(4000):
         publisher.publish(low_state(tick))
-        time.sleep(0.01)
+        time.sleep(0.003)
         if recording.poll() is not None:
             break
     _, said = recording.communicate(timeout=60)
@@ -192,6 +192,6 @@ def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
 def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> None:
     recording = start_recording("low_state", "--out", str(tmp_path / "walk.mcap"), "--seconds", "0.5")
     _, said = recording.communicate(timeout=60)
-    assert recording.returncode == 2
+    assert recording.returncode == 1
     assert "nothing came on /low_state on ROS domain" in said
     assert list(tmp_path.iterdir()) == []

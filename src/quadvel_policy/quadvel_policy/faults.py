@@ -32,9 +32,14 @@ and `reason` of `controller/state`. Every limit is a parameter of the node `cont
 robot is passive or in fault, its joints brake and nothing more happens to it.
 
 This page is printed by `python -m quadvel_policy.faults`; a test brings about every row, and another one sees the first fail
-without its guard.
+without its guard. `make faults` lets sensors, links and processes fail at random instants of a simulated robot's life, and measures
+[how soon it reacts](results/faults.md).
 
 {tables}
+
+What it cannot see: a sensor that is late but agrees with itself, as an IMU or an encoder whose readings come 80 ms late; a
+gyroscope or an orientation alone that stands still while the trunk hardly turns; a command that somebody did not mean. A robot
+whose IMU freezes while it walks brakes blind, and falls in about one of three cases.
 
 Where nobody commands the joints any more, because the controller has died or hangs, the next in line brakes: the driver after
 its `command_timeout`, the robot's board and the simulator by themselves 20 ms after the last packet.
