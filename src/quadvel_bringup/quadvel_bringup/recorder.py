@@ -5,6 +5,7 @@ Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import Counter
@@ -100,12 +101,15 @@ class Recorder:
         while (left := until - time.monotonic()) > 0.0:
             time.sleep(min(left, pause))
             executor.spin_once(timeout_sec=left)
-            self.write_waiting(executor)
+            self.write_waiting(executor, until)
 
-    def write_waiting(self, executor: Executor) -> None:
-        """Write all that waits now. Other callbacks of our node, such as that of /clock, take turns with ours."""
+    def write_waiting(self, executor: Executor, until: float = math.inf) -> None:
+        """Write all that waits now. Other callbacks of our node, such as that of /clock, take turns with ours.
+
+        until: s on the monotonic clock, when to leave the rest for the next time: more may come than one can write.
+        """
         in_vain = 0
-        while in_vain < OTHERS:
+        while in_vain < OTHERS and time.monotonic() < until:
             written = self.counts.total()
             executor.spin_once(timeout_sec=0.0)
             in_vain = 0 if self.counts.total() > written else in_vain + 1
