@@ -167,6 +167,17 @@ def test_of_a_recorder_that_was_killed_all_but_the_last_second_is_read(node: Nod
     assert len(found) > 50
 
 
+def test_it_looks_up_in_time_although_more_comes_than_it_can_write(node: Node, tmp_path: Path) -> None:
+    class Busy:
+        def spin_once(self, timeout_sec: float) -> None:
+            recorder.counts["/low_state"] += 1
+
+    with Recorder(node, tmp_path / "walk.mcap") as recorder:
+        began = time.monotonic()
+        recorder.serve(Busy(), 0.2)  # type: ignore[arg-type]
+        assert time.monotonic() - began < 10.0
+
+
 def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
     node: Node, tmp_path: Path
 ) -> None:

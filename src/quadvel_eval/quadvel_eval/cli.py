@@ -88,7 +88,12 @@ def faults_command(
     out: Annotated[Path, typer.Option(help="Folder for faults.json, faults.md and faults.png.")] = Path(
         "out/faults"
     ),
-    seeds: Annotated[int, typer.Option(min=1, help="Runs of each case, with seeds 0, 1, ...")] = 20,
+    seeds: Annotated[
+        int,
+        typer.Option(
+            min=1, help="Runs of each component and kind, in turn in its modes, with seeds 0, 1, ..."
+        ),
+    ] = 20,
     only: Annotated[
         str | None,
         typer.Option(help="Cases whose 'component kind mode' holds this text.", show_default="all of them"),

@@ -67,11 +67,19 @@ class Run:
 def campaign(
     seeds: int, only: str | None = None, progress: Callable[[int, int], None] = lambda done, of: None
 ) -> list[Run]:
-    """Every case from seeds 0, 1, ...; `only`: those whose "component kind mode" holds this text. ValueError where none does."""
+    """Every component and kind from seeds 0, 1, ..., which take turns in its modes.
+
+    only: those cases whose "component kind mode" holds this text. ValueError where none does.
+    """
     cases = [case for case in CASES if only is None or only in case.name]
     if not cases:
         raise ValueError(f"no case holds '{only}'; there are {', '.join(case.name for case in CASES)}")
-    calls: list[Call] = [(run, case, seed) for case in cases for seed in range(seeds)]
+    kinds: dict[tuple[str, str], list[Case]] = {}
+    for case in cases:
+        kinds.setdefault((case.component, case.kind), []).append(case)
+    calls: list[Call] = [
+        (run, modes[seed % len(modes)], seed) for modes in kinds.values() for seed in range(seeds)
+    ]
     runs: list[Run | None] = [None] * len(calls)
     for done, (i, answer) in enumerate(in_parallel(calls), 1):
         runs[i] = answer
