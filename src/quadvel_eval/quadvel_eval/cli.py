@@ -90,9 +90,7 @@ def faults_command(
     ),
     seeds: Annotated[
         int,
-        typer.Option(
-            min=1, help="Runs of each component and kind, in turn in its modes, with seeds 0, 1, ..."
-        ),
+        typer.Option(min=1, help="Runs of each kind of fault, in turn in its modes, with seeds 0, 1, ..."),
     ] = 20,
     only: Annotated[
         str | None,

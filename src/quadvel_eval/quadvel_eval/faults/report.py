@@ -46,8 +46,9 @@ def total(entries: Entries) -> str:
     worst = {name: max(entry[name] for entry in entries) for name in ("torque", "speed", "beyond")}
     kinds = {entry["case"].rsplit(" ", 1)[0] for entry in entries}
     return (
-        f"{len(kinds)} kinds of fault in {len(entries)} cases, {runs} runs, {good} as expected; largest torque {worst['torque']:.2f} and speed under drive "
-        f"{worst['speed']:.2f} of the drive's limit, {worst['beyond']:.2f} rad into a mechanical stop"
+        f"{len(kinds)} kinds of fault in {len(entries)} cases, {runs} runs, {good} as expected; largest torque "
+        f"{worst['torque']:.2f} and speed under drive {worst['speed']:.2f} of the drive's limit, "
+        f"{worst['beyond']:.2f} rad into a mechanical stop"
     )
 
 
