@@ -43,6 +43,10 @@ class JointCommand:
         """The angles (12,) rad at which the drives would push as little as without a target: q + tau / kp."""
         return self.q + np.divide(self.tau, self.kp, out=np.zeros_like(self.q), where=self.kp > 0)
 
+    def torque(self, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
+        """The torque (12,) N m that is asked for where the joints are: q (12,) rad, dq (12,) rad/s."""
+        return self.tau + self.kp * (self.q - q) + self.kd * (self.dq - dq)
+
     @classmethod
     def damping(cls, kd: float = 5.0, tick: int = 0) -> JointCommand:
         """Brake every joint."""

@@ -53,8 +53,8 @@ class CommandLimits:
         command.q, torque = within_range(command.q, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", beyond)
-        asked = _torque(command, state)
-        allowed = self._after_step(asked, _torque(previous, state))
+        asked = command.torque(state.q, state.dq)
+        allowed = self._after_step(asked, previous.torque(state.q, state.dq))
         allowed = self._at_most(allowed)
         allowed = self._at_speed(allowed, state.dq)
         allowed = self._of_power(allowed, state.dq)
@@ -90,14 +90,6 @@ class CommandLimits:
             return torque
         self._count("power_too_large", True)
         return np.where(power > 0.0, torque * limit / total, torque)
-
-
-def _torque(command: JointCommand, state: RobotState) -> Array:
-    """(12,) N m, that the command asks for where the joints are."""
-    if command.mode == MODE_DAMPING:
-        return -command.kd * state.dq
-    torque: Array = command.tau + command.kp * (command.q - state.q) + command.kd * (command.dq - state.dq)
-    return torque
 
 
 def _ask_for(command: JointCommand, change: Array) -> None:

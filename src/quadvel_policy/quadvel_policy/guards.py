@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 
 MOVING = ("stand_up", "stance", "walk", "lie_down")
 """The modes in which the joints do more than brake"""
-POSTURES = ("stand_up", "stance", "lie_down")
 WALK = ("walk",)
 
 ENCODER_MEMORY = 0.1  # s, over which angles and speeds of the joints have to agree
@@ -481,11 +480,7 @@ class EstimateStale(Guard):
     modes = WALK
 
     def look(self, see: Sight) -> str | None:
-        if see.velocity is None:
-            return "there is no fresh velocity estimate"
-        return (
-            None if all(map(math.isfinite, see.velocity.tolist())) else "the velocity estimate is not finite"
-        )
+        return _lost(see.velocity)
 
 
 class EstimateWrong(Guard):
@@ -520,7 +515,7 @@ class NoVelocity(Guard):
     modes = WALK
 
     def look(self, see: Sight) -> str | None:
-        lost = EstimateStale().look(see)
+        lost = _lost(see.velocity)
         return f"{lost}, nor has the Kalman filter one" if lost and see.backup is None else None
 
 
@@ -591,9 +586,16 @@ def _findings(guards: Iterable[Guard], see: Sight) -> list[Finding]:
 
 def torque_of(command: JointCommand, state: RobotState) -> Array:
     """The torque (12,) N m that a drive without flaws gives for `command` where the joints are, within its limit."""
-    asked = command.tau + command.kp * (command.q - state.q) + command.kd * (command.dq - state.dq)
+    asked = command.torque(state.q, state.dq)
     torque: Array = np.minimum(np.maximum(asked, -TORQUE_LIMIT), TORQUE_LIMIT)
     return torque
+
+
+def _lost(velocity: Array | None) -> str | None:
+    """Why a velocity estimate (3,) cannot be followed, a sentence, or None."""
+    if velocity is None:
+        return "there is no fresh velocity estimate"
+    return None if all(map(math.isfinite, velocity.tolist())) else "the velocity estimate is not finite"
 
 
 def _rotation_between(before: Array, after: Array) -> Array:

@@ -239,7 +239,7 @@ class Supervisor:
             self.findings.append(Finding(unfit, *OTHER_FAULTS[unfit]))
         self._act_on(self.findings, state.time)
         seen = self._seen(state, self._velocity_in_effect(sight))
-        if 0.0 <= sight.gap <= self.config.max_state_age and sight.gap > self.config.reset_gap:
+        if self.config.reset_gap < sight.gap <= self.config.max_state_age:
             self._walk.forget()
         if self.mode in self._after and (following := self._after[self.mode](seen)):
             self._switch(*following)

@@ -19,7 +19,7 @@ from quadvel_sim.simulator import DT, Simulator
 from ..pool import Call, in_parallel
 from .cases import CASES, Case
 from .injection import injection
-from .stack import Stack
+from .stack import Array, Stack
 
 SCHEMA = 1
 AFTERWARDS = 2.5  # s that a run goes on after the fault began
@@ -101,16 +101,16 @@ def run(case: Case, seed: int) -> Run:
     if healthy or stack.supervisor.fault:
         result.wrong.append(f"before the fault: {stack.supervisor.fault or healthy[0].name}")
     injection(case.component, case.kind).begin(stack, rng)
-    began = stack.now
+    began, too_fast = stack.now, np.zeros(12)  # ms; s by joint
     for _ in range(round(AFTERWARDS / DT)):
         try:
             stack.step()
         except FloatingPointError as error:
             result.wrong.append(str(error))
             break
-        _observe(stack, case, (stack.now - began) * DT, result)
+        too_fast = _observe(stack, case, (stack.now - began) * DT, result, too_fast)
     result.ended, result.fell = stack.supervisor.mode, stack.simulator.fallen
-    result.wrong += _judge(case, result, stack)
+    result.wrong += _judge(case, result)
     return result
 
 
@@ -122,8 +122,9 @@ def _prepared(mode: str, rng: np.random.Generator, seed: int) -> Stack:
     policy.reset()
     estimator.reset()
     stack = Stack(simulator, policy, estimator)
-    for _ in _order(stack, "stand_up" if mode == "stand_up" else "stance", 0.6):
-        pass
+    _let(stack, 0.05)
+    _request(stack, "stand_up" if mode == "stand_up" else "stance")
+    _let(stack, 0.6)
     if mode == "stand_up":
         _let(stack, rng.uniform(0.0, 1.0))
     elif mode == "stance":
@@ -137,14 +138,6 @@ def _prepared(mode: str, rng: np.random.Generator, seed: int) -> Stack:
     return stack
 
 
-def _order(stack: Stack, mode: str, seconds: float) -> Iterator[None]:
-    """Ask for a mode after the first states, and let it last."""
-    _let(stack, 0.05)
-    _request(stack, mode)
-    _let(stack, seconds)
-    yield
-
-
 def _request(stack: Stack, mode: str) -> None:
     taken, sentence = stack.supervisor.request(mode)
     if not taken:
@@ -156,15 +149,18 @@ def _let(stack: Stack, seconds: float) -> None:
         stack.step()
 
 
-def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
-    """Take down what is seen at one millisecond."""
+def _observe(stack: Stack, case: Case, time: float, result: Run, too_fast: Array) -> Array:
+    """Take down what is seen at one millisecond.
+
+    too_fast: for how long each joint (12,) has been driven beyond MAX_SPEED by the millisecond before, s; returned for this one.
+    """
     data, supervisor = stack.simulator.data, stack.supervisor
     result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
     q, dq = data.qpos[7:], data.qvel[6:]
     driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
     result.speed = max(result.speed, float(driven.max()))
-    stack.too_fast = np.where(driven > MAX_SPEED, stack.too_fast + DT, 0.0)
-    result.too_fast = max(result.too_fast, float(stack.too_fast.max()))
+    too_fast = np.where(driven > MAX_SPEED, too_fast + DT, 0.0)
+    result.too_fast = max(result.too_fast, float(too_fast.max()))
     result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
     for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
         if name and name not in result.findings:
@@ -174,18 +170,21 @@ def _observe(stack: Stack, case: Case, time: float, result: Run) -> None:
         result.named_after = time
     if result.safe_after is None and case.ends != "goes on" and _is_safe(stack, case.ends):
         result.safe_after = time
+    return too_fast
 
 
 def _is_safe(stack: Stack, ends: str) -> bool:
     if ends == "damping":
         return stack.simulator.braking or stack.held_mode == MODE_DAMPING
-    if ends in ("stance", "stopped"):
-        return stack.supervisor.mode in ("stance", "fault")[: 1 + (ends == "stopped")]
+    if ends == "stance":
+        return stack.supervisor.mode == "stance"
+    if ends == "stopped":
+        return stack.supervisor.mode in ("stance", "fault")
     velocity = stack.simulator.data.qvel
     return float(np.linalg.norm(velocity[:2])) < STANDS and abs(velocity[5]) < TURNS_NOT
 
 
-def _judge(case: Case, result: Run, stack: Stack) -> Iterator[str]:
+def _judge(case: Case, result: Run) -> Iterator[str]:
     """What is against the oracle."""
     if case.named and result.named_after is None:
         found = ", ".join(result.findings) or "nothing"

@@ -27,6 +27,7 @@ from quadvel_nodes.messages import (
     numbers,
     read_low_cmd,
     read_low_state,
+    seconds,
     write_low_cmd,
     write_low_state,
 )
@@ -115,7 +116,6 @@ class Stack:
         self.simulator = simulator
         self.now = 0  # ms
         self.held_mode = MODE_DAMPING
-        self.too_fast = np.zeros(12)  # s, by joint, for those who watch
         self.clock_offset = self.late = 0.0
         self.velocity = np.zeros(3)
         self.sensors: Callable[[int, RobotState], RobotState] | None = None
@@ -203,13 +203,13 @@ class Stack:
 
     def _velocity_to_controller(self, message: Message) -> None:
         self._to_controller(
-            lambda: self._loop.on_velocity(_seconds(message.stamp), numbers(message, "velocity", 3))
+            lambda: self._loop.on_velocity(seconds(message.stamp), numbers(message, "velocity", 3))
         )
 
     def _command_to_controller(self, message: Message) -> None:
         self._to_controller(
             lambda: self._loop.on_command(
-                _seconds(message.stamp), numbers(message, "velocity", 3), message.stance
+                seconds(message.stamp), numbers(message, "velocity", 3), message.stance
             )
         )
 
@@ -251,7 +251,3 @@ def spoil(message: Message, rng: np.random.Generator) -> Message:
 def _time(seconds: float) -> Message:
     whole = int(seconds)
     return SimpleNamespace(sec=whole, nanosec=int(1e9 * (seconds - whole)))
-
-
-def _seconds(stamp: Message) -> float:
-    return float(stamp.sec + 1e-9 * stamp.nanosec)
