@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quadvel_eval.people.laser import FloorPlan, Laser
+from quadvel_eval.people.measure import Recording, labelled
 from quadvel_follow import LegDetector
-from quadvel_follow.laser import Laser, World
-from quadvel_follow.measure import Recording, labelled
 
 ROOM = [[-4.0, -3.0, 6.0, -3.0], [6.0, -3.0, 6.0, 3.0], [6.0, 3.0, -4.0, 3.0], [-4.0, 3.0, -4.0, -3.0]]
 LEGS = np.array([[2.0, 0.6], [2.1, 0.9]])
@@ -22,7 +22,7 @@ def detector() -> LegDetector:
 
 def scanned(laser: Laser, legs: np.ndarray = LEGS, seed: int = 0) -> np.ndarray:
     circles = [[*leg, 0.06] for leg in legs]
-    return laser.scan(World(circles, ROOM), np.zeros(3), np.random.default_rng(seed))
+    return laser.scan(FloorPlan(circles, ROOM), np.zeros(3), np.random.default_rng(seed))
 
 
 def around(degrees: float, **changes: float) -> Laser:
@@ -42,7 +42,7 @@ def test_both_legs_are_found_at_any_resolution(detector: LegDetector, degrees: f
 def test_however_a_scanner_says_that_there_was_nothing(detector: LegDetector, nothing: float) -> None:
     laser = around(0.5, nothing=nothing, lost=0.02)
     circles = [[*leg, 0.06] for leg in LEGS]
-    ranges = laser.scan(World(circles), np.zeros(3), np.random.default_rng(0))
+    ranges = laser.scan(FloorPlan(circles), np.zeros(3), np.random.default_rng(0))
     found = detector.detect(ranges, laser.angle_min, laser.angle_increment)
     assert len(found) >= 1
     assert (np.linalg.norm(found[:, None] - LEGS[None], axis=2).min(1) < 0.25).all()

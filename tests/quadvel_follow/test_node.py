@@ -16,12 +16,12 @@ from rclpy.executors import SingleThreadedExecutor
 from sensor_msgs.msg import LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
 
+from quadvel_eval.people.laser import FloorPlan, Laser
+from quadvel_eval.people.scenes import Scene
 from quadvel_follow import person_tracker_node
-from quadvel_follow.laser import Laser, World
 from quadvel_follow.looking import to_frame
-from quadvel_follow.scenes import Scene
-from quadvel_follow.walker import Walker
 from quadvel_msgs.srv import SelectPerson
+from quadvel_sim.walker import Walker
 
 LASER = Laser(rays=540, angle_min=-0.75 * np.pi, angle_increment=np.deg2rad(0.5))
 MOUNTED = (0.3, 0.0)  # m, ahead of the robot's middle
@@ -114,7 +114,13 @@ def feed(bench: Bench, robot: np.ndarray | None, seconds: float = 3.0, start: fl
     pose = np.zeros(3) if robot is None else np.array([*to_frame(np.array([MOUNTED]), robot)[0], robot[2]])
     way = to_frame(np.array([[3.0, -2.0], [3.0, 2.0]]), pose)
     scene = Scene(
-        LASER, 10.0, World(), [Walker(way=way, speed=1.2)], seconds, np.random.default_rng(0), lambda _: pose
+        LASER,
+        10.0,
+        FloorPlan(),
+        [Walker(way=way, speed=1.2)],
+        seconds,
+        np.random.default_rng(0),
+        lambda _: pose,
     )
     for instant in scene.instants():
         bench.send(start + instant.time, instant.ranges, robot)

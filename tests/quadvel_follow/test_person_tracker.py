@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from quadvel_eval.people.laser import FloorPlan, Laser
+from quadvel_eval.people.measure import Recording, persons, simulated
+from quadvel_eval.people.scenes import Instant, Scene, along_walls, crossing, occlusion
 from quadvel_follow import LegDetector, PersonTracker, Track, TrackerConfig
-from quadvel_follow.laser import Laser, World
-from quadvel_follow.measure import Recording, persons, simulated
-from quadvel_follow.scenes import Instant, Scene, along_walls, crossing, occlusion
-from quadvel_follow.walker import Walker
+from quadvel_sim.walker import Walker
 
 LASER = Laser(rays=540, angle_min=-0.75 * np.pi, angle_increment=np.deg2rad(0.5))
-ROOM = World([[1.5, -2.0, 0.025], [2.3, -2.0, 0.025]], [[-6.0, 4.0, 9.0, 4.0], [-6.0, -4.0, 9.0, -4.0]])
+ROOM = FloorPlan([[1.5, -2.0, 0.025], [2.3, -2.0, 0.025]], [[-6.0, 4.0, 9.0, 4.0], [-6.0, -4.0, 9.0, -4.0]])
 
 
 @pytest.fixture(scope="module")

@@ -9,13 +9,13 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
+from quadvel_eval.people.laser import FloorPlan, Laser  # noqa: E402
 from quadvel_follow import LegDetector  # noqa: E402
-from quadvel_follow.laser import Laser, World  # noqa: E402
-from quadvel_follow.walker import Walker  # noqa: E402
+from quadvel_sim.walker import Walker  # noqa: E402
 from quadvel_training import leg_classifier, leg_examples  # noqa: E402
 
 LASER = Laser(rays=500, angle_min=-np.pi / 2, angle_increment=np.deg2rad(0.36))
-ROOM = World([[2.0, -1.5, 0.02]], [[-1.0, 4.0, 6.0, 4.0], [5.5, -4.0, 5.5, 4.0]])
+ROOM = FloorPlan([[2.0, -1.5, 0.02]], [[-1.0, 4.0, 6.0, 4.0], [5.5, -4.0, 5.5, 4.0]])
 
 
 def recorded(path: Path, person: bool, labels: bool) -> Path:
@@ -25,8 +25,8 @@ def recorded(path: Path, person: bool, labels: bool) -> Path:
     ranges, legs = [], []
     for _ in range(40):
         walker.step(0.1)
-        world = ROOM.with_circles(walker.legs) if person else ROOM
-        ranges.append(LASER.scan(world, np.zeros(3), rng))
+        plan = ROOM.with_circles(walker.legs) if person else ROOM
+        ranges.append(LASER.scan(plan, np.zeros(3), rng))
         legs.append(walker.legs[:, :2])
     fields = {"ranges": ranges, "angle_min": LASER.angle_min, "angle_increment": LASER.angle_increment,
               "range_max": LASER.range_max, "stamp": 0.1 * np.arange(40)}  # fmt: skip

@@ -14,9 +14,9 @@ import onnx
 import torch
 from torch import Tensor, nn
 
+from quadvel_eval.people.measure import Recording, labelled, persons
 from quadvel_follow.clusters import NUMBERS, WINDOW
 from quadvel_follow.leg_detector import LegDetector
-from quadvel_follow.measure import Recording, labelled, persons
 
 from .leg_examples import Examples, from_file, simulated
 from .onnx_file import commit

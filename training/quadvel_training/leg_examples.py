@@ -10,10 +10,10 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_eval.people.laser import FloorPlan, Laser
 from quadvel_follow.clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
-from quadvel_follow.laser import Laser, World
 from quadvel_follow.looking import to_frame
-from quadvel_follow.walker import Walker, circles
+from quadvel_sim.walker import Walker, circles
 
 Array = NDArray[np.float64]
 
@@ -180,7 +180,7 @@ def _direction(rng: np.random.Generator) -> Array:
     return np.array([np.cos(angle), np.sin(angle)])
 
 
-def _room(rng: np.random.Generator) -> World:
+def _room(rng: np.random.Generator) -> FloorPlan:
     """Walls all round, or none; walls with door frames, boxes, tables and chairs on their legs, poles and trees."""
     segments, posts = [], []
     if rng.random() < 0.8:
@@ -196,7 +196,7 @@ def _room(rng: np.random.Generator) -> World:
         posts += [(*corner, radius) for corner in _rectangle(rng, *size)]
     for _ in range(rng.integers(0, 5)):
         posts.append((*(rng.uniform(0.8, 9.0) * _direction(rng)), rng.choice([0.015, 0.15, 0.2, 0.3])))
-    return World(posts, segments)
+    return FloorPlan(posts, segments)
 
 
 def _rectangle(rng: np.random.Generator, a: float, b: float) -> Array:

@@ -321,7 +321,7 @@ def paper(context: typer.Context) -> None:
 @app.command(context_settings=HANDED_ON, add_help_option=False)
 def people(context: typer.Context) -> None:
     """Measure how well persons are found and tracked in laser scans, real and simulated."""
-    _hand_on(context, "quadvel_follow.cli:people_command")
+    _hand_on(context, "quadvel_eval.people.cli:people_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

@@ -1,4 +1,4 @@
-"""Persons in laser scans: finding their legs, tracking them, and simulated scans to try it on."""
+"""Persons in laser scans: finding their legs, and tracking them."""
 
 from .leg_detector import LegDetector
 from .person_tracker import PersonTracker, Track, TrackerConfig

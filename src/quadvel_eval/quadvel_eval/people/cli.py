@@ -11,8 +11,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from quadvel_follow.leg_detector import SHIPPED_MODEL, LegDetector
+
 from .figure import draw_tracks
-from .leg_detector import SHIPPED_MODEL, LegDetector
 from .measure import Recording, measure_files, measure_scenes
 
 Figures = Mapping[str, Mapping[str, float]]

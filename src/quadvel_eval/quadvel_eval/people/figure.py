@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from .leg_detector import LegDetector
+from quadvel_follow.leg_detector import LegDetector
+
 from .measure import Recording
 
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_follow.laser import Laser, World
-from quadvel_follow.walker import Walker
+from quadvel_eval.people.laser import FloorPlan, Laser
+from quadvel_sim.walker import Walker
 
 QUIET = Laser(rays=8, angle_increment=np.pi / 4, noise=0.0, noise_share=0.0, lost=0.0, mixed=0.0)
 
 
 def test_rays_end_on_the_near_side_of_circles_and_on_walls() -> None:
-    world = World([[3.0, 0.0, 0.5]], [[-2.0, -5.0, -2.0, 5.0]])
-    ranges = QUIET.scan(world, np.zeros(3), np.random.default_rng(0))
+    plan = FloorPlan([[3.0, 0.0, 0.5]], [[-2.0, -5.0, -2.0, 5.0]])
+    ranges = QUIET.scan(plan, np.zeros(3), np.random.default_rng(0))
     wall, diagonal = 2.0, 2.0 * np.sqrt(2.0)
     np.testing.assert_allclose(
         ranges, [wall, diagonal, np.inf, np.inf, 2.5, np.inf, np.inf, diagonal], atol=1e-12
@@ -21,7 +21,9 @@ def test_rays_end_on_the_near_side_of_circles_and_on_walls() -> None:
 
 
 def test_a_scan_is_made_from_the_sensor_s_pose() -> None:
-    ranges = QUIET.scan(World([[3.0, 1.0, 0.5]]), np.array([3.0, -1.0, np.pi / 2]), np.random.default_rng(0))
+    ranges = QUIET.scan(
+        FloorPlan([[3.0, 1.0, 0.5]]), np.array([3.0, -1.0, np.pi / 2]), np.random.default_rng(0)
+    )
     assert ranges[4] == pytest.approx(1.5)
     assert np.isinf(np.delete(ranges, 4)).all()
 
@@ -31,9 +33,9 @@ def test_faults_of_a_scanner_come_as_often_as_asked_for() -> None:
         rays=20000, angle_increment=1e-4, noise=0.02, noise_share=0.0, lost=0.1, mixed=0.0, nothing=0.0
     )
     ranges = noisy.scan(
-        World(segments=[[-50, -50, 50, -50]]), np.array([0, -45, 0.0]), np.random.default_rng(1)
+        FloorPlan(segments=[[-50, -50, 50, -50]]), np.array([0, -45, 0.0]), np.random.default_rng(1)
     )
-    hit = World(segments=[[-50, -50, 50, -50]]).cast([0.0, -45.0], noisy.angles)
+    hit = FloorPlan(segments=[[-50, -50, 50, -50]]).cast([0.0, -45.0], noisy.angles)
     near = hit < 11.5
     assert np.mean(ranges[near] == 0.0) == pytest.approx(0.1, abs=0.01)
     seen = near & (ranges > 0.0)

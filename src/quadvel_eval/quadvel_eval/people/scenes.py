@@ -8,8 +8,9 @@ import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .laser import Laser, World
-from .walker import Walker, circles
+from quadvel_sim.walker import Walker, circles
+
+from .laser import FloorPlan, Laser
 
 Array = NDArray[np.float64]
 
@@ -30,11 +31,11 @@ class Instant:
 
 @attrs.frozen
 class Scene:
-    """Persons in a world, seen by a scanner of so many scans a second, whose pose is a function of the persons' positions."""
+    """Persons on a floor plan, seen by a scanner of so many scans a second, whose pose is a function of the persons' positions."""
 
     laser: Laser
     rate: float
-    world: World
+    plan: FloorPlan
     walkers: list[Walker]
     duration: float
     rng: np.random.Generator
@@ -46,7 +47,7 @@ class Scene:
         for k in range(int(self.duration * self.rate)):
             persons = np.array([walker.position for walker in self.walkers])
             pose = self.pose(persons)
-            ranges = self.laser.scan(self.world.with_circles(circles(self.walkers)), pose, self.rng)
+            ranges = self.laser.scan(self.plan.with_circles(circles(self.walkers)), pose, self.rng)
             yield Instant(k * steps * STEP, ranges, pose, persons)
             for walker in self.walkers:
                 for _ in range(steps):
@@ -79,8 +80,8 @@ def occlusion(seed: int) -> Scene:
     turn = rng.uniform(-np.pi, np.pi)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     tree = rotation @ [to_tree, 0.0]
-    world = _trees(rng, rotation @ [distance, 0.0]).with_circles([[*tree, radius]])
-    return Scene(_laser(rng), rng.choice(RATES), world, [_walker(rng, way @ rotation.T, speed)], 6.0, rng)
+    plan = _trees(rng, rotation @ [distance, 0.0]).with_circles([[*tree, radius]])
+    return Scene(_laser(rng), rng.choice(RATES), plan, [_walker(rng, way @ rotation.T, speed)], 6.0, rng)
 
 
 def along_walls(seed: int) -> Scene:
@@ -107,7 +108,7 @@ def along_walls(seed: int) -> Scene:
     return Scene(
         _laser(rng),
         rng.choice(RATES),
-        World(posts, segments),
+        FloorPlan(posts, segments),
         [walker],
         20.0 / speed + 2.0,
         rng,
@@ -144,8 +145,8 @@ def _laser(rng: np.random.Generator) -> Laser:
     )
 
 
-def _trees(rng: np.random.Generator, free: Array) -> World:
+def _trees(rng: np.random.Generator, free: Array) -> FloorPlan:
     """Some trees and a wall, not within 2 m of `free`."""
     trees = [(*rng.uniform(-7.0, 7.0, 2), rng.uniform(0.1, 0.3)) for _ in range(6)]
     kept = [tree for tree in trees if np.hypot(*(tree[:2] - free)) > 2.0 and np.hypot(*tree[:2]) > 1.0]
-    return World(kept, [[-8.0, 7.5, 8.0, 7.5], [-8.0, -7.5, 8.0, -7.5]])
+    return FloorPlan(kept, [[-8.0, 7.5, 8.0, 7.5], [-8.0, -7.5, 8.0, -7.5]])

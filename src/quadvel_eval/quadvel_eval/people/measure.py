@@ -11,8 +11,9 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .leg_detector import LegDetector
-from .person_tracker import PersonTracker, Track
+from quadvel_follow.leg_detector import LegDetector
+from quadvel_follow.person_tracker import PersonTracker, Track
+
 from .scenes import SCENES, Scene
 
 Array = NDArray[np.float64]

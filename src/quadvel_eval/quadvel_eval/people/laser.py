@@ -1,4 +1,4 @@
-"""A simulated plane of the world and a laser scanner in it: rays against circles and segments, with a scanner's faults.
+"""A floor plan and a laser scanner in it: rays against circles and segments, with a scanner's faults.
 
 For tests, training and as the measure of other simulated lasers; not for dynamics.
 """
@@ -21,15 +21,15 @@ def _segments(values: ArrayLike) -> Array:
 
 
 @attrs.frozen
-class World:
+class FloorPlan:
     """What a ray may hit: circles (N, 3), each x, y, radius; segments (M, 4), each x, y of both ends; all m."""
 
     circles: Array = attrs.field(default=(), converter=_circles)
     segments: Array = attrs.field(default=(), converter=_segments)
 
-    def with_circles(self, circles: ArrayLike) -> World:
-        """This world with more circles in it."""
-        return World(np.vstack([self.circles, _circles(circles)]), self.segments)
+    def with_circles(self, circles: ArrayLike) -> FloorPlan:
+        """This plan with more circles in it."""
+        return FloorPlan(np.vstack([self.circles, _circles(circles)]), self.segments)
 
     def cast(self, origin: ArrayLike, angles: Array) -> Array:
         """How far rays from `origin` (2,) at `angles` (rays,) go, (rays,) in m; inf where they hit nothing."""
@@ -81,9 +81,9 @@ class Laser:
         """Of its rays, (rays,)."""
         return self.angle_min + self.angle_increment * np.arange(self.rays, dtype=float)
 
-    def scan(self, world: World, pose: Array, rng: np.random.Generator) -> Array:
+    def scan(self, plan: FloorPlan, pose: Array, rng: np.random.Generator) -> Array:
         """Ranges (rays,) in m, from a pose x, y, yaw."""
-        ranges = np.minimum(world.cast(pose[:2], self.angles + pose[2]), 2.0 * self.range_max)
+        ranges = np.minimum(plan.cast(pose[:2], self.angles + pose[2]), 2.0 * self.range_max)
         behind = np.maximum(np.roll(ranges, 1), np.roll(ranges, -1))
         at_edge = (behind - ranges > 0.1) & (rng.random(self.rays) < self.mixed)
         ranges = np.where(at_edge, ranges + rng.random(self.rays) * (behind - ranges), ranges)
