@@ -6,7 +6,9 @@ Not for what a node computes, nor for the tools of ROS 2: those are in tests/ros
 from __future__ import annotations
 
 import itertools
+from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import pytest
 from geometry_msgs.msg import Twist
@@ -18,6 +20,7 @@ from std_srvs.srv import SetBool
 from quadvel_bringup.stack import Stack
 from quadvel_msgs.msg import ControllerState, LowState
 
+RIGHTS = Path(__file__).parents[2] / "ros_ws" / "security" / "node.xml"
 TRUTH_RATE = 200  # Hz, of ground_truth/odom
 SPEED = 0.5  # m/s
 TOPICS = {
@@ -185,3 +188,9 @@ def end(graph: Any, program: Any) -> str:
     order = graph.node.create_publisher(Empty, "end", 10)
     graph.wait(lambda: order.publish(Empty()) or program.poll() is not None, lambda: "it goes on")
     return program.stdout.read()
+
+
+def test_every_enclave_may_offer_what_rclpy_offers_of_a_node_by_itself(graph: Any) -> None:
+    services = graph.node.get_service_names_and_types_by_node("watcher", "/")
+    allowed = ElementTree.parse(RIGHTS).findall("services[@reply='ALLOW']/service")
+    assert {name.replace("/watcher/", "~/") for name, _ in services} == {one.text for one in allowed}

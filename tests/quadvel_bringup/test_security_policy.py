@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import subprocess
@@ -9,7 +10,11 @@ import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
+import pytest
+
+from quadvel_bringup.cli import drive
 from quadvel_bringup.nodes import NODES
+from quadvel_bringup.stack import LOW_LEVELS, Stack
 
 FOLDER = Path(__file__).parents[2] / "ros_ws" / "security"
 KINDS = {
@@ -44,6 +49,13 @@ print(json.dumps(created))
 """
 
 
+def enclave(name: str) -> ElementTree.Element:
+    """Fails the test if there is no such enclave."""
+    found = ElementTree.parse(FOLDER / "policy.xml").find(f"enclaves/enclave[@path='{name}']")
+    assert found is not None, f"there is no enclave {name}"
+    return found
+
+
 def allowed(profile: ElementTree.Element) -> dict[str, set[str]]:
     """Names by what a node may create of them."""
     found: dict[str, set[str]] = {kind: set() for kind in KINDS.values()}
@@ -66,11 +78,38 @@ def test_each_node_may_do_what_it_does_and_no_more() -> None:
     assert run.returncode == 0, run.stderr
     created = json.loads(run.stdout)
     common = allowed(ElementTree.parse(FOLDER / "node.xml").getroot())
-    policy = ElementTree.parse(FOLDER / "policy.xml")
     assert set(created) == set(NODES)
     for node, names in created.items():
-        profile = policy.find(f"enclaves/enclave[@path='/quadvel/{node}']/profiles/profile[@node='{node}']")
-        assert profile is not None, f"{node} has no enclave"
+        profile = enclave(f"/quadvel/{node}").find(f"profiles/profile[@node='{node}']")
+        assert profile is not None, f"{node} has no rights"
         for kind, may in allowed(profile).items():
             does = {name.removeprefix("/") for name in names.get(kind, ())} - common[kind]
             assert may - common[kind] == does, f"{node}: {kind}"
+
+
+@pytest.mark.parametrize("low_level", LOW_LEVELS)
+def test_each_process_of_a_robot_names_an_enclave_that_there_is(low_level: str) -> None:
+    for name, arguments in Stack(low_level=low_level).arguments().items():
+        assert arguments[arguments.index("--enclave") + 1] == f"/quadvel/{name}"
+        enclave(f"/quadvel/{name}")
+
+
+@pytest.mark.parametrize("order", ["reset", "pause", "step", "push"])
+def test_the_operator_may_give_an_order_to_whichever_node_simulates_the_robot(order: str) -> None:
+    profile = enclave("/quadvel/operator").find(f"profiles/profile[@node='{order}']")
+    assert profile is not None
+    simulations = {level.simulation for level in LOW_LEVELS.values() if level.simulation}
+    assert allowed(profile)["client"] == {f"{node}/{order}" for node in simulations}
+
+
+def test_the_operator_may_drive_by_the_topic_that_drive_publishes_on() -> None:
+    profile = enclave("/quadvel/operator").find("profiles/profile[@node='drive']")
+    assert profile is not None
+    assert allowed(profile)["publisher"] == {inspect.signature(drive).parameters["topic"].default}
+
+
+def test_there_is_nothing_but_enclaves_in_the_list_of_enclaves() -> None:
+    """`ros2 security generate_artifacts` takes a comment there for an enclave without a name."""
+    builder = ElementTree.TreeBuilder(insert_comments=True)
+    policy = ElementTree.parse(FOLDER / "policy.xml", ElementTree.XMLParser(target=builder))
+    assert {one.tag for one in policy.iterfind("enclaves/")} == {"enclave"}

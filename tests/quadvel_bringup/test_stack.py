@@ -86,8 +86,9 @@ def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None
         estimator="kalman",
         parameters=tmp_path / "my.yaml",
     )
-    file = ["--ros-args", "--params-file", str(tmp_path / "my.yaml")]
-    assert stack.arguments() == {
+    file = ["--params-file", str(tmp_path / "my.yaml")]
+    parameters = {name: arguments[3:] for name, arguments in stack.arguments().items()}
+    assert parameters == {
         "sim_node": [*file, "-p", 'terrain:="rough"', "-p", f'actuator_file:="{tmp_path}/found.yaml"'],
         "estimator": [*file, "-p", 'kind:="kalman"'],
         "controller": [

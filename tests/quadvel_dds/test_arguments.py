@@ -37,6 +37,10 @@ def test_values_that_no_parameter_can_hold_are_refused(text: str) -> None:
         overrides("-p", f"gain:={text}")
 
 
+def test_an_enclave_is_read_over_as_there_is_no_security() -> None:
+    assert overrides("--enclave", "/quadvel/controller", "-p", "a:=1", "-e", "/other") == {"a": 1}
+
+
 @pytest.mark.parametrize(
     "args", [["-p"], ["-p", "gain"], ["--frob"], ["-r", "a=b"], ["-r", "rostopic://a:=b"]]
 )

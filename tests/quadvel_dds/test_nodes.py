@@ -35,6 +35,12 @@ def test_node_names_are_told_to_ros(ros: Start) -> None:
     assert len(told.reader_gid_seq) == 6
 
 
+def test_security_that_is_not_here_is_not_pretended(ros: Start, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("ROS_SECURITY_ENABLE", "true")
+    with pytest.raises(ValueError, match="the embedded middleware has no security"):
+        ros("--ros-args", "--enclave", "/quadvel/controller")
+
+
 def test_remapping_of_node_namespace_and_topics(ros: Start) -> None:
     ros(
         "--ros-args",

@@ -97,6 +97,14 @@ class Ros:
         self._ros = {**environment, **own, "RMW_IMPLEMENTATION": rmw}
         self._embedded = {**os.environ, **own, "QUADVEL_MIDDLEWARE": "embedded"}
 
+    def secure(self, keystore: Path) -> None:
+        """Have what is started from now on keep to the rights of its SROS 2 enclave."""
+        self._ros |= {
+            "ROS_SECURITY_KEYSTORE": str(keystore),
+            "ROS_SECURITY_ENABLE": "true",
+            "ROS_SECURITY_STRATEGY": "Enforce",
+        }
+
     def start(self, *command: str) -> Process:
         """Start a command of ROS 2; it ends with the test."""
         self.processes.append(Process(command, self._ros))

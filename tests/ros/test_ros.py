@@ -23,6 +23,8 @@ pytestmark = pytest.mark.ros
 CYCLONE = "rmw_cyclonedds_cpp"
 with_cyclone = pytest.mark.parametrize("ros", [CYCLONE], indirect=True)
 
+POLICY = Path(__file__).parents[2] / "ros_ws" / "security" / "policy.xml"
+AS_TOOL = ("env", "ROS_SECURITY_ENCLAVE_OVERRIDE=/quadvel/tools")
 STACK = ("sim_node", "estimator", "controller", "command_mux")
 # Nothing goes out to a robot's address, and no port is taken that somebody else may have.
 ALONE = {"board": ("-p", "port:=0"), "driver": ("-p", "dry_run:=true")}
@@ -206,6 +208,28 @@ def test_a_recording_made_under_ros2_is_whole_and_readable(ros: Any, tmp_path: P
             assert reader.deserialize(data, connection.msgtype).__msgtype__ == connection.msgtype
     if has_rosbag2(ros):
         assert "/low_state" in ros.call("ros2", "bag", "info", str(file))
+
+
+def test_under_sros2_the_robot_stands_up_and_obeys_its_operator_alone(ros: Any, tmp_path: Path) -> None:
+    if "sros2" not in ros.call("ros2", "pkg", "list").split():
+        pytest.skip("sros2 is not installed")
+    keystore = tmp_path / "keystore"
+    ros.call("ros2", "security", "create_keystore", str(keystore))
+    ros.call("ros2", "security", "generate_artifacts", "-k", str(keystore), "-p", str(POLICY))
+    ros.secure(keystore)
+    launch = ros.start(*LAUNCH, "use_sim_time:=true")
+    ros.wait_until(lambda: "stance: stood up" in launch.text, 120.0, lambda: "it does not stand up")
+    obeyed = ros.program(*QUADVEL, "drive", "--vx", "0.5", "--seconds", "3")
+    assert obeyed.wait(120.0) == 0, obeyed.text
+    heard = ros.call(*AS_TOOL, "ros2", "topic", "echo", "--once", "low_state", "quadvel_msgs/msg/LowState")
+    assert "stamp:" in heard
+    for order in (
+        ("topic", "pub", "--once", "low_cmd", "quadvel_msgs/msg/LowCmd", "{}"),
+        ("service", "call", "controller/set_mode", "quadvel_msgs/srv/SetMode", "{mode: passive}"),
+    ):
+        refused = ros.start(*AS_TOOL, "ros2", *order)
+        assert refused.wait(60.0) != 0, refused.text
+    assert launch.interrupt() == 0, launch.text
 
 
 def assert_ends_cleanly(ros: Any, process: Any, times: int, *nodes: str) -> None:

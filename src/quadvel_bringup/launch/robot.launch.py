@@ -13,7 +13,7 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from quadvel_bringup.nodes import NODES
+from quadvel_bringup.nodes import NODES, enclave
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 ARGUMENTS = [
@@ -49,6 +49,7 @@ def start(context: LaunchContext) -> list[Action]:
             executable=name,
             name=name,
             output="screen",
+            ros_arguments=enclave(name),
             parameters=[str(stack.parameters), *([overrides] if overrides else [])],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )

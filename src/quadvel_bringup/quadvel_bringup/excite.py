@@ -28,7 +28,7 @@ from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 
 from .alone import ensure_alone
 from .node_output import PrefixedOutput
-from .nodes import command
+from .nodes import command, enclave
 from .processes import ProcessGroup, StopSignals
 from .stack import PARAMETERS
 
@@ -210,7 +210,7 @@ def _propose(report: Path, console: Console) -> None:
 def sim_arguments(**parameters: Any) -> list[str]:
     """Arguments of a simulator that stands, in lockstep, at 1 kHz."""
     lockstep = {"mode": "lockstep", "state_rate": 1000, "keyframe": "stand", "answer_timeout": ANSWER_TIMEOUT}
-    words = ["--ros-args", "--params-file", str(PARAMETERS.resolve())]
+    words = ["--ros-args", *enclave("sim_node"), "--params-file", str(PARAMETERS.resolve())]
     for name, value in {**lockstep, **parameters}.items():
         words += ["-p", f"{name}:={json.dumps(value)}"]
     return words
@@ -230,7 +230,7 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
     columns = (TextColumn("{task.completed:5.1f} of {task.total:.1f} s"), BarColumn(), TimeElapsedColumn())
     bar = Progress(*columns, console=console)
 
-    rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+    rclpy.init(args=["--ros-args", *enclave("excite")], signal_handler_options=SignalHandlerOptions.NO)
     clock = [Parameter("use_sim_time", value=bool(nodes))]
     node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:

@@ -62,6 +62,11 @@ def run(name: str, arguments: Sequence[str]) -> None:
     import_module(module).main()
 
 
+def enclave(name: str) -> list[str]:
+    """The arguments of ROS 2 that name a process's rights under SROS 2 (docs/security.md); without it they change nothing."""
+    return ["--enclave", f"/quadvel/{name}"]
+
+
 def command(name: str, arguments: Sequence[str] = ()) -> list[str]:
     """The command line that runs a node as a process of its own."""
     entry(name)

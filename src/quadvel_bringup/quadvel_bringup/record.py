@@ -36,7 +36,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     with (
         StopSignals() as signals,
         console.status("recording; Ctrl-C stops") as status,
-        Session("recorder") as session,
+        Session("recorder", rights="recorder") as session,
         Recorder(session.node, path) as recorder,
     ):
         try:

@@ -15,7 +15,7 @@ from quadvel_eval.script import SCRIPTS
 
 from .alone import ensure_alone
 from .node_output import PrefixedOutput
-from .nodes import command
+from .nodes import command, enclave
 from .processes import ProcessGroup, StopSignals
 
 RECORDED = {
@@ -74,7 +74,7 @@ class ScriptedWalk:
 
         from .recorder import Recorder
 
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=["--ros-args", *enclave("recorder")], signal_handler_options=SignalHandlerOptions.NO)
         use_sim_time = Parameter("use_sim_time", value=self._lockstep)
         node = rclpy.create_node("recorder", parameter_overrides=[use_sim_time])
         executor = SingleThreadedExecutor()
@@ -100,7 +100,7 @@ class ScriptedWalk:
             group.start(name, line)
         planner = {"script": self._script, "use_sim_time": str(self._lockstep).lower()}
         arguments = [word for name, value in planner.items() for word in ("-p", f"{name}:={value}")]
-        group.start("planner", command("planner", ["--ros-args", *arguments]))
+        group.start("planner", command("planner", ["--ros-args", *enclave("planner"), *arguments]))
 
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
         """Record until one of the nodes ends: the planner, if all goes well."""

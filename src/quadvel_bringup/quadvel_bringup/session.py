@@ -17,6 +17,8 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from .nodes import enclave
+
 PATIENCE = 4.0
 """s to find out whether somebody is there: on a busy machine discovery takes a second, and where Fast DDS has missed the first
 announcements the next ones come 3 s later"""
@@ -33,11 +35,14 @@ class NobodyThere(ConnectionError):
 class Session:
     """A node and the executor that serves it. To be entered: outside of that they do not exist."""
 
-    def __init__(self, name: str) -> None:
-        self._name = name
+    def __init__(self, name: str, rights: str = "operator") -> None:
+        """rights: the SROS 2 enclave of the node `name`."""
+        self._name, self._rights = name, rights
 
     def __enter__(self) -> Session:
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(
+            args=["--ros-args", *enclave(self._rights)], signal_handler_options=SignalHandlerOptions.NO
+        )
         self.node: Any = rclpy.create_node(self._name)
         self.executor = SingleThreadedExecutor()
         self.executor.add_node(self.node)

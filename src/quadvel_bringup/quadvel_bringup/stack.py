@@ -9,7 +9,7 @@ from pathlib import Path
 
 import attrs
 
-from .nodes import command
+from .nodes import command, enclave
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
@@ -116,14 +116,14 @@ class Stack:
 
     def arguments(self) -> dict[str, list[str]]:
         """The same as arguments of ROS 2."""
-        return {name: self._arguments(values) for name, values in self.overrides().items()}
+        return {name: self._arguments(name, values) for name, values in self.overrides().items()}
 
     def commands(self) -> dict[str, list[str]]:
         """The same as command lines, which run each node as a process of its own."""
         return {name: command(name, arguments) for name, arguments in self.arguments().items()}
 
-    def _arguments(self, values: Parameters) -> list[str]:
-        arguments = ["--ros-args", "--params-file", str(self.parameters.resolve())]
+    def _arguments(self, node: str, values: Parameters) -> list[str]:
+        arguments = ["--ros-args", *enclave(node), "--params-file", str(self.parameters.resolve())]
         for name, value in values.items():
             # JSON is YAML with quotes, and without them a file named "1" would be a number.
             arguments += ["-p", f"{name}:={json.dumps(value)}"]

@@ -11,7 +11,10 @@ import attrs
 import yaml
 
 SCOPE_KEY = "ros__parameters"
-FLAGS = {"-p": "p", "--param": "p", "-r": "r", "--remap": "r", "--params-file": "file", "--log-level": "log"}
+FLAGS = {
+    "-p": "p", "--param": "p", "-r": "r", "--remap": "r", "--params-file": "file", "--log-level": "log",
+    "-e": "enclave", "--enclave": "enclave",
+}  # fmt: skip
 IGNORED_FLAGS = {f"--{on}-{what}" for on in ("enable", "disable") for what in ("rosout-logs", "stdout-logs")}
 
 
@@ -90,9 +93,9 @@ def _parse_one(flag: str, following: Iterator[str], found: RosArguments) -> None
         found.remappings.append(parse_rule(flag, value))
     elif FLAGS[flag] == "file":
         found.overrides += read_parameter_file(Path(value))
-    else:
+    elif FLAGS[flag] == "log":
         name, _, level = value.rpartition(":=")
-        found.log_levels[name] = level
+        found.log_levels[name] = level  # an enclave means nothing without security, which Context refuses
 
 
 def parse_rule(flag: str, text: str) -> Rule:

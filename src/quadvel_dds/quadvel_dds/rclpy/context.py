@@ -41,6 +41,10 @@ class Context(Partial):
             if not text.isdecimal() or int(text) > 232:
                 raise ValueError(f"ROS_DOMAIN_ID is '{text}', expected a number from 0 to 232")
             domain_id = int(text)
+        if os.environ.get("ROS_SECURITY_ENABLE") == "true":
+            raise ValueError(
+                "ROS_SECURITY_ENABLE is 'true', but the embedded middleware has no security; use ROS 2's rclpy"
+            )
         self._domain_id = domain_id
         self.arguments = arguments.parse(sys.argv if args is None else args)
         set_levels(self.arguments.log_levels)
