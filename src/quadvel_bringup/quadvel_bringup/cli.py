@@ -115,6 +115,13 @@ def up(
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
     ] = None,
     terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(
+            help="Simulated robot: what is around it, corridor, park, campus or a file.",
+            show_default="nothing",
+        ),
+    ] = None,
     actuator: Annotated[
         Path | None,
         typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
@@ -138,6 +145,7 @@ def up(
         low_level=low_level,
         policy=policy,
         terrain=terrain,
+        world=world,
         actuator=actuator,
         estimator=estimator,
         parameters=params,

@@ -10,6 +10,7 @@ from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_sim.checks import number, numbers, whole_number
 from quadvel_sim.terrain import Terrain
+from quadvel_sim.world import World
 
 
 @attrs.frozen
@@ -34,6 +35,8 @@ class SimulatorConfig:
 
     actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
     terrain: Terrain = attrs.field(factory=Terrain)
+    world: World | None = None
+    """What is around the robot, ground included; without one there is the terrain alone."""
     noise: SensorNoise = attrs.field(factory=SensorNoise)
     seed: int = attrs.field(default=0, **whole_number())
     """Of torque and sensor noise; the ground has its own."""
@@ -57,3 +60,9 @@ class SimulatorConfig:
     """Gain of that brake, N m s/rad."""
     fall_tilt: float = attrs.field(default=1.0, **number(0.1, np.pi))
     """Angle of the trunk's z axis to the vertical (rad) beyond which the robot counts as fallen."""
+
+    def __attrs_post_init__(self) -> None:
+        if self.world is not None and self.terrain.kind != "flat":
+            raise ValueError(
+                f"SimulatorConfig.terrain: found {self.terrain.kind!r} in a world, which brings its own ground; expected 'flat'"
+            )
