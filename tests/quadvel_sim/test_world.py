@@ -139,7 +139,8 @@ def test_persons_are_tracked_where_they_are() -> None:
         Person(way=[[2.0, -2.0], [2.5, 3.0]], led=True, speed=0.9),
         Person(way=[[5.0, 2.0], [3.0, -3.0]], pace=0.2),
     ]
-    world = World(persons=persons, trees=[Trees(positions=[[4.0, 3.5], [3.0, -4.0]])])
+    laser = Laser(field_of_view=180.0, rays=540)
+    world = World(laser=laser, persons=persons, trees=[Trees(positions=[[4.0, 3.5], [3.0, -4.0]])])
     simulator, tracker, errors = Simulator(SimulatorConfig(world=world)), PersonTracker(), []
     offset = world.laser.position
     for k in range(80):

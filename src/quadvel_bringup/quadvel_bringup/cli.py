@@ -333,6 +333,12 @@ def people(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
+def world(context: typer.Context) -> None:
+    """Check a world's file, and draw the world from above."""
+    _hand_on(context, "quadvel_eval.world_map:world_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
 def bench(context: typer.Context) -> None:
     """Measure the speed of simulator, policy and loop on this machine."""
     _hand_on(context, "quadvel_eval.cli:bench_command")

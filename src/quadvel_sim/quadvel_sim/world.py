@@ -281,6 +281,11 @@ class Hill:
         """Rise a metre along it and across it, (2,)."""
         return np.tan(np.radians([self.slope, self.slope if self.sides is None else self.sides]))
 
+    @property
+    def top(self) -> Array:
+        """Along and across, of its level top, (2,), m."""
+        return np.asarray(self.size - 2.0 * self.height / self._steepness)
+
     def above(self, x: Array, y: Array) -> Array:
         """Its height at `x`, `y` (m, of one shape), zero beside it."""
         away = np.stack([x - self.position[0], y - self.position[1]], axis=-1) @ _rotation(
@@ -292,7 +297,7 @@ class Hill:
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
         """A convex mesh of the corners of foot and top."""
         foot = 0.5 * self.size * [[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]
-        top = foot - np.sign(foot) * self.height / self._steepness
+        top = 0.5 * self.top * np.sign(foot)
         corners = np.vstack(
             [np.column_stack([foot, np.zeros(4)]), np.column_stack([top, np.full(4, self.height)])]
         )
