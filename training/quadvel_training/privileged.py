@@ -172,6 +172,15 @@ class Judgement:
         self._sum[ids], self._age[ids] = 0.0, 0.0
         return np.stack([np.hypot(mean[:, 0], mean[:, 1]), np.abs(mean[:, 2])], axis=1), judged
 
+    def tell(self, grid: CommandGrid, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
+        """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
+        ids = np.flatnonzero(over)
+        if not len(ids):
+            return
+        error, judged = self.close(ids)
+        tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
+        grid.note(command[ids][tells], error[tells], fell[ids][tells])
+
 
 class PrivilegedRun:
     """Environment and learner of stage 1."""
@@ -283,7 +292,7 @@ class PrivilegedRun:
             stride = self.past.stride
             errors = np.hypot(stride[:, 0], stride[:, 1]).mean(), np.abs(stride[:, 2]).mean()
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
-            self._judge(command, fell | late | env.changed, fell)
+            self.judgement.tell(self.grid, command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
         self.samples += c.length * c.n
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
@@ -303,15 +312,6 @@ class PrivilegedRun:
             "contact_ratio": contact,
             "reward": float(t["reward"].mean()),
         } | {f"reward/{name}": value for name, value in terms.items()}
-
-    def _judge(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
-        """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
-        ids = np.flatnonzero(over)
-        if not len(ids):
-            return
-        error, judged = self.judgement.close(ids)
-        tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
-        self.grid.note(command[ids][tells], error[tells], fell[ids][tells])
 
 
 class Numbered:
