@@ -28,6 +28,7 @@ from quadvel_sim import persons
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.laser import Scan
 from quadvel_sim.surroundings import Surroundings, is_ground
+from quadvel_sim.world import SURFACE_PRIORITY
 
 __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 
@@ -93,6 +94,12 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     model = spec.compile()
     for leg, friction in zip(robot.LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
+    config.physics.apply(model)
+    foot, own = model.geom(f"{robot.LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
+    model.geom_solref[own], model.geom_condim[own] = (
+        foot.solref,
+        foot.condim,
+    )  # friction alone is a surface's own
     disable = mujoco.mjtDisableBit
     model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a new start
     model.opt.disableflags |= disable.mjDSBL_ISLAND  # the robot is one island; finding that out costs 10 %
@@ -208,7 +215,8 @@ class Simulator:
     def step(self, n: int = 1) -> None:
         """Advance by `n` ms. FloatingPointError where the physics diverged."""
         model, data, q, dq = self.model, self.data, self._q, self._dq
-        torque, answer, surroundings = data.ctrl, self.actuator.step, self._surroundings
+        torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
+        surroundings = self._surroundings
         for _ in range(n):
             torque[:] = answer(q, dq, *self._law)
             if self._sampled:  # all that depends on positions and velocities alone is there
@@ -216,6 +224,8 @@ class Simulator:
                 self._sampled = False
             else:
                 mujoco.mj_step(model, data)
+            if more:
+                mujoco.mj_step(model, data, more)
             self._command_left -= 1
             if self._command_left == 0:
                 self._law = self._brake

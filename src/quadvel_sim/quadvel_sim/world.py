@@ -29,6 +29,8 @@ FOLDER = Path(__file__).parent / "worlds"
 SHIPPED = ("corridor", "park", "campus")
 LOW = 0
 """Group of what lies so low that a laser need not see it"""
+SURFACE_PRIORITY = 2
+"""Of geoms of grass, gravel and hills, above the feet's 1: the surface tells the friction"""
 STEEPEST = 15.0  # deg
 _DEEP = 0.3  # m, by which what stands on the ground goes into it
 _STEP = 0.05  # m between the points of a patch's heights
@@ -36,7 +38,6 @@ _RIM = 0.005  # m, of a patch above the ground around it
 _LEG_RADIUS, _BOARD = 0.025, 0.03  # m, of tables
 _ARC = 8  # points of a turn
 _SOLREF = (0.01, 1.0)  # of all contacts, as the robot's own
-_PRIORITY = 2  # above the feet's 1: the surface tells the friction
 
 
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
@@ -235,7 +236,7 @@ class Patch:
             pos=[*self.position, 0.0],
             quat=_about_z(np.radians(self.yaw)),
             friction=[friction, 0.02, 0.01],
-            priority=_PRIORITY,
+            priority=SURFACE_PRIORITY,
             group=LOW,
             rgba=_COLOURS[self.surface],
         )
@@ -312,7 +313,7 @@ class Hill:
             type=mujoco.mjtGeom.mjGEOM_MESH,
             meshname=name,
             friction=[SURFACES[self.surface].friction, 0.02, 0.01],
-            priority=_PRIORITY,
+            priority=SURFACE_PRIORITY,
             rgba=_COLOURS[self.surface],
         )
 
