@@ -61,7 +61,14 @@ def _ground(axes: Axes, world: World) -> None:
     for hill in world.hills:
         _rectangle(axes, hill.position, hill.size, hill.yaw, GROUND[hill.surface], edge="0.5", label="hill")
         _rectangle(axes, hill.position, hill.top, hill.yaw, "none", edge="0.5")
-        axes.annotate(f"{hill.slope:g}°", hill.position, ha="center", va="center", fontsize=7, zorder=5)
+        axes.annotate(
+            f"{hill.slope:g}°",
+            (hill.position[0], hill.position[1]),
+            ha="center",
+            va="center",
+            fontsize=7,
+            zorder=5,
+        )
 
 
 def _things(axes: Axes, world: World) -> None:

@@ -271,29 +271,21 @@ class Hill:
     surface: str = attrs.field(default="paved", **one_of(list(SURFACES)))
 
     def __attrs_post_init__(self) -> None:
-        highest = 0.98 * float((0.5 * self.size * self._steepness).min())
+        highest = 0.98 * float((0.5 * self.size * self.steepness).min())
         if self.height > highest:
             raise ValueError(
                 f"Hill.height: found {self.height:g}, expected at most {highest:.3g}, as slopes of its size meet above that"
             )
 
     @property
-    def _steepness(self) -> Array:
+    def steepness(self) -> Array:
         """Rise a metre along it and across it, (2,)."""
         return np.tan(np.radians([self.slope, self.slope if self.sides is None else self.sides]))
 
     @property
     def top(self) -> Array:
         """Along and across, of its level top, (2,), m."""
-        return np.asarray(self.size - 2.0 * self.height / self._steepness)
-
-    def above(self, x: Array, y: Array) -> Array:
-        """Its height at `x`, `y` (m, of one shape), zero beside it."""
-        away = np.stack([x - self.position[0], y - self.position[1]], axis=-1) @ _rotation(
-            np.radians(self.yaw)
-        )
-        rise = (0.5 * self.size - np.abs(away)) * self._steepness
-        return np.asarray(np.clip(rise.min(-1), 0.0, self.height))
+        return np.asarray(self.size - 2.0 * self.height / self.steepness)
 
     def add_to(self, spec: mujoco.MjSpec, name: str, world: World) -> None:
         """A convex mesh of the corners of foot and top."""
@@ -448,11 +440,26 @@ class World:
 
     def height(self, x: ArrayLike, y: ArrayLike) -> Array:
         """Height of the ground (m) at `x`, `y` (m, shapes that broadcast), the bumps of patches apart."""
-        x, y = np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float))
-        heights = np.zeros(x.shape)
-        for hill in self.hills:
-            heights = np.maximum(heights, hill.above(x, y))
-        return heights
+        place = np.stack(np.broadcast_arrays(np.asarray(x, float), np.asarray(y, float)), axis=-1)
+        if not self.hills:
+            return np.zeros(place.shape[:-1])
+        centre, turn, half, steepness, top = self._hills
+        away = ((place[..., None, :] - centre)[..., None, :] @ turn)[
+            ..., 0, :
+        ]  # (..., hills, 2), along and across each
+        rise = ((half - np.abs(away)) * steepness).min(-1)
+        return np.asarray(np.minimum(rise, top).max(-1).clip(0.0))
+
+    @cached_property
+    def _hills(self) -> tuple[Array, ...]:
+        """Of all hills: centres, rotations, half sizes, steepnesses, heights."""
+        return (
+            np.array([hill.position for hill in self.hills]),
+            np.array([_rotation(np.radians(hill.yaw)) for hill in self.hills]),
+            np.array([0.5 * hill.size for hill in self.hills]),
+            np.array([hill.steepness for hill in self.hills]),
+            np.array([hill.height for hill in self.hills]),
+        )
 
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add all that stands still to the robot's `spec`, as geoms of the world body that are named after their parts."""
