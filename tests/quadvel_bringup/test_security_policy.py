@@ -37,7 +37,7 @@ for kind in ("publisher", "subscription", "service", "client"):
 for module in map(import_module, sys.argv[1:]):
     (make,) = [one for _, one in inspect.getmembers(module, inspect.isclass)
                if issubclass(one, Node) and one.__module__ == module.__name__]
-    rclpy.init(args=["node", "--ros-args", "-p", "board:port:=0", "-p", "driver:board_address:=127.0.0.1"])
+    rclpy.init(args=["node", "--ros-args", "-p", "board:port:=0", "-p", "driver:board_address:=127.0.0.1", "-p", "view:port:=0"])
     make().destroy_node()
     rclpy.shutdown()
 print(json.dumps(created))
