@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
 from quadvel_description import robot
-from quadvel_recordings.definitions import STORE
-from quadvel_recordings.recorded import _default
 from quadvel_view.operator import Operator
 from quadvel_view.panel import panel
 from quadvel_view.picture import RobotPicture
 
-
-def message(typename: str, **fields: Any) -> Any:
-    """A message of this type, its fields at their defaults but for those given."""
-    made = STORE.types[typename](*(_default(typename, *field) for field in STORE.fielddefs[typename][1]))
-    for name, value in fields.items():
-        setattr(made, name, value)
-    return made
-
-
-def odometry(x: float, y: float) -> Any:
-    odom = message("nav_msgs/msg/Odometry")
-    odom.pose.pose.position.x, odom.pose.pose.position.y, odom.pose.pose.position.z = x, y, 0.4
-    odom.twist.twist.linear.x = 0.7
-    return odom
+from .conftest import message, odometry
 
 
 def test_joints_are_taken_by_their_names() -> None:

@@ -192,6 +192,21 @@ def drive(
 
 
 @app.command()
+def teleop(
+    by: Annotated[Literal["keyboard", "gamepad"], typer.Argument(help="What the hands are on.")] = "keyboard",
+) -> None:
+    """Drive the robot by the keys of this terminal, or by a gamepad: it goes while something is held, and stands once it is let go.
+
+    \b
+    For example:
+      quadvel teleop
+      quadvel teleop gamepad
+    """
+    module = _with_middleware("teleop")
+    raise typer.Exit(module.by_keyboard() if by == "keyboard" else module.by_gamepad())
+
+
+@app.command()
 def mode(
     wanted: Annotated[
         Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="MODE")

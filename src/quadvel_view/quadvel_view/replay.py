@@ -17,9 +17,9 @@ from .viewer import FRAME, Viewer
 def replay(
     path: Path, host: str, port: int, is_over: Callable[[float], bool], tell: Callable[[str], None]
 ) -> None:
-    """Serve the page until `is_over(seconds)`, which waits for so long, says so. tell: told the address.
+    """Serve the page, where it plays while somebody watches, until `is_over(seconds)`, which waits for so long, says so.
 
-    Raises RecordingError, OSError, and AddressError where the page can't be served.
+    tell: told the address. Raises RecordingError, OSError, and AddressError where the page can't be served.
     """
     playback = Playback(path)
     words: SimpleQueue[dict[str, Any]] = SimpleQueue()
@@ -30,7 +30,8 @@ def replay(
         then = time.monotonic()
         while not is_over(FRAME):
             now = time.monotonic()
-            playback.advance(now - then)
+            if viewer.is_watched:
+                playback.advance(now - then)
             then = now
             while (word := _next(words)) is not None:
                 heed(playback, word)

@@ -3,6 +3,9 @@
 viser itself asks nobody who he is, so it listens on this host's loopback interface, and what reaches it from a browser has
 passed here: the token where there is one, a Host that is ours where there is none (against names that somebody lets point
 at this host), and for WebSockets an Origin that is our own page (against other pages in the operator's browser).
+
+Where the page is called 127.0.0.1 its scene is called localhost, and the other way round: to the browser these are two sites,
+each with a process of its own, so that drawing never keeps pad and STOP waiting.
 """
 
 from __future__ import annotations
@@ -35,13 +38,18 @@ KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg":
 PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE, WORDS = "/scene", "/words"
 LARGEST_WORD = 4096  # bytes that a page says at once
+LOOPBACK = "http://127.0.0.1:* http://localhost:*"
 # What a browser may load for our pages: nothing from any other host. viser's page is one file that unpacks itself.
 POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; "
-    "form-action 'none'; frame-ancestors 'self'"
+    f"form-action 'none'; frame-src 'self' {LOOPBACK}; frame-ancestors 'self' {LOOPBACK}"
 )
-# viser's own panel and notes have no place beside ours: of its page there is the picture alone.
-PICTURE_ALONE = b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
+# viser's own panel and notes have no place beside ours: of its page there is the picture alone. It looks for its server while
+# it has the focus, which stays with our page.
+PICTURE_ALONE = (
+    b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
+    b"<script>document.hasFocus = () => true;</script>"
+)
 
 
 class AddressError(ValueError):
@@ -122,6 +130,11 @@ class PageServer:
         host = f"[{self._host}]" if ":" in self._host else self._host
         query = f"?token={self._guard.token}" if self._guard.token else ""
         return f"http://{host}:{self._port}/{query}"
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether a page is open."""
+        return bool(self._pages)
 
     def tell(self, words: dict[str, Any]) -> None:
         """Say something to every page; from any thread."""

@@ -100,7 +100,9 @@ class View(Node):
         )
 
     def _show(self) -> None:
-        """Thirty times a second: read what came, draw it."""
+        """Thirty times a second: read what came, draw it, where somebody looks or a STOP waits to be seen through."""
+        if not self._viewer.is_watched and not self._operator.stopped:
+            return
         now = time.monotonic()
         for topic, waiting in self._waiting.items():
             while waiting:

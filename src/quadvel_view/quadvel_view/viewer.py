@@ -41,6 +41,11 @@ class Viewer:
             raise
         self.url = self._page.url
 
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody has the page open."""
+        return self._page.is_watched
+
     def show(self, picture: RobotPicture, operator: Operator, now: float, **more: Any) -> None:
         """One picture, and the readings, to which `more` is added. now: s, on the clock of the picture."""
         self._scene.draw(picture)

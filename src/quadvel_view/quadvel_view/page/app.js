@@ -104,6 +104,8 @@ addEventListener("keydown", (event) => {
 });
 addEventListener("keyup", (event) => { if (held.keys.delete(event.code)) speak(); });
 for (const over of ["blur", "pagehide"]) addEventListener(over, letGo);
+// A click into the scene must not keep the space bar from us.
+addEventListener("blur", () => setTimeout(() => { if (document.activeElement === $("scene")) { $("scene").blur(); window.focus(); } }));
 document.addEventListener("visibilitychange", () => { if (document.hidden) letGo(); });
 setInterval(speak, AGAIN);
 
@@ -119,9 +121,9 @@ function show(news) {
   $("operator").hidden = playing;
   $("playback").hidden = !playing;
   $("simulation").hidden = !news.simulated;
-  $("mode").textContent = news.mode.replace("_", " ") || "silent";
+  $("mode").textContent = news.mode.replace("_", " ") || (playing ? "recording" : "silent");
   $("mode").className = `pill ${news.mode}`;
-  $("reason").textContent = news.refusal || news.reason;
+  $("reason").textContent = playing && !news.mode ? news.playback.name : news.refusal || news.reason;
   $("stop").innerHTML = news.stopped ? "<b>STOPPED</b><small>press to release</small>" : "<b>STOP</b><small>space</small>";
   $("said").textContent = news.said || "";
   $("record").classList.toggle("on", Boolean(news.recording));
@@ -229,4 +231,8 @@ $("time").addEventListener("input", () => { seeking = true; say({ do: "seek", ti
 $("time").addEventListener("change", () => { seeking = false; });
 document.querySelectorAll("#paces button").forEach((one) => one.addEventListener("click", () => say({ do: "pace", pace: Number(one.dataset.pace) })));
 setInterval(drawReadings, 100);
+
+// Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours.
+const OTHER_NAME = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
+$("scene").src = `${location.protocol}//${OTHER_NAME[location.hostname] || location.hostname}:${location.port}/scene/?darkMode`;
 connect();
