@@ -164,6 +164,8 @@ def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
     page.page.mouse.up()
     page.page.click("#stop")
     page.until("!state.stopped")
+    page.page.click("[data-do=reset]")
+    page.until("state.said.includes('lie')")
     page.page.click("[data-do=stand_up]")
     page.until("state.mode === 'stance'")
 

@@ -156,7 +156,12 @@ def view(
         str,
         typer.Option(help="Address to listen on; others than this host's own need the token that is shown."),
     ] = "127.0.0.1",
-    port: Annotated[int | None, typer.Option(help="TCP port.", show_default="8765")] = None,
+    port: Annotated[
+        int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
+    ] = None,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve the topics to Foxglove or Lichtblick instead of a page.")
+    ] = False,
 ) -> None:
     """Show the robot in the browser, in 3-D, with all that its operator needs; or play a recording of it.
 
@@ -169,7 +174,7 @@ def view(
     """
     from .view import view as run_view
 
-    run_view(recording, host, port)
+    run_view(recording, host, port, foxglove)
 
 
 @app.command()

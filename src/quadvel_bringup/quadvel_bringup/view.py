@@ -4,15 +4,29 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import quadvel_dds
+
 from . import nodes
 from .processes import StopSignals
 
 
-def view(recording: Path | None, host: str, port: int | None) -> None:
-    """Serve the page until Ctrl-C. host: the address to listen on. port: None for the node's own.
+def view(recording: Path | None, host: str, port: int | None, for_foxglove: bool) -> None:
+    """Serve the page until Ctrl-C, or the topics for Foxglove. host: the address to listen on. port: None for the usual one.
 
     Raises ValueError or OSError, of which AddressError and RecordingError are kinds, where that can't be.
     """
+    if for_foxglove:
+        if recording is not None:
+            raise ValueError(
+                f"{recording}: Foxglove opens recordings itself; --foxglove serves a robot that runs"
+            )
+        quadvel_dds.install()
+        from quadvel_view import foxglove_live
+
+        from .foxglove import serve
+
+        serve(host, foxglove_live.PORT if port is None else port)
+        return
     if recording is None:
         given = {"host": host} | ({} if port is None else {"port": port})
         nodes.run("view", nodes.parameters(given))

@@ -17,7 +17,7 @@ from .server import PageServer
 
 FRAME = 1.0 / 30.0
 """s, between two pictures"""
-PORT = 8765
+PORT = 8770
 """TCP port of the page, unless told otherwise"""
 
 

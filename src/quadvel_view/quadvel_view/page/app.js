@@ -102,7 +102,7 @@ addEventListener("keydown", (event) => {
     held.keys.add(event.code);
   }
 });
-addEventListener("keyup", (event) => { if (held.keys.delete(event.code)) speak(); });
+addEventListener("keyup", (event) => { if (event.code === "Space") event.preventDefault(); if (held.keys.delete(event.code)) speak(); });
 for (const over of ["blur", "pagehide"]) addEventListener(over, letGo);
 // A click into the scene must not keep the space bar from us.
 addEventListener("blur", () => setTimeout(() => { if (document.activeElement === $("scene")) { $("scene").blur(); window.focus(); } }));
