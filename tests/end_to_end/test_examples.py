@@ -90,6 +90,7 @@ LEFT_OUT = {
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
     "quadvel view": "the same page, beside a robot that runs",
     "quadvel view out/demo/demo.mcap": "tests/quadvel_view/test_page.py plays one",
+    "quadvel view --foxglove": "tests/quadvel_view/test_foxglove.py asks such a server",
     "quadvel teleop": "tests/end_to_end/test_operator.py types its keys",
     "quadvel teleop gamepad": "needs a gamepad; tests/quadvel_view/test_hands.py has its events",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
