@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_sim.checks import number, numbers, whole_number
+from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
 
@@ -49,6 +50,8 @@ class SimulatorConfig:
     """Coulomb friction, (12,), N m."""
     joint_damping: NDArray[np.float64] = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
     """Viscous friction, (12,), N m s/rad."""
+    physics: Physics = attrs.field(factory=Physics)
+    """How motion and contact are solved."""
     hung: bool = False
     """Whether the trunk is held in the air, as on a stand."""
     watchdog: float = attrs.field(default=0.02, **number(0.001))

@@ -85,6 +85,7 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     model = spec.compile()
     for leg, friction in zip(robot.LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
+    config.physics.apply(model)
     disable = mujoco.mjtDisableBit
     model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a new start
     model.opt.disableflags |= disable.mjDSBL_ISLAND  # the robot is one island; finding that out costs 10 %
@@ -194,7 +195,7 @@ class Simulator:
     def step(self, n: int = 1) -> None:
         """Advance by `n` ms. FloatingPointError where the physics diverged."""
         model, data, q, dq = self.model, self.data, self._q, self._dq
-        torque, answer = data.ctrl, self.actuator.step
+        torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
         for _ in range(n):
             torque[:] = answer(q, dq, *self._law)
             if self._sampled:  # all that depends on positions and velocities alone is there
@@ -202,6 +203,8 @@ class Simulator:
                 self._sampled = False
             else:
                 mujoco.mj_step(model, data)
+            if more:
+                mujoco.mj_step(model, data, more)
             self._command_left -= 1
             if self._command_left == 0:
                 self._law = self._brake
