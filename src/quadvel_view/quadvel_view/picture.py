@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description import robot
-from quadvel_description.kinematics import rotate
+from quadvel_description.kinematics import foot_positions, rotate
 
 Array = NDArray[np.float64]
 
@@ -100,6 +100,16 @@ class RobotPicture:
     def is_fresh(self, topic: str, now: float) -> bool:
         """Whether something came on a topic within the last second."""
         return now - self._heard.get(topic, -np.inf) < FRESH
+
+    def above_floor(self) -> float:
+        """How far the lowest foot is above the ground, m, as odometry and ground have it: what they are off each other, mostly."""
+        feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
+        x, y, z = feet[feet[:, 2].argmin()]
+        floor = 0.0
+        if self.ground is not None:
+            away = (self.ground.vertices[:, 0] - x) ** 2 + (self.ground.vertices[:, 1] - y) ** 2
+            floor = float(self.ground.vertices[away.argmin(), 2])
+        return float(z) - robot.FOOT_RADIUS - floor
 
     def forget_the_past(self) -> None:
         """As after a jump in time: nothing was heard, and there is no way behind."""

@@ -31,6 +31,7 @@ GROUND: Colour = (58, 66, 72)
 SCAN, TRAIL, PATH = (64, 196, 255), (72, 110, 150), (120, 230, 140)
 PERSON_HEIGHT, PERSON_RADIUS = 1.7, 0.2  # m
 CORNER = 0.012  # m, by which edges of boxes are rounded, so that light catches them
+LIFTING = 0.15  # share of what the feet are off the floor that is made up for in a picture: they may leave it for a moment
 ABOVE = 0.006  # m, of lines over the floor that they lie on
 CAMERA = (1.2, -1.3, 0.6)
 """m, from the robot"""
@@ -68,12 +69,15 @@ class Scene:
             fade_distance=14.0,
             shadow_opacity=0.35,
         )
+        self._lifted = 0.0  # m, by which odometry has the robot too high; its height drifts
         self._drawn: dict[str, Any] = {}
         self._persons: dict[int, Any] = {}
 
     def draw(self, picture: RobotPicture) -> None:
         """Show the picture."""
         x, y, z = picture.position.tolist()
+        self._lifted += LIFTING * (picture.above_floor() - self._lifted)
+        z -= self._lifted
         with self._server.atomic():
             self._base.position, self._base.wxyz = (0.0, 0.0, z - robot.NOMINAL_HEIGHT), picture.quaternion
             self._world.position = (-x, -y, -robot.NOMINAL_HEIGHT)
