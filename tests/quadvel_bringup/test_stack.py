@@ -34,6 +34,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
     from quadvel_sim.parameters import BoardParameters, SimParameters
+    from quadvel_view.view_node import ViewParameters
 
     classes: dict[str, type[attrs.AttrsInstance]] = {
         "sim_node": SimParameters,
@@ -43,6 +44,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
         "planner": PlannerParameters,
+        "view": ViewParameters,
     }
     return {
         name: {

@@ -5,8 +5,9 @@ The one table of nodes; the entry points in the packages' setup.cfg files name t
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 import attrs
@@ -33,6 +34,7 @@ NODES = {
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
     "person_tracker": NodeEntry("quadvel_follow.person_tracker_node", "persons in the scans of a 2-D laser"),
+    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
     "planner": NodeEntry(
         "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
     ),
@@ -60,6 +62,13 @@ def run(name: str, arguments: Sequence[str]) -> None:
     quadvel_dds.install()
     sys.argv = [name, *arguments]
     import_module(module).main()
+
+
+def parameters(values: Mapping[str, bool | str | int | float]) -> list[str]:
+    """Parameters as arguments of ROS 2."""
+    # JSON is YAML with quotes, and without them a file named "1" would be a number.
+    pairs = [("-p", f"{name}:={json.dumps(value)}") for name, value in values.items()]
+    return ["--ros-args", *(word for pair in pairs for word in pair)]
 
 
 def command(name: str, arguments: Sequence[str] = ()) -> list[str]:

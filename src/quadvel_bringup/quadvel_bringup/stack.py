@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import attrs
 
-from .nodes import command
+from .nodes import command, parameters
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
@@ -119,16 +118,17 @@ class Stack:
         """The same as arguments of ROS 2."""
         return {name: self._arguments(values) for name, values in self.overrides().items()}
 
+    def view_arguments(self) -> list[str]:
+        """Those of the node `view` beside them; it is no part of the robot, and stays in the time of who looks at it."""
+        return self._arguments({})
+
     def commands(self) -> dict[str, list[str]]:
         """The same as command lines, which run each node as a process of its own."""
         return {name: command(name, arguments) for name, arguments in self.arguments().items()}
 
     def _arguments(self, values: Parameters) -> list[str]:
-        arguments = ["--ros-args", "--params-file", str(self.parameters.resolve())]
-        for name, value in values.items():
-            # JSON is YAML with quotes, and without them a file named "1" would be a number.
-            arguments += ["-p", f"{name}:={json.dumps(value)}"]
-        return arguments
+        first, *rest = parameters(values)
+        return [first, "--params-file", str(self.parameters.resolve()), *rest]  # what comes later counts
 
 
 def _found(world: str | None) -> str | None:
