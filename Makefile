@@ -79,15 +79,15 @@ $(PY):
 
 $(VENV)/.run: $(PY) $(LOCKED)
 	@echo "Installing what quadvel needs into $(VENV) (a few minutes the first time) ..."
-	$(PY) $(INSTALL) '.[video]'
+	$(PY) $(INSTALL) '.[video,view]'
 	@touch $@
 
 $(VENV)/.lint: $(VENV)/.run
-	$(PY) $(INSTALL) '.[video,lint]'
+	$(PY) $(INSTALL) '.[video,view,lint]'
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
-	$(PY) $(INSTALL) '.[video,test,train]'
+	$(PY) $(INSTALL) '.[video,view,test,train]'
 	@touch $@
 
 # The wheels are for x86-64 alone, and our interfaces are compiled: looked at before anything is installed.
@@ -97,10 +97,10 @@ $(ROS_PY): $(PY) $(BUILD_INTERFACES)
 
 $(ROS_VENV)/.run: $(ROS_PY) $(LOCKED) $(INTERFACES)
 	@echo "Installing ROS 2's rclpy and what quadvel needs into $(ROS_VENV) (a few minutes the first time) ..."
-	$(ROS_PY) $(INSTALL) '.[video,ros]'
+	$(ROS_PY) $(INSTALL) '.[video,view,ros]'
 	$(ROS_PY) $(BUILD_INTERFACES)
 	@touch $@
 
 $(ROS_VENV)/.test: $(ROS_VENV)/.run
-	$(ROS_PY) $(INSTALL) '.[video,ros,test]'
+	$(ROS_PY) $(INSTALL) '.[video,view,ros,test]'
 	@touch $@

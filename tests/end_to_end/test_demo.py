@@ -33,7 +33,8 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
     assert "refused mode" not in ended.stdout
     summary = json.loads((out / "summary.json").read_text())
     assert sorted(summary) == [
-        *("estimator", "falls", "loop", "max_error_xy", "mean_error_xy", "realtime_factor", "segments"),
+        *("estimator", "falls", "loop", "max_error_wz", "max_error_xy", "mean_error_wz", "mean_error_xy"),
+        *("realtime_factor", "segments"),
     ]
     assert [segment["command"] for segment in summary["segments"]] == [[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]]
     assert summary["falls"] == 0

@@ -6,7 +6,9 @@ The tests share one robot; each begins with one that stands.
 from __future__ import annotations
 
 import os
+import pty
 import re
+import select
 import signal
 import subprocess
 import sys
@@ -67,6 +69,26 @@ class Robot:
         return self._process.wait(60.0)
 
 
+class Shown:
+    """What a program has written to its terminal."""
+
+    def __init__(self, terminal: int) -> None:
+        self._terminal, self._text = terminal, ""
+
+    def now(self) -> str:
+        """All of it up to now."""
+        while select.select([self._terminal], [], [], 0.0)[0]:
+            self._text += os.read(self._terminal, 4096).decode(errors="replace")
+        return self._text
+
+    def until(self, text: str, since: str = "") -> None:
+        """Wait for it to come, behind the last place of `since`."""
+        until = time.monotonic() + 60.0
+        while text not in self.now().rpartition(since)[2] if since else text not in self.now():
+            assert time.monotonic() < until, f"{text!r} is not in:\n{self._text[-2000:]}"
+            time.sleep(0.05)
+
+
 @pytest.fixture(scope="module")
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     robot = Robot(tmp_path_factory.mktemp("up") / "up.log")
@@ -85,6 +107,35 @@ def test_drive_says_what_was_commanded_and_what_was_measured(up: Robot) -> None:
     assert float(measured[2]) == pytest.approx(0.0, abs=0.1)
     up.says("follows teleop")
     up.says("walk: a velocity was commanded")
+
+
+def test_teleop_walks_while_a_key_repeats_and_its_space_bar_stops_for_good(up: Robot) -> None:
+    terminal, other = pty.openpty()
+    teleop = subprocess.Popen([*QUADVEL, "teleop"], stdin=other, stdout=other, stderr=other)
+    os.close(other)
+    shown = Shown(terminal)
+    shown.until("speed 0.5 m/s")
+    while "walk " not in shown.now():
+        os.write(terminal, b"w")
+        time.sleep(0.05)
+    shown.until("vx +0.00 m/s, vy +0.00 m/s", since="walk ")
+    os.write(terminal, b" ")
+    shown.until("STOPPED")
+    shown.until("passive")
+    os.write(terminal, b"w")
+    teleop.send_signal(signal.SIGINT)
+    assert teleop.wait(30.0) == 0
+    os.close(terminal)
+    up.says("passive: was asked for")
+    up.stand_up()
+
+
+def test_teleop_without_a_terminal_says_so(up: Robot) -> None:
+    done = subprocess.run(
+        [*QUADVEL, "teleop"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode != 0
+    assert "keys come from a terminal" in done.stdout + done.stderr
 
 
 def test_drive_says_when_a_command_is_cut(up: Robot) -> None:

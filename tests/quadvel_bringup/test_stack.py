@@ -34,6 +34,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
     from quadvel_sim.parameters import BoardParameters, SimParameters
+    from quadvel_view.view_node import ViewParameters
 
     classes: dict[str, type[attrs.AttrsInstance]] = {
         "sim_node": SimParameters,
@@ -43,6 +44,7 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
         "planner": PlannerParameters,
+        "view": ViewParameters,
     }
     return {
         name: {
@@ -86,20 +88,29 @@ def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None
         estimator="kalman",
         parameters=tmp_path / "my.yaml",
     )
-    file = ["--params-file", str(tmp_path / "my.yaml")]
-    parameters = {name: arguments[3:] for name, arguments in stack.arguments().items()}
-    assert parameters == {
-        "sim_node": [*file, "-p", 'terrain:="rough"', "-p", f'actuator_file:="{tmp_path}/found.yaml"'],
-        "estimator": [*file, "-p", 'kind:="kalman"'],
-        "controller": [
+    file = ["--ros-args", "--params-file", str(tmp_path / "my.yaml"), "--enclave"]
+    assert stack.arguments() == {
+        "sim_node": [
             *file,
-            *("-p", "auto_stand:=true", "-p", "robot_waits:=true", "-p", f'policy:="{tmp_path}/1"'),
+            *("/quadvel/sim_node", "-p", 'terrain:="rough"', "-p", f'actuator_file:="{tmp_path}/found.yaml"'),
         ],
-        "command_mux": file,
+        "estimator": [*file, "/quadvel/estimator", "-p", 'kind:="kalman"'],
+        "controller": [
+            *(*file, "/quadvel/controller", "-p", "auto_stand:=true", "-p", "robot_waits:=true"),
+            *("-p", f'policy:="{tmp_path}/1"'),
+        ],
+        "command_mux": [*file, "/quadvel/command_mux"],
     }
 
 
-@pytest.mark.parametrize("chosen", [{"terrain": "rough"}, {"actuator": Path("found.yaml")}])
+def test_a_world_is_a_name_or_a_file_of_any_folder() -> None:
+    for world, handed_on in (("campus", "campus"), ("mine.yaml", str(Path("mine.yaml").resolve()))):
+        assert Stack(world=world).overrides()["sim_node"] == {"world": handed_on}
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"terrain": "rough"}, {"world": "park"}, {"actuator": Path("found.yaml")}]
+)
 def test_what_only_a_simulated_robot_has_is_refused_for_another(chosen: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"only a simulated robot has this, not external"):
         Stack(low_level="external", **chosen).overrides()

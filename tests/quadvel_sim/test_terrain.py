@@ -102,3 +102,14 @@ def test_perlin_noise_vanishes_on_its_lattice_and_is_smooth_between() -> None:
 def test_bad_ground_is_refused_by_name(arguments: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}$"):
         Terrain(**arguments)
+
+
+def test_the_ground_that_people_see_is_the_ground_that_carries() -> None:
+    terrain = Terrain(kind="rough", seed=3)
+    corners = terrain.triangles(4.0, 0.5)
+    assert corners.shape == (8 * 8 * 2 * 3, 3)
+    assert corners[:, 2] == pytest.approx(terrain.height(corners[:, 0], corners[:, 1]))
+    first, second, third = corners.reshape(-1, 3, 3).transpose(1, 0, 2)
+    normals = np.cross(second - first, third - first)
+    assert (normals[:, 2] > 0.0).all()  # seen from above
+    assert np.abs(normals[:, 2]).sum() / 2 == pytest.approx(16.0)

@@ -50,7 +50,7 @@ app = typer.Typer(no_args_is_help=True, **{**PLAIN, "add_completion": True})
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
 # Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
-ENDED_BY_CTRL_C = ("run", "up", "drive", "record")
+ENDED_BY_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
 
 
 def _version(asked: bool) -> None:
@@ -115,6 +115,13 @@ def up(
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
     ] = None,
     terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(
+            help="Simulated robot: what is around it, corridor, park, campus or a file.",
+            show_default="nothing",
+        ),
+    ] = None,
     actuator: Annotated[
         Path | None,
         typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
@@ -123,6 +130,7 @@ def up(
     params: Annotated[
         Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
     ] = PARAMETERS,
+    view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
 ) -> None:
     """Start robot, estimator, controller and command mux, each as a process; Ctrl-C stops them.
 
@@ -138,11 +146,43 @@ def up(
         low_level=low_level,
         policy=policy,
         terrain=terrain,
+        world=world,
         actuator=actuator,
         estimator=estimator,
         parameters=params,
     )
-    raise typer.Exit(run_up(stack))
+    raise typer.Exit(run_up(stack, view))
+
+
+@app.command()
+def view(
+    recording: Annotated[
+        Path | None,
+        typer.Argument(metavar="[FILE]", help="A recording to play: MCAP, rosbag2.", show_default=False),
+    ] = None,
+    host: Annotated[
+        str,
+        typer.Option(help="Address to listen on; others than this host's own need the token that is shown."),
+    ] = "127.0.0.1",
+    port: Annotated[
+        int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
+    ] = None,
+    foxglove: Annotated[
+        bool, typer.Option("--foxglove", help="Serve the topics to Foxglove or Lichtblick instead of a page.")
+    ] = False,
+) -> None:
+    """Show the robot in the browser, in 3-D, with all that its operator needs; or play a recording of it.
+
+    It prints the address to open. What it needs, pip brings with quadvel[view].
+
+    \b
+    For example:
+      quadvel view
+      quadvel view out/demo/demo.mcap
+    """
+    from .view import view as run_view
+
+    run_view(recording, host, port, foxglove)
 
 
 @app.command()
@@ -162,6 +202,21 @@ def drive(
       quadvel drive --vx 0.5 --wz 0.3 --seconds 5
     """
     raise typer.Exit(_with_middleware("drive").drive(vx, vy, wz, seconds, topic))
+
+
+@app.command()
+def teleop(
+    by: Annotated[Literal["keyboard", "gamepad"], typer.Argument(help="What the hands are on.")] = "keyboard",
+) -> None:
+    """Drive the robot by the keys of this terminal, or by a gamepad: it goes while something is held, and stands once it is let go.
+
+    \b
+    For example:
+      quadvel teleop
+      quadvel teleop gamepad
+    """
+    module = _with_middleware("teleop")
+    raise typer.Exit(module.by_keyboard() if by == "keyboard" else module.by_gamepad())
 
 
 @app.command()
@@ -322,6 +377,12 @@ def paper(context: typer.Context) -> None:
 def people(context: typer.Context) -> None:
     """Measure how well persons are found and tracked in laser scans, real and simulated."""
     _hand_on(context, "quadvel_eval.people.cli:people_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def world(context: typer.Context) -> None:
+    """Check a world's file, and draw the world from above."""
+    _hand_on(context, "quadvel_eval.world_map:world_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

@@ -20,9 +20,11 @@ from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
+from .nodes import command
 from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
+from .up import VIEW
 
 MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 """What is made of the recording; what is left of an earlier one goes."""
@@ -51,6 +53,7 @@ def demo_command(
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
+    view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
 ) -> None:
     """Walk a simulated robot through all directions, in real time, through the nodes.
 
@@ -63,7 +66,8 @@ def demo_command(
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
         script = "quick" if quick else "full"
-        problem = ScriptedWalk(draft, script, stack.commands(), lockstep, console).run()
+        nodes = stack.commands() | ({VIEW: command(VIEW, stack.view_arguments())} if view else {})
+        problem = ScriptedWalk(draft, script, nodes, lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
     if problem:
@@ -94,6 +98,7 @@ def _report(summary: dict[str, Any], console: Console) -> None:
     loop, rmse = summary["loop"], ", ".join(f"{x:.3f}" for x in summary["estimator"]["rmse"])
     console.print(
         f"error_xy mean {summary['mean_error_xy']:.3f}, largest {summary['max_error_xy']:.3f} m/s; "
+        f"yaw rate off by {summary['mean_error_wz']:.3f}, at most {summary['max_error_wz']:.3f} rad/s; "
         f"falls {summary['falls']}; estimator RMSE {rmse} m/s\n"
         f"loop {loop['rate_hz']:.0f} Hz, period p99 {loop['period_p99_ms']:.2f} ms, compute p50 "
         f"{loop['compute_p50_us']:.0f}, p99 {loop['compute_p99_us']:.0f} us, inference p50 "

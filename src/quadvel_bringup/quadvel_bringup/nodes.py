@@ -5,8 +5,9 @@ The one table of nodes; the entry points in the packages' setup.cfg files name t
 
 from __future__ import annotations
 
+import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import import_module
 
 import attrs
@@ -33,6 +34,7 @@ NODES = {
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
     "person_tracker": NodeEntry("quadvel_follow.person_tracker_node", "persons in the scans of a 2-D laser"),
+    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
     "planner": NodeEntry(
         "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
     ),
@@ -65,6 +67,13 @@ def run(name: str, arguments: Sequence[str]) -> None:
 def enclave(name: str) -> list[str]:
     """The arguments of ROS 2 that name a process's rights under SROS 2 (docs/security.md); without it they change nothing."""
     return ["--enclave", f"/quadvel/{name}"]
+
+
+def arguments(name: str, parameters: Mapping[str, bool | str | int | float]) -> list[str]:
+    """A node's arguments of ROS 2: its enclave and its parameters."""
+    # JSON is YAML with quotes, and without them a file named "1" would be a number.
+    pairs = [("-p", f"{parameter}:={json.dumps(value)}") for parameter, value in parameters.items()]
+    return ["--ros-args", *enclave(name), *(word for pair in pairs for word in pair)]
 
 
 def command(name: str, arguments: Sequence[str] = ()) -> list[str]:

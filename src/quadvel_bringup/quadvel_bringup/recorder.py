@@ -27,7 +27,7 @@ from quadvel_recordings.definitions import STORE
 ANY_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Hears every publisher, a reliable one too; of the fastest topic it holds seconds, for where other work keeps us from writing."""
 LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-LATCHED = ("/tf_static", "/robot_description")
+LATCHED = ("/tf_static", "/robot_description", "/ground")
 """Topics that are published once and kept for those who come later."""
 HIDDEN = ("/parameter_events", "/rosout")
 BATCH = 0.05  # s

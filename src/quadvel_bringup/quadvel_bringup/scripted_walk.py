@@ -23,6 +23,7 @@ RECORDED = {
     "/command": "quadvel_msgs/msg/VelocityCommand",
     "/controller/state": "quadvel_msgs/msg/ControllerState",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/ground": "visualization_msgs/msg/Marker",
     "/ground_truth/odom": "nav_msgs/msg/Odometry",
     "/imu": "sensor_msgs/msg/Imu",
     "/joint_states": "sensor_msgs/msg/JointState",

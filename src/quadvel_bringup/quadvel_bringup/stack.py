@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 
 import attrs
 
-from .nodes import command, enclave
+from .nodes import arguments, command
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
@@ -67,6 +66,7 @@ class Stack:
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
     policy: Path | None = None
     terrain: str | None = None
+    world: str | None = None
     actuator: Path | None = None
     estimator: str | None = None
     use_sim_time: bool = attrs.field(default=False)
@@ -102,7 +102,7 @@ class Stack:
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
-        simulated = _given(terrain=self.terrain, actuator_file=actuator)
+        simulated = _given(terrain=self.terrain, world=_found(self.world), actuator_file=actuator)
         if simulated and not low_level.simulation:
             raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
         serving = dict(low_level.nodes)
@@ -118,16 +118,22 @@ class Stack:
         """The same as arguments of ROS 2."""
         return {name: self._arguments(name, values) for name, values in self.overrides().items()}
 
+    def view_arguments(self) -> list[str]:
+        """Those of the node `view` beside them; it is no part of the robot, and stays in the time of who looks at it."""
+        return self._arguments("view", {})
+
     def commands(self) -> dict[str, list[str]]:
         """The same as command lines, which run each node as a process of its own."""
         return {name: command(name, arguments) for name, arguments in self.arguments().items()}
 
-    def _arguments(self, node: str, values: Parameters) -> list[str]:
-        arguments = ["--ros-args", *enclave(node), "--params-file", str(self.parameters.resolve())]
-        for name, value in values.items():
-            # JSON is YAML with quotes, and without them a file named "1" would be a number.
-            arguments += ["-p", f"{name}:={json.dumps(value)}"]
-        return arguments
+    def _arguments(self, name: str, values: Parameters) -> list[str]:
+        first, *rest = arguments(name, values)
+        return [first, "--params-file", str(self.parameters.resolve()), *rest]  # what comes later counts
+
+
+def _found(world: str | None) -> str | None:
+    """A shipped world's name as it is, a file, which has a suffix, for whatever folder a node runs in."""
+    return str(Path(world).resolve()) if world and Path(world).suffix else world
 
 
 def _given(**values: str | None) -> Parameters:

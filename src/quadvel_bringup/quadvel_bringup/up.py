@@ -11,9 +11,12 @@ from .processes import ProcessGroup, StopSignals
 from .rehearsal import rehearse
 from .stack import Stack
 
+VIEW = "view"
+"""The node that shows the robot: where it ends, the robot goes on"""
 
-def up(stack: Stack) -> int:
-    """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command.
+
+def up(stack: Stack, view: bool = False) -> int:
+    """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command. view: with a page.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
     are stopped, and its exit code is ours (1 if that was 0). Raises ValueError or OSError where a parameter or
@@ -22,7 +25,7 @@ def up(stack: Stack) -> int:
     rehearse(stack)
     if stack.brings_robot:
         look_for_others()
-    nodes = stack.arguments()
+    nodes = stack.arguments() | ({VIEW: stack.view_arguments()} if view else {})
     say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
@@ -31,7 +34,7 @@ def up(stack: Stack) -> int:
                 group.start(name, command(name, arguments))
         ended: dict[str, int] = {}
         while not ended and not signals.wait(0.1):
-            ended = group.ended()
+            ended = {name: code for name, code in group.ended().items() if name != VIEW}
         for name, code in ended.items():
             say("quadvel", f"{name} ended with exit code {code}; stopping the others")
         codes = group.stop()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,18 @@ def read_messages(
     Of an MCAP file whose recorder was killed come the messages that were written whole. One sentence that says so goes
     to `tell`, or becomes a warning. Raises RecordingError for what is no recording, and OSError where there is no such file.
     """
+    for topic, time, message in unread_messages(path, wanted, tell):
+        try:
+            whole = message()
+        except Exception as error:
+            raise _broken(path, error) from error
+        yield topic, time, whole
+
+
+def unread_messages(
+    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None = None
+) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+    """The same where most messages are never looked at: in place of each message what reads it out of its bytes."""
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     if path.is_dir() and not (path / "metadata.yaml").exists():
@@ -44,17 +57,21 @@ def read_messages(
             ]
             # Without any chosen channel the reader would give all messages.
             for channel, time, data in reader.messages(chosen) if chosen else ():
-                yield channel.topic, time, read(data, channel.msgtype, channel.msgdef)
+                yield channel.topic, time, partial(read, data, channel.msgtype, channel.msgdef)
     except PermissionError:
         raise
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
-        what = " ".join(str(error).split()) or type(error).__name__
-        raise RecordingError(f"{path}: no whole recording, perhaps cut off: {what}") from error
+        raise _broken(path, error) from error
+
+
+def _broken(path: Path, error: Exception) -> RecordingError:
+    what = " ".join(str(error).split()) or type(error).__name__
+    return RecordingError(f"{path}: no whole recording, perhaps cut off: {what}")
 
 
 def _kept(
     path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None
-) -> Iterator[tuple[str, int, Any]]:
+) -> Iterator[tuple[str, int, Callable[[], Any]]]:
     """The same of a file that was cut off."""
     kept = what_is_kept(path)
     if not kept:
@@ -66,4 +83,4 @@ def _kept(
         tell(text)
     for one in kept_messages(path):
         if wanted(one.topic, one.typename) and is_known(one.typename, one.definition):
-            yield one.topic, one.time, read(one.data, one.typename, one.definition)
+            yield one.topic, one.time, partial(read, one.data, one.typename, one.definition)

@@ -12,26 +12,35 @@ from threading import Thread
 from typing import Any, Generic, TypeVar
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_srvs.srv import SetBool
 from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import Marker
 
 from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.node import end, read_parameters
-from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
+from quadvel_nodes.robot_view import LATCHED, fill_quaternion, fill_vector, transforms
 from quadvel_nodes.system_time import SystemTime, as_time
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport
 from quadvel_sim.parameters import PlantParameters
 from quadvel_sim.simulator import Simulator, Truth
+from quadvel_sim.terrain import Terrain
+from quadvel_sim.world_view import WorldView
 
 TRUTH_PERIOD = 5  # ms
 VIEW_PERIOD = 20  # ms, of what people look at
+GROUND_SIZE, GROUND_STEP = (
+    16.0,
+    0.16,
+)  # m, edge of the square of ground that they see, and distance of its points
+GROUND_COLOUR = (0.25, 0.29, 0.32, 1.0)
 
 Settings = TypeVar("Settings", bound=PlantParameters)
 
@@ -55,9 +64,12 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._has_fallen = False
         self._failure = ""
         self._loop = self._settings.loop(simulator, self._publish)
+        world = simulator.config.world
+        self._world_view = None if world is None else WorldView(self, world)
         self._thread = Thread(target=self._simulate, name="simulation")
         self._truth = self.create_publisher(Odometry, "ground_truth/odom", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
+        self._ground = self.create_publisher(Marker, "ground", LATCHED)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(ResetSim, "~/reset", self._on_reset)
         self.create_service(SetBool, "~/pause", self._on_pause)
@@ -67,6 +79,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
 
     def begin(self) -> None:
         """Start the simulation, once all that `publish_sample` needs is there."""
+        self._publish_ground(self._loop.simulator.config.terrain)
         gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
         self._thread.start()
 
@@ -96,6 +109,18 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             return self._system_time.stamp(instant)
         return as_time(round(instant * 1e9))
 
+    def _publish_ground(self, terrain: Terrain) -> None:
+        """The ground in the frame odom, once, for who looks; flat ground everybody can imagine."""
+        if terrain.kind == "flat":
+            return
+        marker = Marker(ns="ground", type=Marker.TRIANGLE_LIST, action=Marker.ADD)
+        marker.header.frame_id = ODOM
+        marker.pose.orientation.w = marker.scale.x = marker.scale.y = marker.scale.z = 1.0
+        marker.color.r, marker.color.g, marker.color.b, marker.color.a = GROUND_COLOUR
+        step = GROUND_STEP if terrain.kind == "rough" else GROUND_SIZE
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in terrain.triangles(GROUND_SIZE, step).tolist()]
+        self._ground.publish(marker)
+
     # In the simulation's thread.
 
     def _simulate(self) -> None:
@@ -112,6 +137,8 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             return
         view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
         self.publish_sample(state, instant, view)
+        if self._world_view is not None:
+            self._world_view.publish(self.stamp(instant), self._loop.simulator, view)
         if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
             transform = view and self._settings.publish_tf
             self._publish_truth(self.stamp(instant), self._loop.simulator.truth(), transform)
@@ -179,6 +206,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             "unanswered": report.unanswered,
             "braking": report.braking,
             "fallen": report.fallen,
+            **self._in_world(report),
             **self.figures(),
         }
         stamp = self.get_clock().now().to_msg()
@@ -188,6 +216,13 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if report.fallen and not self._has_fallen:
             self.get_logger().warning("the robot has fallen; ~/reset puts it back")
         self._has_fallen = report.fallen
+
+    def _in_world(self, report: LoopReport) -> dict[str, object]:
+        """What /diagnostics shows of a world, if there is one."""
+        if self._world_view is None:
+            return {}
+        touched = ", ".join(f"{name} {count}" for name, count in sorted(report.touched.items()))
+        return {"world": self._settings.world, "touched": touched or "nothing"}
 
     def _judge(self, report: LoopReport) -> tuple[bytes, str]:
         """Level and summary of the last second."""

@@ -104,6 +104,17 @@ class Terrain:
         below, above = u * (right - here) + v * (far - right), v * (up - here) + u * (far - up)
         return np.asarray(here + np.where(u > v, below, above))
 
+    def triangles(self, size: float, step: float) -> NDArray[np.float64]:
+        """The ground in a square about the origin, as people are shown it: each three of the vertices (N, 3), m, are a triangle.
+
+        size: edge of the square, m. step: distance of its points, m.
+        """
+        axis = np.linspace(-0.5 * size, 0.5 * size, round(size / step) + 1)
+        x, y = np.meshgrid(axis, axis)
+        points = np.stack([x, y, self.height(x, y)], axis=-1)
+        here, right, up, far = points[:-1, :-1], points[:-1, 1:], points[1:, :-1], points[1:, 1:]
+        return np.stack([here, right, far, here, far, up], axis=2).reshape(-1, 3)
+
     def add_to(self, spec: mujoco.MjSpec) -> None:
         """Add the ground to the robot's `spec` as the geom `ground` of the world body."""
         # The robot's geoms collide with contype 1 alone.

@@ -1,0 +1,71 @@
+"""What the operator wants: a velocity while something is held down, and a STOP that stays. No ROS, no page.
+
+Page, keyboard and gamepad are alike here: each says what is held, again and again, and silence means that it was let go.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SILENCE = 0.4
+"""s without a word from who holds, after which it counts as let go: twenty words a second are expected, but a browser may stall"""
+AFTERGLOW = 0.5
+"""s of zeros once all is let go; then whoever else commands the robot has its turn"""
+TOP_SPEED = np.array([3.5, 2.1, 3.0])
+"""m/s, m/s, rad/s: no hand asks for more"""
+
+
+class Operator:
+    """Who holds what. stopped: whether STOP was pressed and not released since."""
+
+    def __init__(self) -> None:
+        self.stopped = False
+        self._holder: object = None
+        self._velocity = np.zeros(3)
+        self._held_at = self._let_go_at = -math.inf
+
+    def hold(self, holder: object, velocity: Sequence[float], now: float) -> None:
+        """`holder` holds this velocity (vx, vy in m/s, wz in rad/s), and says so at least every SILENCE (s).
+
+        While one holds, others are not listened to. Raises ValueError for what is no velocity.
+        """
+        wanted = np.array(velocity, float)
+        if wanted.shape != (3,) or not np.isfinite(wanted).all():
+            raise ValueError(f"velocity is {list(velocity)}, expected three finite numbers")
+        if self._is_held(now) and holder is not self._holder:
+            return
+        self._holder, self._held_at = holder, now
+        self._velocity = np.clip(wanted, -TOP_SPEED, TOP_SPEED)
+
+    def let_go(self, holder: object, now: float) -> None:
+        """`holder` holds nothing any more."""
+        if holder is self._holder and self._is_held(now):
+            self._held_at, self._let_go_at = -math.inf, now
+
+    def stop(self) -> None:
+        """STOP: no velocity any more until `release`."""
+        self.stopped = True
+        self._held_at = self._let_go_at = -math.inf
+
+    def release(self) -> None:
+        """End the STOP. What was held when it came does not count."""
+        self.stopped = False
+        self._held_at = self._let_go_at = -math.inf
+
+    def velocity(self, now: float) -> Array | None:
+        """What is to be published now: the velocity that is held, zeros for a while after it, or None: nothing."""
+        if self.stopped:
+            return None
+        if self._is_held(now):
+            return self._velocity.copy()
+        ended = max(self._let_go_at, self._held_at + SILENCE)
+        return np.zeros(3) if now - ended <= AFTERGLOW else None
+
+    def _is_held(self, now: float) -> bool:
+        return now - self._held_at <= SILENCE

@@ -1,0 +1,238 @@
+// The operator's page: shows what the server says thirty times a second, and says what the operator holds and presses.
+"use strict";
+
+const AGAIN = 50;          // ms between two words of a hand that holds something
+const REACH = 62;          // px that the pad's knob goes from its middle
+const TURN = 1.6;          // rad/s at the pad's edge, per m/s of the speed that is set, 1.2 at most
+const SIDEWAYS = 0.6;      // share of the speed that is set
+const SECONDS = 10;        // of the graphs
+const AXES = [["forward", "m/s"], ["left", "m/s"], ["turn", "rad/s"]];
+const LEGS = ["FR", "FL", "RR", "RL"], JOINTS = ["hip", "thigh", "calf"];
+const $ = (id) => document.getElementById(id);
+
+let socket = null;
+let state = null;
+
+function say(word) {
+  if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(word));
+}
+
+function connect() {
+  const scheme = location.protocol === "https:" ? "wss:" : "ws:";
+  socket = new WebSocket(`${scheme}//${location.host}/words`);
+  socket.onmessage = (event) => show(JSON.parse(event.data));
+  socket.onopen = () => document.body.classList.remove("lost");
+  socket.onclose = () => {
+    document.body.classList.add("lost");
+    $("mode").className = "pill fault";
+    $("mode").textContent = "no connection";
+    $("reason").textContent = "the page lost `quadvel view`; it tries again";
+    letGo();
+    setTimeout(connect, 1000);
+  };
+}
+
+// Hands: what is held, by pointer or by key. Nothing is said of a hand that holds nothing.
+
+const held = { pad: null, strafe: null, keys: new Set() };
+const KEYS = { KeyW: [1, 0, 0], KeyS: [-1, 0, 0], KeyA: [0, 0, 1], KeyD: [0, 0, -1], KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
+               ArrowUp: [1, 0, 0], ArrowDown: [-1, 0, 0], ArrowLeft: [0, 0, 1], ArrowRight: [0, 0, -1] };
+let wasHeld = false;
+
+function wanted() {
+  const share = [0, 0, 0];
+  if (held.pad) { share[0] += held.pad[1]; share[2] += held.pad[0]; }
+  if (held.strafe) share[1] += held.strafe[0];
+  for (const key of held.keys) KEYS[key].forEach((value, axis) => { share[axis] += value; });
+  const speed = Number($("speed").value);
+  const scale = [speed, SIDEWAYS * speed, TURN * Math.min(speed, 1.2)];
+  return share.map((value, axis) => Math.max(-1, Math.min(1, value)) * scale[axis]);
+}
+
+function isHeld() { return held.pad !== null || held.strafe !== null || held.keys.size > 0; }
+
+function speak() {
+  if (isHeld()) { say({ do: "hold", velocity: wanted() }); wasHeld = true; }
+  else if (wasHeld) { say({ do: "let_go" }); wasHeld = false; }
+}
+
+function letGo() {
+  for (const name of ["pad", "strafe"]) { held[name] = null; place($(name), 0, 0); $(name).classList.remove("held"); }
+  held.keys.clear();
+  speak();
+}
+
+function place(element, x, y) {
+  const knob = element.querySelector(".knob");
+  knob.style.setProperty("--x", `${x}px`);
+  knob.style.setProperty("--y", `${y}px`);
+}
+
+// name: the element that is dragged; both: whether it goes up and down, too.
+function draggable(name, both) {
+  const element = $(name);
+  const follow = (event) => {
+    const box = element.getBoundingClientRect();
+    let x = event.clientX - box.left - box.width / 2, y = both ? event.clientY - box.top - box.height / 2 : 0;
+    const far = Math.hypot(x, y), most = both ? REACH : box.width / 2 - 18;
+    if (far > most) { x *= most / far; y *= most / far; }
+    held[name] = [-x / most, -y / most];
+    place(element, x, y);
+    speak();
+  };
+  const end = () => { held[name] = null; place(element, 0, 0); element.classList.remove("held"); speak(); };
+  element.addEventListener("pointerdown", (event) => {
+    event.preventDefault();
+    element.focus({ preventScroll: true });
+    element.setPointerCapture(event.pointerId);
+    element.classList.add("held");
+    follow(event);
+  });
+  element.addEventListener("pointermove", (event) => { if (held[name]) follow(event); });
+  for (const over of ["pointerup", "pointercancel", "lostpointercapture"]) element.addEventListener(over, end);
+}
+
+function stopOrRelease() { say({ do: state && state.stopped ? "release" : "stop" }); }
+
+addEventListener("keydown", (event) => {
+  if (document.body.classList.contains("playing")) return;
+  if (event.code === "Space") { event.preventDefault(); if (!event.repeat) { letGo(); say({ do: "stop" }); } }
+  else if (event.code in KEYS && !event.ctrlKey && !event.altKey && event.target.type !== "range") {
+    event.preventDefault();
+    held.keys.add(event.code);
+  }
+});
+addEventListener("keyup", (event) => { if (event.code === "Space") event.preventDefault(); if (held.keys.delete(event.code)) speak(); });
+for (const over of ["blur", "pagehide"]) addEventListener(over, letGo);
+// A click into the scene must not keep the space bar from us.
+addEventListener("blur", () => setTimeout(() => { if (document.activeElement === $("scene")) { $("scene").blur(); window.focus(); } }));
+document.addEventListener("visibilitychange", () => { if (document.hidden) letGo(); });
+setInterval(speak, AGAIN);
+
+// Readings.
+
+const past = [];  // [ms, commanded, measured]
+
+function show(news) {
+  state = news;
+  const playing = news.playback !== null;
+  document.body.classList.toggle("playing", playing);
+  document.body.classList.toggle("stopped", news.stopped);
+  $("operator").hidden = playing;
+  $("playback").hidden = !playing;
+  $("simulation").hidden = !news.simulated;
+  $("mode").textContent = news.mode.replace("_", " ") || (playing ? "recording" : "silent");
+  $("mode").className = `pill ${news.mode}`;
+  $("reason").textContent = playing && !news.mode ? news.playback.name : news.refusal || news.reason;
+  $("stop").innerHTML = news.stopped ? "<b>STOPPED</b><small>press to release</small>" : "<b>STOP</b><small>space</small>";
+  $("said").textContent = news.said || "";
+  $("record").classList.toggle("on", Boolean(news.recording));
+  $("record").lastElementChild.textContent = news.recording ? "Recording" : "Record";
+  document.querySelectorAll("#modes button").forEach((one) => one.classList.toggle("on", one.dataset.do === news.mode));
+  if (playing) showPlayback(news.playback);
+  past.push([performance.now(), news.commanded, news.measured]);
+  while (past.length && past[0][0] < performance.now() - 1000 * SECONDS) past.shift();
+}
+
+function drawReadings() {
+  if (!state) return;
+  document.querySelectorAll(".graph").forEach((graph, axis) => {
+    graph.lastElementChild.textContent = signed(state.measured[axis]);
+    drawGraph(graph.querySelector("canvas"), axis);
+  });
+  document.querySelectorAll(".bar").forEach((bar, joint) => {
+    const share = Math.min(Math.abs(state.torque[joint]), 1);
+    bar.firstElementChild.style.transform = `scaleY(${share})`;
+    bar.className = `bar ${share > 0.95 ? "full" : share > 0.7 ? "high" : ""}`;
+  });
+  const { rate, period, compute, missed } = state.loop;
+  const rows = rate === undefined ? [["", "silent"]]
+    : [["rate", `${rate.toFixed(0)} Hz`], ["period", `${period.toFixed(1)} ms`], ["compute", `${(compute / 1000).toFixed(1)} ms`], ["missed", missed]];
+  fill(document.querySelector("#loop dl"), rows.flatMap(([name, value]) => [["dt", name], ["dd", value]]));
+  showLamps(state.lamps);
+}
+
+function fill(parent, children) {
+  parent.replaceChildren(...children.map(([tag, text]) => Object.assign(document.createElement(tag), { textContent: text })));
+}
+
+let lampsShown = "";
+function showLamps(lamps) {
+  const text = JSON.stringify(lamps);
+  if (text === lampsShown) return;
+  lampsShown = text;
+  $("lamps").replaceChildren(...lamps.map((lamp) => {
+    const item = document.createElement("li"), words = document.createElement("span");
+    item.className = lamp.level;
+    item.title = lamp.text;
+    fill(words, [["b", lamp.name], ["span", ` ${lamp.text}`]]);
+    item.append(words);
+    return item;
+  }));
+}
+
+function signed(value) { return (value < 0 ? "\u2212" : "+") + Math.abs(value).toFixed(2); }
+
+function drawGraph(canvas, axis) {
+  const ratio = devicePixelRatio || 1, width = canvas.clientWidth * ratio, height = canvas.clientHeight * ratio;
+  if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
+  const context = canvas.getContext("2d"), now = performance.now();
+  const most = Math.max(0.6, ...past.map(([, asked, got]) => Math.max(Math.abs(asked[axis]), Math.abs(got[axis]))));
+  context.clearRect(0, 0, width, height);
+  context.fillStyle = "#252c37";
+  context.fillRect(0, height / 2, width, ratio);
+  for (const [which, colour] of [[2, "#4cc2ff"], [1, "#ff9a4d"]]) {
+    context.strokeStyle = colour;
+    context.lineWidth = 1.5 * ratio;
+    context.beginPath();
+    for (const one of past) {
+      context.lineTo(width * (1 - (now - one[0]) / (1000 * SECONDS)), height * (0.5 - 0.46 * one[which][axis] / most));
+    }
+    context.stroke();
+  }
+}
+
+// Playback.
+
+let seeking = false;
+
+function showPlayback({ time, length, playing, pace, name }) {
+  $("play").textContent = playing ? "Pause" : "Play";
+  $("time").max = length;
+  if (!seeking) $("time").value = time;
+  $("at").textContent = `${time.toFixed(1)} s`;
+  $("length").textContent = `${length.toFixed(1)} s`;
+  document.title = name;
+  document.querySelectorAll("#paces button").forEach((one) => one.classList.toggle("on", Number(one.dataset.pace) === pace));
+}
+
+// Set up.
+
+AXES.forEach(([name, unit]) => {
+  const graph = document.createElement("div");
+  graph.className = "graph";
+  graph.innerHTML = `<span>${name}</span><canvas></canvas><output></output>`;
+  graph.title = unit;
+  document.querySelector(".graphs").append(graph);
+});
+LEGS.forEach((leg) => {
+  const bars = document.createElement("div");
+  bars.innerHTML = JOINTS.map((joint) => `<div class="bar" title="${leg} ${joint}"><i></i></div>`).join("") + `<span>${leg}</span>`;
+  $("torques").append(bars);
+});
+draggable("pad", true);
+draggable("strafe", false);
+$("stop").addEventListener("click", () => { letGo(); stopOrRelease(); });
+document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, to: one.dataset.to })));
+$("speed").addEventListener("input", () => { $("top").textContent = `${Number($("speed").value).toFixed(1)} m/s`; });
+$("speed").dispatchEvent(new Event("input"));
+$("play").addEventListener("click", () => say({ do: "play" }));
+$("time").addEventListener("input", () => { seeking = true; say({ do: "seek", time: Number($("time").value) }); });
+$("time").addEventListener("change", () => { seeking = false; });
+document.querySelectorAll("#paces button").forEach((one) => one.addEventListener("click", () => say({ do: "pace", pace: Number(one.dataset.pace) })));
+setInterval(drawReadings, 100);
+
+// Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours.
+const OTHER_NAME = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
+$("scene").src = `${location.protocol}//${OTHER_NAME[location.hostname] || location.hostname}:${location.port}/scene/?darkMode`;
+connect();

@@ -1,0 +1,217 @@
+"""What is known of a robot from its topics, live or recorded: `RobotPicture`. No ROS, and nothing of how it is drawn."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description import robot
+from quadvel_description.kinematics import foot_positions, rotate
+
+Array = NDArray[np.float64]
+
+TOPICS = {
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/command": "quadvel_msgs/msg/VelocityCommand",
+    "/controller/state": "quadvel_msgs/msg/ControllerState",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/scan": "sensor_msgs/msg/LaserScan",
+    "/person_tracker/markers": "visualization_msgs/msg/MarkerArray",
+    "/follow_planner/path": "nav_msgs/msg/Path",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/ground": "visualization_msgs/msg/Marker",
+}
+"""What a picture is made of, live"""
+LOW_STATE = "/low_state"
+"""What it is made of where a recording has nothing better; live it would come 200 times a second"""
+LATCHED = ("/tf_static", "/ground")
+"""Published once and kept for those who come later"""
+FRESH = 1.0  # s, after which what came counts as silent
+LONGEST_SILENCE = 3.0  # s, of a node on /diagnostics, which speaks once a second
+TRAIL_STEP = 0.05  # m between two points of the way behind
+TRAIL = 600  # points of it
+CYLINDER, TRIANGLES = 3, 11  # of visualization_msgs/Marker
+LEVELS = ("ok", "warning", "error", "stale")  # of diagnostic_msgs/DiagnosticStatus
+
+
+@attrs.frozen
+class Person:
+    """Where a tracked person stands, (2,) m in odom, the id of its track, and the colour that the tracker gave it."""
+
+    position: Array
+    id: int
+    colour: tuple[int, int, int]
+
+
+@attrs.frozen
+class NodeHealth:
+    """What a node said last on /diagnostics, and when, s."""
+
+    level: str
+    text: str
+    heard: float
+
+
+@attrs.frozen
+class Ground:
+    """A surface in the frame odom: vertices (N, 3) m; each three of them are a triangle."""
+
+    vertices: Array
+
+
+@attrs.define
+class RobotPicture:
+    """The newest of everything. Joint order as everywhere; positions in the frame odom; velocities in the body frame."""
+
+    q: Array = attrs.field(factory=lambda: np.array(robot.NOMINAL_Q))
+    torque: Array = attrs.field(factory=lambda: np.zeros(12))
+    position: Array = attrs.field(factory=lambda: np.array([0.0, 0.0, robot.NOMINAL_HEIGHT]))
+    quaternion: Array = attrs.field(factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
+    measured: Array = attrs.field(factory=lambda: np.zeros(3))
+    """vx, vy (m/s), wz (rad/s)"""
+    commanded: Array = attrs.field(factory=lambda: np.zeros(3))
+    """the command in effect"""
+    source: str = "none"
+    """which input of the command mux counts"""
+    state: Any = None
+    """the newest controller/state"""
+    nodes: dict[str, NodeHealth] = attrs.field(factory=dict)
+    scan: Array = attrs.field(factory=lambda: np.zeros((0, 3)))
+    persons: Sequence[Person] = ()
+    path: Array = attrs.field(factory=lambda: np.zeros((0, 3)))
+    ground: Ground | None = None
+    trail: deque[Array] = attrs.field(factory=lambda: deque(maxlen=TRAIL))
+    _heard: dict[str, float] = attrs.field(factory=dict)
+    _fixed: dict[str, tuple[str, Array, Array]] = attrs.field(factory=dict)
+
+    def take(self, topic: str, message: Any, now: float) -> None:
+        """Note a message of one of TOPICS, or of LOW_STATE; others are left alone. now: s, on any clock that goes on."""
+        take = _TAKES.get(topic)
+        if take is not None:
+            take(self, message, now)
+            self._heard[topic] = now
+
+    def is_fresh(self, topic: str, now: float) -> bool:
+        """Whether something came on a topic within the last second."""
+        return now - self._heard.get(topic, -np.inf) < FRESH
+
+    def above_floor(self) -> float:
+        """How far the lowest foot is above the ground, m, as odometry and ground have it: what they are off each other, mostly."""
+        feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
+        x, y, z = feet[feet[:, 2].argmin()]
+        floor = 0.0
+        if self.ground is not None:
+            away = (self.ground.vertices[:, 0] - x) ** 2 + (self.ground.vertices[:, 1] - y) ** 2
+            floor = float(self.ground.vertices[away.argmin(), 2])
+        return float(z) - robot.FOOT_RADIUS - floor
+
+    def forget_the_past(self) -> None:
+        """As after a jump in time: nothing was heard, and there is no way behind."""
+        self._heard.clear()
+        self.trail.clear()
+        self.nodes.clear()
+        self.scan, self.path, self.persons, self.state = np.zeros((0, 3)), np.zeros((0, 3)), (), None
+
+    # How each message is taken.
+
+    def _joint_states(self, message: Any, now: float) -> None:
+        order = robot.joint_index(message.name)
+        self.q[order] = message.position
+        if len(message.effort) == len(order):
+            self.torque[order] = message.effort
+
+    def _low_state(self, message: Any, now: float) -> None:
+        if not self.is_fresh("/joint_states", now):
+            self.q, self.torque = np.array(message.q, float), np.array(message.tau, float)
+        if not self.is_fresh("/odom", now):
+            self.quaternion = np.array(message.orientation_wxyz, float)
+
+    def _odom(self, message: Any, now: float) -> None:
+        self.position = _vector(message.pose.pose.position)
+        self.quaternion = _quaternion(message.pose.pose.orientation)
+        self.measured = _planar(message.twist.twist)
+        here = self.position * [1.0, 1.0, 0.0]
+        if not self.trail or np.linalg.norm(here - self.trail[-1]) > TRAIL_STEP:
+            self.trail.append(here)
+
+    def _command(self, message: Any, now: float) -> None:
+        self.source = message.source
+
+    def _controller_state(self, message: Any, now: float) -> None:
+        self.state = message
+        self.commanded = _planar(message.command)
+
+    def _diagnostics(self, message: Any, now: float) -> None:
+        for one in message.status:
+            level = one.level if isinstance(one.level, int) else ord(one.level)
+            self.nodes[one.name] = NodeHealth(LEVELS[min(level, 3)], one.message, now)
+        gone = [name for name, node in self.nodes.items() if now - node.heard > LONGEST_SILENCE]
+        for name in gone:
+            self.nodes[name] = attrs.evolve(self.nodes[name], level="stale", text="says nothing any more")
+
+    def _tf_static(self, message: Any, now: float) -> None:
+        for one in message.transforms:
+            placed = _vector(one.transform.translation), _quaternion(one.transform.rotation)
+            self._fixed[one.child_frame_id] = (one.header.frame_id, *placed)
+
+    def _scan(self, message: Any, now: float) -> None:
+        ranges = np.array(message.ranges, float)
+        seen = (ranges >= message.range_min) & (ranges < message.range_max)
+        angles = (message.angle_min + message.angle_increment * np.arange(len(ranges)))[seen]
+        flat = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+        points, frame = flat * ranges[seen, None], message.header.frame_id
+        while frame in self._fixed:
+            frame, origin, turn = self._fixed[frame]
+            points = rotate(turn, points) + origin
+        self.scan = rotate(self.quaternion, points) + self.position
+
+    def _markers(self, message: Any, now: float) -> None:
+        self.persons = [
+            Person(
+                _vector(one.pose.position)[:2],
+                one.id,
+                (round(255 * one.color.r), round(255 * one.color.g), round(255 * one.color.b)),
+            )
+            for one in message.markers
+            if one.type == CYLINDER and one.action == 0
+        ]
+
+    def _path(self, message: Any, now: float) -> None:
+        self.path = np.array([_vector(one.pose.position) for one in message.poses]).reshape(-1, 3)
+
+    def _ground(self, message: Any, now: float) -> None:
+        if message.type == TRIANGLES:
+            self.ground = Ground(np.array([(p.x, p.y, p.z) for p in message.points]).reshape(-1, 3))
+
+
+_TAKES: dict[str, Callable[[RobotPicture, Any, float], None]] = {
+    "/joint_states": RobotPicture._joint_states,
+    "/odom": RobotPicture._odom,
+    "/command": RobotPicture._command,
+    "/controller/state": RobotPicture._controller_state,
+    "/diagnostics": RobotPicture._diagnostics,
+    "/scan": RobotPicture._scan,
+    "/person_tracker/markers": RobotPicture._markers,
+    "/follow_planner/path": RobotPicture._path,
+    "/tf_static": RobotPicture._tf_static,
+    "/ground": RobotPicture._ground,
+    LOW_STATE: RobotPicture._low_state,
+}
+
+
+def _vector(message: Any) -> Array:
+    return np.array([message.x, message.y, message.z], float)
+
+
+def _quaternion(message: Any) -> Array:
+    return np.array([message.w, message.x, message.y, message.z], float)
+
+
+def _planar(twist: Any) -> Array:
+    return np.array([twist.linear.x, twist.linear.y, twist.angular.z], float)

@@ -1,0 +1,203 @@
+"""The robot and what surrounds it in 3-D, on a viser server: what a picture becomes to the eye. Not for controls.
+
+The robot stays in the middle and the world moves under it, so that a camera that orbits it needs no word from here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+from xml.etree import ElementTree
+
+import attrs
+import numpy as np
+import trimesh
+import viser
+from numpy.typing import NDArray
+
+from quadvel_description import robot
+from quadvel_description.frames import moving_links
+from quadvel_description.urdf import urdf
+
+from .picture import Person, RobotPicture
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+TRUNK, LEG, FOOT = (226, 230, 236), (84, 93, 107), (255, 128, 48)
+BACKGROUND: Colour = (14, 17, 22)
+GRID, GRID_SECTION = (38, 44, 54), (58, 67, 80)
+GROUND: Colour = (58, 66, 72)
+SCAN, TRAIL, PATH = (64, 196, 255), (72, 110, 150), (120, 230, 140)
+PERSON_HEIGHT, PERSON_RADIUS = 1.7, 0.2  # m
+CORNER = 0.012  # m, by which edges of boxes are rounded, so that light catches them
+LIFTING = 0.15  # share of what the feet are off the floor that is made up for in a picture: they may leave it for a moment
+ABOVE = 0.006  # m, of lines over the floor that they lie on
+CAMERA = (1.2, -1.3, 0.6)
+"""m, from the robot"""
+
+
+@attrs.frozen
+class Shape:
+    """A visible part of a link: a mesh in the link's frame, and its colour."""
+
+    link: str
+    mesh: trimesh.Trimesh
+    colour: Colour
+
+
+class Scene:
+    """The nodes of the scene. `draw` moves them; what did not change since is not sent again."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server, scene = server, server.scene
+        scene.set_up_direction("+z")
+        server.initial_camera.position = CAMERA
+        server.initial_camera.look_at = (0.0, 0.0, -0.05)
+        server.initial_camera.fov = 0.75
+        _furnish(server)
+        self._world = scene.add_frame("/world", show_axes=False)
+        self._base = scene.add_frame("/robot", show_axes=False)
+        self._links = self._add_links()
+        self._grid = scene.add_grid(
+            "/grid",
+            infinite_grid=True,
+            cell_color=GRID,
+            section_color=GRID_SECTION,
+            cell_size=0.25,
+            section_size=1.0,
+            fade_distance=14.0,
+            shadow_opacity=0.35,
+        )
+        self._lifted = 0.0  # m, by which odometry has the robot too high; its height drifts
+        self._drawn: dict[str, Any] = {}
+        self._persons: dict[int, Any] = {}
+
+    def draw(self, picture: RobotPicture) -> None:
+        """Show the picture."""
+        x, y, z = picture.position.tolist()
+        self._lifted += LIFTING * (picture.above_floor() - self._lifted)
+        z -= self._lifted
+        with self._server.atomic():
+            self._base.position, self._base.wxyz = (0.0, 0.0, z - robot.NOMINAL_HEIGHT), picture.quaternion
+            self._world.position = (-x, -y, -robot.NOMINAL_HEIGHT)
+            self._grid.position = (-x % 1.0, -y % 1.0, -robot.NOMINAL_HEIGHT)
+            for placed in moving_links(picture.q):
+                self._links[placed.child].wxyz = placed.quaternion
+            self._draw_world(picture)
+
+    def _draw_world(self, picture: RobotPicture) -> None:
+        if self._is_new("ground", picture.ground) and picture.ground is not None:
+            self._grid.visible = False
+            corners = picture.ground.vertices
+            faces = np.arange(len(corners)).reshape(-1, 3)
+            merged = trimesh.Trimesh(corners, faces)  # with one vertex where triangles meet, for smooth light
+            self._server.scene.add_mesh_simple(
+                "/world/ground", merged.vertices, merged.faces, color=GROUND, side="double", cast_shadow=False
+            )
+        if self._is_new("scan", picture.scan):
+            self._server.scene.add_point_cloud(
+                "/world/scan", picture.scan, SCAN, point_size=0.035, point_shape="circle", precision="float32"
+            )
+        if self._is_new("trail", picture.trail[-1] if picture.trail else None):
+            self._draw_line("/world/trail", np.array(picture.trail).reshape(-1, 3), TRAIL)
+        if self._is_new("path", picture.path):
+            self._draw_line("/world/path", picture.path, PATH)
+        if self._is_new("persons", picture.persons):
+            self._draw_persons(picture)
+
+    def _draw_line(self, name: str, points: Array, colour: Colour) -> None:
+        if len(points) < 2:
+            self._server.scene.remove_by_name(name)
+            return
+        segments = np.stack([points[:-1], points[1:]], axis=1) + np.array([0.0, 0.0, ABOVE])
+        self._server.scene.add_line_segments(name, segments, colour, thickness=2.5, thickness_units="screen")
+
+    def _draw_persons(self, picture: RobotPicture) -> None:
+        """A column for each, of the colour that the tracker gave it, and its number above."""
+        now = {person.id: person for person in picture.persons}
+        for gone in self._persons.keys() - now.keys():
+            self._persons.pop(gone).remove()
+        for number, person in now.items():
+            if number not in self._persons:
+                self._persons[number] = self._add_person(person)
+            self._persons[number].position = (*person.position.tolist(), 0.5 * PERSON_HEIGHT)
+
+    def _add_person(self, person: Person) -> Any:
+        name = f"/world/person_{person.id}"
+        handle = self._server.scene.add_cylinder(
+            name, PERSON_RADIUS, PERSON_HEIGHT, person.colour, opacity=0.65
+        )
+        self._server.scene.add_label(f"{name}/id", str(person.id), position=(0.0, 0.0, 0.6 * PERSON_HEIGHT))
+        return handle
+
+    def _is_new(self, name: str, what: Any) -> bool:
+        """Whether this is another object than what was drawn last under the name."""
+        before = self._drawn.get(name)
+        self._drawn[name] = what
+        return before is not what
+
+    def _add_links(self) -> dict[str, Any]:
+        """A frame for each link that moves, below that of its parent, with the link's shapes in it."""
+        scene, names, frames = self._server.scene, {"base_link": "/robot"}, {}
+        for link in robot.LINKS:
+            names[link.name] = f"{names[link.parent or 'base_link']}/{link.name}"
+            frames[link.name] = scene.add_frame(names[link.name], show_axes=False, position=link.origin)
+        for number, shape in enumerate(shapes()):
+            scene.add_mesh_simple(
+                f"{names[shape.link]}/shape_{number}",
+                shape.mesh.vertices,
+                shape.mesh.faces,
+                color=shape.colour,
+            )
+        return frames
+
+
+def shapes() -> Iterator[Shape]:
+    """What of the robot is to be seen, by its URDF."""
+    for link in ElementTree.fromstring(urdf()).iter("link"):
+        for visual in link.iter("visual"):
+            geometry = visual.find("geometry/*")
+            assert geometry is not None
+            mesh = _mesh(geometry)
+            origin = visual.find("origin")
+            assert origin is not None
+            mesh.apply_transform(_transform(origin))
+            name = link.get("name", "")
+            colour = TRUNK if name == "trunk" else FOOT if name.endswith("foot") else LEG
+            yield Shape(name, mesh, colour)
+
+
+def _mesh(geometry: ElementTree.Element) -> trimesh.Trimesh:
+    sizes = {key: np.array(value.split(), float) for key, value in geometry.items()}
+    if geometry.tag == "box":
+        corner = min(CORNER, 0.45 * sizes["size"].min())
+        centres = trimesh.creation.box(sizes["size"] - 2 * corner).vertices
+        ball = trimesh.creation.icosphere(subdivisions=2, radius=corner)
+        return trimesh.convex.convex_hull((centres[:, None] + ball.vertices).reshape(-1, 3))
+    if geometry.tag == "cylinder":
+        return trimesh.creation.cylinder(float(sizes["radius"][0]), float(sizes["length"][0]), sections=40)
+    return trimesh.creation.icosphere(subdivisions=3, radius=float(sizes["radius"][0]))
+
+
+def _transform(origin: ElementTree.Element) -> Array:
+    place, angles = (np.array(origin.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
+    matrix: Array = trimesh.transformations.euler_matrix(*angles)  # type: ignore[no-untyped-call]
+    matrix[:3, 3] = place
+    return matrix
+
+
+def _furnish(server: viser.ViserServer) -> None:
+    """Light and background, and none of viser's own controls."""
+    scene = server.scene
+    scene.configure_default_lights(enabled=False)
+    scene.configure_environment_map(None)
+    scene.set_background_image(np.full((1, 1, 3), BACKGROUND, np.uint8))
+    scene.configure_fog(6.0, 16.0, color=BACKGROUND)
+    scene.add_light_hemisphere(
+        "/light/sky", sky_color=(215, 228, 255), ground_color=(52, 50, 48), intensity=1.6
+    )
+    scene.add_light_directional(
+        "/light/sun", color=(255, 244, 228), intensity=2.4, cast_shadow=True, position=(1.5, -2.0, 4.0)
+    )
+    server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)

@@ -1,0 +1,61 @@
+"""The page as a whole: viser's scene, the web server, and what both show. Where the picture comes from is others' matter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import redirect_stdout
+from io import StringIO
+from typing import Any
+
+import viser
+
+from .operator import Operator
+from .panel import panel
+from .picture import RobotPicture
+from .scene import Scene
+from .server import PageServer
+
+FRAME = 1.0 / 30.0
+"""s, between two pictures"""
+PORT = 8770
+"""TCP port of the page, unless told otherwise"""
+
+
+class Viewer:
+    """Serves the page from the time it is made until `close`. on_word, on_leave: as of PageServer, in its thread."""
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        on_word: Callable[[int, dict[str, Any]], None],
+        on_leave: Callable[[int], None],
+    ) -> None:
+        with redirect_stdout(StringIO()):  # viser tells of its own address, which is nobody's business
+            self._scene_server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        try:
+            self._scene = Scene(self._scene_server)
+            self._page = PageServer(host, port, self._scene_server.get_port(), on_word, on_leave)
+        except BaseException:
+            self._end_scene()
+            raise
+        self.url = self._page.url
+
+    @property
+    def is_watched(self) -> bool:
+        """Whether somebody has the page open."""
+        return self._page.is_watched
+
+    def show(self, picture: RobotPicture, operator: Operator, now: float, **more: Any) -> None:
+        """One picture, and the readings, to which `more` is added. now: s, on the clock of the picture."""
+        self._scene.draw(picture)
+        self._page.tell({**panel(picture, operator, now), **more})
+
+    def close(self) -> None:
+        """End both servers."""
+        self._page.close()
+        self._end_scene()
+
+    def _end_scene(self) -> None:
+        with redirect_stdout(StringIO()):
+            self._scene_server.stop()

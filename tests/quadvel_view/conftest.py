@@ -1,0 +1,56 @@
+"""Messages made by hand, and a recording of a robot that walks straight on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import Writer
+
+from quadvel_description import robot
+from quadvel_recordings.definitions import STORE
+from quadvel_recordings.recorded import _default
+from quadvel_view.picture import TOPICS
+
+SPEED = 0.5  # m/s
+SECONDS = 3.0
+
+
+def message(typename: str, **fields: Any) -> Any:
+    """A message of this type, its fields at their defaults but for those given."""
+    made = STORE.types[typename](*(_default(typename, *field) for field in STORE.fielddefs[typename][1]))
+    for name, value in fields.items():
+        setattr(made, name, value)
+    return made
+
+
+def odometry(x: float, y: float, speed: float = SPEED) -> Any:
+    """Odometry of a robot at this place."""
+    odom = message("nav_msgs/msg/Odometry")
+    odom.pose.pose.position.x, odom.pose.pose.position.y, odom.pose.pose.position.z = x, y, 0.4
+    odom.twist.twist.linear.x = speed
+    return odom
+
+
+@pytest.fixture(scope="session")
+def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """joint_states and odom, 50 times a second, as `quadvel record` writes them."""
+    path = tmp_path_factory.mktemp("walked") / "walked.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2", library="test")
+        channels = {}
+        for topic in ("/joint_states", "/odom"):
+            text, _ = STORE.generate_msgdef(TOPICS[topic], ros_version=2)
+            schema = writer.register_schema(TOPICS[topic], "ros2msg", text.encode())
+            channels[topic] = writer.register_channel(topic, "cdr", schema)
+        for step in range(round(50 * SECONDS) + 1):
+            angles = robot.NOMINAL_Q + 0.1 * np.sin(0.2 * step)
+            joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=angles)
+            for topic, one in {"/joint_states": joints, "/odom": odometry(SPEED * step / 50, 0.0)}.items():
+                data = bytes(STORE.serialize_cdr(one, TOPICS[topic]))
+                writer.add_message(channels[topic], 1_000_000_000 + 20_000_000 * step, data, 0)
+        writer.finish()
+    return path

@@ -1,0 +1,68 @@
+"""Topics as Foxglove's protocol has them: offered with their definitions, and handed on as they came."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from importlib.resources import files
+
+import pytest
+from websockets.sync.client import connect
+
+from quadvel_recordings.definitions import STORE
+from quadvel_view.server import AddressError
+
+from .conftest import odometry
+
+foxglove_live = pytest.importorskip("quadvel_view.foxglove_live", reason="foxglove-sdk is not installed")
+SUBPROTOCOLS = ["foxglove.sdk.v1", "foxglove.websocket.v1"]
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+@pytest.fixture
+def server() -> Iterator[foxglove_live.FoxgloveServer]:
+    server = foxglove_live.FoxgloveServer("127.0.0.1", 0)
+    yield server
+    server.close()
+
+
+def advertised(client) -> dict:
+    """The first channel that the server offers."""
+    while True:
+        word = client.recv(timeout=10.0)
+        if isinstance(word, str) and json.loads(word)["op"] == "advertise":
+            return json.loads(word)["channels"][0]
+
+
+@pytest.mark.parametrize("latched", [True, False])
+def test_a_topic_comes_with_its_definition_and_its_bytes(server, latched: bool) -> None:
+    data = bytes(STORE.serialize_cdr(odometry(1.0, 2.0), ODOMETRY))
+    server.offer("/odom", ODOMETRY, latched)
+    server.tell("/odom", data, 1)
+    with connect(server.url, subprotocols=SUBPROTOCOLS) as client:
+        channel = advertised(client)
+        assert (channel["topic"], channel["encoding"], channel["schemaName"]) == ("/odom", "cdr", ODOMETRY)
+        assert "geometry_msgs/Point position" in channel["schema"]
+        wanted = {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": channel["id"]}]}
+        client.send(json.dumps(wanted))
+        if not latched:
+            with pytest.raises(TimeoutError):
+                client.recv(timeout=0.3)
+            server.tell("/odom", data, 2)
+        assert client.recv(timeout=10.0)[13:] == data  # behind operation, subscription, and time
+
+
+def test_other_hosts_are_refused_as_nobody_shows_a_token_here() -> None:
+    with pytest.raises(AddressError, match=r"this host alone.*ssh -L"):
+        foxglove_live.FoxgloveServer("0.0.0.0", 0)
+
+
+def test_the_layout_shows_the_robot_by_its_description() -> None:
+    layout = json.loads(files("quadvel_view").joinpath("layouts", "foxglove.json").read_text())
+    assert layout["configById"]["3D!robot"]["layers"]["urdf"]["topic"] == "/robot_description"
+    shown = {layout["layout"]["first"]}
+    rest = layout["layout"]["second"]
+    while isinstance(rest, dict):
+        shown.add(rest["first"])
+        rest = rest["second"]
+    assert shown | {rest} == set(layout["configById"])

@@ -1,0 +1,83 @@
+"""Keys that repeat and gamepads with a dead-man's button: what is held counts, and nothing else."""
+
+from __future__ import annotations
+
+import pytest
+
+from quadvel_view import gamepad
+from quadvel_view.gamepad import Gamepad, Span
+from quadvel_view.keyboard import BETWEEN_REPEATS, UNTIL_REPEAT, Keyboard, strokes
+
+SPANS = {code: Span(-32768, 32767) for code in gamepad.STICKS}
+
+
+def test_a_key_counts_until_its_repeats_end() -> None:
+    keys = Keyboard()
+    assert keys.velocity(0.0) is None
+    keys.stroke("w", 0.0)
+    assert keys.velocity(0.9 * UNTIL_REPEAT) == pytest.approx([0.5, 0.0, 0.0])
+    last = 0.5
+    for repeat in range(30):
+        last = 0.5 + repeat / 30
+        keys.stroke("w", last)
+        assert keys.velocity(last + 0.03) is not None
+    assert keys.velocity(last + 1.01 * BETWEEN_REPEATS) is None
+
+
+def test_a_tap_ends_by_itself() -> None:
+    keys = Keyboard()
+    keys.stroke("d", 0.0)
+    assert keys.velocity(0.1)[2] < 0.0
+    assert keys.velocity(1.01 * UNTIL_REPEAT) is None
+
+
+def test_any_other_key_lets_go() -> None:
+    keys = Keyboard()
+    keys.stroke("w", 0.0)
+    keys.stroke("m", 0.1)
+    assert keys.velocity(0.1) is None
+
+
+def test_speed_changes_in_steps_and_has_ends() -> None:
+    keys = Keyboard()
+    keys.stroke("+", 0.0)
+    assert keys.speed == 0.8
+    for _ in range(20):
+        keys.stroke("-", 0.0)
+    assert keys.speed == 0.1
+    keys.stroke("s", 0.0)
+    assert keys.velocity(0.0) == pytest.approx([-0.1, 0.0, 0.0])
+
+
+def test_what_a_terminal_sends_is_cut_into_keys() -> None:
+    assert strokes("w\x1b[Aa\x1b[C ") == ["w", "\x1b[A", "a", "\x1b[C", " "]
+
+
+def test_sticks_count_while_the_dead_mans_button_is_held() -> None:
+    pad = Gamepad(SPANS)
+    pad.follow(gamepad.ABSOLUTE, gamepad.FORWARD, -32768)
+    pad.follow(gamepad.ABSOLUTE, gamepad.YAW, 32767)
+    assert pad.velocity() is None
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 1)
+    assert pad.velocity() == pytest.approx([0.5, 0.0, -0.8])
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 0)
+    assert pad.velocity() is None
+
+
+def test_a_stick_that_rests_a_little_off_its_middle_is_at_rest() -> None:
+    pad = Gamepad(SPANS)
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 1)
+    pad.follow(gamepad.ABSOLUTE, gamepad.SIDE, 2500)
+    assert pad.velocity() == pytest.approx([0.0, 0.0, 0.0])
+
+
+def test_buttons_stop_and_release_when_they_go_down() -> None:
+    pad = Gamepad(SPANS)
+    assert pad.follow(gamepad.KEY, gamepad.STOP, 1) == "stop"
+    assert pad.follow(gamepad.KEY, gamepad.STOP, 0) == ""
+    assert pad.follow(gamepad.KEY, gamepad.RELEASE, 1) == "release"
+
+
+def test_what_has_no_two_sticks_is_refused() -> None:
+    with pytest.raises(ValueError, match="no axis 0x3, expected two sticks"):
+        Gamepad({code: SPANS[code] for code in (gamepad.FORWARD, gamepad.SIDE)})

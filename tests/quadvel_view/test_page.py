@@ -1,0 +1,216 @@
+"""The page in a real browser: it opens, its pad makes the robot walk, STOP stops it, recordings play, nothing overlaps.
+
+All without a card: Chromium draws with SwiftShader. Where there is no Chromium these tests are left out.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from io import BytesIO
+from itertools import combinations
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+from matplotlib.image import imread
+
+from quadvel_bringup.stack import PARAMETERS
+
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no Chromium on this machine: apt install chromium")
+
+QUADVEL = (sys.executable, "-m", "quadvel_bringup")
+ARGUMENTS = (
+    "--no-sandbox",
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+)
+PARTS = ("main", ".controls", ".readings", "#stop")
+PATIENCE = 60_000  # ms; a machine that tests run on is busy
+
+
+class Served:
+    """A command of quadvel that serves the page, and what it says."""
+
+    def __init__(self, log: Path, *words: str) -> None:
+        self._log = log
+        with log.open("w") as file:
+            self._process = subprocess.Popen(
+                [*QUADVEL, *words],
+                cwd=log.parent,
+                stdout=file,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    def said(self, pattern: str) -> str:
+        """What the group of the pattern matched, once it did."""
+        until = time.monotonic() + 60.0
+        while (found := re.search(pattern, self._log.read_text())) is None:
+            assert self._process.poll() is None, self._log.read_text()
+            assert time.monotonic() < until, self._log.read_text()
+            time.sleep(0.05)
+        return found[1]
+
+    def end(self) -> int:
+        self._process.send_signal(signal.SIGINT)
+        return self._process.wait(30.0)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    with playwright.sync_playwright() as started:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=[*ARGUMENTS])
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The address of the page of a simulated robot that stands."""
+    folder = tmp_path_factory.mktemp("view")
+    parameters = yaml.safe_load(PARAMETERS.read_text())
+    parameters["view"]["ros__parameters"]["port"] = 0
+    (folder / "params.yaml").write_text(yaml.safe_dump(parameters))
+    up = Served(folder / "up.log", "up", "--view", "--params", "params.yaml")
+    up.said("(ready: a velocity makes it walk)")
+    yield up.said(r"open (http://127\.0\.0\.1:\d+/)")
+    assert up.end() == 0
+
+
+class Page:
+    """A page of the browser, and what it asked for and complained of."""
+
+    def __init__(
+        self, browser: Any, url: str, width: int = 1280, height: int = 720, scene: bool = False
+    ) -> None:
+        """scene: whether it draws the robot, which without a card takes most of the time that there is."""
+        self.page = browser.new_page(viewport={"width": width, "height": height})
+        self.page.set_default_timeout(PATIENCE)
+        self.complaints: list[str] = []
+        self.requests: list[str] = []
+        self.page.on(
+            "console", lambda said: self.complaints.append(said.text) if said.type == "error" else None
+        )
+        self.page.on("pageerror", lambda error: self.complaints.append(str(error)))
+        self.page.on("request", lambda request: self.requests.append(request.url))
+        if not scene:
+            self.page.route("**/scene/**", lambda route: route.fulfill(body=""))
+        self.page.goto(url)
+
+    def until(self, condition: str) -> None:
+        """Wait until a condition on what the page was told last holds."""
+        self.page.wait_for_function(f"state !== null && ({condition})")
+
+    def press(self, x: float, y: float) -> None:
+        """Take the knob of the pad from its middle to a place, shares of the way to the edge, and hold it."""
+        box = self.page.locator("#pad").bounding_box()
+        middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        self.page.mouse.move(*middle)
+        self.page.mouse.down()
+        self.page.mouse.move(middle[0] + 60 * x, middle[1] - 60 * y)
+
+    def shows_the_robot(self) -> None:
+        """Wait for the picture in 3-D: light trunk, orange feet."""
+        self.page.frame_locator("#scene").locator("canvas").first.wait_for()
+        until = time.monotonic() + PATIENCE / 1000
+        while not {"trunk", "feet"} <= self._seen():
+            assert time.monotonic() < until, f"the picture shows {self._seen() or 'nothing'}"
+            time.sleep(0.2)
+
+    def _seen(self) -> set[str]:
+        pixels = imread(BytesIO(self.page.locator("main").screenshot()))[..., :3]
+        red, green, blue = np.moveaxis(pixels, -1, 0)
+        seen = {"trunk": (pixels.min(-1) > 0.6), "feet": (red > 0.75) & (green < 0.6) & (blue < 0.4)}
+        return {name for name, where in seen.items() if where.sum() > 50}
+
+
+@pytest.fixture
+def page(browser: Any, robot: str) -> Iterator[Page]:
+    page = Page(browser, robot)
+    yield page
+    page.page.close()
+    assert page.complaints == []
+
+
+def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
+    page.until("state.mode === 'stance'")
+    page.press(0.0, 1.0)
+    page.until("state.mode === 'walk' && state.source === 'teleop' && state.measured[0] > 0.2")
+    page.page.mouse.up()
+    page.until("state.commanded.every((value) => value === 0) && state.source === 'none'")
+
+    page.press(0.0, 1.0)
+    page.until("state.measured[0] > 0.1")
+    page.page.keyboard.press("Space")
+    page.until("state.stopped && state.mode === 'passive'")
+    page.press(0.0, 1.0)
+    page.page.wait_for_timeout(300)
+    assert page.page.evaluate("state.source") == "none"
+    page.page.mouse.up()
+    page.page.click("#stop")
+    page.until("!state.stopped")
+    page.page.click("[data-do=reset]")
+    page.until("state.said.includes('lie')")
+    page.page.click("[data-do=stand_up]")
+    page.until("state.mode === 'stance'")
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
+def test_nothing_overlaps(browser: Any, robot: str, width: int, height: int) -> None:
+    page = Page(browser, robot, width, height)
+    page.until("state.lamps.length > 2")
+    boxes = {
+        part: page.page.locator(part).bounding_box()
+        for part in (PARTS if width > 820 else ("main", ".panel", "#stop"))
+    }
+    for (one, a), (other, b) in combinations(boxes.items(), 2):
+        apart = (
+            a["x"] + a["width"] <= b["x"] + 0.5
+            or b["x"] + b["width"] <= a["x"] + 0.5
+            or a["y"] + a["height"] <= b["y"] + 0.5
+            or b["y"] + b["height"] <= a["y"] + 0.5
+        )
+        assert apart, f"{one} and {other}: {a}, {b}"
+    for box in boxes.values():
+        assert box["x"] >= 0
+        assert box["y"] >= 0
+        assert box["x"] + box["width"] <= width
+        assert box["y"] + box["height"] <= height
+    assert page.page.evaluate("document.documentElement.scrollWidth") <= width
+    page.page.close()
+    assert page.complaints == []
+
+
+def test_a_recording_plays_and_nothing_comes_from_elsewhere(
+    browser: Any, walked: Path, tmp_path: Path
+) -> None:
+    view = Served(tmp_path / "view.log", "view", str(walked), "--port", "0")
+    url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
+    page = Page(browser, url, 800, 600, scene=True)
+    page.until("state.playback.playing && state.playback.time > 0.3 && state.measured[0] > 0.4")
+    page.page.click("#play")
+    page.until("!state.playback.playing")
+    page.page.evaluate("$('time').value = 1.5; $('time').dispatchEvent(new Event('input'))")
+    page.until("state.playback.time === 1.5 && state.measured[0] > 0.4")
+    assert page.page.locator("#stop").is_hidden()
+    page.shows_the_robot()
+    ours = (url, url.replace("127.0.0.1", "localhost"), "data:", "blob:")
+    assert [one for one in page.requests if not one.startswith(ours)] == []
+    page.page.close()
+    assert view.end() == 0
+    assert page.complaints == []

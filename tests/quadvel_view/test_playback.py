@@ -1,0 +1,66 @@
+"""A recording as a film: any moment of it is the picture that was there then."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from mcap.writer import Writer
+
+from quadvel_recordings.reading import RecordingError
+from quadvel_view.playback import Playback
+from quadvel_view.replay import heed
+
+from .conftest import SECONDS, SPEED
+
+
+def test_it_plays_at_its_pace_and_ends(walked: Path) -> None:
+    film = Playback(walked)
+    assert film.length == pytest.approx(SECONDS)
+    film.advance(1.0)
+    assert film.picture.position[0] == pytest.approx(SPEED, abs=0.011)
+    film.set_pace(0.5)
+    film.advance(1.0)
+    assert film.picture.position[0] == pytest.approx(1.5 * SPEED, abs=0.011)
+    film.set_pace(2.0)
+    film.advance(60.0)
+    assert film.time == film.length
+    assert not film.playing
+    film.toggle()
+    assert film.playing
+    assert film.time == 0.0
+
+
+def test_paused_it_stands_still(walked: Path) -> None:
+    film = Playback(walked)
+    film.toggle()
+    film.advance(1.0)
+    assert film.time == 0.0
+
+
+def test_a_jump_back_shows_the_way_up_to_there_alone(walked: Path) -> None:
+    film = Playback(walked)
+    film.advance(2.5)
+    film.seek(1.0)
+    assert film.picture.position[0] == pytest.approx(SPEED, abs=0.011)
+    assert max(point[0] for point in film.picture.trail) <= SPEED
+    assert min(point[0] for point in film.picture.trail) == pytest.approx(0.0, abs=0.06)
+
+
+def test_words_that_make_no_sense_change_nothing(walked: Path) -> None:
+    film = Playback(walked)
+    for word in ({}, {"do": "seek"}, {"do": "seek", "time": "x"}, {"do": "pace", "pace": float("nan")}):
+        heed(film, word)
+    assert (film.time, film.pace, film.playing) == (0.0, 1.0, True)
+    heed(film, {"do": "seek", "time": 99})
+    assert film.time == film.length
+
+
+def test_a_recording_without_a_robot_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "empty.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="ros2")
+        writer.finish()
+    with pytest.raises(RecordingError, match="no robot in it"):
+        Playback(path)

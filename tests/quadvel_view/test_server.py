@@ -1,0 +1,113 @@
+"""Who may reach the page: this host's own pages, and elsewhere who shows the token."""
+
+from __future__ import annotations
+
+import http.client
+import time
+from collections.abc import Iterator
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
+
+from quadvel_view.server import AddressError, PageServer
+
+
+@pytest.fixture
+def heard() -> list[Any]:
+    return []
+
+
+def serve(host: str, heard: list[Any]) -> Iterator[PageServer]:
+    server = PageServer(host, 0, 9, lambda page, word: heard.append(word), lambda page: heard.append("left"))
+    yield server
+    server.close()
+
+
+@pytest.fixture
+def here(heard: list[Any]) -> Iterator[PageServer]:
+    yield from serve("127.0.0.1", heard)
+
+
+@pytest.fixture
+def everywhere(heard: list[Any]) -> Iterator[PageServer]:
+    yield from serve("0.0.0.0", heard)
+
+
+def get(server: PageServer, path: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Status, headers, and body of what the server answers on the loopback interface."""
+    connection = http.client.HTTPConnection("127.0.0.1", urlsplit(server.url).port, timeout=10.0)
+    connection.request("GET", path, headers=headers)
+    answer = connection.getresponse()
+    return answer.status, dict(answer.getheaders()), answer.read()
+
+
+def socket(server: PageServer, origin: str | None = None, **headers: str) -> Any:
+    port = urlsplit(server.url).port
+    return connect(f"ws://127.0.0.1:{port}/words", origin=origin, additional_headers=headers)
+
+
+def test_on_this_host_the_page_comes_without_a_token(here: PageServer) -> None:
+    status, headers, body = get(here, "/")
+    assert status == 200
+    assert b"STOP" in body
+    assert "connect-src 'self'" in headers["Content-Security-Policy"]
+    assert "token" not in here.url
+
+
+@pytest.mark.parametrize("host", ["robot.example:80", "192.168.1.20", "127.0.0.1.example"])
+def test_a_name_that_somebody_else_lets_point_here_is_refused(here: PageServer, host: str) -> None:
+    status, _, body = get(here, "/", Host=host)
+    assert status == 403
+    assert b"for this host alone" in body
+
+
+@pytest.mark.parametrize("origin", [None, "https://example.com", "http://127.0.0.1:1"])
+def test_a_page_from_elsewhere_may_not_command_the_robot(here: PageServer, origin: str | None) -> None:
+    with pytest.raises(InvalidStatus, match="403"):
+        socket(here, origin)
+
+
+def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
+    with socket(here, f"http://127.0.0.1:{urlsplit(here.url).port}") as page:
+        page.send('{"do":"stop"}')
+        page.send('{"do":"let_go"}')
+        page.ping().wait(10.0)
+    until = time.monotonic() + 10.0
+    while "left" not in heard and time.monotonic() < until:
+        time.sleep(0.01)
+    assert heard == [{"do": "stop"}, {"do": "let_go"}, "left"]
+
+
+def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:
+    for nonsense in ("[1]", "{", '"' + "x" * 5000 + '"'):
+        with socket(here, f"http://127.0.0.1:{urlsplit(here.url).port}") as page:
+            page.send(nonsense)
+            with pytest.raises(Exception, match="not understood"):
+                page.recv(timeout=10.0)
+    assert [word for word in heard if word != "left"] == []
+
+
+def test_elsewhere_only_the_token_lets_in(everywhere: PageServer) -> None:
+    token = urlsplit(everywhere.url).query.partition("=")[2]
+    assert len(token) >= 20
+    for path in ("/", "/app.js", "/scene/", "/?token=wrong", f"/?token={token[:-1]}"):
+        assert get(everywhere, path)[0] == 403
+    with pytest.raises(InvalidStatus, match="403"):
+        socket(everywhere, f"http://127.0.0.1:{urlsplit(everywhere.url).port}")
+    status, headers, _ = get(everywhere, f"/?token={token}")
+    assert status == 200
+    cookie = headers["Set-Cookie"].partition(";")[0]
+    assert "HttpOnly" in headers["Set-Cookie"]
+    assert get(everywhere, "/app.js", Cookie=cookie)[0] == 200
+    with socket(everywhere, f"http://127.0.0.1:{urlsplit(everywhere.url).port}", Cookie=cookie) as page:
+        page.ping().wait(10.0)
+
+
+def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
+    port = urlsplit(here.url).port
+    assert port is not None
+    with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: the page can't be served there"):
+        PageServer("127.0.0.1", port, 9, lambda page, word: None, lambda page: None)
