@@ -1,4 +1,4 @@
-"""What a package imports of ROS 2 and of quadvel is what its package.xml asks for, so that it can be built and run without the others."""
+"""What a package imports of the others, and of ROS 2, its package.xml asks for: so it can be built and run by itself."""
 
 from __future__ import annotations
 
