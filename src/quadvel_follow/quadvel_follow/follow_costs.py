@@ -17,6 +17,8 @@ FORGETS = 2.0  # s, in which a person's velocity is taken to fade
 BODY = 0.25  # m, from the middle of a person to its outside
 SOFT = 0.3  # m, up to which an error of the distance counts by its square, and then by itself
 TURNS = 0.7  # m, from its place beside the person, up to which the robot turns as the person does
+CHANGES = np.array([3.0, 10.0, 15.0])  # cost of the squared change of vx, vy, wz from one step to the next
+USE = np.array([0.0, 2.0, 0.3])  # of their squares
 COLLISION = 1000.0
 GUARD = 0.05  # m, below which a clearance counts as a collision
 
@@ -77,9 +79,8 @@ class FollowCost:
             + self._effort(situation, rollouts)
         )
 
-    def errors(self, situation: Situation, poses: Array) -> tuple[Array, Array]:
-        """Of the distance, m, too far above 0, and of the heading, rad, for poses (K, STEPS, 3)."""
-        person = ahead(situation.person[None])[0]
+    def errors(self, situation: Situation, poses: Array, person: Array) -> tuple[Array, Array]:
+        """Of the distance, m, too far above 0, and of the heading, rad, for poses (K, n, 3) and the person at (n, 2), m."""
         if not situation.direct:
             off = situation.goal - poses[..., :2]
             far = np.hypot(off[..., 0], off[..., 1]) + situation.rest - self.distance
@@ -98,16 +99,25 @@ class FollowCost:
         wanted = np.where(far < TURNS, heading, np.arctan2(off[..., 1], off[..., 0]))
         return far, _wrapped(wanted - poses[..., 2])
 
+    def _beside(self, situation: Situation) -> Array:
+        """From the person to the place beside it, (2,) m."""
+        heading = np.arctan2(situation.person[3], situation.person[2])
+        return self.side * self.distance * np.array([-np.sin(heading), np.cos(heading)])
+
+    def place(self, situation: Situation) -> Array:
+        """Where to walk now, (2,) m: the goal, or the place beside the person."""
+        return situation.goal + self._beside(situation) if situation.direct else situation.goal
+
     def _following(self, situation: Situation, rollouts: Rollouts) -> Array:
-        far, turn = self.errors(situation, rollouts.poses)
-        return (10.0 * (np.sqrt(far**2 + SOFT**2) - SOFT) + 2.0 * (1.0 - np.cos(turn))).mean(1)
+        far, turn = self.errors(situation, rollouts.poses, ahead(situation.person[None])[0])
+        return (10.0 * (np.sqrt(far**2 + SOFT**2) - SOFT) + 6.0 * (1.0 - np.cos(turn))).mean(1)
 
     def _obstacles(self, clearance: Array, speed: Array) -> Array:
         least = clearance.min(1)
-        short = np.maximum(self.margin + 0.03 - least, 0.0)
+        short = np.maximum(self.margin + 0.02 - least, 0.0)
         near = np.maximum(self.margin + 0.2 - clearance, 0.0)
         return (
-            COLLISION * (least < GUARD) + 400.0 * short**2 + (20.0 * near**2 + 1.5 * speed**2 * near).mean(1)
+            COLLISION * (least < GUARD) + 200.0 * short**2 + (20.0 * near**2 + 1.5 * speed**2 * near).mean(1)
         )
 
     def gaps(self, persons: Array, poses: Array) -> Array:
@@ -128,16 +138,21 @@ class FollowCost:
         """Fast into what the scan does not show."""
         place = to_sensor(rollouts.poses[..., :2].reshape(-1, 2), situation.sensor)
         distance = np.hypot(*place.T)
-        reading = situation.scan.at(np.arctan2(place[:, 1], place[:, 0]))
-        hidden = (distance > self.length) & ~(reading > distance - 0.2)
+        bearing = np.arctan2(place[:, 1], place[:, 0])
+        hidden = (distance > self.length) & ~(situation.scan.at(bearing) > distance - 0.2)
+        person = to_sensor(situation.person[None, :2], situation.sensor)[0]
+        behind = np.abs(_wrapped(bearing - np.arctan2(person[1], person[0]))) < np.arctan2(
+            2.0 * BODY, np.hypot(*person)
+        )
+        hidden &= ~behind  # where the person walks, nothing else is
         return (2.0 * speed**2 * hidden.reshape(speed.shape)).mean(1)
 
     def _effort(self, situation: Situation, rollouts: Rollouts) -> Array:
         first = rollouts.commands[:, :1] - situation.command
         changes = np.concatenate([first, np.diff(rollouts.commands, axis=1)], axis=1)
-        used = rollouts.commands**2 * [0.0, 1.0, 0.1]
+        used = USE * rollouts.commands**2
         back = np.minimum(rollouts.commands[..., 0], 0.0) ** 2
-        return (2.0 * changes**2 + used).sum(2).mean(1) + 2.0 * back.mean(1)
+        return (CHANGES * changes**2 + used).sum(2).mean(1) + 2.0 * back.mean(1)
 
 
 def _wrapped(angle: Array) -> Array:

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from .clearance import Clearance
 from .clusters import Scan
-from .follow_costs import BODY, FollowCost, Situation
+from .follow_costs import BODY, FollowCost, Situation, ahead
 from .mppi import Mppi
 from .obstacle_memory import ObstacleMemory
 from .pose_history import PoseHistory
+from .pursuit import pursue
 from .rollouts import STEPS, TIMES, Axes, Limits, Rollouts, roll_out
 from .trail import Trail
 
@@ -81,7 +82,7 @@ class FollowConfig:
         metadata={"description": "where the robot goes: behind, left or right of the person"},
     )
     clearance: float = _described(0.3, "clearance from the robot's outline that it keeps where it can, m")
-    max_velocity: Axes = _described((2.0, 0.6, 1.5), "largest vx, vy, wz commanded, m/s, rad/s")
+    max_velocity: Axes = _described((2.5, 0.6, 1.5), "largest vx, vy, wz commanded, m/s, rad/s")
     acceleration: Axes = _described(
         (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2"
     )
@@ -262,12 +263,12 @@ class FollowPlanner:
             self._leading = now
             self._search.reset()
             return self._ease(State.FOLLOWING, "stands with the person", elapsed)
-        guess = self._guess(situation, error, turn)
+        guesses = self._guesses(situation)
 
         def cost(targets: Array) -> Array:
-            return self._cost.of(situation, self._rolled(situation, situation.limits.held(targets)))
+            return self._cost.of(situation, self._rolled(situation, targets))
 
-        targets = situation.limits.held(self._search.search(cost, self._command, guess, elapsed))
+        targets = self._search.search(cost, situation.limits, self._command, guesses, elapsed)
         found = self._rolled(situation, targets[None])
         if np.abs(targets[:6]).max() > CRAWLING:
             self._leading = now
@@ -367,9 +368,7 @@ class FollowPlanner:
         return bool((field.of_disc(line) > 0.5 * self.config.width + 0.5 * self.config.clearance).all())
 
     def _errors(self, situation: Situation) -> tuple[float, float]:
-        poses = np.broadcast_to(situation.pose, (1, STEPS, 3))
-        still = attrs.evolve(situation, person=np.append(situation.person[:2], 1e-9 * situation.person[2:]))
-        far, turn = self._cost.errors(still, poses)
+        far, turn = self._cost.errors(situation, situation.pose[None, None], situation.person[None, :2])
         return float(far[0, 0]), float(turn[0, 0])
 
     def _may_stand(self, situation: Situation, error: float, turn: float) -> bool:
@@ -379,13 +378,13 @@ class FollowPlanner:
         far, off = ARRIVED if self._command.any() else AT_EASE
         return (abs(error) < far or -0.6 * self.config.distance < error < 0.0) and abs(turn) < off
 
-    def _guess(self, situation: Situation, error: float, turn: float) -> Array:
-        """As a proportional controller would go."""
-        person, pose = situation.person, situation.pose
-        towards = pose[2] + turn
-        along = person[2] * np.cos(towards) + person[3] * np.sin(towards)
-        speed = max(along, 0.0) + 1.2 * error
-        return np.array([speed * max(np.cos(turn), 0.0), 0.3 * speed * np.sin(turn), 2.0 * turn])
+    def _guesses(self, situation: Situation) -> Array:
+        """Towards the goal, as if nothing stood about, (n, STEPS, 3)."""
+        person, pose = ahead(situation.person[None])[0], situation.pose
+        start = np.broadcast_to(pose, (1, STEPS, 3))
+        far = self._cost.errors(situation, start, person)[0][0]
+        goal = self._cost.place(situation)
+        return pursue(pose, goal, far, float(np.hypot(*situation.person[2:])), situation.limits)
 
     def _rolled(self, situation: Situation, targets: Array) -> Rollouts:
         return roll_out(targets, situation.pose, situation.velocity, situation.command, situation.limits)

@@ -10,14 +10,14 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .rollouts import STEP, STEPS
+from .rollouts import STEP, STEPS, Limits
 
 Array = NDArray[np.float64]
 
 ROLLOUTS = 192
 KNOTS = 4  # between which the noise of a rollout goes straight
-SPREAD = np.array([0.5, 0.25, 0.7])  # m/s, m/s, rad/s, standard deviation of the noise
-TEMPERATURE = 0.15  # of the cost
+SPREAD = np.array([0.4, 0.2, 0.5])  # m/s, m/s, rad/s, standard deviation of the noise
+TEMPERATURE = 0.05  # of the cost
 
 
 class Mppi:
@@ -30,19 +30,24 @@ class Mppi:
         left = np.minimum(at.astype(int), KNOTS - 2)
         share = (at - left)[:, None]
         smooth = (1.0 - share) * half[:, left] + share * half[:, left + 1]
-        self._noise = SPREAD * np.concatenate([smooth, -smooth])
+        self._noise = SPREAD * np.stack([smooth, -smooth], axis=1).reshape(-1, STEPS, 3)
         self._plan = np.zeros((STEPS, 3))
 
     def reset(self) -> None:
         """Forget the last plan."""
         self._plan = np.zeros((STEPS, 3))
 
-    def search(self, cost: Callable[[Array], Array], command: Array, guess: Array, elapsed: float) -> Array:
-        """The targets (STEPS, 3) to command; cost: of targets (K, STEPS, 3); guess (3,): commands that may be good."""
+    def search(
+        self, cost: Callable[[Array], Array], limits: Limits, command: Array, guesses: Array, elapsed: float
+    ) -> Array:
+        """The targets (STEPS, 3) to command; cost: of targets (K, STEPS, 3); guesses (n, STEPS, 3): targets that may be good."""
         at = np.arange(STEPS) + elapsed / STEP
         plan = np.column_stack([np.interp(at, np.arange(STEPS), axis) for axis in self._plan.T])
-        plans = [plan, np.broadcast_to(guess, plan.shape), 0.5 * (plan + guess), np.zeros_like(plan)]
-        targets = np.concatenate([plan + self._noise, np.array(plans)])
+        half = ROLLOUTS // 2
+        targets = np.concatenate(
+            [plan + self._noise[:half], guesses[0] + self._noise[half:], guesses, [plan, np.zeros_like(plan)]]
+        )
+        targets = limits.held(targets)
         costs = cost(targets)
         weights = np.exp((costs.min() - costs) / TEMPERATURE)
         self._plan = np.einsum("k,ksa->sa", weights / weights.sum(), targets)

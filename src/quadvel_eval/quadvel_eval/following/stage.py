@@ -15,7 +15,7 @@ from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, S
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_follow.person_tracker import PersonTracker
 from quadvel_follow.selection import Selection
-from quadvel_policy.command_mux import CommandMux, MuxInput
+from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput
 from quadvel_sim.walker import circles
 
 from ..people.laser import FloorPlan, Laser
@@ -29,6 +29,7 @@ LAG = 0.15  # s, of the velocity behind it
 ACCELERATION = np.array([2.6, 2.0, 6.0])  # m/s^2, rad/s^2, that the robot reaches
 FOLLOW = MuxInput("follow", 50, 0.2)
 MOUNTING = np.array([0.3, 0.0, 0.0])  # m, rad, of the laser on the robot
+CONFIG = FollowConfig(laser_x=float(MOUNTING[0]))
 LASER = Laser(rays=541, angle_min=-0.75 * np.pi, angle_increment=np.deg2rad(0.5), range_max=12.0)
 GROUND = 0.15  # share of the scans in which some rays hit the ground
 BAND = 0.5  # m, round the set distance
@@ -82,12 +83,19 @@ class Instant:
 class Stage:
     """`run` is a generator of instants; `mute`, what is not heard while it is set: "scan", "person" or "planner"."""
 
-    def __init__(self, scene: FollowScene, seed: int, detector: LegDetector, search: Any = None) -> None:
+    def __init__(
+        self,
+        scene: FollowScene,
+        seed: int,
+        detector: LegDetector,
+        search: Any = None,
+        config: FollowConfig = CONFIG,
+    ) -> None:
         self._scene, self._rng = scene, np.random.default_rng(seed)
-        self.config = FollowConfig(laser_x=float(MOUNTING[0]))
+        self.config = config
         self._planner = FollowPlanner(self.config, search)
         self._tracker, self._selection = PersonTracker(detector=detector), Selection()
-        self._mux = CommandMux([FOLLOW])
+        self._mux = CommandMux([FOLLOW], MuxConfig(acceleration=self.config.acceleration))
         first = scene.persons[0].position
         self.robot = Robot(np.array([first[0] - scene.start, first[1], 0.0]))
         self._standing = _points(scene.plan)
