@@ -10,7 +10,7 @@ import pytest
 from quadvel_eval.following.scenes import FollowScene
 from quadvel_eval.following.stage import LASER, Instant, Stage
 from quadvel_eval.people.laser import FloorPlan
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, State
+from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_sim.walker import Walker
 
@@ -19,8 +19,8 @@ OPEN = np.full(LASER.rays, np.inf)
 
 
 def walk(mute: Callable[[float], str], seconds: float) -> list[Instant]:
-    """Behind a person at 1.2 m/s along a wall; `mute` says at each time what is not heard."""
-    stage = Stage(FollowScene(WALL, [Walker([[0.0, 0.0], [30.0, 0.0]], 1.2)], seconds), 0, LegDetector())
+    """Behind a person at 0.8 m/s along a wall; `mute` says at each time what is not heard."""
+    stage = Stage(FollowScene(WALL, [Walker([[0.0, 0.0], [30.0, 0.0]], 0.8)], seconds), 0, LegDetector())
     instants = []
     for instant in stage.run():
         instants.append(instant)
@@ -30,15 +30,16 @@ def walk(mute: Callable[[float], str], seconds: float) -> list[Instant]:
 
 @pytest.mark.parametrize("what", ["scan", "person", "planner"])
 def test_the_command_is_zero_within_0_6_s_of_the_last_word_and_goes_on_after_it(what: str) -> None:
-    instants = walk(lambda time: what if 4.0 <= time < 5.0 else "", 6.5)
+    instants = walk(lambda time: what if 4.0 <= time < 5.0 else "", 6.0)
     speeds = {round(i.time, 2): float(np.hypot(*i.command[:2])) for i in instants}
-    assert speeds[4.0] > 1.0
+    assert speeds[4.0] > 0.5
     assert max(speed for time, speed in speeds.items() if 4.0 + 0.6 < time < 5.0) == 0.0
-    assert speeds[6.4] > 1.0
+    assert speeds[5.9] > 0.4
 
 
 def test_the_same_seed_walks_the_same_way() -> None:
-    first, second = (walk(lambda time: "", 4.0) for _ in range(2))
+    first, second = (walk(lambda time: "", 2.5) for _ in range(2))
+    assert first[-1].velocity.any()
     np.testing.assert_array_equal([i.pose for i in first], [i.pose for i in second])
 
 
@@ -50,9 +51,11 @@ class Bench:
         self.now = 0.0
         self.pose = np.zeros(3)
 
-    def step(self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD) -> list:
+    def step(
+        self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD
+    ) -> list:
         """The plans of so many seconds, the robot being where it is commanded to be."""
-        plans = []
+        plans: list[Plan] = []
         for _ in range(round(seconds / PERIOD)):
             self.now += PERIOD
             velocity = plans[-1].velocity if plans else np.zeros(3)
@@ -88,10 +91,11 @@ def test_it_looks_around_once_where_the_person_was_lost_and_takes_up_again() -> 
 
 def test_commands_change_no_faster_than_they_may() -> None:
     bench = Bench()
-    commands = np.array([plan.velocity for plan in bench.step((4.0, 1.0, 1.0, 0.0), seconds=3.0)])
-    config = FollowConfig()
+    plans = bench.step((6.0, 1.0, 0.0, 0.0), seconds=3.0)
+    commands = np.array([plan.velocity for plan in plans])
     steps = np.abs(np.diff(commands, axis=0)) / PERIOD
-    assert (steps <= np.maximum(config.acceleration, config.deceleration) + np.array(1e-6)).all()
+    assert {plan.words for plan in plans} == {"follows"}
+    assert (steps < np.maximum(FollowConfig().acceleration, FollowConfig().deceleration) + 1e-6).all()
     assert commands[:, 0].max() > 1.0
 
 
@@ -141,6 +145,6 @@ def test_numbers_that_are_not_finite_are_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize("config", [{"distance": -1.0}, {"side": "above"}, {"max_velocity": (1.0, 0.0, 1.0)}])
-def test_configurations_without_sense_are_refused(config: dict) -> None:
+def test_configurations_without_sense_are_refused(config: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(config))):
-        FollowConfig(**config)
+        FollowConfig(**config)  # type: ignore[arg-type]

@@ -23,7 +23,7 @@ KEEPS = 0.03  # by which a way has to be better than the last one
 class DynamicWindow:
     """Looks twice: over the window, and round the best in it."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self) -> None:
         axes = [np.linspace(-1.0, 1.0, count) for count in COUNTS]
         self._last = np.zeros((STEPS, 3))
         self._grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -1,6 +1,6 @@
 """Follows a person: from scans, odometry and tracks to velocities, with what the planner is doing and why.
 
-Plain numbers and times; it knows no ROS. `follow_costs` says which ways are good, `mppi` looks for the best of them.
+Plain numbers and times; it knows no ROS. `follow_costs` says which ways are good, `dynamic_window` looks for the best of them.
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .clearance import Clearance
 from .clusters import Scan
+from .dynamic_window import DynamicWindow
 from .follow_costs import BODY, FollowCost, Situation, ahead
-from .mppi import Mppi
 from .obstacle_memory import ObstacleMemory
 from .pose_history import PoseHistory
 from .pursuit import pursue
@@ -41,6 +41,7 @@ REACTS, BRAKES = 0.3, 2.5  # s, m/s^2, until it brakes and how, as measured with
 AT_EASE = (0.25, 0.5)  # m, rad, errors of a standing robot that it leaves alone
 ARRIVED = (0.12, 0.2)  # m, rad, those of a walking robot that may stand
 STANDS = 0.25  # m/s, below which a person stands
+NEARLY = 0.4  # m, of the distance that is too large, up to which nothing is in the way
 TRIES = 0.6  # s, without a way, after which the robot says that it is blocked
 SOON = 0.8  # s, in which nobody may be met, were the robot to brake
 CRAWLING = 0.1  # m/s, rad/s, below which a plan leads nowhere
@@ -90,19 +91,16 @@ class FollowConfig:
         (2.0, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2"
     )
     stop_deceleration: Axes = _described(
-        (4.0, 3.0, 8.0), "the same where the robot has to stop at once, m/s^2, rad/s^2"
+        (5.0, 4.0, 8.0), "the same where the robot has to stop at once, m/s^2, rad/s^2"
     )
     length: float = _described(0.65, "length of the robot's outline, legs included, m")
     width: float = _described(0.35, "its width, m")
     laser_x: float = _described(0.0, "where the laser is on the robot: forward, m", positive=False)
     laser_y: float = _described(0.0, "where the laser is on the robot: to the left, m", positive=False)
     laser_yaw: float = _described(0.0, "where the laser looks on the robot: to the left, rad", positive=False)
-    scan_timeout: float = _described(0.25, "silence of the scan after which the robot stops, s")
+    scan_timeout: float = _described(0.2, "silence of the scan after which the robot stops, s")
     odom_timeout: float = _described(0.2, "silence of the odometry after which the robot stops, s")
-    person_timeout: float = _described(0.25, "silence about the person after which it is lost, s")
-    seed: int = attrs.field(
-        default=0, metadata={"description": "seed of the noise among which the best way is looked for"}
-    )
+    person_timeout: float = _described(0.2, "silence about the person after which it is lost, s")
 
 
 @attrs.frozen
@@ -129,12 +127,12 @@ class _Heard:
 class FollowPlanner:
     """Take what arrives by `on_...`, then ask `step` at a rate of 1 / PERIOD."""
 
-    def __init__(self, config: FollowConfig | None = None, search: Any = None) -> None:
+    def __init__(self, config: FollowConfig | None = None) -> None:
         self.config = config = config or FollowConfig()
         self._cost = FollowCost(
             config.distance, SIDES[config.side], config.clearance, config.length, config.width
         )
-        self._search = search or Mppi(config.seed)
+        self._search = DynamicWindow()
         self._limits = Limits(config.max_velocity, BACKWARD, CURVE, config.acceleration, config.deceleration)
         self._mounting = np.array([config.laser_x, config.laser_y, config.laser_yaw])
         self._poses = PoseHistory(self._mounting.tolist())
@@ -199,6 +197,11 @@ class FollowPlanner:
     def on_others(self, now: float, stamp: float, persons: ArrayLike) -> None:
         """Everybody else, (n, 4) as in `on_person`; the person to follow may be among them. Raises ValueError if not finite."""
         self._others = _Heard(now, stamp, _persons(persons))
+
+    @property
+    def obstacles(self) -> Array:
+        """Where something stands, (n, 2) m, frame of the odometry."""
+        return self._memory.points
 
     def step(self, now: float) -> Plan:
         """What to command at `now` (s)."""
@@ -270,7 +273,7 @@ class FollowPlanner:
 
         targets = self._search.search(cost, situation.limits, self._command, guesses, elapsed)
         found = self._rolled(situation, targets[None])
-        if np.abs(targets[:6]).max() > CRAWLING:
+        if np.abs(targets[:6]).max() > CRAWLING or error < NEARLY:
             self._leading = now
         if now - self._leading > TRIES:
             return self._stop(State.BLOCKED, "something stands in the way", elapsed)

@@ -46,7 +46,7 @@ class MuxConfig:
         metadata={"description": "largest change of a command away from zero, m/s^2, rad/s^2"},
     )
     stop_acceleration: Axes = attrs.field(
-        default=(4.0, 3.0, 8.0),
+        default=(5.0, 4.0, 8.0),
         validator=_axes,
         metadata={
             "description": "the same towards zero: braking, and where every source is silent or a lock is set"

@@ -11,7 +11,7 @@ from quadvel_follow.follow_planner import PERIOD, State
 from quadvel_follow.leg_detector import LegDetector
 
 from .scenes import SCENES, FollowScene
-from .stage import BAND, SETTLED, Instant, Stage
+from .stage import BAND, CONFIG, SETTLED, Instant, Stage
 
 
 def figures(instants: Sequence[Instant], distance: float) -> dict[str, float]:
@@ -43,17 +43,17 @@ def figures(instants: Sequence[Instant], distance: float) -> dict[str, float]:
     }
 
 
-def run(scene: FollowScene, seed: int, detector: LegDetector, search: Any = None) -> list[Instant]:
+def run(scene: FollowScene, seed: int, detector: LegDetector) -> list[Instant]:
     """All instants of a scene."""
-    return list(Stage(scene, seed, detector, search).run())
+    return list(Stage(scene, seed, detector).run())
 
 
-def measure(runs: int, make: Any = lambda seed: None) -> Mapping[str, dict[str, float]]:
+def measure(runs: int) -> Mapping[str, dict[str, float]]:
     """Of each kind of scene, `runs` of them: means; of clearances and gaps the least, of times the largest."""
     detector = LegDetector()
     found = {}
     for name, scene in SCENES.items():
-        rows = [figures(run(scene(seed), seed, detector, make(seed)), 1.5) for seed in range(runs)]
-        how = {"clearance": min, "gap": min, "slowest": max}
+        rows = [figures(run(scene(seed), seed, detector), CONFIG.distance) for seed in range(runs)]
+        how: dict[str, Any] = {"clearance": min, "gap": min, "slowest": max}
         found[name] = {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}
     return found

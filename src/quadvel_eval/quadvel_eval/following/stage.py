@@ -27,7 +27,7 @@ STEP = 0.01  # s
 DELAY = 0.06  # s, from a command to the first motion
 LAG = 0.15  # s, of the velocity behind it
 ACCELERATION = np.array([2.6, 2.0, 6.0])  # m/s^2, rad/s^2, that the robot reaches
-FOLLOW = MuxInput("follow", 50, 0.2)
+FOLLOW = MuxInput("follow", 50, 0.15)
 MOUNTING = np.array([0.3, 0.0, 0.0])  # m, rad, of the laser on the robot
 CONFIG = FollowConfig(laser_x=float(MOUNTING[0]))
 LASER = Laser(rays=541, angle_min=-0.75 * np.pi, angle_increment=np.deg2rad(0.5), range_max=12.0)
@@ -88,12 +88,11 @@ class Stage:
         scene: FollowScene,
         seed: int,
         detector: LegDetector,
-        search: Any = None,
         config: FollowConfig = CONFIG,
     ) -> None:
         self._scene, self._rng = scene, np.random.default_rng(seed)
         self.config = config
-        self._planner = FollowPlanner(self.config, search)
+        self._planner = FollowPlanner(self.config)
         self._tracker, self._selection = PersonTracker(detector=detector), Selection()
         self._mux = CommandMux([FOLLOW], MuxConfig(acceleration=self.config.acceleration))
         first = scene.persons[0].position
