@@ -273,7 +273,7 @@ class FollowPlanner:
 
         targets = self._search.search(cost, situation.limits, self._command, guesses, elapsed)
         found = self._rolled(situation, targets[None])
-        if np.abs(targets[:6]).max() > CRAWLING or error < NEARLY:
+        if max(np.abs(targets[:6]).max(), np.abs(self._command).max()) > CRAWLING or error < NEARLY:
             self._leading = now
         if now - self._leading > TRIES:
             return self._stop(State.BLOCKED, "something stands in the way", elapsed)

@@ -57,9 +57,7 @@ class ObstacleMemory:
         rows = np.floor(points / CELL).astype(np.int64)
         keys, first = np.unique(rows[:, 0] * _ROW + rows[:, 1], return_index=True)
         place = np.searchsorted(self._keys, keys)
-        known = (place < len(self._keys)) & (
-            np.append(self._keys, -1)[np.minimum(place, len(self._keys))] == keys
-        )
+        known = np.isin(keys, self._keys, assume_unique=True)
         again, found = place[known], first[known]
         self._points[again], self._times[again] = points[found], time
         self._counts[again] = np.minimum(np.maximum(self._counts[again] + 1, counts[found]), SURE)
