@@ -72,6 +72,8 @@ LOGS = [  # of one leg each
 ]
 NODES = [
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
+    Step("quadvel run sim_node --ros-args -p world:=park", served=True),
+    Step("quadvel world campus --out out/campus.png"),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
@@ -89,6 +91,7 @@ LEFT_OUT = {
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
     "quadvel up": "as with --terrain",
+    "quadvel up --world campus": "the same",
     "quadvel demo": "tests/end_to_end/test_demo.py runs it",
     "quadvel demo --low-level board --loss 0.02 --jitter 2": "minutes; tests/end_to_end/test_walk_behind_network.py",
     "quadvel excite creep --seconds 60 --low-level external --out hung.mcap": "needs the robot",
@@ -102,7 +105,7 @@ LEFT_OUT = {
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
-    "quadvel eval --grid quick --policy out/training/dagger/policy.onnx --out out/eval": "the same",
+    "quadvel eval --grid quick --policy out/training/constrained/policy.onnx --out out/eval": "the same",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",

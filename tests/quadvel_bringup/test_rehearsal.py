@@ -34,6 +34,10 @@ def test_the_shipped_stack_is_in_order() -> None:
     ("choice", "sentence"),
     [
         ({"terrain": "moon"}, "sim_node: .*'moon', expected one of flat, slope, rough"),
+        (
+            {"world": "moon"},
+            "sim_node: world moon: .*, expected a YAML file or one of corridor, park, campus",
+        ),
         ({"estimator": "magic"}, "estimator: kind is 'magic', expected learned or kalman"),
         ({"policy": Path("nowhere.onnx")}, r"controller: .*nowhere\.onnx: no such file"),
         ({"policy": PARAMETERS}, r"controller: .*params\.yaml"),

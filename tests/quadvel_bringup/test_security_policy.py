@@ -37,7 +37,8 @@ for kind in ("publisher", "subscription", "service", "client"):
 for module in map(import_module, sys.argv[1:]):
     (make,) = [one for _, one in inspect.getmembers(module, inspect.isclass)
                if issubclass(one, Node) and one.__module__ == module.__name__]
-    rclpy.init(args=["node", "--ros-args", "-p", "board:port:=0", "-p", "driver:board_address:=127.0.0.1"])
+    given = ["board:port:=0", "driver:board_address:=127.0.0.1", "sim_node:world:=corridor", "board:world:=corridor"]
+    rclpy.init(args=["node", "--ros-args", *(item for parameter in given for item in ("-p", parameter))])
     make().destroy_node()
     rclpy.shutdown()
 print(json.dumps(created))

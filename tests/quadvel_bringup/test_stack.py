@@ -104,7 +104,14 @@ def test_what_was_chosen_stands_above_the_parameter_file(tmp_path: Path) -> None
     }
 
 
-@pytest.mark.parametrize("chosen", [{"terrain": "rough"}, {"actuator": Path("found.yaml")}])
+def test_a_world_is_a_name_or_a_file_of_any_folder() -> None:
+    for world, handed_on in (("campus", "campus"), ("mine.yaml", str(Path("mine.yaml").resolve()))):
+        assert Stack(world=world).overrides()["sim_node"] == {"world": handed_on}
+
+
+@pytest.mark.parametrize(
+    "chosen", [{"terrain": "rough"}, {"world": "park"}, {"actuator": Path("found.yaml")}]
+)
 def test_what_only_a_simulated_robot_has_is_refused_for_another(chosen: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"only a simulated robot has this, not external"):
         Stack(low_level="external", **chosen).overrides()

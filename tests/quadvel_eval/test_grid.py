@@ -17,6 +17,7 @@ def walk(velocity: tuple[float, float, float], seconds: float = 6.0) -> Walk:
         time=time,
         position=np.outer(time, [*velocity[:2], 0.0]),
         velocity=np.where(time[:, None] < 2.0, 0.0, velocity),
+        asked=np.where(time[:, None] < 1.5, 0.0, velocity),
         heading=np.zeros(n),
         contact=np.ones((n, 4), dtype=bool),
         targets=np.tile((0.5 * 0.002 * np.arange(n) ** 2)[:, None], (1, 12)),
@@ -68,6 +69,8 @@ def test_a_cell_is_judged_over_its_last_four_seconds() -> None:
     assert judged.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
     np.testing.assert_allclose(judged.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
     assert judged.estimator_drift == {"learned": 0.3}
+    assert judged.delay_xy == pytest.approx(0.5, abs=0.02)
+    assert judged.delay_wz is None  # no turn was commanded
     assert judged.way == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
 
 
@@ -126,5 +129,6 @@ def test_a_grid_over_processes_equals_itself_in_the_order_of_its_cells(
     heard: list[tuple[int, int]] = []
     evaluation = evaluate(Setup(estimator="truth"), "quick", 1, lambda done, of: heard.append((done, of)))
     assert [cell["command"][0] for cell in evaluation["cells"]] == [0.0, 0.3]
-    assert heard == [(1, 3), (2, 3), (3, 3)]
+    assert heard == [(done, 6) for done in range(1, 7)]  # two plants, two commands and a stance on each
+    assert evaluation["second_plant"]["cells"] != evaluation["cells"]
     assert set(evaluation["estimator"]) == {"learned", "kalman"}

@@ -21,6 +21,7 @@ def walk(contact: np.ndarray, vx: float) -> Walk:
         time=np.arange(n) * PERIOD,
         position=np.zeros((n, 3)),
         velocity=np.tile([vx, 0.0, 0.0], (n, 1)),
+        asked=np.tile([vx, 0.0, 0.0], (n, 1)),
         heading=np.zeros(n),
         contact=contact,
         targets=np.zeros((n, 12)),

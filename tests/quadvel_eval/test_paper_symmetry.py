@@ -25,6 +25,7 @@ def trot(right: float = 1.0) -> Walk:
         time=np.arange(N) * PERIOD,
         position=np.zeros((N, 3)),
         velocity=np.zeros((N, 3)),
+        asked=np.zeros((N, 3)),
         heading=np.zeros(N),
         contact=legs % 1.0 < 0.5,
         targets=joints * sides,

@@ -15,13 +15,15 @@ from quadvel_policy.observation import CommandLimits
 LIMITS = CommandLimits((-1.0, -0.5, -1.0), (2.0, 0.5, 1.0))
 
 
-def answer(vx: float, vy: float, error: float | None, inside: int = 1) -> tuple[dict, CellResult]:
+def answer(
+    vx: float, vy: float, error: float | None, inside: int = 1, plant: str = "usual"
+) -> tuple[dict, CellResult]:
     cell = Cell((vx, vy, 0.0), 0)
-    labels = {"policy": "mine", "grid": "paper", "within": inside}
+    labels = {"policy": "mine", "plant": plant, "grid": "paper", "within": inside}
     if error is None:
         return labels, CellResult(cell)
     return labels, CellResult(
-        cell, Segment(np.array(cell.command), np.array([vx - error, vy, 0.0])), 0.01, 0.5
+        cell, Segment(np.array(cell.command), np.array([vx - error, vy, 2.0 * error])), 0.01, 0.5
     )
 
 
@@ -43,19 +45,25 @@ def test_left_right_is_the_largest_difference_between_mirrored_commands() -> Non
 def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() -> None:
     section = Tracking()
     answers = [answer(1.0, 0.0, 0.02), answer(1.0, 0.4, None), answer(2.5, 0.0, 0.5, inside=0)]
-    records = section.judge(answers)
+    records = section.judge([*answers, answer(1.0, 0.0, 0.04, plant="second")])
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
     assert ours["paper grid, all: runs"] == 3
     assert ours["paper grid, all: falls"] == 1
     assert ours["paper grid, all: largest error"] == pytest.approx(0.5)
     assert ours["paper grid, within the policy's limits: largest error"] == pytest.approx(0.02)
     assert ours["paper grid, within the policy's limits: largest left-right difference"] is None
+    assert ours["paper grid, within the policy's limits: largest error of the yaw rate"] == pytest.approx(
+        0.04
+    )
+    assert ours["paper grid, second plant: largest error"] == pytest.approx(0.04)
+    assert ours["paper grid, second plant: mean error of the yaw rate"] == pytest.approx(0.08)
     assert len(section.figure(records).axes) == 2  # the grid and its scale
 
 
-def test_the_grid_has_every_command_with_every_seed() -> None:
+def test_the_grid_has_every_command_with_every_seed_on_both_plants() -> None:
     jobs = Tracking(grids=("paper",)).jobs(Study(seeds=3))
-    assert len(jobs) == 363
+    assert len(jobs) == 2 * 363
+    assert {job.labels["plant"] for job in jobs} == {"usual", "second"}
     assert {job.labels["policy"] for job in jobs} == {"aliengo"}
 
 

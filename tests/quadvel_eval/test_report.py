@@ -24,7 +24,8 @@ WALKED = CellResult(
     way=4.0,
 )
 FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
-EVALUATION = summarise([WALKED, FALLEN], [0.01])
+ONE = summarise([WALKED, FALLEN], [0.01])
+EVALUATION = {**ONE, "second_plant": ONE}
 
 
 def test_only_own_outputs_of_a_folder_are_replaced(tmp_path: Path) -> None:
@@ -45,14 +46,17 @@ def test_csv_has_a_row_a_cell_and_nothing_where_a_robot_fell(tmp_path: Path) -> 
     write_evaluation(tmp_path, EVALUATION)
     with (tmp_path / "eval.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [(row["vx"], row["error_xy"], row["fell"]) for row in rows] == [
-        ("0.5", "0.1", "0"),
-        ("1.0", "", "1"),
+    assert [(row["plant"], row["vx"], row["error_xy"], row["fell"]) for row in rows] == [
+        ("usual", "0.5", "0.1", "0"),
+        ("usual", "1.0", "", "1"),
+        ("second", "0.5", "0.1", "0"),
+        ("second", "1.0", "", "1"),
     ]
 
 
 def test_heatmap_is_drawn_even_if_every_robot_fell(tmp_path: Path) -> None:
-    write_evaluation(tmp_path, summarise([FALLEN, CellResult(Cell((0.5, 0.2, 1.0), 0))], [None]))
+    fallen = summarise([FALLEN, CellResult(Cell((0.5, 0.2, 1.0), 0))], [None])
+    write_evaluation(tmp_path, {**fallen, "second_plant": fallen})
     assert matplotlib.image.imread(tmp_path / "eval.png").size > 0
 
 

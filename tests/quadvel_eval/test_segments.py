@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_eval.segments import Segment, max_and_mean_error_xy, measure, rounded
+from quadvel_eval.segments import Segment, measure, response_delay, rounded, tracking_errors
 
 TIME = np.arange(0.0, 6.0, 0.005)
 
@@ -38,8 +38,19 @@ def test_a_stretch_without_samples_is_refused_in_a_sentence() -> None:
 
 
 def test_aggregates_are_the_largest_and_the_mean_error() -> None:
-    segments = [Segment(np.zeros(3), np.array([x, 0.0, 0.0])) for x in (0.1, 0.2, 0.6)]
-    assert max_and_mean_error_xy(segments) == pytest.approx((0.6, 0.3))
+    segments = [Segment(np.zeros(3), np.array([x, 0.0, -2 * x])) for x in (0.1, 0.2, 0.6)]
+    assert tracking_errors(segments) == pytest.approx(
+        {"max_error_xy": 0.6, "mean_error_xy": 0.3, "max_error_wz": 1.2, "mean_error_wz": 0.6}
+    )
+
+
+def test_delay_is_that_of_a_first_order_response_and_knows_no_steady_error() -> None:
+    asked = np.minimum(TIME, 1.0)
+    late = np.zeros_like(asked)
+    for k in range(1, len(late)):
+        late[k] = late[k - 1] + (asked[k - 1] - late[k - 1]) * (TIME[1] - TIME[0]) / 0.3
+    assert response_delay(asked, 0.8 * late, TIME[1] - TIME[0]) == pytest.approx(0.3, abs=0.02)
+    assert response_delay(asked, 0.3 * late, TIME[1] - TIME[0]) is None
 
 
 def test_numbers_in_files_are_plain_and_short() -> None:

@@ -55,6 +55,30 @@ def test_lockstep_waits_for_answers_and_tells_the_time(start: Start, peer: Any) 
     }  # where the trunk is, the estimator says
 
 
+def test_in_a_world_the_laser_scans_and_persons_are_told(start: Start, peer: Any) -> None:
+    start(mode="fast", world="corridor")
+    scans, static = peer.heard["scan"], peer.heard["/tf_static"]
+    peer.spin_until(lambda: len(scans) > 5 and "touched" in peer.diagnosed()[1])
+    scan = scans[-1]
+    assert scan.header.frame_id == "laser"
+    assert len(scan.ranges) == 1080
+    assert scan.angle_max == pytest.approx(-scan.angle_min) == pytest.approx(np.radians(135.0))
+    ranges = np.array(scan.ranges)
+    assert ((ranges < scan.range_max) | np.isinf(ranges)).all()
+    assert ranges.min() == pytest.approx(1.25, abs=0.1)  # the walls beside the robot
+    assert peer.diagnosed()[1]["touched"] == "nothing"
+    people = peer.heard["ground_truth/persons"][-1]
+    assert people.header.frame_id == "odom"
+    assert len(people.poses) == 3
+    assert people.poses[0].position.x > 1.8
+    peer.spin_until(lambda: static)
+    (mounted,) = (t for m in static for t in m.transforms if t.child_frame_id == "laser")
+    assert (mounted.header.frame_id, mounted.transform.translation.x) == ("base_link", 0.25)
+    stamps = np.array([seconds(scan.header.stamp) for scan in scans])
+    steps = np.diff(stamps) / 0.05
+    np.testing.assert_allclose(steps, np.round(steps), atol=1e-6)
+
+
 def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None:
     start(mode="lockstep", publish_tf=True)
     states = peer.heard["low_state"]

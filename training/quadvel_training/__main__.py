@@ -16,6 +16,7 @@ from quadvel_eval.paper import gap
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import (
+    constrained,
     crl,
     dagger,
     distill,
@@ -24,6 +25,7 @@ from . import (
     kalman_tuning,
     leg_classifier,
     loop,
+    parallel,
     privileged,
     recipe,
     run_folder,
@@ -105,6 +107,34 @@ def train_dagger(
     about = run_folder.made_of("dagger", source, config, checkpoint)
     dagger.export_policy(run.student, run.env, run.grid, out / "policy.onnx", about)
     print(f"written: {out / 'policy.onnx'}")
+
+
+@app.command("constrained")
+def train_constrained(
+    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger`.")] = Path(
+        "out/training/dagger/dagger.pt"
+    ),
+    teacher_file: Annotated[
+        Path, typer.Option("--teacher", help="Checkpoint of `privileged`, which pulls at first.")
+    ] = Path("out/training/privileged/privileged.pt"),
+    out: Out = Path("out/training/constrained"),
+    source: Recipe = None,
+    minutes: Minutes = None,
+    device: Device = "cpu",
+) -> None:
+    """Stage 3 without a clock: constrained reinforcement learning of the plain network, from the student of `dagger`.
+
+    Writes DIR/policy.onnx; on the way, policies and what a quick evaluation says of them go to DIR/kept.
+    """
+    config = _configured(constrained.ConstrainedConfig, source, minutes)
+    run = constrained.ConstrainedRun(config, start, teacher_file, device)
+    checkpoint = out / "constrained.pt"
+    if parallel.rank() == 0:
+        run_folder.describe(out, "constrained", source, config)
+    loop.train(run, config.budget, checkpoint, run_folder.Evaluated(run, out))
+    if parallel.rank() == 0:
+        run.write_policy(out / "policy.onnx", run_folder.made_of("constrained", source, config, checkpoint))
+        print(f"written: {out / 'policy.onnx'}")
 
 
 @app.command("distill")

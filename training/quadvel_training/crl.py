@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import attrs
@@ -119,6 +120,10 @@ class CrlRun:
         """A copy of the policy as it is now, on the CPU."""
         network: Recurrent = copy.deepcopy(self.actor.network).cpu()
         return network
+
+    def write_policy(self, path: Path, about: dict[str, Any]) -> None:
+        """The policy file as it is now; about: how it came to be."""
+        student.export_policy(self.policy(), self.env, path, about, self.command_map)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""

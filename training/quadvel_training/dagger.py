@@ -27,10 +27,10 @@ from .env import TICK, EnvConfig, VelocityEnv, cores
 from .loop import Budget, cosine, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
 from .onnx_file import commit, export
+from .ppo import FAR
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
 from .randomisation import Randomisation, actuator
 
-FAR = 0.5  # of the network's unit: what the teacher asks of a robot that is about to fall must not drown all else
 AGO = 4  # ticks between the teacher's actions as it learned them
 
 

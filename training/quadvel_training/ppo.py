@@ -18,6 +18,9 @@ from .loop import set_rate
 from .networks import Gaussian, State, select
 
 LOG_RATIO_BOUND = 10.0  # of the likelihoods now and when it was drawn; the clip of PPO lies far inside
+FAR = (
+    0.5  # of the network's unit: what a teacher asks of a robot that is about to fall must not drown all else
+)
 ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
 
 
@@ -63,6 +66,7 @@ class Rollout:
     last_critic_obs: Tensor  # (N, C)
     state: State | None = None  # of the actor at the start
     mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
+    label: Tensor | None = None  # (T, N, A) what a teacher would have done
 
 
 def _mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -126,8 +130,13 @@ class Ppo:
             advantage[t] = running
         return advantage, advantage + value[:-1]
 
-    def update(self, r: Rollout, learn_actor: bool = True) -> dict[str, float]:
-        """Several epochs over one rollout; returns means of the loss terms."""
+    def update(
+        self, r: Rollout, learn_actor: bool = True, pull: float = 0.0, constraints: float = 1.0
+    ) -> dict[str, float]:
+        """Several epochs over one rollout; returns means of the loss terms.
+
+        pull: weight of the distance to the rollout's labels; constraints: share of the configuration's weights.
+        """
         advantage, target = self.advantages(r)
         explained = 1 - _mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
         centre = parallel.mean(_mean(advantage, r.mask))
@@ -141,7 +150,8 @@ class Ppo:
             mask = r.mask[:, ids]
             terms = self._critic_step(r.critic_obs[:, ids], target[:, ids], mask)
             if learn_actor:
-                terms |= self._actor_step(r, ids, advantage[:, ids], old_log_prob[:, ids], mask)
+                weights = pull, constraints
+                terms |= self._actor_step(r, ids, advantage[:, ids], old_log_prob[:, ids], mask, weights)
             for name, value in terms.items():
                 total[name] = total.get(name, 0.0) + value
             batches += 1
@@ -177,9 +187,16 @@ class Ppo:
         return {"value_loss": total / steps}
 
     def _actor_step(
-        self, r: Rollout, ids: Tensor, advantage: Tensor, old_log_prob: Tensor, mask: Tensor
+        self,
+        r: Rollout,
+        ids: Tensor,
+        advantage: Tensor,
+        old_log_prob: Tensor,
+        mask: Tensor,
+        weights: tuple[float, float],
     ) -> dict[str, float]:
         c, actor = self.config, self.actor
+        pull, constraints = weights
         mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
         log_ratio = self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob
         ratio = log_ratio.clamp(
@@ -198,9 +215,14 @@ class Ppo:
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
         smoothness = _mean(bend.norm(dim=-1), mask[2:])
 
-        loss = surrogate + c.symmetry * symmetry + c.smoothness * smoothness - c.entropy * actor.entropy()
-        self._step(self.actor_optimiser, actor, loss)
+        constrained = constraints * (c.symmetry * symmetry + c.smoothness * smoothness)
+        loss = surrogate + constrained - c.entropy * actor.entropy()
         terms = {"surrogate": surrogate, "symmetry": symmetry, "smoothness": smoothness}
+        if r.label is not None:
+            away = torch.nn.functional.huber_loss(mean, r.label[:, ids], reduction="none", delta=FAR)
+            terms["away"] = _mean(away.mean(-1), mask)
+            loss = loss + pull * terms["away"]
+        self._step(self.actor_optimiser, actor, loss)
         if c.target_kl is not None:
             shift = ((mean.detach() - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1)
             terms["kl"] = parallel.mean(_mean(shift, mask))

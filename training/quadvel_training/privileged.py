@@ -1,8 +1,8 @@
 """Stage 1: a memoryless teacher that sees the true state finds a gait from random weights, by rewards alone.
 
-No clock, no gait, no reference motion. It acts 50 times a second, learns by PPO with a mirror loss, and its commands
-grow with what it follows (`command_grid`). What it sees of the past, errors over a stride and over some seconds, a
-recurrent student can keep for itself.
+No clock, no gait, no reference motion. It acts 50 times a second, at last 100 times, learns by PPO with a mirror loss, and
+its commands grow with what it follows (`command_grid`). What it sees of the past, errors over a stride and over some
+seconds, a recurrent student can keep for itself.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
-from .walking_rewards import WalkingRewards, WalkingWeights
+from .walking_rewards import SAMPLE, WalkingRewards, WalkingWeights
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 ACTION_BOUND = 4.0  # of the network's unit
@@ -95,7 +95,7 @@ def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
 def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
     """The teacher's input (n, SIZE): the paper's 48 numbers from the true state, feet, height, past errors, ground, plant.
 
-    previous (n, 12): its action 20 ms ago.
+    previous (n, 12): its action SAMPLE ago.
     """
     return np.concatenate(
         [
@@ -172,6 +172,15 @@ class Judgement:
         self._sum[ids], self._age[ids] = 0.0, 0.0
         return np.stack([np.hypot(mean[:, 0], mean[:, 1]), np.abs(mean[:, 2])], axis=1), judged
 
+    def tell(self, grid: CommandGrid, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
+        """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
+        ids = np.flatnonzero(over)
+        if not len(ids):
+            return
+        error, judged = self.close(ids)
+        tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
+        grid.note(command[ids][tells], error[tells], fell[ids][tells])
+
 
 class PrivilegedRun:
     """Environment and learner of stage 1."""
@@ -199,7 +208,8 @@ class PrivilegedRun:
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
-        self._actions = np.zeros((2, c.n, 12), np.float32)  # the last two
+        self._ago = round(SAMPLE / c.period)  # samples between its action and the one that it sees
+        self._actions = np.zeros((max(2, self._ago), c.n, 12), np.float32)  # the last ones, the newest first
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -260,7 +270,7 @@ class PrivilegedRun:
         terms: dict[str, float] = {}
         seen = np.zeros(5)
         for _ in range(c.length):
-            obs = observe(env, self.past, self._actions[0])
+            obs = observe(env, self.past, self._actions[self._ago - 1])
             critic_obs = self._critic_obs(obs)
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
@@ -271,9 +281,9 @@ class PrivilegedRun:
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
             self.judgement.advance(velocity_error(env, command), c.period)
-            parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions]))
+            parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions[:2]]))
             reward = self.rewards.total(parts, env.fallen)
-            self._actions = np.stack([action, self._actions[0]])
+            self._actions = np.concatenate([action[None], self._actions[:-1]])
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
             for name, value in zip(names, (obs, critic_obs, drawn, mean, reward, fell, late), strict=True):
                 keep[name].append(value)
@@ -282,11 +292,11 @@ class PrivilegedRun:
             stride = self.past.stride
             errors = np.hypot(stride[:, 0], stride[:, 1]).mean(), np.abs(stride[:, 2]).mean()
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
-            self._judge(command, fell | late | env.changed, fell)
+            self.judgement.tell(self.grid, command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
         self.samples += c.length * c.n
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
-        last = self._critic_obs(observe(env, self.past, self._actions[0]))
+        last = self._critic_obs(observe(env, self.past, self._actions[self._ago - 1]))
         rollout = Rollout(
             **t,
             noise=torch.zeros(c.n, 12),
@@ -302,15 +312,6 @@ class PrivilegedRun:
             "contact_ratio": contact,
             "reward": float(t["reward"].mean()),
         } | {f"reward/{name}": value for name, value in terms.items()}
-
-    def _judge(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
-        """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
-        ids = np.flatnonzero(over)
-        if not len(ids):
-            return
-        error, judged = self.judgement.close(ids)
-        tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
-        self.grid.note(command[ids][tells], error[tells], fell[ids][tells])
 
 
 class Numbered:

@@ -16,7 +16,8 @@ from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.report import write_json
 from quadvel_eval.walk import Setup
 
-from . import loop, student
+from . import loop
+from .constrained import ConstrainedRun
 from .crl import CrlRun
 from .onnx_file import commit
 from .randomisation import ACTUATORS, actuator
@@ -56,7 +57,7 @@ class Evaluated:
     On the drives as they are known best: those of an actuator file where the run has one, else Table 4.
     """
 
-    run: CrlRun
+    run: CrlRun | ConstrainedRun
     folder: Path
     _asked_at: int | None = attrs.field(default=None, init=False)
 
@@ -72,7 +73,7 @@ class Evaluated:
         kept = self.folder / "kept" / f"{run.samples // 1000:06}k"
         loop.save(run.state(), kept.with_suffix(".pt"))
         policy = kept.with_suffix(".onnx")
-        student.export_policy(run.policy(), run.env, policy, {"samples": run.samples}, run.command_map)
+        run.write_policy(policy, {"samples": run.samples})
         name = run.config.actuator
         plant = {} if name in ACTUATORS else {"actuator": actuator(name)}
         found = _evaluate(Setup(policy=policy, plant=plant))

@@ -14,6 +14,7 @@ from quadvel_description import robot
 
 from .env import VelocityEnv
 
+SAMPLE = 0.02  # s, of which the weights are; shorter samples count for so much less, what happens at an instant counts as it is
 LOWEST, HIGHEST = -6.0, 4.0  # of a sample's sum of terms, a fall apart: nothing may drown all else
 CARRIED = 0.36  # m, wanted height of the trunk
 LIFT = 0.06  # m, clearance wanted in swing
@@ -30,7 +31,7 @@ class Past(Protocol):
 
 @attrs.frozen
 class WalkingWeights:
-    """Weights of the terms of a sample of 20 ms; all fines are positive here."""
+    """Weights of the terms of a SAMPLE; all fines are positive here."""
 
     linear: float = 1.2  # exp(-e^2 / (0.25 m^2/s^2 (1 + |c| / 2))) of the velocity error e
     linear_narrow: float = 0.5  # exp(-e^2 / 0.04)
@@ -64,6 +65,7 @@ class WalkingRewards:
 
     def __init__(self, env: VelocityEnv, weights: WalkingWeights) -> None:
         self.env, self.weights = env, weights
+        self._samples = SAMPLE / env.config.period  # of the environment in one of SAMPLE
         self._dq = env.dq.copy()
 
     def reset(self, ids: np.ndarray) -> None:
@@ -74,7 +76,7 @@ class WalkingRewards:
         """The reward (n,) of these terms, bounded, and of a fall (n,)."""
         w = self.weights
         bounded = np.clip(np.sum(list(terms.values()), axis=0), LOWEST, HIGHEST)
-        return np.asarray(w.scale * (bounded - w.fall * fell))
+        return np.asarray(w.scale * (bounded / self._samples - w.fall * fell))
 
     def terms(
         self, command: np.ndarray, past: Past, air: np.ndarray, actions: np.ndarray
@@ -119,8 +121,8 @@ class WalkingRewards:
             "height": -w.height * np.minimum((env.height - CARRIED) ** 2, 0.02),
             "power": -w.power * env.power / (1 + 0.5 * speed),
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
-            "smoothness": -w.rate * np.sum((now - before) ** 2, axis=1)
-            - w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
+            "smoothness": -self._samples * w.rate * np.sum((now - before) ** 2, axis=1)
+            - self._samples**2 * w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
             "alive": np.full(len(now), w.alive),
         }
 
@@ -132,7 +134,9 @@ class WalkingRewards:
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
         missing = np.maximum(LIFT - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
         return {
-            "swing": w.swing * (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1),
+            "swing": self._samples
+            * w.swing
+            * (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1),
             "dragging": -w.dragging * (past.down > LONG_DOWN).sum(axis=1),
             "slip": -w.slip * (np.minimum(speed, 3.0) * env.contact).sum(axis=1),
             "stumble": -w.stumble * missing.sum(axis=1),

@@ -22,6 +22,9 @@ ARGUMENTS = [
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
     DeclareLaunchArgument("terrain", default_value="", description="flat, slope or rough; empty: flat"),
+    DeclareLaunchArgument(
+        "world", default_value="", description="corridor, park, campus or a file; empty: none"
+    ),
     DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
     DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="show it"),
     DeclareLaunchArgument(
@@ -40,6 +43,7 @@ def start(context: LaunchContext) -> list[Action]:
         low_level=chosen["low_level"],
         policy=Path(chosen["policy"]) if chosen["policy"] else None,
         terrain=chosen["terrain"] or None,
+        world=chosen["world"] or None,
         parameters=Path(chosen["params"]),
         use_sim_time=chosen["use_sim_time"] == "true",
     )

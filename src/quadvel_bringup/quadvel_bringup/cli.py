@@ -115,6 +115,13 @@ def up(
         Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
     ] = None,
     terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    world: Annotated[
+        str | None,
+        typer.Option(
+            help="Simulated robot: what is around it, corridor, park, campus or a file.",
+            show_default="nothing",
+        ),
+    ] = None,
     actuator: Annotated[
         Path | None,
         typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
@@ -138,6 +145,7 @@ def up(
         low_level=low_level,
         policy=policy,
         terrain=terrain,
+        world=world,
         actuator=actuator,
         estimator=estimator,
         parameters=params,
@@ -328,6 +336,12 @@ def people(context: typer.Context) -> None:
 def following(context: typer.Context) -> None:
     """Measure how well a person is followed, in simulated scenes in the plane."""
     _hand_on(context, "quadvel_eval.following.cli:following_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def world(context: typer.Context) -> None:
+    """Check a world's file, and draw the world from above."""
+    _hand_on(context, "quadvel_eval.world_map:world_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

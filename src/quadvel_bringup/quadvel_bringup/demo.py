@@ -94,6 +94,7 @@ def _report(summary: dict[str, Any], console: Console) -> None:
     loop, rmse = summary["loop"], ", ".join(f"{x:.3f}" for x in summary["estimator"]["rmse"])
     console.print(
         f"error_xy mean {summary['mean_error_xy']:.3f}, largest {summary['max_error_xy']:.3f} m/s; "
+        f"yaw rate off by {summary['mean_error_wz']:.3f}, at most {summary['max_error_wz']:.3f} rad/s; "
         f"falls {summary['falls']}; estimator RMSE {rmse} m/s\n"
         f"loop {loop['rate_hz']:.0f} Hz, period p99 {loop['period_p99_ms']:.2f} ms, compute p50 "
         f"{loop['compute_p50_us']:.0f}, p99 {loop['compute_p99_us']:.0f} us, inference p50 "

@@ -67,6 +67,7 @@ class Stack:
     parameters: Path = attrs.field(default=PARAMETERS, converter=Path)
     policy: Path | None = None
     terrain: str | None = None
+    world: str | None = None
     actuator: Path | None = None
     estimator: str | None = None
     use_sim_time: bool = attrs.field(default=False)
@@ -102,7 +103,7 @@ class Stack:
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
-        simulated = _given(terrain=self.terrain, actuator_file=actuator)
+        simulated = _given(terrain=self.terrain, world=_found(self.world), actuator_file=actuator)
         if simulated and not low_level.simulation:
             raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
         serving = dict(low_level.nodes)
@@ -128,6 +129,11 @@ class Stack:
             # JSON is YAML with quotes, and without them a file named "1" would be a number.
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
         return arguments
+
+
+def _found(world: str | None) -> str | None:
+    """A shipped world's name as it is, a file, which has a suffix, for whatever folder a node runs in."""
+    return str(Path(world).resolve()) if world and Path(world).suffix else world
 
 
 def _given(**values: str | None) -> Parameters:

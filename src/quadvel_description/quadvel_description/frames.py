@@ -2,6 +2,7 @@
 
     odom -> base_link -> base_footprint                 the floor below the robot, level, with its heading
                       -> trunk -> imu_link, the links of the legs
+                      -> laser                         where there is one; who serves it says where
 
 `base_link` and `trunk` are the same place: the trunk carries the mass, and KDL wants a root of the URDF without any.
 """
@@ -21,6 +22,7 @@ ODOM = "odom"
 BASE = "base_link"
 FOOTPRINT = "base_footprint"
 IMU = "imu_link"
+LASER = "laser"
 
 _IDENTITY = np.array([1.0, 0.0, 0.0, 0.0])
 _MOVING = tuple(link for link in robot.LINKS if link.axis)

@@ -25,6 +25,7 @@ from quadvel_driver import wire
 from quadvel_estimator.learned import LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
+from quadvel_sim import Simulator, SimulatorConfig, World
 
 from . import round_trip
 from .robot_loop import PERIOD, STEPS, RobotLoop, TrueVelocity
@@ -73,6 +74,24 @@ def simulator() -> dict[str, Any]:
     return {
         "realtime_factor": PERIOD / float(np.median(alone)),
         "with_sensors_realtime_factor": PERIOD / float(np.median(read)),
+    }
+
+
+def world() -> dict[str, Any]:
+    """The same robot on the campus; and a scan of its laser there."""
+    campus = World.load("campus")
+    robot = Simulator(SimulatorConfig(world=campus))
+    robot.reset("stand")
+    command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
+
+    def step() -> None:
+        robot.command(command)
+        robot.step(STEPS)
+
+    stepping, scanning = _time(step, 1000), _time(robot.scan, 50, lambda: robot.step(campus.laser.period))
+    return {
+        "realtime_factor": PERIOD / float(np.median(stepping)),
+        "scan_p50_us": _percentiles(scanning)["p50_us"],
     }
 
 
@@ -186,6 +205,7 @@ def _training(part: str) -> Callable[[], dict[str, Any]]:
 
 PARTS: dict[str, Callable[[], dict[str, Any]]] = {
     "simulator": simulator,
+    "world": world,
     "loop": loop,
     "policy": policy,
     "estimator": estimator,
@@ -198,6 +218,8 @@ PARTS: dict[str, Callable[[], dict[str, Any]]] = {
 ROWS = (  # part, figure, what it is, what is wanted
     ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
     ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
+    ("world", "realtime_factor", "simulator on the campus, times real time", ""),
+    ("world", "scan_p50_us", "a scan of 1080 rays there, median, us", "5000 or less"),
     ("loop", "realtime_factor", "evaluation loop, times real time", ""),
     ("policy", "p50_us", "inference, observation to action, median, us", "50 or less"),
     ("policy", "p99_us", "inference, observation to action, 99 %, us", ""),

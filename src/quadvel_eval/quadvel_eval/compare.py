@@ -13,6 +13,14 @@ from rich.table import Table
 from .grid import SCHEMA
 
 EVALUATION = "eval.json"
+ON_BOTH = (
+    "falls",
+    "mean error, m/s",
+    "largest error, m/s",
+    "mean error of the yaw rate, rad/s",
+    "largest error of the yaw rate, rad/s",
+)
+"""Figures that are told of both plants."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
@@ -38,19 +46,21 @@ def figures(evaluation: Mapping[str, Any]) -> dict[str, float | None]:
         "falls": float(evaluation["falls"]),
         "mean error, m/s": evaluation["mean_error_xy"],
         "largest error, m/s": evaluation["max_error_xy"],
-        "mean error of the yaw rate, rad/s": _mean(cell["error_wz"] for cell in evaluation["cells"]),
+        "mean error of the yaw rate, rad/s": evaluation["mean_error_wz"],
+        "largest error of the yaw rate, rad/s": evaluation["max_error_wz"],
+        "delay of the velocity, s": evaluation["delay_xy"],
+        "delay of the yaw rate, s": evaluation["delay_wz"],
         "jitter, rad": evaluation["jitter"],
         "cost of transport, mean": float(np.mean(costs)) if costs else None,
         "drift in 10 s of standing, m": drift,
     }
     for name, errors in evaluation["estimator"].items():
         found |= {f"{name} estimator, largest RMSE, m/s": max(errors["rmse"])}
+    if second := evaluation.get("second_plant"):
+        found |= {
+            f"second plant: {name}": value for name, value in figures(second).items() if name in ON_BOTH
+        }
     return found
-
-
-def _mean(values: Any) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
 
 
 def common_errors(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[float, float] | None:

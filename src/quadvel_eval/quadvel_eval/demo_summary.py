@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .recording import Recording
-from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
+from .segments import SETTLE, Segment, measure, rounded, tracking_errors
 
 Array = NDArray[np.float64]
 
@@ -57,12 +57,10 @@ def summarise(recording: Recording) -> dict[str, Any]:
     walked = segments(recording)
     if not walked:
         raise ValueError("no command was held for long enough to be judged")
-    max_error, mean_error = max_and_mean_error_xy(walked)
     return {
         "segments": [segment.to_json() for segment in walked],
         "falls": _falls(recording),
-        "max_error_xy": rounded(max_error),
-        "mean_error_xy": rounded(mean_error),
+        **tracking_errors(walked),
         "loop": _loop_figures(recording),
         "estimator": {"rmse": rounded(_estimator_rmse(recording))},
         "realtime_factor": rounded(recording.realtime_factor.value.mean()),

@@ -5,16 +5,18 @@ Files and pictures are `report`'s matter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from quadvel_sim.physics import SECOND
+
 from .pool import Call, in_parallel
-from .robot_loop import RobotLoop
-from .segments import SETTLE, Segment, max_and_mean_error_xy, measure, rounded
+from .robot_loop import PERIOD, RobotLoop
+from .segments import SETTLE, Segment, measure, response_delay, rounded, tracking_errors
 from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record
 
 Array = NDArray[np.float64]
@@ -27,6 +29,9 @@ GRIDS: dict[str, tuple[Array, Array, Array]] = {  # vx, vy (m/s), wz (rad/s): ev
 }
 STANCE_WALK = [((0.5, 0.0, 0.0), 2.0), ((0.0, 0.0, 0.0), 2.0)]  # how the robot comes to stand
 STANCE_SECONDS = 10.0
+LEAST_SPEED, LEAST_TURN = 0.2, 0.3  # m/s, rad/s: of slower ones no delay can be told
+PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": SECOND}}
+"""Fields of `SimulatorConfig` of the plants that a policy is judged on: the usual one, and one that solves contacts otherwise."""
 
 
 @attrs.frozen
@@ -48,6 +53,10 @@ class CellResult:
     estimator_mse: dict[str, Array] = attrs.Factory(dict)  # (3,) (m/s)^2, over the whole walk
     estimator_drift: dict[str, float] = attrs.Factory(dict)  # m, at its end
     way: float = 0.0  # m, that the trunk went
+    delay_xy: float | None = (
+        None  # s, from the velocity asked for to the robot's, along the command; None: too slow to tell
+    )
+    delay_wz: float | None = None  # s, the same of the yaw rate
 
     def to_json(self) -> dict[str, Any]:
         """The entry of `eval.json`."""
@@ -93,7 +102,20 @@ def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
         {name: np.square(error).mean(axis=0) for name, error in walk.estimate_errors.items()},
         walk.estimate_drifts,
         float(np.linalg.norm(np.diff(walk.position[:, :2], axis=0), axis=1).sum()),
+        *_delays(walk, np.asarray(cell.command)),
     )
+
+
+def _delays(walk: Walk, command: Array) -> tuple[float | None, float | None]:
+    """Of the velocity along the command and of the yaw rate, s."""
+    speed, turn = float(np.hypot(*command[:2])), abs(command[2])
+    asked, found, xy, wz = walk.asked, walk.velocity, None, None
+    if speed >= LEAST_SPEED:
+        ahead = command[:2] / speed
+        xy = response_delay(asked[:, :2] @ ahead, found[:, :2] @ ahead, PERIOD)
+    if turn >= LEAST_TURN:
+        wz = response_delay(asked[:, 2], found[:, 2], PERIOD)
+    return xy, wz
 
 
 def run_stance(setup: Setup, seed: int) -> float | None:
@@ -122,18 +144,24 @@ def summarise(results: Sequence[CellResult], drifts: Sequence[float | None]) -> 
     stood = [r for r in results if r.segment is not None]
     segments = [r.segment for r in stood if r.segment is not None]
     still = [Segment(np.array(r.cell.command), np.zeros(3)) for r in results]
-    max_error, mean_error = max_and_mean_error_xy(segments or still)
     return {
         "schema": SCHEMA,
         "cells": [r.to_json() for r in results],
-        "max_error_xy": rounded(max_error),
-        "mean_error_xy": rounded(mean_error),
+        **tracking_errors(segments or still),
+        "delay_xy": _mean([r.delay_xy for r in stood]),
+        "delay_wz": _mean([r.delay_wz for r in stood]),
         "falls": len(results) - len(stood),
         "jitter": rounded(np.mean([r.jitter for r in stood])) if stood else 0.0,
         "cot": [None if r.cot is None else rounded(r.cot) for r in results],
         "stance": {"drift_10s_m": _largest(drifts)},
         "estimator": _estimator_errors(stood),
     }
+
+
+def _mean(values: Sequence[float | None]) -> Any:
+    """Of those that are known, or None."""
+    known = [value for value in values if value is not None]
+    return rounded(np.mean(known)) if known else None
 
 
 def _largest(drifts: Sequence[float | None]) -> Any:
@@ -162,12 +190,22 @@ def evaluate(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cluster: str | None = None,
 ) -> dict[str, Any]:
-    """Run the whole grid as `pool.in_parallel` does; `progress` hears how many runs of how many are done."""
+    """Run the whole grid on all PLANTS as `pool.in_parallel` does; `progress` hears how many runs of how many are done.
+
+    What comes of the usual plant, and under `second_plant` the same of the other one.
+    """
     todo = cells(grid, seeds)
-    calls: list[Call] = [(run_cell, setup, cell) for cell in todo]
-    calls += [(run_stance, setup, seed) for seed in range(seeds)]
+    calls: list[Call] = []
+    for plant in PLANTS.values():
+        there = attrs.evolve(setup, plant={**plant, **setup.plant})
+        calls += [(run_cell, there, cell) for cell in todo]
+        calls += [(run_stance, there, seed) for seed in range(seeds)]
     results: list[Any] = [None] * len(calls)
     for done, (i, result) in enumerate(in_parallel(calls, cluster), start=1):
         results[i] = result
         progress(done, len(calls))
-    return summarise(results[: len(todo)], results[len(todo) :])
+    usual, second = results[: len(calls) // 2], results[len(calls) // 2 :]
+    return {
+        **summarise(usual[: len(todo)], usual[len(todo) :]),
+        "second_plant": summarise(second[: len(todo)], second[len(todo) :]),
+    }

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from rich.table import Table
 from .output import replacing
 
 CSV_COLUMNS = (
+    "plant",
     *("vx", "vy", "wz", "seed"),
     *("mean_vx", "mean_vy", "mean_wz"),
     *("error_xy", "error_wz", "fell"),
@@ -44,10 +45,11 @@ def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
     with replacing(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
         writer = csv.writer(file)
         writer.writerow(CSV_COLUMNS)
-        for cell in evaluation["cells"]:
-            mean = cell["mean"] or [None] * 3
-            errors = cell["error_xy"], cell["error_wz"]
-            writer.writerow([*cell["command"], cell["seed"], *mean, *errors, int(cell["fell"])])
+        for plant, one in (("usual", evaluation), ("second", evaluation["second_plant"])):
+            for cell in one["cells"]:
+                mean = cell["mean"] or [None] * 3
+                errors = cell["error_xy"], cell["error_wz"]
+                writer.writerow([plant, *cell["command"], cell["seed"], *mean, *errors, int(cell["fell"])])
     write_figure(folder / "eval.png", heatmap(evaluation["cells"]))
 
 
@@ -94,23 +96,50 @@ def _mean_errors(
 
 
 def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
-    """The aggregates, for people."""
-    table = Table("", "", title="Velocity tracking", show_header=False)
-    cells = evaluation["cells"]
-    table.add_row("runs, of these fallen", f"{len(cells)}, {evaluation['falls']}")
-    mean, largest = evaluation["mean_error_xy"], evaluation["max_error_xy"]
-    table.add_row("error, mean and largest", f"{mean:.3f}, {largest:.3f} m/s")
-    worst = [cell for cell in cells if not cell["fell"] and cell["error_xy"] == largest]
-    if worst:
-        table.add_row("largest at (vx, vy, wz)", ", ".join(f"{x:g}" for x in worst[0]["command"]))
-    table.add_row("jitter", f"{evaluation['jitter']:.5f} rad")
-    drift = evaluation["stance"]["drift_10s_m"]
-    table.add_row("drift in 10 s of standing", "fell" if drift is None else f"{100 * drift:.2f} cm")
-    for name, figures in evaluation["estimator"].items():
-        rmse = ", ".join(f"{x:.3f}" for x in figures["rmse"])
-        table.add_row(f"{name} estimator, RMSE x, y, z", f"{rmse} m/s")
-        table.add_row(f"{name} estimator, drift", f"{100 * figures['drift']:.1f} % of the way")
+    """The aggregates on both plants, for people."""
+    plants = [evaluation, evaluation["second_plant"]]
+    table = Table("", "usual plant", "second plant", title="Velocity tracking")
+    for name, show in AGGREGATES.items():
+        table.add_row(name, *(show(one) for one in plants))
+    for name in evaluation["estimator"]:
+        figures = [one["estimator"].get(name) for one in plants]
+        rmse = [", ".join(f"{x:.3f}" for x in one["rmse"]) if one else "fell" for one in figures]
+        table.add_row(f"{name} estimator, RMSE x, y, z, m/s", *rmse)
+        table.add_row(
+            f"{name} estimator, drift",
+            *(f"{100 * one['drift']:.1f} % of the way" if one else "" for one in figures),
+        )
     return table
+
+
+def _furthest_off(one: Mapping[str, Any], error: str) -> str:
+    worst = max(
+        (cell for cell in one["cells"] if not cell["fell"]), key=lambda cell: cell[error], default=None
+    )
+    return "" if worst is None else ", ".join(f"{x:g}" for x in worst["command"])
+
+
+def _seconds(value: float | None) -> str:
+    return "" if value is None else f"{value:.2f} s"
+
+
+def _drift(one: Mapping[str, Any]) -> str:
+    drift = one["stance"]["drift_10s_m"]
+    return "fell" if drift is None else f"{100 * drift:.2f} cm"
+
+
+AGGREGATES: dict[str, Callable[[Mapping[str, Any]], str]] = {
+    "runs, of these fallen": lambda one: f"{len(one['cells'])}, {one['falls']}",
+    "error, mean and largest": lambda one: f"{one['mean_error_xy']:.3f}, {one['max_error_xy']:.3f} m/s",
+    "largest at (vx, vy, wz)": lambda one: _furthest_off(one, "error_xy"),
+    "yaw rate, mean and largest": lambda one: f"{one['mean_error_wz']:.3f}, {one['max_error_wz']:.3f} rad/s",
+    "largest at (vx, vy, wz) ": lambda one: _furthest_off(one, "error_wz"),
+    "delay of the velocity": lambda one: _seconds(one["delay_xy"]),
+    "delay of the yaw rate": lambda one: _seconds(one["delay_wz"]),
+    "jitter": lambda one: f"{one['jitter']:.5f} rad",
+    "drift in 10 s of standing": _drift,
+}
+"""Rows of the table, and what stands in them of one plant's evaluation."""
 
 
 def segment_table(segments: Sequence[Mapping[str, Any]]) -> Table:

@@ -66,6 +66,8 @@ class Sample:
 
     state: RobotState
     truth: Truth
+    asked: Array
+    """velocity (3,), vx, vy (m/s), wz (rad/s), that the mux asked the supervisor for"""
     estimates: dict[str, Array]
     """velocity (3,), m/s, body frame, of the estimators beside"""
     command: JointCommand
@@ -110,7 +112,9 @@ class RobotLoop:
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)
         simulator.step(STEPS)
-        return Sample(state, truth, estimates, command, self.supervisor.mode, fallen)
+        return Sample(
+            state, truth, np.array(asked.velocity), estimates, command, self.supervisor.mode, fallen
+        )
 
     def start_walking(self) -> None:
         """From a simulator reset to "stand": half a second in the standing posture, then the policy stands.

@@ -58,10 +58,24 @@ def measure(time: ArrayLike, velocity: ArrayLike, command: ArrayLike, start: flo
     return Segment(np.asarray(command, float), velocity[within].mean(axis=0))
 
 
-def max_and_mean_error_xy(segments: Sequence[Segment]) -> tuple[float, float]:
-    """Largest and mean error_xy, m/s, of at least one segment."""
-    errors = [segment.error_xy for segment in segments]
-    return max(errors), float(np.mean(errors))
+def tracking_errors(segments: Sequence[Segment]) -> dict[str, float]:
+    """Largest and mean errors of at least one segment: xy in m/s, wz in rad/s."""
+    errors = {"xy": [s.error_xy for s in segments], "wz": [s.error_wz for s in segments]}
+    found = {f"max_error_{axis}": rounded(max(some)) for axis, some in errors.items()}
+    return found | {f"mean_error_{axis}": rounded(np.mean(some)) for axis, some in errors.items()}
+
+
+def response_delay(asked: Array, velocity: Array, period: float) -> float | None:
+    """By how much a velocity (n,) comes after what was asked for (n,), s: the area between both, each as a share of its end.
+
+    Ends are means over the second half of the stretch, so that a steady error is no delay. Samples are `period` (s) apart.
+    None where the velocity does not get half as far as it should: that is no delay either.
+    """
+    late = len(asked) // 2
+    wanted, reached = float(asked[late:].mean()), float(velocity[late:].mean())
+    if reached / wanted < 0.5:
+        return None
+    return float(period * np.sum(asked / wanted - velocity / reached))
 
 
 def rounded(value: ArrayLike) -> Any:

@@ -101,6 +101,7 @@ class Walk:
     time: Array  # (n,) s
     position: Array  # (n, 3) m, trunk, world
     velocity: Array  # (n, 3) vx, vy (m/s), wz (rad/s), true
+    asked: Array  # (n, 3) the same, that the policy was asked for
     heading: Array  # (n,) rad, of the trunk, without jumps
     contact: NDArray[np.bool_]  # (n, 4) whether a foot touches the ground
     targets: Array  # (n, 12) rad, what the joints were asked for
@@ -155,6 +156,7 @@ def _walk(samples: Sequence[Sample]) -> Walk:
         time=time - time[0],
         position=position,
         velocity=np.column_stack([true[:, :2], turning[:, 2]]),
+        asked=np.array([s.asked for s in samples]),
         heading=np.unwrap(yaw(np.array([s.truth.quaternion for s in samples]))),
         contact=np.array([s.truth.contact for s in samples]),
         targets=np.array([s.command.target for s in samples]),

@@ -54,11 +54,12 @@ class ObstacleMemory:
 
     def _take(self, time: float, points: Array, counts: Array) -> None:
         """One reading a cell and scan; a cell that is near counts as believed."""
-        rows = np.floor(points / CELL).astype(np.int64)
-        keys, first = np.unique(rows[:, 0] * _ROW + rows[:, 1], return_index=True)
+        rows: NDArray[np.int64] = np.floor(points / CELL).astype(np.int64)
+        cells: NDArray[np.int64] = rows[:, 0] * _ROW + rows[:, 1]
+        keys, first = np.unique(cells, return_index=True)
         place = np.searchsorted(self._keys, keys)
         known = np.isin(keys, self._keys, assume_unique=True)
-        again, found = place[known], first[known]
+        again, found = np.atleast_1d(place)[known], first[known]
         self._points[again], self._times[again] = points[found], time
         self._counts[again] = np.minimum(np.maximum(self._counts[again] + 1, counts[found]), SURE)
         new = first[~known]

@@ -2,5 +2,6 @@
 
 from quadvel_sim.simulator import SensorNoise, Simulator, SimulatorConfig, Truth
 from quadvel_sim.terrain import Terrain
+from quadvel_sim.world import World
 
-__all__ = ["SensorNoise", "Simulator", "SimulatorConfig", "Terrain", "Truth"]
+__all__ = ["SensorNoise", "Simulator", "SimulatorConfig", "Terrain", "Truth", "World"]

@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_sim.checks import number, numbers, whole_number
+from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
+from quadvel_sim.world import World
 
 
 @attrs.frozen
@@ -34,6 +36,8 @@ class SimulatorConfig:
 
     actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
     terrain: Terrain = attrs.field(factory=Terrain)
+    world: World | None = None
+    """What is around the robot, ground included; without one there is the terrain alone."""
     noise: SensorNoise = attrs.field(factory=SensorNoise)
     seed: int = attrs.field(default=0, **whole_number())
     """Of torque and sensor noise; the ground has its own."""
@@ -49,6 +53,8 @@ class SimulatorConfig:
     """Coulomb friction, (12,), N m."""
     joint_damping: NDArray[np.float64] = attrs.field(factory=lambda: robot.DAMPING, **numbers(12, low=0.0))
     """Viscous friction, (12,), N m s/rad."""
+    physics: Physics = attrs.field(factory=Physics)
+    """How motion and contact are solved."""
     hung: bool = False
     """Whether the trunk is held in the air, as on a stand."""
     watchdog: float = attrs.field(default=0.02, **number(0.001))
@@ -57,3 +63,9 @@ class SimulatorConfig:
     """Gain of that brake, N m s/rad."""
     fall_tilt: float = attrs.field(default=1.0, **number(0.1, np.pi))
     """Angle of the trunk's z axis to the vertical (rad) beyond which the robot counts as fallen."""
+
+    def __attrs_post_init__(self) -> None:
+        if self.world is not None and self.terrain.kind != "flat":
+            raise ValueError(
+                f"SimulatorConfig.terrain: found {self.terrain.kind!r} in a world, which brings its own ground; expected 'flat'"
+            )

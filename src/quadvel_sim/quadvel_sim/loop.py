@@ -16,7 +16,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import attrs
 from numpy.typing import ArrayLike
@@ -46,6 +46,7 @@ class LoopReport:
     unanswered: int  # times that lockstep waited in vain, since the start
     braking: bool  # now
     fallen: bool  # now
+    touched: Mapping[str, int]  # since the reset, as `Simulator.touched`
 
 
 class SimulationLoop:
@@ -179,6 +180,7 @@ class SimulationLoop:
                 unanswered=self._unanswered,
                 braking=self.simulator.braking,
                 fallen=self.simulator.fallen,
+                touched=dict(self.simulator.touched),
             )
             self._begin_report()
             return report

@@ -15,6 +15,7 @@ from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.loop import MODES, Publish, SimulationLoop
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import KINDS, Terrain
+from quadvel_sim.world import SHIPPED, World
 
 _NOISE, _TERRAIN, _CONFIG = SensorNoise(), Terrain(), SimulatorConfig()
 
@@ -32,6 +33,9 @@ class PlantParameters(Scheduling):
     publish_tf: bool = _parameter(False, "whether to publish the true transform from odom to base_link")
     seed: int = _parameter(_CONFIG.seed, "seed of sensor and torque noise")
     actuator_file: str = _parameter("", "actuator model, YAML; empty: the shipped AlienGo")
+    world: str = _parameter(
+        "", f"what is around the robot: a YAML file, or {', '.join(SHIPPED)}; empty: nothing"
+    )
     terrain: str = _parameter(_TERRAIN.kind, f"the ground: {', '.join(KINDS)}")
     slope: float = _parameter(_TERRAIN.slope, "inclination of the ground, rad, rising along x")
     roughness: float = _parameter(_TERRAIN.roughness, "rough ground: bound of its heights, m")
@@ -71,6 +75,7 @@ class PlantParameters(Scheduling):
         return SimulatorConfig(
             actuator=self._actuator(),
             terrain=self._terrain(),
+            world=World.load(self.world) if self.world else None,
             noise=SensorNoise(
                 self.noise_q,
                 self.noise_dq,

@@ -29,6 +29,7 @@ from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport
 from quadvel_sim.parameters import PlantParameters
 from quadvel_sim.simulator import Simulator, Truth
+from quadvel_sim.world_view import WorldView
 
 TRUTH_PERIOD = 5  # ms
 VIEW_PERIOD = 20  # ms, of what people look at
@@ -55,6 +56,8 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._has_fallen = False
         self._failure = ""
         self._loop = self._settings.loop(simulator, self._publish)
+        world = simulator.config.world
+        self._world_view = None if world is None else WorldView(self, world)
         self._thread = Thread(target=self._simulate, name="simulation")
         self._truth = self.create_publisher(Odometry, "ground_truth/odom", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
@@ -112,6 +115,8 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             return
         view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
         self.publish_sample(state, instant, view)
+        if self._world_view is not None:
+            self._world_view.publish(self.stamp(instant), self._loop.simulator, view)
         if self._samples % max(1, TRUTH_PERIOD // self._settings.period) == 0:
             transform = view and self._settings.publish_tf
             self._publish_truth(self.stamp(instant), self._loop.simulator.truth(), transform)
@@ -179,6 +184,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             "unanswered": report.unanswered,
             "braking": report.braking,
             "fallen": report.fallen,
+            **self._in_world(report),
             **self.figures(),
         }
         stamp = self.get_clock().now().to_msg()
@@ -188,6 +194,13 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if report.fallen and not self._has_fallen:
             self.get_logger().warning("the robot has fallen; ~/reset puts it back")
         self._has_fallen = report.fallen
+
+    def _in_world(self, report: LoopReport) -> dict[str, object]:
+        """What /diagnostics shows of a world, if there is one."""
+        if self._world_view is None:
+            return {}
+        touched = ", ".join(f"{name} {count}" for name, count in sorted(report.touched.items()))
+        return {"world": self._settings.world, "touched": touched or "nothing"}
 
     def _judge(self, report: LoopReport) -> tuple[bytes, str]:
         """Level and summary of the last second."""

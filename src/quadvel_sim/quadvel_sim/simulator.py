@@ -11,7 +11,8 @@ foot forces follow from all these. A command given at t counts from t on.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 
 import attrs
 import mujoco
@@ -23,7 +24,11 @@ from quadvel_description import robot
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.mjcf import Plant, build_spec
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_sim import persons
 from quadvel_sim.config import SensorNoise, SimulatorConfig
+from quadvel_sim.laser import Scan
+from quadvel_sim.surroundings import Surroundings, is_ground
+from quadvel_sim.world import SURFACE_PRIORITY
 
 __all__ = ["DT", "SensorNoise", "Simulator", "SimulatorConfig", "Truth"]
 
@@ -67,7 +72,11 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
         hung=config.hung,
     )
     spec = build_spec(plant)
-    config.terrain.add_to(spec)
+    if config.world is None:
+        config.terrain.add_to(spec)
+    else:
+        config.world.add_to(spec)
+        persons.add_to(spec, config.world.persons)
     if config.payload > 0.0:
         spec.body("trunk").add_body(
             name="payload",
@@ -85,6 +94,12 @@ def build_model(config: SimulatorConfig) -> mujoco.MjModel:
     model = spec.compile()
     for leg, friction in zip(robot.LEGS, config.friction, strict=True):
         model.geom(f"{leg}_foot").friction[0] = friction
+    config.physics.apply(model)
+    foot, own = model.geom(f"{robot.LEGS[0]}_foot"), model.geom_priority == SURFACE_PRIORITY
+    model.geom_solref[own], model.geom_condim[own] = (
+        foot.solref,
+        foot.condim,
+    )  # friction alone is a surface's own
     disable = mujoco.mjtDisableBit
     model.opt.disableflags |= disable.mjDSBL_AUTORESET  # a diverged run is an error, not a new start
     model.opt.disableflags |= disable.mjDSBL_ISLAND  # the robot is one island; finding that out costs 10 %
@@ -111,9 +126,12 @@ class Simulator:
             for name in ("orientation", "gyro", "accelerometer")
         )
         self._trunk_geom = self.model.geom("trunk").id
+        self._ground = np.array([is_ground(self.model.geom(i).name) for i in range(self.model.ngeom)])
         self._fall_cosine = np.cos(self.config.fall_tilt)
         self._watchdog_steps = round(self.config.watchdog / DT)
         self._brake = _law(JointCommand.damping(self.config.watchdog_kd))
+        world = self.config.world
+        self._surroundings = None if world is None else Surroundings(self.model, world)
         self._noise = np.repeat(attrs.astuple(self.config.noise), (12, 12, 3, 3, 3))
         self.reset()
 
@@ -125,7 +143,8 @@ class Simulator:
         keyframes = [self.model.key(i).name for i in range(self.model.nkey)]
         if keyframe not in keyframes:
             raise ValueError(f"keyframe: found {keyframe!r}, expected one of {', '.join(keyframes)}")
-        seeds = np.random.SeedSequence(self.config.seed if seed is None else seed).generate_state(2)
+        seed = self.config.seed if seed is None else seed
+        seeds = np.random.SeedSequence(seed).generate_state(2)
         self.actuator = self._make_actuator(int(seeds[0]))
         self._rng = np.random.default_rng(seeds[1])
         mujoco.mj_resetDataKeyframe(self.model, self.data, self.model.key(keyframe).id)
@@ -133,6 +152,8 @@ class Simulator:
             tilt = self.config.terrain.tilt
             self.data.qpos[:3] = rotate(tilt, self.data.qpos[:3])
             self.data.qpos[3:7] = tilt
+        if self._surroundings is not None:
+            self._surroundings.reset(self.data, seed)
         self._pushes: list[_Push] = []
         self.steps = 0
         self._sampled = False
@@ -194,7 +215,8 @@ class Simulator:
     def step(self, n: int = 1) -> None:
         """Advance by `n` ms. FloatingPointError where the physics diverged."""
         model, data, q, dq = self.model, self.data, self._q, self._dq
-        torque, answer = data.ctrl, self.actuator.step
+        torque, answer, more = data.ctrl, self.actuator.step, self.config.physics.substeps - 1
+        surroundings = self._surroundings
         for _ in range(n):
             torque[:] = answer(q, dq, *self._law)
             if self._sampled:  # all that depends on positions and velocities alone is there
@@ -202,11 +224,15 @@ class Simulator:
                 self._sampled = False
             else:
                 mujoco.mj_step(model, data)
+            if more:
+                mujoco.mj_step(model, data, more)
             self._command_left -= 1
             if self._command_left == 0:
                 self._law = self._brake
             if self._pushes:
                 self._end_pushes()
+            if surroundings is not None:
+                surroundings.step(data)
         self.steps += n
         if not np.isfinite(data.qpos).all():
             raise FloatingPointError(f"simulation: the robot's state is not finite at {self.time:.3f} s")
@@ -218,7 +244,7 @@ class Simulator:
 
         Pushes add up. ValueError names an unknown body, a wrench that is not finite, a duration under 1 ms.
         """
-        bodies = [self.model.body(i).name for i in range(1, self.model.nbody)]
+        bodies = [self.model.body(i).name for i in range(1, self.model.nbody) if self.model.body_weldid[i]]
         if body not in bodies:
             raise ValueError(f"push: body: found {body!r}, expected one of {', '.join(bodies)}")
         wrench = np.concatenate([np.ravel(force), np.ravel(torque)]).astype(float)
@@ -245,7 +271,7 @@ class Simulator:
         """What the board reports of this instant, with sensor noise. New arrays."""
         self._sample()
         foot_force, wrench = np.zeros(4), np.zeros(6)
-        for foot, i in self._foot_contacts():
+        for foot, i, _ in self._foot_contacts():
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
             foot_force[foot] += wrench[0]
         noise, sensors = self._noise * self._rng.standard_normal(33), self.data.sensordata
@@ -265,10 +291,10 @@ class Simulator:
         """The trunk's true motion and the contacts of this instant. New arrays."""
         self._sample()
         contact, force, wrench = np.zeros(4, dtype=bool), np.zeros((4, 3)), np.zeros(6)
-        for foot, i in self._foot_contacts():
+        for foot, i, sign in self._foot_contacts():
             mujoco.mj_contactForce(self.model, self.data, i, wrench)
             contact[foot] = True
-            force[foot] += wrench[:3] @ self.data.contact.frame[i].reshape(3, 3)
+            force[foot] += sign * wrench[:3] @ self.data.contact.frame[i].reshape(3, 3)
         quaternion = self.data.qpos[3:7].copy()
         return Truth(
             time=self.time,
@@ -290,12 +316,36 @@ class Simulator:
         self._sample()
         _, x, y, _ = self.data.qpos[3:7]
         upright = 1.0 - 2.0 * (x * x + y * y)  # z component of the trunk's z axis
-        return bool(upright < self._fall_cosine or (self.data.contact.geom[:, 1] == self._trunk_geom).any())
+        if upright < self._fall_cosine:
+            return True
+        geoms = self.data.contact.geom
+        return bool(((geoms == self._trunk_geom).any(1) & self._ground[geoms].any(1)).any())
 
-    def _foot_contacts(self) -> list[tuple[int, int]]:
-        """The contacts of feet now: index of the foot, index of the contact."""
-        geoms = self.data.contact.geom[:, 1].tolist()  # the first of each pair is the ground
-        return [(self._foot_of_geom[geom], i) for i, geom in enumerate(geoms) if geom in self._foot_of_geom]
+    @property
+    def touched(self) -> Mapping[str, int]:
+        """How often since the reset the robot touched what stands or walks in its world, by name."""
+        return MappingProxyType({} if self._surroundings is None else self._surroundings.touched)
+
+    def scan(self) -> Scan | None:
+        """The laser's scan of this instant, or None if none is due since the last one. ValueError without a world."""
+        if self._surroundings is None:
+            raise ValueError("scan: found no world, expected SimulatorConfig.world, which has the laser")
+        self._sample()
+        return self._surroundings.scan(self.data)
+
+    def persons(self) -> _Array:
+        """Where the world's persons are and where they walk to, (n, 3): x, y in m, yaw in rad, world; who is led first."""
+        return np.zeros((0, 3)) if self._surroundings is None else self._surroundings.persons.poses
+
+    def _foot_contacts(self) -> list[tuple[int, int, float]]:
+        """The contacts of feet now: index of the foot, index of the contact, and 1, or -1 where its frame shows from the foot."""
+        found, feet = [], self._foot_of_geom
+        for i, (first, second) in enumerate(self.data.contact.geom.tolist()):
+            if second in feet:
+                found.append((feet[second], i, 1.0))
+            elif first in feet:
+                found.append((feet[first], i, -1.0))
+        return found
 
     def _sample(self) -> None:
         """Bring all that MuJoCo derives from positions, velocities and torques to the present instant.

@@ -23,9 +23,10 @@ def _points(values: ArrayLike) -> Array:
 class Walker:
     """A person on a way of straight pieces.
 
-    way (n, 2): m, from one point to the next, at the last of which it stays; speed: m/s; stops: (from, to) in s, times
-    at which it stands; pace: share by which its speed changes, slowly, up and down; radius: m, of a leg; apart: m, of
-    the legs from each other sideways.
+    way (n, 2): m, from one point to the next, at the last of which it stays, or, where the way is closed, from which it
+    goes on to the first, round after round; travelled: m so far; speed: m/s; waiting: whether it stands; stops: (from, to)
+    in s, times at which it stands; pace: share by which its speed changes, slowly, up and down; radius: m, of a leg;
+    apart: m, of the legs from each other sideways.
     """
 
     way: Array = attrs.field(converter=_points)
@@ -36,14 +37,21 @@ class Walker:
     apart: float = 0.2
     phase: float = 0.0  # of its stride, 0 to 1
     time: float = 0.0
-    travelled: float = attrs.field(default=0.0, init=False)
+    travelled: float = 0.0
+    closed: bool = False
+    waiting: bool = False
     swing: float = attrs.field(default=0.0, init=False)  # m, of a foot before and behind the body
+    _directions: Array = attrs.field(init=False)  # (pieces, 2) of the way
+    _begins: Array = attrs.field(init=False)  # (pieces,) m along the way
+    _ends: Array = attrs.field(init=False)
 
     def step(self, dt: float) -> None:
         """Walk on for `dt` s."""
         self.time += dt
         standing = (
-            any(begin <= self.time < end for begin, end in self.stops) or self.travelled >= self._length
+            self.waiting
+            or any(begin <= self.time < end for begin, end in self.stops)
+            or (self.travelled >= self.length and not self.closed)
         )
         speed = 0.0 if standing else self.speed * (1.0 + self.pace * np.sin(1.3 * self.time))
         self.travelled += speed * dt
@@ -52,9 +60,18 @@ class Walker:
         if speed > 0.0:
             self.phase = (self.phase + dt / period) % 1.0
 
+    def __attrs_post_init__(self) -> None:
+        way = np.vstack([self.way, self.way[:1]]) if self.closed else self.way
+        pieces = np.diff(way, axis=0)
+        lengths = np.hypot(*pieces.T)
+        self._directions = pieces / lengths[:, None]
+        self._ends = np.cumsum(lengths)
+        self._begins = self._ends - lengths
+
     @property
-    def _length(self) -> float:
-        return float(np.hypot(*np.diff(self.way, axis=0).T).sum())
+    def length(self) -> float:
+        """Of the way, or of a round, m."""
+        return float(self._ends[-1])
 
     @property
     def position(self) -> Array:
@@ -63,13 +80,16 @@ class Walker:
 
     def _place(self) -> tuple[Array, Array]:
         """Position (2,) and direction (2,)."""
-        pieces = np.diff(self.way, axis=0)
-        lengths = np.hypot(*pieces.T)
-        ends = np.cumsum(lengths)
-        i = min(int(np.searchsorted(ends, self.travelled, side="right")), len(pieces) - 1)
-        direction = pieces[i] / lengths[i]
-        into = min(self.travelled - (ends[i] - lengths[i]), lengths[i])
-        return self.way[i] + into * direction, direction
+        along = self.travelled % self.length if self.closed else min(self.travelled, self.length)
+        i = min(int(self._ends.searchsorted(along, side="right")), len(self._ends) - 1)
+        direction = self._directions[i]
+        return self.way[i] + (along - self._begins[i]) * direction, direction
+
+    @property
+    def heading(self) -> float:
+        """Where it walks to, rad."""
+        ahead = self._place()[1]
+        return float(np.arctan2(ahead[1], ahead[0]))
 
     @property
     def legs(self) -> Array:

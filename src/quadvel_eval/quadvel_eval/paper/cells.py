@@ -55,6 +55,16 @@ def largest_error(records: Sequence[Record]) -> float:
     return largest(records, "error_xy")
 
 
+def mean_turn_error(records: Sequence[Record]) -> float:
+    """Of the mean yaw rates of the robots that did not fall, rad/s."""
+    return mean(records, "error_wz")
+
+
+def largest_turn_error(records: Sequence[Record]) -> float:
+    """Of the mean yaw rates of the robots that did not fall, rad/s."""
+    return largest(records, "error_wz")
+
+
 def limits(study: Study, policy: str) -> CommandLimits:
     """The commands that a policy takes."""
     return PolicyFile(study.policies[policy]).metadata.limits

@@ -1,16 +1,27 @@
-"""Figure 10: velocity tracking over the paper's grid, and over the quick grid, where the robot turns as it walks."""
+"""Figure 10: velocity tracking over the paper's grid, and over the quick grid, where the robot turns as it walks; on two plants."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import ClassVar
 
 import attrs
 from matplotlib.figure import Figure
 
-from ..grid import cells
+from ..grid import PLANTS, cells
 from ..report import heatmaps
-from .cells import cell_job, cell_record, falls, largest_error, limits, mean_error, within
+from .cells import (
+    cell_job,
+    cell_record,
+    falls,
+    largest_error,
+    largest_turn_error,
+    limits,
+    mean_error,
+    mean_turn_error,
+    within,
+)
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
 
 LARGEST = 0.084  # m/s, the paper's largest error
@@ -37,7 +48,9 @@ class Tracking(Section):
         "Each robot follows one command for 6 s from standing; the error is the length of commanded minus mean velocity "
         "over the last 4 s. The paper's grid is vx -2.5 to 2.5 by 0.5 and vy -1 to 1 by 0.2 m/s; the quick grid holds vx -1 "
         "to 1.5, vy -0.4 to 0.4 m/s and wz -1 to 1 rad/s. A command beyond the limits in a policy's file is cut to them "
-        "before the policy sees it, and judged as it was asked for. A cross in the picture: a robot fell."
+        "before the policy sees it, and judged as it was asked for. A cross in the picture: a robot fell. The second "
+        "plant is MuJoCo at 0.5 ms with pyramidal friction cones, contacts twice as stiff, friction against turning feet, and "
+        "links 3 % heavier with 15 % more inertia."
     )
     grids: tuple[str, ...] = ("paper", "quick")
 
@@ -45,10 +58,12 @@ class Tracking(Section):
         jobs = []
         for policy in study.policies:
             bounds = limits(study, policy)
-            for grid in self.grids:
+            for (plant, fields), grid in itertools.product(PLANTS.items(), self.grids):
+                setup = study.setup(policy, **fields)
                 for cell in cells(grid, study.seeds):
-                    labels = {"policy": policy, "grid": grid, "within": int(within(cell.command, bounds))}
-                    jobs.append(cell_job(study.setup(policy), cell.command, cell.seed, **labels))
+                    inside = int(within(cell.command, bounds))
+                    labels = {"policy": policy, "plant": plant, "grid": grid, "within": inside}
+                    jobs.append(cell_job(setup, cell.command, cell.seed, **labels))
         return jobs
 
     def judge(self, answers: Answers) -> list[Record]:
@@ -57,17 +72,52 @@ class Tracking(Section):
     def figure(self, records: Sequence[Record]) -> Figure:
         panels = {}
         for policy in distinct(records, "policy"):
-            mine = select(records, policy=policy, grid=self.grids[0])
+            mine = select(records, policy=policy, plant="usual", grid=self.grids[0])
             title = f"{policy}: mean {mean_error(mine):.3f}, max {largest_error(mine):.3f} m/s"
             panels[title] = [{**r, "command": [r["vx"], r["vy"], r["wz"]]} for r in mine]
         return heatmaps(panels)
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
-        return [row for grid in distinct(records, "grid") for row in _rows(grid, select(records, grid=grid))]
+        rows: list[Row] = []
+        for grid in distinct(records, "grid"):
+            rows += _rows(grid, select(records, grid=grid, plant="usual"))
+            rows += _second_rows(grid, select(records, grid=grid, plant="second", within=1))
+        return rows
+
+
+def _second_rows(grid: str, records: Sequence[Record]) -> list[Row]:
+    """Of one grid on the second plant, within the policies' limits."""
+    where = f"{grid} grid, second plant"
+    return [
+        Row(f"{where}: runs", "", None, by_policy(records, len), 0),
+        Row(f"{where}: falls", "", 0.0, by_policy(records, falls), 0, key=True),
+        Row(f"{where}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
+        Row(f"{where}: largest error", "m/s", None, by_policy(records, largest_error), key=True),
+        *_turn_rows(where, records),
+    ]
+
+
+def _turn_rows(where: str, records: Sequence[Record]) -> list[Row]:
+    return [
+        Row(
+            f"{where}: mean error of the yaw rate",
+            "rad/s",
+            None,
+            by_policy(records, mean_turn_error),
+            key=True,
+        ),
+        Row(
+            f"{where}: largest error of the yaw rate",
+            "rad/s",
+            None,
+            by_policy(records, largest_turn_error),
+            key=True,
+        ),
+    ]
 
 
 def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
-    """Of one grid; the paper's figure is that of its own."""
+    """Of one grid on the usual plant; the paper's figure is that of its own."""
     paper = LARGEST if grid == "paper" else None
     every, inside = f"{grid} grid, all", f"{grid} grid, within the policy's limits"
     taken = select(records, within=1)
@@ -80,5 +130,6 @@ def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
         Row(f"{inside}: falls", "", 0.0, by_policy(taken, falls), 0),
         Row(f"{inside}: mean error", "m/s", None, by_policy(taken, mean_error), key=True),
         Row(f"{inside}: largest error", "m/s", paper, by_policy(taken, largest_error), key=True),
+        *_turn_rows(inside, taken),
         Row(f"{inside}: largest left-right difference", "m/s", None, by_policy(taken, left_right), key=True),
     ]

@@ -1,4 +1,4 @@
-"""A floor plan and a laser scanner in it: rays against circles and segments, with a scanner's faults.
+"""A floor plan and a laser scanner in it: rays against circles and segments, with the faults of the simulator's.
 
 For tests, training and as the measure of other simulated lasers; not for dynamics.
 """
@@ -8,6 +8,8 @@ from __future__ import annotations
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from quadvel_sim.laser import Scanner
 
 Array = NDArray[np.float64]
 
@@ -59,34 +61,9 @@ class FloorPlan:
         return np.where((t > 0.0) & (s >= 0.0) & (s <= 1.0), t, np.inf).min(1)
 
 
-@attrs.frozen
-class Laser:
-    """A scanner. angle_min and angle_increment in rad; noise: standard deviation of a range, m, of which `noise_share`
-    grows with it; lost: share of rays without a reading; mixed: share of the rays at an edge that read something between
-    the thing and what is behind it; nothing: what it says where there was nothing.
-    """
-
-    rays: int = 720
-    angle_min: float = -np.pi
-    angle_increment: float = np.deg2rad(0.5)
-    range_max: float = 12.0
-    noise: float = 0.01
-    noise_share: float = 0.001
-    lost: float = 0.002
-    mixed: float = 0.3
-    nothing: float = np.inf
-
-    @property
-    def angles(self) -> Array:
-        """Of its rays, (rays,)."""
-        return self.angle_min + self.angle_increment * np.arange(self.rays, dtype=float)
+class Laser(Scanner):
+    """A scanner in a floor plan."""
 
     def scan(self, plan: FloorPlan, pose: Array, rng: np.random.Generator) -> Array:
         """Ranges (rays,) in m, from a pose x, y, yaw."""
-        ranges = np.minimum(plan.cast(pose[:2], self.angles + pose[2]), 2.0 * self.range_max)
-        behind = np.maximum(np.roll(ranges, 1), np.roll(ranges, -1))
-        at_edge = (behind - ranges > 0.1) & (rng.random(self.rays) < self.mixed)
-        ranges = np.where(at_edge, ranges + rng.random(self.rays) * (behind - ranges), ranges)
-        ranges += (self.noise + self.noise_share * ranges) * rng.standard_normal(self.rays)
-        silent = (ranges >= self.range_max) | (rng.random(self.rays) < self.lost)
-        return np.where(silent, self.nothing, np.maximum(ranges, 0.0))
+        return self.read(plan.cast(pose[:2], self.angles + pose[2]), rng)

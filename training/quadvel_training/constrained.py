@@ -1,0 +1,248 @@
+"""Stage 3 without a clock: constrained reinforcement learning of the paper's plain network at 200 Hz (Section 3.3).
+
+Starts from the student of `dagger`, whose teacher pulls it back at first: what an action costs shows at once, what it gains only
+after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and one for the
+error over a stride: steady errors are the policy's own to remove. Exploration is correlated in time, as soft gains filter white
+noise away at 200 Hz.
+"""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import torch
+
+from quadvel_description import symmetry
+from quadvel_sim.terrain import Terrain
+
+from . import dagger, parallel, privileged
+from .command_grid import CommandGrid, GridConfig
+from .env import TICK, EnvConfig, VelocityEnv, cores
+from .loop import Budget, Shares, load
+from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
+from .ppo import Ppo, PpoConfig, Rollout
+from .privileged import ACTION_BOUND, Judgement, velocity_error
+from .randomisation import Randomisation, actuator
+from .rewards import RewardWeights, Table2
+
+CRITIC_EXTRA = privileged.CRITIC_EXTRA + 12 + 12  # and torques, exploration under way
+
+
+@attrs.frozen
+class ConstrainedConfig:
+    """One run; a recipe file sets these fields."""
+
+    budget: Budget = Budget(samples=1e8, minutes=6e3)
+    n: int = 512
+    threads: int = attrs.field(factory=cores)
+    length: int = 64  # ticks a sequence, 0.32 s
+    std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit
+    critic_first: int = 40  # updates of the critic alone
+    pull: float = 1.0  # weight of the teacher's pull at first,
+    pull_samples: float = 3e7  # and samples over which it fades
+    constraint_samples: float = 2e7  # over which the weights of the constraints grow to their full
+    stride: float = 2.0  # fine, s/m and s/rad, of the error over a stride
+    keep: float = 5e6  # samples between policies that are kept and evaluated
+    actuator: str = "eam"  # or ideal, or an actuator file
+    timestep: float = 0.0025
+    seed: int = 3
+    grid: GridConfig = GridConfig()  # the student's; its open cells come with it
+    terrain: Terrain = Terrain()
+    randomisation: Randomisation = Randomisation()
+    rewards: RewardWeights = RewardWeights()
+    ppo: PpoConfig = PpoConfig(
+        discount=0.995,
+        gae=0.97,
+        epochs=1,
+        mini_batches=1,
+        critic_steps=16,
+        learning_rate=1.5e-4,
+        target_kl=None,
+        momentum=0.95,
+        max_grad_norm=4.0,
+        symmetry=0.01,
+        smoothness=3.2,
+        symmetric_share=0.25,
+        correlation=0.9,
+    )
+
+
+class ConstrainedRun:
+    """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
+
+    def __init__(self, config: ConstrainedConfig, start: Path, teacher: Path, device: str = "cpu") -> None:
+        """start, teacher: checkpoints of `dagger` and of `privileged`."""
+        self.config = c = config
+        self.device = parallel.join(device)
+        torch.manual_seed(c.seed)
+        known = load(start)
+        self.grid = CommandGrid(c.grid)
+        self.grid.restore(known["grid"])
+        env_config = EnvConfig(
+            n=c.n,
+            threads=c.threads,
+            seed=c.seed + 1000 * parallel.rank(),
+            timestep=c.timestep,
+            actuator=actuator(c.actuator),
+            terrain=c.terrain,
+            randomisation=c.randomisation,
+        )
+        self.env = VelocityEnv(env_config, self.grid)
+        self.teacher = dagger.Teacher(load(teacher), self.env)
+        self.rewards = Table2(self.env, c.rewards)
+        self.judgement = Judgement(c.n)
+        network = Recurrent(symmetry.OBSERVATION.index.size, 12)
+        network.load_state_dict(known["student"])
+        self.actor = Gaussian(network, 12, c.std).to(self.device)
+        self.actor.log_std.requires_grad_(False)
+        self.critic = Mlp(privileged.SIZE + CRITIC_EXTRA, 1).to(self.device)
+        self.mirror_obs, mirror_action = (
+            torch_mirror(mirror, self.device) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS)
+        )
+        self.ppo = Ppo(self.actor, self.critic, c.ppo, self.mirror_obs, mirror_action)
+        self.map = dagger.action_map(self.env)
+        self.shares = Shares()
+        self.samples = self.updates = 0
+        self._action = np.zeros((c.n, 12), np.float32)
+        self._noise = np.zeros((c.n, 12), np.float32)
+        self._state = self._initial_state(c.n)
+        self._mirrored = self._initial_state(self.ppo.mirrored(c.n))
+
+    def _initial_state(self, n: int) -> State:
+        h, c = self.actor.network.initial_state(n)
+        return h.to(self.device), c.to(self.device)
+
+    def policy(self) -> Recurrent:
+        """A copy of the policy as it is now, on the CPU."""
+        network: Recurrent = copy.deepcopy(self.actor.network).cpu()
+        return network
+
+    def write_policy(self, path: Path, about: dict[str, Any]) -> None:
+        """The policy file as it is now; about: how it came to be."""
+        dagger.export_policy(self.policy(), self.env, self.grid, path, about)
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run needs."""
+        return {
+            "actor": self.actor.state_dict(),
+            "critic": self.critic.state_dict(),
+            "learner": self.ppo.state(),
+            "grid": self.grid.state(),
+            "samples": self.samples,
+            "updates": self.updates,
+            "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
+        self.actor.load_state_dict(state["actor"])
+        self.critic.load_state_dict(state["critic"])
+        self.ppo.restore(state["learner"])
+        self.grid.restore(state["grid"])
+        self.samples, self.updates = state["samples"], state["updates"]
+        if parallel.size() == 1:
+            torch.set_rng_state(state["random"]["learner"])
+            self.env.rng.bit_generator.state = state["random"]["environments"]
+
+    def step(self, done: float) -> dict[str, float]:
+        """One rollout, one update."""
+        c = self.config
+        rollout, seen = self.collect()
+        self.updates += 1
+        pull = c.pull * max(0.0, 1.0 - self.samples / c.pull_samples)
+        constraints = min(1.0, self.samples / c.constraint_samples)
+        with self.shares.of("learning"):
+            learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
+        return (
+            seen
+            | learned
+            | {"pull": pull, "constraints": constraints}
+            | self.grid.reach()
+            | self.shares.taken()
+        )
+
+    def _critic_obs(self) -> np.ndarray:
+        env, past = self.env, self.teacher.past
+        known = privileged.observe(env, past, self._action)
+        seen = known, privileged.critic_extra(env, past), 0.05 * env.torque, self._noise
+        return np.concatenate(seen, axis=1).astype(np.float32)
+
+    def _act(self, obs: np.ndarray, state: State) -> tuple[np.ndarray, State]:
+        with torch.no_grad():
+            mean, state = self.actor(torch.from_numpy(obs[None]).to(self.device), state)
+        return mean[0].cpu().numpy(), state
+
+    def collect(self) -> tuple[Rollout, dict[str, float]]:
+        """One sequence of every environment."""
+        c, env, past = self.config, self.env, self.teacher.past
+        names = ("obs", "critic_obs", "action", "mean", "label", "reward", "ended", "cut", "mask")
+        keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
+        std = self.actor.log_std.exp().cpu().numpy()
+        alive = np.ones(c.n, bool)
+        state, start, mirrored_start, before = self._state, self._state, self._mirrored, self._noise
+        for _ in range(c.length):
+            with self.shares.of("sensing"):
+                obs, critic_obs = dagger.observe(env, self._action), self._critic_obs()
+            with self.shares.of("inference"):
+                mean, state = self._act(obs, state)
+                label = self.teacher.action()
+            with self.shares.of("physics"):
+                drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
+                self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
+                action, command = mean + self._noise, env.command.copy()
+                env.tick(self.map.targets(action))
+            with self.shares.of("sensing"):
+                self.teacher.advance(command, action.clip(-ACTION_BOUND, ACTION_BOUND))
+                astray = np.hypot(past.stride[:, 0], past.stride[:, 1]) + np.abs(past.stride[:, 2])
+                reward = self.rewards(action) - c.stride * astray
+            self._action = action
+            fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
+            row = (obs, critic_obs, action, mean, label, reward, fell, late, alive.copy())
+            for name, value in zip(names, row, strict=True):
+                keep[name].append(value)
+            self.judgement.advance(velocity_error(env, command), TICK)
+            self.judgement.tell(self.grid, command, (fell | late | env.changed) & alive, fell)
+            alive &= ~(fell | late)
+        self.samples += c.length * c.n * parallel.size()
+        rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
+        rows |= {"noise": before, "last_critic_obs": self._critic_obs()}
+        t = {name: torch.from_numpy(value).to(self.device) for name, value in rows.items()}
+        rollout = Rollout(**t, state=start, mirrored_state=mirrored_start)
+        seen = self._figures(t, alive)
+        with self.shares.of("inference"):
+            self._advance_memories(state, t["obs"], np.flatnonzero(~alive))
+        return rollout, seen
+
+    def _figures(self, rows: dict[str, torch.Tensor], alive: np.ndarray) -> dict[str, float]:
+        """Errors over a stride of robots that are up (m/s, rad/s), falls a robot-minute."""
+        stride = self.teacher.past.stride[alive]
+        return {
+            "reward": float(rows["reward"].mean()),
+            "error_xy": float(np.hypot(stride[:, 0], stride[:, 1]).mean()),
+            "error_wz": float(np.abs(stride[:, 2]).mean()),
+            "falls_per_minute": float(60 * rows["ended"].sum() / (self.config.length * self.config.n * TICK)),
+        }
+
+    def _advance_memories(self, state: State, obs: torch.Tensor, over: np.ndarray) -> None:
+        """Carry the memory and, for the sequences that the symmetry term may see, that of the mirrored past."""
+        seen = self._mirrored[0].shape[1]
+        with torch.no_grad():
+            _, mirrored = self.actor(self.mirror_obs(obs[:, :seen]), self._mirrored)
+        self._state, self._mirrored = state, mirrored
+        if not len(over):
+            return
+        self.env.reset(over)
+        self.rewards.reset(over)
+        self.teacher.reset(over)
+        self.judgement.close(over)
+        self._noise = self._noise.copy()  # the rollout holds the one before
+        self._action[over] = self._noise[over] = 0.0
+        self._state, self._mirrored = (tuple(m.clone() for m in pair) for pair in (state, mirrored))
+        for memory in self._state:
+            memory[:, over] = 0.0
+        for memory in self._mirrored:
+            memory[:, over[over < seen]] = 0.0
