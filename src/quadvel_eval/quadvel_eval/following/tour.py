@@ -1,0 +1,224 @@
+"""A walk after a person through a simulated world, in one process: laser, tracker, planner, mux, policy and robot.
+
+As the nodes make it, and as fast as the machine allows. Odometry is dead reckoning with the estimated velocity, as the estimator's
+node does it: where the robot really is, only the measurement knows.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from time import process_time
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from quadvel_description.kinematics import rotate, yaw
+from quadvel_estimator.kalman import KalmanEstimator
+from quadvel_estimator.learned import SHIPPED_MODEL
+from quadvel_follow.clearance import outline_distance
+from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
+from quadvel_follow.person_tracker import PersonTracker
+from quadvel_follow.pose_history import PoseHistory
+from quadvel_follow.selection import Selection
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
+from quadvel_policy.supervisor import Supervisor
+from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sim.world import World
+
+from ..robot_loop import PERIOD as TICK
+from ..robot_loop import RobotLoop, Sample, make_estimator
+from ..segments import rounded
+from .obstacles import outlines
+
+Array = NDArray[np.float64]
+
+STRIDE = 0.35  # s, over which velocities are averaged before they are compared: a stride's sway is no error
+BODY = 0.2  # m, radius of a person
+SIGHT = 3.0  # m, to which clearances are looked for
+SETTLED = 6.0  # s, at the start, that distances leave out: the robot stands up to the person first
+BAND = 0.5  # m, round the set distance
+ODOMETRY = 4  # ticks from one odometry to the next
+
+
+@attrs.frozen(kw_only=True)
+class TourSetup:
+    """Who walks where. world: a shipped one or a file; metres: how far the robot is to walk."""
+
+    world: str = "campus"
+    metres: float = 3100.0
+    seed: int = 0
+    policy: Path = SHIPPED_POLICY
+    estimator: str = "learned"
+    estimator_file: Path = SHIPPED_MODEL
+    distance: float = 1.5
+    plant: dict[str, Any] = attrs.field(factory=dict)
+
+
+@attrs.frozen
+class Moment:
+    """What is kept every PERIOD. pose, person: true, x, y (m), yaw (rad); asked, velocity (3,): means over a stride.
+
+    clearance, gap: m, from the outline to what stands within SIGHT and to the nearest person, inf where there is none.
+    """
+
+    time: float
+    pose: Array
+    person: Array
+    asked: Array
+    velocity: Array
+    state: State
+    words: str
+    clearance: float
+    gap: float
+
+
+class Follower:
+    """Tracker, selection and planner as their nodes connect them: scans and odometry in, plans out."""
+
+    def __init__(self, config: FollowConfig) -> None:
+        self._planner, self._tracker, self._selection = FollowPlanner(config), PersonTracker(), Selection()
+        self._poses = PoseHistory([config.laser_x, config.laser_y, config.laser_yaw])
+
+    def on_odometry(self, now: float, pose: Array, velocity: Array) -> None:
+        """pose (3,): x, y (m), yaw (rad), by dead reckoning; velocity (3,): vx, vy (m/s), wz (rad/s)."""
+        self._poses.add(now, pose.tolist())
+        self._planner.on_odometry(now, now, pose.tolist(), velocity)
+
+    def on_scan(self, now: float, scan: Any) -> None:
+        """A scan of this instant, after the odometry of it."""
+        self._planner.on_scan(now, now, scan.ranges, scan.angle_min, scan.angle_increment)
+        sensor = self._poses.sensor_at(now)
+        ranges = np.where(scan.ranges > 0.0, scan.ranges, np.inf)
+        tracks = self._tracker.update(now, ranges, scan.angle_min, scan.angle_increment, sensor.tolist())
+        meant = self._selection.update(now, tracks, sensor.tolist())
+        others = [np.append(track.position, track.velocity) for track in tracks if track.confirmed]
+        self._planner.on_others(now, now, np.reshape(others, (-1, 4)))
+        if meant is not None:
+            self._planner.on_person(now, now, np.append(meant.position, meant.velocity), meant.deviation)
+
+    def step(self, now: float) -> Plan:
+        """The plan now."""
+        return self._planner.step(now)
+
+
+class Tour:
+    """One walk: `moments` goes through it; what it came to is in the attributes afterwards.
+
+    walked: m, way of the trunk. fell: whether the robot did. planning: s of one core for each step of the planner.
+    """
+
+    def __init__(self, setup: TourSetup) -> None:
+        self.setup, self.world = setup, World.load(setup.world)
+        self.simulator = Simulator(SimulatorConfig(world=self.world, seed=setup.seed, **setup.plant))
+        self.simulator.reset("stand")
+        supervisor = Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator())
+        estimator = make_estimator(setup.estimator, self.simulator, setup.estimator_file)
+        self._loop = RobotLoop(self.simulator, supervisor, estimator)
+        laser = self.world.laser
+        x, y, _ = laser.position
+        self._config = FollowConfig(distance=setup.distance, laser_x=float(x), laser_y=float(y))
+        self._follower = Follower(self._config)
+        self._half = 0.5 * self._config.length, 0.5 * self._config.width
+        self._points = outlines(self.world)
+        self._tree = cKDTree(self._points) if len(self._points) else None
+        self.walked, self.fell, self.planning = 0.0, False, []  # type: tuple[float, bool, list[float]]
+
+    def moments(self) -> Iterator[Moment]:
+        """PERIOD apart, until the way is walked, the robot fell, or the person has long been lost."""
+        loop, follower, place = self._loop, self._follower, np.zeros(3)
+        loop.start_walking()
+        asked, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
+        share, often, tick = TICK / STRIDE, round(PERIOD / TICK), 0
+        last = self.simulator.truth().position[:2].copy()
+        plan: Plan | None = None
+        while self.walked < self.setup.metres:
+            try:
+                sample = loop.tick(command)
+            except FloatingPointError:
+                self.fell = True
+                return
+            if sample.fallen or sample.mode != "walk":
+                self.fell = True
+                return
+            now = sample.truth.time
+            estimated = np.zeros(3) if loop.velocity is None else loop.velocity
+            place = place + TICK * rotate(sample.state.quaternion, estimated)
+            true = np.append(sample.truth.linear_velocity[:2], sample.truth.angular_velocity[2])
+            asked, velocity = asked + share * (sample.asked - asked), velocity + share * (true - velocity)
+            if tick % ODOMETRY == 0:
+                heading = float(yaw(sample.state.quaternion))
+                motion = np.append(estimated[:2], sample.state.angular_velocity[2])
+                follower.on_odometry(now, np.append(place[:2], heading), motion)
+                if (scan := self.simulator.scan()) is not None:
+                    follower.on_scan(now, scan)
+            if tick % often == 0 and tick:
+                begin = process_time()
+                plan = follower.step(now)
+                self.planning.append(process_time() - begin)
+                command = plan.velocity
+                here = sample.truth.position[:2]
+                self.walked += float(np.hypot(*(here - last)))
+                last = here.copy()
+                yield self._moment(sample, asked, velocity, plan)
+            tick += 1
+
+    def _moment(self, sample: Sample, asked: Array, velocity: Array, plan: Plan) -> Moment:
+        truth = sample.truth
+        pose = np.array([*truth.position[:2], float(yaw(truth.quaternion))])
+        persons = self.simulator.persons()
+        gaps = outline_distance(persons[:, :2], pose, self._half) - BODY
+        return Moment(
+            truth.time,
+            pose,
+            persons[0],
+            asked,
+            velocity,
+            plan.state,
+            plan.words,
+            self._clearance(pose),
+            float(gaps.min()),
+        )
+
+    def _clearance(self, pose: Array) -> float:
+        if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SIGHT)):
+            return float("inf")
+        return float(outline_distance(self._points[near], pose, self._half).min())
+
+
+def summary(tour: Tour, moments: list[Moment]) -> dict[str, Any]:
+    """The figures of a tour; errors beside the paper's 0.077 m/s and 0.059 rad/s."""
+    time = np.array([one.time for one in moments])
+    late = time >= time[0] + SETTLED
+    asked, velocity = (np.array([getattr(one, name) for one in moments]) for name in ("asked", "velocity"))
+    off = asked - velocity
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
+    lost = [one.state in (State.LOST, State.LOOKING) for one in moments]
+    begins = np.flatnonzero(np.diff(np.append(False, lost).astype(int)) == 1)
+    states = Counter(one.state.value for one in moments)
+    return {
+        "schema": 1,
+        "world": tour.setup.world,
+        "seed": tour.setup.seed,
+        "walked_m": rounded(tour.walked),
+        "minutes": rounded(time[-1] / 60.0),
+        "fell": tour.fell,
+        "touched": dict(tour.simulator.touched),
+        "error_xy": rounded(np.hypot(off[:, 0], off[:, 1]).mean()),
+        "error_wz": rounded(np.abs(off[:, 2]).mean()),
+        "distance_mean_m": rounded(away[late].mean()),
+        "distance_kept": rounded(np.mean(np.abs(away[late] - tour.setup.distance) < BAND)),
+        "least_clearance_m": rounded(min(one.clearance for one in moments)),
+        "least_gap_m": rounded(min(one.gap for one in moments)),
+        "losses": len(begins),
+        "lost_s": rounded(PERIOD * sum(lost)),
+        "seconds": {name: rounded(PERIOD * count) for name, count in states.items()},
+        "planner_ms": {
+            "mean": rounded(1e3 * np.mean(tour.planning)),
+            "p99": rounded(1e3 * np.quantile(tour.planning, 0.99)),
+        },
+    }
