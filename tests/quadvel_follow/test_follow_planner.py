@@ -50,7 +50,9 @@ class Bench:
         self.now = 0.0
         self.pose = np.zeros(3)
 
-    def step(self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD) -> list:
+    def step(
+        self, person: tuple[float, ...] | None, ranges: np.ndarray = OPEN, seconds: float = PERIOD
+    ) -> list:
         """The plans of so many seconds, the robot being where it is commanded to be."""
         plans = []
         for _ in range(round(seconds / PERIOD)):

@@ -1,4 +1,4 @@
-"""What stands in a world, as points in the plane from which clearances are told."""
+"""How far the robot stays from what stands in a world and from the persons there, in the plane, as they really are."""
 
 from __future__ import annotations
 
@@ -6,12 +6,36 @@ from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
 
+from quadvel_follow.clearance import outline_distance
+from quadvel_follow.follow_planner import FollowConfig
 from quadvel_sim.world import World
 
 Array = NDArray[np.float64]
 
 APART = 0.03  # m, between two points of an outline
+SIGHT = 3.0  # m, to which clearances are looked for
+BODY = 0.2  # m, radius of a person
+
+
+class Clearances:
+    """Of a robot with the outline of `config`."""
+
+    def __init__(self, world: World, config: FollowConfig) -> None:
+        self._half = 0.5 * config.length, 0.5 * config.width
+        self._points = outlines(world)
+        self._tree = cKDTree(self._points) if len(self._points) else None
+
+    def of(self, pose: Array) -> float:
+        """From the outline at a pose (3,) to what stands, m; inf where nothing does within SIGHT."""
+        if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SIGHT)):
+            return float("inf")
+        return float(outline_distance(self._points[near], pose, self._half).min())
+
+    def of_persons(self, pose: Array, persons: Array) -> float:
+        """From the outline to the nearest of persons (n, 2 or more), m; inf where there are none."""
+        return float((outline_distance(persons[:, :2], pose, self._half) - BODY).min(initial=np.inf))
 
 
 def outlines(world: World) -> Array:

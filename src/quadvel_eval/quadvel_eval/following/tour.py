@@ -7,7 +7,7 @@ node does it: where the robot really is, only the measurement knows.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from time import process_time
 from typing import Any
@@ -15,12 +15,10 @@ from typing import Any
 import attrs
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_follow.clearance import outline_distance
 from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
 from quadvel_follow.person_tracker import PersonTracker
 from quadvel_follow.pose_history import PoseHistory
@@ -33,13 +31,11 @@ from quadvel_sim.world import World
 from ..robot_loop import PERIOD as TICK
 from ..robot_loop import RobotLoop, Sample, make_estimator
 from ..segments import rounded
-from .obstacles import outlines
+from .obstacles import Clearances
 
 Array = NDArray[np.float64]
 
 STRIDE = 0.35  # s, over which velocities are averaged before they are compared: a stride's sway is no error
-BODY = 0.2  # m, radius of a person
-SIGHT = 3.0  # m, to which clearances are looked for
 SETTLED = 6.0  # s, at the start, that distances leave out: the robot stands up to the person first
 BAND = 0.5  # m, round the set distance
 ODOMETRY = 4  # ticks from one odometry to the next
@@ -63,7 +59,7 @@ class TourSetup:
 class Moment:
     """What is kept every PERIOD. pose, person: true, x, y (m), yaw (rad); asked, velocity (3,): means over a stride.
 
-    clearance, gap: m, from the outline to what stands within SIGHT and to the nearest person, inf where there is none.
+    clearance, gap: m, from the robot's outline to what stands near and to the nearest person, inf where there is none.
     """
 
     time: float
@@ -123,10 +119,22 @@ class Tour:
         x, y, _ = laser.position
         self._config = FollowConfig(distance=setup.distance, laser_x=float(x), laser_y=float(y))
         self._follower = Follower(self._config)
-        self._half = 0.5 * self._config.length, 0.5 * self._config.width
-        self._points = outlines(self.world)
-        self._tree = cKDTree(self._points) if len(self._points) else None
-        self.walked, self.fell, self.planning = 0.0, False, []  # type: tuple[float, bool, list[float]]
+        self._clearances = Clearances(self.world, self._config)
+        self.walked, self.fell = 0.0, False
+        self.planning: list[float] = []
+
+    @property
+    def outcome(self) -> Outcome:
+        """What it has come to so far."""
+        return Outcome(
+            world=self.world.name,
+            seed=self.setup.seed,
+            distance=self.setup.distance,
+            walked=self.walked,
+            fell=self.fell,
+            touched=self.simulator.touched,
+            planning=self.planning,
+        )
 
     def moments(self) -> Iterator[Moment]:
         """PERIOD apart, until the way is walked, the robot fell, or the person has long been lost."""
@@ -171,7 +179,6 @@ class Tour:
         truth = sample.truth
         pose = np.array([*truth.position[:2], float(yaw(truth.quaternion))])
         persons = self.simulator.persons()
-        gaps = outline_distance(persons[:, :2], pose, self._half) - BODY
         return Moment(
             truth.time,
             pose,
@@ -180,45 +187,62 @@ class Tour:
             velocity,
             plan.state,
             plan.words,
-            self._clearance(pose),
-            float(gaps.min()),
+            self._clearances.of(pose),
+            self._clearances.of_persons(pose, persons),
         )
 
-    def _clearance(self, pose: Array) -> float:
-        if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SIGHT)):
-            return float("inf")
-        return float(outline_distance(self._points[near], pose, self._half).min())
+
+@attrs.frozen(kw_only=True)
+class Outcome:
+    """What a walk after a person came to, moments apart. distance: m, that was to be kept; walked: m; touched: how often what was
+    run into; planning: s of one core for each step of the planner, where that is known.
+    """
+
+    world: str
+    seed: int
+    distance: float
+    walked: float
+    fell: bool
+    touched: Mapping[str, int]
+    planning: Sequence[float] = ()
 
 
-def summary(tour: Tour, moments: list[Moment]) -> dict[str, Any]:
-    """The figures of a tour; errors beside the paper's 0.077 m/s and 0.059 rad/s."""
+def summary(outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
+    """The figures of a walk; errors beside the paper's 0.077 m/s and 0.059 rad/s."""
     time = np.array([one.time for one in moments])
-    late = time >= time[0] + SETTLED
+    late = time >= min(time[0] + SETTLED, time[-1])
     asked, velocity = (np.array([getattr(one, name) for one in moments]) for name in ("asked", "velocity"))
     off = asked - velocity
     away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
     lost = [one.state in (State.LOST, State.LOOKING) for one in moments]
     begins = np.flatnonzero(np.diff(np.append(False, lost).astype(int)) == 1)
     states = Counter(one.state.value for one in moments)
-    return {
+    found = {
         "schema": 1,
-        "world": tour.setup.world,
-        "seed": tour.setup.seed,
-        "walked_m": rounded(tour.walked),
-        "minutes": rounded(time[-1] / 60.0),
-        "fell": tour.fell,
-        "touched": dict(tour.simulator.touched),
-        "error_xy": rounded(np.hypot(off[:, 0], off[:, 1]).mean()),
-        "error_wz": rounded(np.abs(off[:, 2]).mean()),
-        "distance_mean_m": rounded(away[late].mean()),
-        "distance_kept": rounded(np.mean(np.abs(away[late] - tour.setup.distance) < BAND)),
-        "least_clearance_m": rounded(min(one.clearance for one in moments)),
-        "least_gap_m": rounded(min(one.gap for one in moments)),
+        **attrs.asdict(outcome, filter=lambda field, _: field.name != "planning"),
+        "minutes": (time[-1] - time[0]) / 60.0,
+        "error_xy": np.hypot(off[:, 0], off[:, 1]).mean(),
+        "error_wz": np.abs(off[:, 2]).mean(),
+        "distance_mean": away[late].mean(),
+        "distance_kept": np.mean(np.abs(away[late] - outcome.distance) < BAND),
+        "least_clearance": min(one.clearance for one in moments),
+        "least_gap": min(one.gap for one in moments),
         "losses": len(begins),
-        "lost_s": rounded(PERIOD * sum(lost)),
-        "seconds": {name: rounded(PERIOD * count) for name, count in states.items()},
-        "planner_ms": {
-            "mean": rounded(1e3 * np.mean(tour.planning)),
-            "p99": rounded(1e3 * np.quantile(tour.planning, 0.99)),
-        },
+        "lost_seconds": PERIOD * sum(lost),
+        "seconds": {name: PERIOD * count for name, count in states.items()},
     }
+    if outcome.planning:
+        found["planner_ms"] = {
+            "mean": 1e3 * np.mean(outcome.planning),
+            "p99": 1e3 * np.quantile(outcome.planning, 0.99),
+        }
+    return {name: _plain(value) for name, value in found.items()}
+
+
+def _plain(value: Any) -> Any:
+    """As JSON keeps it; what is nowhere near is null."""
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, float | np.floating):
+        return rounded(value) if np.isfinite(value) else None
+    return value
