@@ -333,15 +333,15 @@ def people(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
-def following(context: typer.Context) -> None:
-    """Measure how well a person is followed, in simulated scenes in the plane."""
-    _hand_on(context, "quadvel_eval.following.cli:following_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
 def world(context: typer.Context) -> None:
     """Check a world's file, and draw the world from above."""
     _hand_on(context, "quadvel_eval.world_map:world_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def following(context: typer.Context) -> None:
+    """Measure how well a person is followed, in simulated scenes in the plane."""
+    _hand_on(context, "quadvel_eval.following.cli:following_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
