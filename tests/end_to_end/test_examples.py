@@ -136,7 +136,7 @@ LEFT_OUT_KINDS = {
     r"export .*": "the same",
     r"(\.venv/bin/)?pip install .*": "needs the network",
     r"ssh .*": "needs another host",
-    r"ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
+    r"(ROS_SECURITY_ENCLAVE_OVERRIDE=\S+ )?ros2 .*": "needs ROS 2; tests/ros runs the launch files there",
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
