@@ -1,4 +1,4 @@
-"""What a package imports of ROS 2 and of quadvel is what its package.xml asks for, so that it can be built and run without the others."""
+"""A package asks in its package.xml for what it imports of ROS 2 and of quadvel, so that it runs where only this was built."""
 
 from __future__ import annotations
 
