@@ -79,6 +79,8 @@ NODES = [
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
     Step("quadvel run command_mux --ros-args -p stamped:=true", served=True),
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
+    Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
+    Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
     Step("quadvel people --out out/people", more="--runs 1"),
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
@@ -86,6 +88,7 @@ NODES = [
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 
 LEFT_OUT = {
+    "quadvel following --out out/following": "minutes; tests/quadvel_follow/test_follow_planner.py walks on its stage",
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
     "quadvel up": "as with --terrain",

@@ -1,4 +1,4 @@
-"""A package asks in its package.xml for what it imports of ROS 2 and of quadvel, so that it runs where only this was built."""
+"""What a package imports of the others, and of ROS 2, its package.xml asks for: so it can be built and run by itself."""
 
 from __future__ import annotations
 

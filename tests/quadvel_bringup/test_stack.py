@@ -31,6 +31,9 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
     from quadvel_driver.parameters import DriverParameters
     from quadvel_estimator.estimator import EstimatorParameters
     from quadvel_eval.scripted_planner import PlannerParameters
+    from quadvel_follow.follow_planner import FollowConfig
+    from quadvel_follow.person_tracker_node import PersonTrackerParameters
+    from quadvel_follow.trajectory_planner import TrajectoryParameters
     from quadvel_policy.command_mux_node import MuxParameters
     from quadvel_policy.controller import ControllerParameters
     from quadvel_sim.parameters import BoardParameters, SimParameters
@@ -43,6 +46,9 @@ def declared_parameters() -> dict[str, dict[str, Any]]:
         "estimator": EstimatorParameters,
         "controller": ControllerParameters,
         "command_mux": MuxParameters,
+        "person_tracker": PersonTrackerParameters,
+        "follow_planner": FollowConfig,
+        "trajectory_planner": TrajectoryParameters,
         "planner": PlannerParameters,
         "view": ViewParameters,
     }

@@ -14,7 +14,7 @@ from quadvel_policy.command_mux import LONGEST_STEP, CommandMux, MuxConfig, MuxI
 TELEOP, PLANNER = MuxInput("teleop", 100, 0.5), MuxInput("planner", 10, 0.3)
 FORWARD, BACK = (1.0, 0.0, 0.0), (-0.5, 0.0, 0.0)
 PERIOD = 0.02
-BRISK = MuxConfig(acceleration=(5.0, 5.0, 10.0))
+BRISK = MuxConfig(acceleration=(5.0, 5.0, 10.0), stop_acceleration=(2.0, 2.0, 4.0))
 
 
 @pytest.fixture
@@ -65,6 +65,12 @@ def test_the_command_changes_no_faster_than_allowed(mux: CommandMux) -> None:
     np.testing.assert_allclose(output.velocity, [0.1, 0.025, 0.0])  # 5 m/s^2, on a straight line
 
 
+def test_braking_is_as_quick_as_a_stop_whoever_asks_for_it(mux: CommandMux) -> None:
+    run(mux, 0.0, 1.0, teleop=FORWARD)
+    output = run(mux, 1.0, 0.1, teleop=(0.5, 0.0, 0.0))
+    np.testing.assert_allclose(output.velocity, [1.0 - 2.0 * 0.1, 0.0, 0.0])
+
+
 def test_silence_ramps_to_zero_and_then_asks_for_stance(mux: CommandMux) -> None:
     run(mux, 0.0, 1.0, teleop=FORWARD)
     output = run(mux, 1.0, 0.5 + 0.1)
@@ -98,9 +104,9 @@ def test_a_command_in_the_dead_zone_is_stance_after_the_ramp(mux: CommandMux) ->
     run(mux, 0.0, 1.0, teleop=FORWARD)
     output = run(mux, 1.0, 0.04, teleop=(0.01, -0.01, 0.015))
     assert not output.stance
-    output = run(mux, 1.04, 0.3, teleop=(0.01, -0.01, 0.015))
+    output = run(mux, 1.04, 0.6, teleop=(0.01, -0.01, 0.015))
     assert (output.stance, output.source) == (True, "teleop")
-    output = run(mux, 1.34, 0.3, teleop=(0.0, 0.0, 0.03))
+    output = run(mux, 1.64, 0.3, teleop=(0.0, 0.0, 0.03))
     assert not output.stance
 
 

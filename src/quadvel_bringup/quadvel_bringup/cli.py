@@ -31,7 +31,7 @@ Where ROS 2 is sourced, the nodes talk to it:
   ros2 topic pub -r 20 /cmd_vel geometry_msgs/msg/Twist "{linear: {x: 0.5}}"
 """
 
-NODE_LIST = "\n".join(f"  {name:12} {entry.about}" for name, entry in NODES.items())
+NODE_LIST = "\n".join(f"  {name:18} {entry.about}" for name, entry in NODES.items())
 RUN_HELP = f"""
 Run one node in this process.
 
@@ -383,6 +383,12 @@ def people(context: typer.Context) -> None:
 def world(context: typer.Context) -> None:
     """Check a world's file, and draw the world from above."""
     _hand_on(context, "quadvel_eval.world_map:world_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def following(context: typer.Context) -> None:
+    """Measure how well a person is followed, in simulated scenes in the plane."""
+    _hand_on(context, "quadvel_eval.following.cli:following_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

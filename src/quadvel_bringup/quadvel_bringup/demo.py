@@ -15,11 +15,15 @@ import typer
 from rich.console import Console
 
 from quadvel_eval import demo_figures, demo_summary
+from quadvel_eval.following.tour import TourSetup
+from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
+from quadvel_sim.world import SHIPPED
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
+from .follow_demo import follow
 from .nodes import command
 from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
@@ -31,7 +35,14 @@ MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 
 
 def demo_command(
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/demo"),
+    what: Annotated[
+        Literal["walk", "follow"],
+        typer.Argument(help="A walk through all directions, or after a person through a world."),
+    ] = "walk",
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder for the results.", show_default="out/demo, out/follow, out/tour"),
+    ] = None,
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
     low_level: Annotated[
@@ -54,15 +65,33 @@ def demo_command(
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
     view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
+    world: Annotated[
+        str, typer.Option(help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file.")
+    ] = "campus",
+    seconds: Annotated[float, typer.Option(min=5.0, help="With follow: for how long, s.")] = 180.0,
+    tour: Annotated[
+        bool,
+        typer.Option("--tour", help="With follow: a tour in one process, as fast as the machine allows."),
+    ] = False,
+    metres: Annotated[float, typer.Option(min=1.0, help="With --tour: how far, m.")] = 3100.0,
+    seed: Annotated[int, typer.Option(min=0, help="With --tour: of the sensors' noise.")] = 0,
 ) -> None:
-    """Walk a simulated robot through all directions, in real time, through the nodes.
+    """Walk a simulated robot through all directions, or after a person, in real time, through the nodes.
 
     Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
+    console = Console(soft_wrap=True)
+    if what == "follow":
+        folder = output_folder(out or Path("out/tour" if tour else "out/follow"))
+        if tour:
+            good = run_tour(TourSetup(world=world, metres=metres, seed=seed), folder, console)
+        else:
+            good = follow(folder, world, seconds, console)
+        raise typer.Exit(0 if good else 1)
     stack = _stack(low_level, loss, jitter, lockstep, actuator)
     rehearse(stack)
-    folder, console = output_folder(out), Console(soft_wrap=True)
+    folder = output_folder(out or Path("out/demo"))
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
         script = "quick" if quick else "full"

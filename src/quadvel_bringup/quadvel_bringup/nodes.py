@@ -34,6 +34,8 @@ NODES = {
     "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
     "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
     "person_tracker": NodeEntry("quadvel_follow.person_tracker_node", "persons in the scans of a 2-D laser"),
+    "follow_planner": NodeEntry("quadvel_follow.follow_planner_node", "follows a person, at a set distance"),
+    "trajectory_planner": NodeEntry("quadvel_follow.trajectory_planner", "walks a way from a file"),
     "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
     "planner": NodeEntry(
         "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"

@@ -31,7 +31,8 @@ from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 
 from .processes import ProcessGroup, StopSignals
-from .scripted_walk import LOOK, ScriptedWalk
+from .recorded_run import LOOK
+from .scripted_walk import ScriptedWalk
 from .stack import Stack
 from .twin_page import ROWS, decision, twin_page
 

@@ -116,6 +116,11 @@ class RobotLoop:
             state, truth, np.array(asked.velocity), estimates, command, self.supervisor.mode, fallen
         )
 
+    @property
+    def velocity(self) -> Array | None:
+        """The newest estimate (3,), m/s, body frame; None before the first."""
+        return self._velocity
+
     def start_walking(self) -> None:
         """From a simulator reset to "stand": half a second in the standing posture, then the policy stands.
 

@@ -88,6 +88,11 @@ class TrackerConfig:
     forgotten: float = _positive(0.5)
 
 
+def deviation(covariance: Array) -> float:
+    """Largest standard deviation, in any direction, of something with this covariance (2, 2)."""
+    return float(np.sqrt(np.linalg.eigvalsh(covariance)[-1]))
+
+
 @attrs.frozen
 class Track:
     """A person, or what may become one, at the time of the scan.
@@ -104,6 +109,11 @@ class Track:
     age: float
     seen: float
     confirmed: bool
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the position in the direction in which it is largest, m."""
+        return deviation(self.covariance[:2, :2])
 
 
 @attrs.frozen

@@ -1,4 +1,4 @@
-"""The node `person_tracker`: scan and odom to person, person/odometry and markers, and the service select_person.
+"""The node `person_tracker`: scan and odom to person, person/odometry, persons and markers, and the service select_person.
 
 How persons are tracked is `person_tracker`'s matter, which of them is meant `selection`'s.
 """
@@ -19,7 +19,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 from visualization_msgs.msg import Marker, MarkerArray
 
-from quadvel_description.kinematics import yaw
+from quadvel_msgs.msg import Person, Persons
 from quadvel_msgs.srv import SelectPerson
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
@@ -27,6 +27,7 @@ from quadvel_nodes.node import read_parameters, run
 
 from .leg_detector import SHIPPED_MODEL, LegDetector
 from .person_tracker import PersonTracker, Track
+from .planar import planar_pose, scan_ranges
 from .pose_history import PoseHistory
 from .selection import Selection
 
@@ -84,6 +85,7 @@ class PersonTrackerNode(Node):
         self._used, self._reported, self._refused = 0, 0, 0
         self._person = self.create_publisher(PoseStamped, "person", 10)
         self._odometry = self.create_publisher(Odometry, "person/odometry", 10)
+        self._persons = self.create_publisher(Persons, "persons", 10)
         self._markers = self.create_publisher(MarkerArray, "person_tracker/markers", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SelectPerson, "select_person", self._on_select)
@@ -93,10 +95,8 @@ class PersonTrackerNode(Node):
         self.create_timer(1.0, self._report)
 
     def _on_odom(self, message: Any) -> None:
-        place, turn = message.pose.pose.position, message.pose.pose.orientation
         try:
-            heading = float(yaw(np.array([turn.w, turn.x, turn.y, turn.z])))
-            self._poses.add(seconds(message.header.stamp), (place.x, place.y, heading))
+            self._poses.add(seconds(message.header.stamp), planar_pose(message.pose.pose))
         except ValueError as error:
             self._refusals.add("odom", MessageError(str(error)))
             return
@@ -115,13 +115,11 @@ class PersonTrackerNode(Node):
         time = seconds(message.header.stamp)
         if time < self._time - SET_BACK:
             self._tracker = PersonTracker(detector=self._detector)
-        ranges = np.array(message.ranges, float)
-        ranges[~((ranges >= message.range_min) & (ranges < message.range_max))] = np.inf
         try:
             pose = self._poses.sensor_at(time) if self._settings.use_odom else None
             self._tracks = self._tracker.update(
                 time,
-                ranges,
+                scan_ranges(message),
                 message.angle_min,
                 message.angle_increment,
                 None if pose is None else pose.tolist(),
@@ -141,7 +139,14 @@ class PersonTrackerNode(Node):
             _fill_odometry(odometry, meant)
             self._odometry.publish(odometry)
             self._person.publish(PoseStamped(header=odometry.header, pose=odometry.pose.pose))
+        self._persons.publish(self._all_persons(stamp))
         self._markers.publish(self._all_markers(stamp, meant))
+
+    def _all_persons(self, stamp: Any) -> Any:
+        """Those who are confirmed."""
+        message = Persons(persons=[_person(track) for track in self._tracks if track.confirmed])
+        message.header.stamp, message.header.frame_id = stamp, self._frame
+        return message
 
     def _all_markers(self, stamp: Any, meant: Track | None) -> Any:
         """A column for each track and its id above, in place of those before."""
@@ -195,6 +200,11 @@ class PersonTrackerNode(Node):
         values = {"rate_hz": used, "persons": persons, **self._refusals.values()}
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
+
+
+def _person(track: Track) -> Any:
+    (x, y), (vx, vy) = track.position.tolist(), track.velocity.tolist()
+    return Person(id=track.id, x=x, y=y, vx=vx, vy=vy, deviation=track.deviation)
 
 
 def _fill_odometry(message: Any, track: Track) -> None:

@@ -43,12 +43,14 @@ class MuxConfig:
     acceleration: Axes = attrs.field(
         default=(1.2, 0.8, 1.5),
         validator=_axes,
-        metadata={"description": "largest change of a followed command, m/s^2, rad/s^2"},
+        metadata={"description": "largest change of a command away from zero, m/s^2, rad/s^2"},
     )
     stop_acceleration: Axes = attrs.field(
-        default=(2.0, 2.0, 4.0),
+        default=(5.0, 4.0, 8.0),
         validator=_axes,
-        metadata={"description": "the same where every source is silent or a lock is set, m/s^2, rad/s^2"},
+        metadata={
+            "description": "the same towards zero: braking, and where every source is silent or a lock is set"
+        },
     )
     dead_zone: Axes = attrs.field(
         default=(0.02, 0.02, 0.02),
@@ -99,12 +101,14 @@ class CommandMux:
         self._heard = {name: heard for name, heard in self._heard.items() if heard[0] <= now}
         source = self._winner(now)
         if source is None or self.locks or self.stance_requested:
-            source, target, limit = None, np.zeros(3), self._config.stop_acceleration
+            source, target = None, np.zeros(3)
         else:
-            target, limit = self._target(self._heard[source.name][1]), self._config.acceleration
+            target = self._target(self._heard[source.name][1])
         elapsed = 0.0 if self._updated is None else min(max(now - self._updated, 0.0), LONGEST_STEP)
         self._updated = now
-        self._velocity = self._ramp(target, np.multiply(limit, elapsed))
+        slower = np.abs(target) < np.abs(self._velocity)
+        limit = np.where(slower, self._config.stop_acceleration, self._config.acceleration)
+        self._velocity = self._ramp(target, limit * elapsed)
         stance = not target.any() and not self._velocity.any()
         return MuxOutput(self._velocity.copy(), stance, source.name if source else "none")
 

@@ -35,7 +35,7 @@ class MuxParameters(MuxConfig):
     names: tuple[str, ...] = _listed(("teleop", "follow", "planner"), "name of each input")
     topics: tuple[str, ...] = _listed(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
     priorities: tuple[int, ...] = _listed((100, 50, 10), "priority of each input, the highest wins")
-    timeouts: tuple[float, ...] = _listed((0.5, 0.5, 0.5), "silence after which each input is out, s")
+    timeouts: tuple[float, ...] = _listed((0.5, 0.15, 0.5), "silence after which each input is out, s")
     lock_topics: tuple[str, ...] = _listed(("command_lock",), "std_msgs/Bool topics: true stops the robot")
     stamped: bool = attrs.field(
         default=False, metadata={"description": "inputs are TwistStamped instead of Twist"}

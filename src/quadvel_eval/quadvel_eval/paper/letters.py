@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from quadvel_follow.trajectory import SHIPPED, Trajectory, read_table
+
 from ..robot_loop import PERIOD
 from ..walk import Setup, Walk, make_loop, record_to_the_fall
 from .cells import Command
@@ -31,50 +33,23 @@ from .section import (
 
 Array = NDArray[np.float64]
 
-SPEED = 0.5  # m/s
 SHOWN = 10  # ticks from one line of the CSV to the next
 Stroke = tuple[Command, float]  # velocity in the body frame and its seconds
 
 
-def _line(x: float, y: float) -> Stroke:
-    """Translation by (x, y) m in the body frame."""
-    seconds = float(np.hypot(x, y)) / SPEED
-    return (x / seconds, y / seconds, 0.0), seconds
+def _strokes() -> tuple[Stroke, ...]:
+    """Z without turning, J from its hook, U sideways over to its top."""
+    _, rows = read_table(SHIPPED / "zju.csv")
+    return tuple(((vx, vy, wz), seconds) for seconds, vx, vy, wz in rows.tolist())
 
 
-def _arc(radius: float, angle: float) -> Stroke:
-    """Forward along an arc of `radius` (m), turning by `angle` (rad, positive to the left)."""
-    seconds = radius * abs(angle) / SPEED
-    return (SPEED, 0.0, angle / seconds), seconds
-
-
-def _turn(angle: float) -> Stroke:
-    """A turn on the spot by `angle` (rad), at 1 rad/s."""
-    return (0.0, 0.0, float(np.sign(angle))), abs(angle)
-
-
-LETTERS: tuple[Stroke, ...] = (
-    # Z, without turning: top, diagonal, base
-    _line(1.0, 0.0), _line(-1.0, -1.5), _line(1.0, 0.0),
-    # J, from its hook: over to it, turned to face down, hook, stem
-    _line(0.3, 0.4), _turn(-np.pi / 2), _arc(0.4, np.pi), _line(1.1, 0.0),
-    # U: sideways over to its top, turned to face down, stem, bow, stem
-    _line(0.0, -0.4), _turn(np.pi), _line(1.1, 0.0), _arc(0.4, np.pi), _line(1.1, 0.0),
-)  # fmt: skip
+LETTERS = _strokes()
 
 
 def reference(strokes: Sequence[Stroke]) -> Array:
     """Where the commands lead (n, 3): x, y (m) and heading (rad), a row a tick, from the origin facing +x."""
-    ticks = [command for command, seconds in strokes for _ in range(round(seconds / PERIOD))]
-    commands = np.array(ticks)
-    heading = np.concatenate([[0.0], np.cumsum(commands[:, 2]) * PERIOD])
-    middle = heading[:-1] + 0.5 * PERIOD * commands[:, 2]
-    cos, sin = np.cos(middle), np.sin(middle)
-    steps = np.column_stack(
-        [cos * commands[:, 0] - sin * commands[:, 1], sin * commands[:, 0] + cos * commands[:, 1]]
-    )
-    place = np.vstack([np.zeros(2), np.cumsum(steps * PERIOD, axis=0)])
-    return np.column_stack([place, heading])[:-1]
+    commands, seconds = zip(*strokes, strict=True)
+    return Trajectory.of_commands(seconds, commands, PERIOD).pose
 
 
 def walked(walk: Walk) -> Array:

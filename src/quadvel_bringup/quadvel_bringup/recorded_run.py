@@ -1,0 +1,114 @@
+"""A run of the stack for a demo: every node a process of its own, and all that they say to each other recorded in this one."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+import quadvel_dds
+
+from .alone import ensure_alone
+from .node_output import PrefixedOutput
+from .nodes import enclave
+from .processes import ProcessGroup, StopSignals
+
+RECORDED = {
+    "/command": "quadvel_msgs/msg/VelocityCommand",
+    "/controller/state": "quadvel_msgs/msg/ControllerState",
+    "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
+    "/ground": "visualization_msgs/msg/Marker",
+    "/ground_truth/odom": "nav_msgs/msg/Odometry",
+    "/imu": "sensor_msgs/msg/Imu",
+    "/joint_states": "sensor_msgs/msg/JointState",
+    "/low_cmd": "quadvel_msgs/msg/LowCmd",
+    "/low_state": "quadvel_msgs/msg/LowState",
+    "/odom": "nav_msgs/msg/Odometry",
+    "/robot_description": "std_msgs/msg/String",
+    "/tf": "tf2_msgs/msg/TFMessage",
+    "/tf_static": "tf2_msgs/msg/TFMessage",
+    "/velocity_estimate": "geometry_msgs/msg/TwistWithCovarianceStamped",
+}
+"""What every run records; each adds its planner's."""
+LOOK = 0.2  # s, between two looks whether all nodes still run
+
+
+class RecordedRun(ABC):
+    """The nodes, the recorder in this process, and a bar that shows how far it is."""
+
+    def __init__(
+        self,
+        recording: Path,
+        nodes: Mapping[str, Sequence[str]],
+        topics: Mapping[str, str],
+        lockstep: bool,
+        console: Console,
+        total: float,
+    ) -> None:
+        """nodes: command line of each, by name, in the order of their start. topics: what is recorded besides RECORDED, with types.
+        lockstep: they keep simulated time. total: of the bar.
+        """
+        self._recording, self._nodes, self._topics, self._lockstep = recording, nodes, topics, lockstep
+        columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
+        self._bar = Progress(*columns, console=console)
+        self._say = PrefixedOutput(list(nodes), console)
+        self._task = self._bar.add_task("start", total=total)
+
+    @abstractmethod
+    def listen(self, node: Any) -> None:
+        """Subscribe, in the recorder's node, to what tells how far it is."""
+
+    @abstractmethod
+    def is_over(self, ended: Mapping[str, int]) -> bool:
+        """Whether it ends in good order, though the processes `ended` (names, exit codes) are gone."""
+
+    def run(self) -> str:
+        """Run to the end; what went wrong, or "". Ctrl-C ends it with a typer.Exit.
+
+        Raises NotAlone where a robot is there already.
+        """
+        quadvel_dds.install()
+        import rclpy
+        from rclpy.executors import SingleThreadedExecutor
+        from rclpy.parameter import Parameter
+        from rclpy.signals import SignalHandlerOptions
+
+        from .recorder import Recorder
+
+        rclpy.init(args=["--ros-args", *enclave("recorder")], signal_handler_options=SignalHandlerOptions.NO)
+        use_sim_time = Parameter("use_sim_time", value=self._lockstep)
+        node = rclpy.create_node("recorder", parameter_overrides=[use_sim_time])
+        executor = SingleThreadedExecutor()
+        executor.add_node(node)
+        try:
+            ensure_alone(node)
+            self.listen(node)
+            with StopSignals() as signals, Recorder(node, self._recording) as recorder, self._bar:
+                for topic, kind in {**RECORDED, **self._topics}.items():
+                    recorder.record(topic, kind)
+                with ProcessGroup(self._say) as group:
+                    for name, line in self._nodes.items():
+                        group.start(name, line)
+                    problem = self._wait(group, signals, lambda: recorder.serve(executor, LOOK))
+        finally:
+            node.destroy_node()
+            rclpy.try_shutdown()
+        if signals.received:
+            raise typer.Exit(128 + signals.received)
+        return problem
+
+    def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
+        """Record until it is over, or a node ended that should not have."""
+        ended: dict[str, int] = {}
+        while not self.is_over(ended) and not ended and not signals.received:
+            record()
+            ended = group.ended()
+        if self.is_over(ended):
+            self._bar.update(self._task, completed=self._bar.tasks[0].total, description="done")
+            return ""
+        return ", ".join(f"{name} ended with exit code {code}" for name, code in ended.items())

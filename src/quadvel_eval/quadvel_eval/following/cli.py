@@ -1,0 +1,39 @@
+"""The command `quadvel following`, as a function for a typer application."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from .measure import measure
+
+HEADS = {
+    "success": "success",
+    "share": "within 0.5 m",
+    "late": "there after, s",
+    "jerk": "jerk, m/s^3",
+    "clearance": "clearance, m",
+    "gap": "to persons, m",
+    "ms": "ms a step",
+    "slowest": "slowest",
+}
+
+
+def following_command(
+    out: Annotated[Path, typer.Option(help="Folder for following.json.")],
+    runs: Annotated[int, typer.Option(min=1, help="Scenes of each kind.")] = 10,
+) -> None:
+    """Measure how well a person is followed, in simulated scenes in the plane."""
+    out.mkdir(parents=True, exist_ok=True)
+    found = measure(runs)
+    table = Table(f"simulated, {runs} each", *HEADS.values())
+    for name, row in found.items():
+        table.add_row(name, *(f"{row[head]:.2f}" for head in HEADS))
+    Console().print(table)
+    (out / "following.json").write_text(json.dumps(found, indent=1))
+    print(f"written: {out}/following.json")

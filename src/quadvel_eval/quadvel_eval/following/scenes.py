@@ -1,0 +1,163 @@
+"""Scenes in which a planner that follows a person may fail, each from a seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import attrs
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from quadvel_sim.walker import Walker
+
+from ..people.laser import FloorPlan
+from ..people.scenes import along_walls
+
+Array = NDArray[np.float64]
+
+SHOWN = (
+    1.6,
+    6.0,
+)  # s, from when to when everybody to follow stands: then the tracker knows that it is a person
+HELD = SHOWN[1] - SHOWN[0]
+
+
+@attrs.frozen
+class FollowScene:
+    """persons: the one to follow first; start: m, from it to the robot behind it; seconds: that it lasts."""
+
+    plan: FloorPlan
+    persons: list[Walker]
+    seconds: float
+    start: float = 1.5
+
+
+def corridor(seed: int) -> FollowScene:
+    """20 m along walls with doors and tables, with a stop on the way."""
+    scene = along_walls(seed)
+    person = scene.walkers[0]
+    person.stops = [SHOWN, *((begin + HELD, end + HELD) for begin, end in person.stops)]
+    return FollowScene(scene.plan, [person], 20.0 / person.speed + 2.0 + HELD + 5.0)
+
+
+def trees(seed: int) -> FollowScene:
+    """A slalom, and a stop."""
+    rng = np.random.default_rng([11, seed])
+    places = [(2.5 * i, rng.uniform(-0.2, 0.2), rng.uniform(0.1, 0.25)) for i in range(1, 7)]
+    sides = rng.choice([-1.0, 1.0]) * np.resize([1.0, -1.0], 6)
+    way = [[-1.0, 0.0], *([x, y + 1.0 * s] for (x, y, _), s in zip(places, sides, strict=True)), [18.0, 0.0]]
+    return FollowScene(FloorPlan(places), [_person(rng, way, (0.8, 1.3), [(11.0, 13.0)])], 36.0)
+
+
+def turning_round(seed: int) -> FollowScene:
+    """A person who comes back and passes the robot closely."""
+    rng = np.random.default_rng([12, seed])
+    aside = rng.choice([-1.0, 1.0]) * rng.uniform(0.0, 0.5)
+    away = rng.uniform(5.0, 7.0)
+    way = [[0.0, 0.0], [away, 0.0], [away, 0.2], [-4.0, aside]]
+    posts = [[x, y, 0.15] for x in (-3.0, 1.0, 5.0) for y in (-3.0, 3.0)]
+    return FollowScene(FloorPlan(posts), [_person(rng, way, (0.7, 1.1))], 34.0)
+
+
+def crossing(seed: int) -> FollowScene:
+    """Bystanders who cross between the person and the robot."""
+    rng = np.random.default_rng([13, seed])
+    person = _person(rng, [[0.0, 0.0], [16.0, 0.0]], (0.9, 1.5))
+    others = []
+    for at in rng.uniform(3.0, 14.0, 3):
+        side, speed = rng.choice([-1.0, 1.0]), rng.uniform(0.8, 1.3)
+        begin = side * speed * ((at + rng.uniform(0.4, 1.4)) / person.speed + HELD)
+        way = [[at, begin], [at + rng.uniform(-0.5, 0.5), begin - side * 30.0]]
+        others.append(_walker(rng, way, (speed, speed)))
+    posts = [[x, y, 0.15] for x in (2.0, 8.0, 14.0) for y in (-3.0, 3.0)]
+    return FollowScene(FloorPlan(posts), [person, *others], 16.0 / person.speed + HELD + 5.0)
+
+
+def narrow(seed: int) -> FollowScene:
+    """Through a passage of 1.0 m, 0.4 m deep, that lies aside."""
+    rng = np.random.default_rng([14, seed])
+    gap, x = rng.uniform(-1.5, 1.5), 5.0
+    walls = []
+    for low, high in ((-5.0, gap - 0.5), (gap + 0.5, 5.0)):
+        walls += [
+            [x, low, x, high],
+            [x + 0.4, low, x + 0.4, high],
+            [x, low, x + 0.4, low],
+            [x, high, x + 0.4, high],
+        ]
+    way = [[0.0, 0.0], [x - 1.0, gap], [x + 1.4, gap], [x + 5.0, rng.uniform(-2.0, 2.0)]]
+    return FollowScene(FloorPlan((), walls), [_person(rng, way, (0.7, 1.2))], 24.0)
+
+
+def corner(seed: int) -> FollowScene:
+    """Round the corner of a corridor, out of sight for a while."""
+    rng = np.random.default_rng([15, seed])
+    half, side = rng.uniform(0.8, 1.1), rng.choice([-1.0, 1.0])
+    x = 6.0
+    walls = [[-6.0, -half, x + half, -half], [-6.0, half, x - half, half], [x - half, half, x - half, 12.0],
+             [x + half, -half, x + half, 12.0], [x - half, 12.0, x + half, 12.0], [-6.0, -half, -6.0, half]]  # fmt: skip
+    turned = np.array(walls) * [1.0, side, 1.0, side]
+    way = [[0.0, 0.0], [x, 0.0], [x, 9.0 * side]]
+    return FollowScene(FloorPlan((), turned), [_person(rng, way, (1.1, 1.4))], 24.0)
+
+
+def dead_end(seed: int) -> FollowScene:
+    """Into a blind alley, and out again past the robot."""
+    rng = np.random.default_rng([16, seed])
+    half = rng.uniform(1.1, 1.4)
+    walls = [[1.0, -half, 8.0, -half], [1.0, half, 8.0, half], [8.0, -half, 8.0, half]]
+    aside = rng.choice([-1.0, 1.0]) * (half - 0.4)
+    way = [[0.0, 0.0], [6.8, 0.0], [6.8, 0.5 * aside], [5.8, aside], [-4.0, aside]]
+    return FollowScene(FloorPlan((), walls), [_person(rng, way, (0.7, 1.0), [(15.0, 17.0)])], 40.0)
+
+
+def in_the_way(seed: int) -> FollowScene:
+    """A bystander who comes out of a door behind the person, stands in the corridor for a while, and goes back."""
+    rng = np.random.default_rng([17, seed])
+    half, x = rng.uniform(0.7, 0.85), 6.0
+    walls = [[-4.0, -half, 20.0, -half], [-4.0, half, x - 0.6, half], [x + 0.6, half, 20.0, half]]
+    person = _person(rng, [[0.0, 0.0], [10.0, 0.0]], (0.8, 1.1))
+    comes = (x + 0.5) / person.speed + HELD  # s, when the person has just passed
+    speed = 1.2
+    into = half + 1.0
+    other = _walker(rng, [[x, into], [x, 0.0], [x, 3.0 * into]], (speed, speed))
+    other.stops = [(0.0, comes), (comes + into / speed, comes + into / speed + 6.0)]
+    return FollowScene(FloorPlan((), walls), [person, other], comes + 18.0)
+
+
+SCENES: Mapping[str, Callable[[int], FollowScene]] = {
+    "corridor with doors": corridor,
+    "slalom of trees": trees,
+    "turns round, walks at the robot": turning_round,
+    "bystanders cross": crossing,
+    "passage of 1.0 m": narrow,
+    "round a corner, out of sight": corner,
+    "dead end": dead_end,
+    "a person stands in the way": in_the_way,
+}
+
+
+def _person(
+    rng: np.random.Generator,
+    way: ArrayLike,
+    speeds: tuple[float, float],
+    stops: list[tuple[float, float]] | None = None,
+) -> Walker:
+    """Somebody to follow."""
+    return _walker(rng, way, speeds, [SHOWN, *(stops or ())])
+
+
+def _walker(
+    rng: np.random.Generator,
+    way: ArrayLike,
+    speeds: tuple[float, float],
+    stops: list[tuple[float, float]] | None = None,
+) -> Walker:
+    return Walker(
+        way=way,
+        speed=rng.uniform(*speeds),
+        stops=stops or [],
+        pace=rng.uniform(0.0, 0.1),
+        apart=rng.uniform(0.16, 0.28),
+        phase=rng.random(),
+    )

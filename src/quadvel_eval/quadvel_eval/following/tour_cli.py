@@ -1,0 +1,42 @@
+"""`quadvel demo follow --tour`: a tour with a bar, its table and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from .tour import Moment, Tour, TourSetup
+from .tour_report import tour_table, write_tour
+
+EVERY = 20  # moments, a second: how often the bar moves
+
+
+def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
+    """Follow through a world as `setup` has it; whether the robot neither fell nor touched anything.
+
+    Ctrl-C ends the walk early: what there is of it is judged and written.
+    """
+    tour = Tour(setup)
+    moments: list[Moment] = []
+    columns = (
+        TextColumn("{task.description:32}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f} m"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as bar:
+        task = bar.add_task("sets out", total=setup.metres)
+        try:
+            for moment in tour.moments():
+                moments.append(moment)
+                if len(moments) % EVERY == 0:
+                    bar.update(task, completed=tour.walked, description=moment.words)
+        except KeyboardInterrupt:
+            console.print("stopped")
+    if not moments:
+        return False
+    console.print(tour_table(write_tour(out, tour.world, tour.outcome, moments)))
+    console.print(f"written to {out}: tour.json, tour.png")
+    return not (tour.fell or tour.simulator.touched)

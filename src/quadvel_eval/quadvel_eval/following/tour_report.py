@@ -1,0 +1,86 @@
+"""What a tour came to: tour.json, and tour.png with the way on the map and how the distance was kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from quadvel_follow.follow_planner import State
+from quadvel_sim.world import World
+
+from ..report import write_figure, write_json
+from ..world_map import draw
+from .tour import BAND, Moment, Outcome, summary
+
+PAPER_XY, PAPER_WZ = 0.077, 0.059  # m/s, rad/s: mean errors of the paper's tour of 3.1 km
+
+
+def write_tour(folder: Path, world: World, outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
+    """Both files, each whole or not at all; the figures."""
+    figures = summary(outcome, moments)
+    write_json(folder / "tour.json", figures)
+    write_figure(folder / "tour.png", picture(world, outcome.distance, moments))
+    return figures
+
+
+def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
+    """The robot's way on the map of the world; below, distance to the person and speed over time."""
+    figure = draw(world)
+    way = np.array([one.pose[:2] for one in moments])
+    time = np.array([one.time for one in moments]) / 60.0
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
+    speed = np.array([np.hypot(*one.velocity[:2]) for one in moments])
+    world_map = figure.axes[0]
+    world_map.plot(*way.T, color="tab:red", linewidth=0.8, zorder=7)
+    wide, high = figure.get_size_inches()
+    figure.set_size_inches(wide, high + 3.0)
+    figure.set_layout_engine("none")
+    low = 2.4 / (high + 3.0)
+    world_map.set_position((0.07, low + 0.12, 0.9, 0.8 - low))
+    below = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
+    below.axhspan(distance - BAND, distance + BAND, color="tab:green", alpha=0.15)
+    below.plot(time, away, color="tab:blue", linewidth=0.8)
+    lost = np.array([one.state in (State.LOST, State.LOOKING) for one in moments])
+    below.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
+    below.set(
+        xlabel="min",
+        ylabel="distance, m",
+        ylim=(0.0, max(4.0, float(away.max()))),
+        xlim=(0.0, float(time[-1])),
+    )
+    beside = below.twinx()
+    beside.plot(time, speed, color="0.6", linewidth=0.6)
+    beside.set(ylabel="speed, m/s", ylim=(0.0, 4.0))
+    return figure
+
+
+def tour_table(figures: Mapping[str, Any]) -> Table:
+    """The figures, for people, beside what the paper reports of its own."""
+    table = Table("", "here", "paper", title=f"Following through {figures['world']}, seed {figures['seed']}")
+    touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
+    rows = [
+        ("way", f"{figures['walked']:.0f} m in {figures['minutes']:.1f} min", "3100 m in 37 min"),
+        ("fell", "yes" if figures["fell"] else "no", "no"),
+        ("touched", touched, ""),
+        ("error of the velocity, mean", f"{figures['error_xy']:.3f} m/s", f"{PAPER_XY} m/s"),
+        ("error of the yaw rate, mean", f"{figures['error_wz']:.3f} rad/s", f"{PAPER_WZ} rad/s"),
+        ("distance, mean", f"{figures['distance_mean']:.2f} m", ""),
+        (f"within {BAND} m of the set distance", f"{100 * figures['distance_kept']:.0f} % of the time", ""),
+        ("least clearance from things", _metres(figures["least_clearance"]), ""),
+        ("least clearance from persons", _metres(figures["least_gap"]), ""),
+        ("person lost", f"{figures['losses']} times, {figures['lost_seconds']:.0f} s together", ""),
+    ]
+    if planner := figures.get("planner_ms"):
+        rows.append(("planner, mean and p99", f"{planner['mean']:.1f}, {planner['p99']:.1f} ms", ""))
+    for row in rows:
+        table.add_row(*row)
+    return table
+
+
+def _metres(value: float | None) -> str:
+    return "nothing was near" if value is None else f"{value:.2f} m"

@@ -1,0 +1,79 @@
+"""Following a person through a world in one process: clearances against closed form, figures, and some metres of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+from rich.console import Console
+
+from quadvel_eval.following.obstacles import BODY, Clearances, outlines
+from quadvel_eval.following.tour import Moment, Outcome, TourSetup, summary
+from quadvel_eval.following.tour_cli import run_tour
+from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_sim.world import Box, Trees, Wall, World
+
+CONFIG = FollowConfig(length=0.6, width=0.4)
+STANDING = World(
+    walls=(Wall(points=[[-5.0, 2.0], [5.0, 2.0]], thickness=0.2),),
+    trees=(Trees(positions=[[3.0, 0.0]], radius=0.5),),
+    boxes=(Box(position=[0.0, -2.0], size=[1.0, 1.0, 1.0], yaw=45.0),),
+)
+
+
+def test_clearance_is_from_the_outline_to_the_nearest_thing() -> None:
+    clearances = Clearances(STANDING, CONFIG)
+    assert clearances.of(np.array([1.9, 0.0, 0.0])) == pytest.approx(3.0 - 0.5 - 1.9 - 0.3, abs=0.002)
+    assert clearances.of(np.array([-3.0, 1.0, 0.0])) == pytest.approx(2.0 - 0.1 - 1.0 - 0.2, abs=0.002)
+    corner = -2.0 + np.sqrt(0.5)
+    assert clearances.of(np.array([0.0, -0.5, 0.0])) == pytest.approx(-0.5 - 0.2 - corner, abs=0.02)
+    assert clearances.of(np.array([0.0, 50.0, 0.0])) == np.inf
+    assert clearances.of_persons(np.array([0.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])) == pytest.approx(
+        0.7 - BODY
+    )
+    assert outlines(World()).shape == (0, 2)
+
+
+def moment(time: float, away: float, state: State = State.FOLLOWING) -> Moment:
+    asked, velocity = np.array([1.0, 0.0, 0.2]), np.array([0.97, 0.04, 0.15])
+    person = np.array([away, 0.0, 0.0])
+    return Moment(time, np.zeros(3), person, asked, velocity, state, "", 0.5, float("inf"))
+
+
+def test_figures_tell_errors_distance_losses_and_leave_the_start_out() -> None:
+    states = 140 * [State.FOLLOWING] + 20 * [State.LOST] + 20 * [State.LOOKING] + 20 * [State.FOLLOWING]
+    away = np.where(np.arange(200) < 120, 9.0, np.where(np.arange(200) < 180, 1.6, 3.0))
+    moments = [moment(PERIOD * k, float(d), s) for k, (d, s) in enumerate(zip(away, states, strict=True))]
+    outcome = Outcome(
+        world="w",
+        seed=0,
+        distance=1.5,
+        walked=10.0,
+        fell=False,
+        touched={"tree_0": 1},
+        planning=[0.002, 0.004],
+    )
+    found = summary(outcome, moments)
+    assert found["error_xy"] == pytest.approx(0.05)
+    assert found["error_wz"] == pytest.approx(0.05)
+    assert found["distance_kept"] == pytest.approx(60 / 80)
+    assert (found["losses"], found["lost_seconds"]) == (1, pytest.approx(2.0))
+    assert (found["least_clearance"], found["least_gap"]) == (0.5, None)
+    assert found["planner_ms"]["mean"] == pytest.approx(3.0)
+    assert "planner_ms" not in summary(attrs.evolve(outcome, planning=()), moments)
+    json.dumps(found, allow_nan=False)
+
+
+def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
+    setup = TourSetup(world="corridor", metres=5.0)
+    assert run_tour(setup, tmp_path, Console(quiet=True))
+    found = json.loads((tmp_path / "tour.json").read_text())
+    assert found["walked"] > 5.0
+    assert not found["fell"]
+    assert found["touched"] == {}
+    assert found["least_clearance"] > 0.3
+    assert found["error_xy"] < 0.15
+    assert (tmp_path / "tour.png").stat().st_size > 10_000
