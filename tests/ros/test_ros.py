@@ -14,6 +14,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from quadvel_actuator.identify.read_log import read_log
 from quadvel_bringup.nodes import NODES
 from quadvel_bringup.stack import Stack
 
@@ -196,7 +197,7 @@ def test_a_node_of_ros2_answers_a_service_call_of_an_embedded_node(ros: Any) -> 
 @pytest.mark.parametrize("embedded", [False, True], ids=["rclpy", "embedded"])
 def test_a_recording_made_under_ros2_is_whole_and_readable(ros: Any, tmp_path: Path, embedded: bool) -> None:
     file = tmp_path / "walk.mcap"
-    ros.node("sim_node", embedded=embedded)
+    simulator = ros.node("sim_node", embedded=embedded)
     recording = ros.program(*QUADVEL, "record", "low_state", "imu", "--out", str(file))
     ros.wait_for_nodes("/sim_node", "/recorder")
     ros.wait_until(lambda: file.stat().st_size > 20_000, 60.0, lambda: "nothing was recorded")
@@ -208,6 +209,28 @@ def test_a_recording_made_under_ros2_is_whole_and_readable(ros: Any, tmp_path: P
             assert reader.deserialize(data, connection.msgtype).__msgtype__ == connection.msgtype
     if has_rosbag2(ros):
         assert "/low_state" in ros.call("ros2", "bag", "info", str(file))
+        simulator.interrupt()
+        heard = ros.start("ros2", "topic", "echo", "--once", "imu", "sensor_msgs/msg/Imu")
+        ros.call("ros2", "bag", "play", "--delay", "3", str(file))
+        assert heard.wait(60.0) == 0, heard.text
+
+
+@with_cyclone
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_a_recording_of_ros2_bag_is_a_log_to_identify_from(ros: Any, tmp_path: Path, storage: str) -> None:
+    if not has_rosbag2(ros):
+        pytest.skip("ros2bag is not installed")
+    for name, arguments in Stack(use_sim_time=True).arguments().items():
+        ros.node(name, *arguments[1:])
+    ros.wait_for_nodes(*(f"/{name}" for name in STACK))
+    bag = tmp_path / "bag"
+    recording = ros.start("ros2", "bag", "record", "-s", storage, "-o", str(bag), "/low_state", "/low_cmd")
+    ros.wait_until(lambda: recording.text.count("Subscribed to topic") == 2, 60.0, lambda: recording.text)
+    ros.call("sleep", "3")
+    assert recording.interrupt() == 0, recording.text
+    log = read_log(bag)
+    assert len(log.t) > 50
+    assert len(log.t_cmd) > 50
 
 
 def test_under_sros2_the_robot_stands_up_and_obeys_its_operator_alone(ros: Any, tmp_path: Path) -> None:
