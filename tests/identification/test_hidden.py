@@ -64,7 +64,14 @@ def test_coulomb_friction_is_a_torque_of_constant_size_against_the_motion():
             )
 
 
-@pytest.mark.parametrize("kind", [kind for kind, group in GROUP_OF.items() if group in ("alone", "outside")])
+SEEN_ALWAYS = ("coulomb_friction", "backlash", "mains_hum")
+"""Kinds that are made in every run; making all of them takes a minute of two cores"""
+KINDS = [kind for kind, group in GROUP_OF.items() if group in ("alone", "outside")]
+
+
+@pytest.mark.parametrize(
+    "kind", [kind if kind in SEEN_ALWAYS else pytest.param(kind, marks=pytest.mark.long) for kind in KINDS]
+)
 def test_an_effect_is_worth_between_a_third_and_some_times_the_noise(kind):
     case = make_case(kind, 1)
     worth, noise = case.truth["worth"]["left"], case.truth["noise_var"]
@@ -76,7 +83,7 @@ def test_an_effect_is_worth_between_a_third_and_some_times_the_noise(kind):
     assert np.abs(case.log["dq"]).max() < 30
 
 
-@pytest.mark.parametrize("kind", ["pair", "triple"])
+@pytest.mark.parametrize("kind", ["pair", pytest.param("triple", marks=pytest.mark.long)])
 def test_of_several_effects_each_is_worth_a_third_of_the_noise_beside_the_others(kind):
     case = make_case(kind, 1)
     assert len(case.truth["effects"]) == {"pair": 2, "triple": 3}[kind]
@@ -90,6 +97,7 @@ def test_the_same_seed_gives_the_same_log_and_another_seed_another():
     assert first.truth["noise_var"] != other.truth["noise_var"]
 
 
+@pytest.mark.long
 def test_speed_proportional_friction_is_never_on_all_joints():
     for index in range(4):
         case = make_case("viscous_friction", index)

@@ -6,11 +6,6 @@ import os
 import signal
 import sys
 
-OPERATORS = {"drive", "mode", "enable", "status", "reset", "pause", "step", "push", "doctor"}
-"""Commands beside a robot that may run on this machine: to load what they need, and be found by its nodes, can wait for it"""
-COURTESY = 10
-"""By how much they are nicer than the nodes (nice(1))"""
-
 
 def main() -> None:
     """A wrong argument or file ends in one sentence and exit code 2, without a traceback.
@@ -19,8 +14,6 @@ def main() -> None:
     any moment, and again.
     """
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    if OPERATORS & set(sys.argv[1:2]):
-        os.nice(COURTESY)
     from .cli import app
 
     try:
