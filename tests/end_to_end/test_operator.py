@@ -109,6 +109,7 @@ def test_drive_says_what_was_commanded_and_what_was_measured(up: Robot) -> None:
     up.says("walk: a velocity was commanded")
 
 
+@pytest.mark.realtime
 def test_teleop_walks_while_a_key_repeats_and_its_space_bar_stops_for_good(up: Robot) -> None:
     terminal, other = pty.openpty()
     teleop = subprocess.Popen([*QUADVEL, "teleop"], stdin=other, stdout=other, stderr=other)

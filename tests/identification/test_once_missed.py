@@ -11,16 +11,24 @@ from tests.identification.judge import judge
     ("kind", "index", "seed"),
     [
         ("velocity_filter", 0, 17),  # beside delays of 20 ms it promises little as long as these are wrong
-        ("cross_coupling", 0, 17),  # to an angle, whose zero is a convention
-        ("quadratic_drag", 1, 18),  # every second row met commands at 500 Hz alike, which hid a wrong delay
+        pytest.param(
+            "cross_coupling", 0, 17, marks=pytest.mark.long
+        ),  # to an angle, whose zero is a convention
+        pytest.param(
+            "quadratic_drag", 1, 18, marks=pytest.mark.long
+        ),  # every second row met commands at 500 Hz alike, which hid a wrong delay
         ("backlash", 0, 21),  # the right form keeps little of what it promises at delays that are not its own
         pytest.param(
             "close_pair", 1, 21, marks=pytest.mark.long
         ),  # cogging on three joints, a spring on one of them
-        ("close_pair", 3, 27),  # the drag of a hip that moves slowly was out of bounds
+        pytest.param(
+            "close_pair", 3, 27, marks=pytest.mark.long
+        ),  # the drag of a hip that moves slowly was out of bounds
         ("close_pair", 1, 27),  # given up before a spring replaced the offset
-        ("pair", 2, 27),  # a lag that one joint shows alone
-        ("table_4", 5, 27),  # of 20 logs one takes delays off the drive's steps by chance
+        pytest.param("pair", 2, 27, marks=pytest.mark.long),  # a lag that one joint shows alone
+        pytest.param(
+            "table_4", 5, 27, marks=pytest.mark.long
+        ),  # of 20 logs one takes delays off the drive's steps by chance
         pytest.param(
             "speed_band_drag", 0, 28, marks=pytest.mark.long
         ),  # a drag that was read off the torque as commands that are lost

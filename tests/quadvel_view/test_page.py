@@ -151,6 +151,7 @@ def page(browser: Any, robot: str) -> Iterator[Page]:
     assert page.complaints == []
 
 
+@pytest.mark.realtime
 def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
     page.until("state.mode === 'stance'")
     page.press(0.0, 1.0)
