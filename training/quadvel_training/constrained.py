@@ -24,7 +24,7 @@ from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
-from .ppo import Ppo, PpoConfig, Rollout
+from .ppo import GENTLE, Ppo, PpoConfig, Rollout
 from .privileged import ACTION_BOUND, Judgement, velocity_error
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
@@ -54,21 +54,7 @@ class ConstrainedConfig:
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
-    ppo: PpoConfig = PpoConfig(
-        discount=0.995,
-        gae=0.97,
-        epochs=1,
-        mini_batches=1,
-        critic_steps=16,
-        learning_rate=1.5e-4,
-        target_kl=None,
-        momentum=0.95,
-        max_grad_norm=4.0,
-        symmetry=0.01,
-        smoothness=3.2,
-        symmetric_share=0.25,
-        correlation=0.9,
-    )
+    ppo: PpoConfig = attrs.evolve(GENTLE, smoothness=3.2)
 
 
 class ConstrainedRun:

@@ -24,7 +24,7 @@ from .distill import map_student
 from .env import CommandRange, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
-from .ppo import Ppo, PpoConfig, Rollout
+from .ppo import GENTLE, Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
 
@@ -51,21 +51,7 @@ class CrlConfig:
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
-    ppo: PpoConfig = PpoConfig(
-        discount=0.995,
-        gae=0.97,
-        epochs=1,
-        mini_batches=1,
-        critic_steps=16,
-        learning_rate=1.5e-4,
-        target_kl=None,
-        momentum=0.95,
-        max_grad_norm=4.0,
-        symmetry=0.01,
-        smoothness=0.05,
-        symmetric_share=0.25,
-        correlation=0.9,
-    )
+    ppo: PpoConfig = GENTLE
 
 
 class CrlRun:

@@ -50,6 +50,24 @@ class PpoConfig:
     )
 
 
+GENTLE = PpoConfig(
+    discount=0.995,
+    gae=0.97,
+    epochs=1,
+    mini_batches=1,
+    critic_steps=16,
+    learning_rate=1.5e-4,
+    target_kl=None,
+    momentum=0.95,
+    max_grad_norm=4.0,
+    symmetry=0.01,
+    smoothness=0.05,
+    symmetric_share=0.25,
+    correlation=0.9,
+)
+"""For a recurrent policy at 200 Hz that walks already: one small step a rollout, exploration that lasts"""
+
+
 @attrs.define
 class Rollout:
     """One stretch of experience; time first. `mask` is 1 while the sequence is alive."""

@@ -24,16 +24,13 @@ from quadvel_msgs.srv import SetMode
 from quadvel_view import gamepad, keyboard
 from quadvel_view.gamepad import Gamepad, Span
 from quadvel_view.keyboard import Keyboard, strokes
-from quadvel_view.operator import Operator
+from quadvel_view.operator import PERIOD, Operator
 
 from .drive import planar, velocity_text
 from .orders import CONTROLLER
 from .processes import StopSignals
 from .session import PATIENCE, NobodyThere, Session
 
-PERIOD = 0.05  # s, between two velocities
-STOP_AGAIN = 0.25  # s after which a STOP is said again that was not heeded
-BRAKING = ("passive", "fault")
 ORDERS = {"u": "stand_up", "x": "lie_down"}
 HAND = "hand"
 
@@ -73,7 +70,7 @@ class Teleop:
             self._operator.hold(HAND, velocity, now)
         self._publish(self._operator.velocity(now))
         mode = self._states[-1].mode_name if self._states else ""
-        if self._operator.stopped and mode not in BRAKING and now - self._asked > STOP_AGAIN:
+        if self._operator.is_unheeded(mode, now - self._asked):
             self._ask("passive")
         self._session.spin(PERIOD)
 

@@ -17,6 +17,12 @@ SILENCE = 0.4
 """s without a word from who holds, after which it counts as let go: twenty words a second are expected, but a browser may stall"""
 AFTERGLOW = 0.5
 """s of zeros once all is let go; then whoever else commands the robot has its turn"""
+PERIOD = 0.05
+"""s from one velocity to the next"""
+STOP_AGAIN = 0.25
+"""s after which a STOP that was not heeded is said again"""
+BRAKING = ("passive", "fault")
+"""Modes in which the joints brake"""
 TOP_SPEED = np.array([3.5, 2.1, 3.0])
 """m/s, m/s, rad/s: no hand asks for more"""
 
@@ -57,6 +63,10 @@ class Operator:
         """End the STOP. What was held when it came does not count."""
         self.stopped = False
         self._held_at = self._let_go_at = -math.inf
+
+    def is_unheeded(self, mode: str, since: float) -> bool:
+        """Whether STOP has to be said again, `since` (s) it was said last. mode: the robot's, "" where it is not known."""
+        return self.stopped and since > STOP_AGAIN and mode not in BRAKING
 
     def velocity(self, now: float) -> Array | None:
         """What is to be published now: the velocity that is held, zeros for a while after it, or None: nothing."""

@@ -23,22 +23,18 @@ from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
 
-from .operator import Operator
+from .operator import PERIOD, Operator
 from .picture import LATCHED, TOPICS, RobotPicture
 from .recording import Recording
 from .server import AddressError
 from .viewer import FRAME, PORT, Viewer
 
 NICENESS = 10
-HANDS = 0.05  # s, between two velocities
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 MODES = ("passive", "stand_up", "stance", "walk", "lie_down")
 SIMULATIONS = ("sim_node", "board")
 PUSH, PUSH_TIME = 60.0, 0.2  # N, s
-STOP_AGAIN = 0.25  # s after which a STOP that was not answered is said again
-NEEDED = ("passive", "fault")
-"""Modes in which the joints brake"""
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -79,7 +75,7 @@ class View(Node):
             raise StartError(str(error)) from None
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(FRAME, self._show, clock=steady)
-        self.create_timer(HANDS, self._drive, clock=steady)
+        self.create_timer(PERIOD, self._drive, clock=steady)
         self.get_logger().info(f"open {self._viewer.url}")
 
     def destroy_node(self) -> None:
@@ -119,11 +115,11 @@ class View(Node):
             twist = Twist()
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
             self._velocity.publish(twist)
-        if self._operator.stopped and now - self._stop_asked > STOP_AGAIN and not self._brakes(now):
+        if self._operator.is_unheeded(self._mode(now), now - self._stop_asked):
             self._ask_to_stop()
 
-    def _brakes(self, now: float) -> bool:
-        return self._picture.is_fresh("/controller/state", now) and self._picture.state.mode_name in NEEDED
+    def _mode(self, now: float) -> str:
+        return self._picture.state.mode_name if self._picture.is_fresh("/controller/state", now) else ""
 
     def _ask_to_stop(self) -> None:
         self._stop_asked = time.monotonic()

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.kinematics import yaw
 from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_follow.planar import planar_pose, planar_twist
 from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import RecordingError, read_messages
 from quadvel_sim.world import World
@@ -59,13 +59,11 @@ def read_walk(path: Path, world: World) -> tuple[Outcome, list[Moment]]:
 def _moments(heard: dict[str, list[tuple[float, Any]]], begins: float, world: World) -> list[Moment]:
     truth, clearances = heard["/ground_truth/odom"], Clearances(world, FollowConfig())
     time = np.array([seconds(m.header.stamp) for _, m in truth])
-    poses = np.array([_pose(m.pose.pose) for _, m in truth])
-    twists = np.array(
-        [[m.twist.twist.linear.x, m.twist.twist.linear.y, m.twist.twist.angular.z] for _, m in truth]
-    )
+    poses = np.array([planar_pose(m.pose.pose) for _, m in truth])
+    twists = np.array([planar_twist(m.twist.twist) for _, m in truth])
     velocity = _over_stride(time, twists)
     asked_at = np.array([seconds(m.stamp) for _, m in heard["/command"]])
-    asked = np.array([[m.twist.linear.x, m.twist.linear.y, m.twist.angular.z] for _, m in heard["/command"]])
+    asked = np.array([planar_twist(m.twist) for _, m in heard["/command"]])
     asked = _over_stride(time, asked[_newest(asked_at, time)])
     people = heard["/ground_truth/persons"]
     people_at = np.array([seconds(m.header.stamp) for _, m in people])
@@ -73,7 +71,7 @@ def _moments(heard: dict[str, list[tuple[float, Any]]], begins: float, world: Wo
     found = []
     for now in np.arange(max(begins, time[0]), time[-1], PERIOD):
         i = int(_newest(time, now))
-        persons = np.array([_pose(pose) for pose in people[int(_newest(people_at, now))][1].poses])
+        persons = np.array([planar_pose(pose) for pose in people[int(_newest(people_at, now))][1].poses])
         state, words = _state(heard["/follow_planner/state"][int(_newest(said_at, now))][1])
         here, near = poses[i], clearances.of(poses[i])
         gap = clearances.of_persons(here, persons)
@@ -93,11 +91,6 @@ def _over_stride(time: Array, values: Array) -> Array:
         share = min(1.0, (time[i] - time[i - 1]) / STRIDE)
         found[i] = found[i - 1] + share * (values[i] - found[i - 1])
     return found
-
-
-def _pose(pose: Any) -> list[float]:
-    q = pose.orientation
-    return [pose.position.x, pose.position.y, float(yaw(np.array([q.w, q.x, q.y, q.z])))]
 
 
 def _state(message: Any) -> tuple[State, str]:

@@ -32,12 +32,11 @@ from ..robot_loop import PERIOD as TICK
 from ..robot_loop import RobotLoop, Sample, make_estimator
 from ..segments import rounded
 from .obstacles import Clearances
+from .stage import BAND, SETTLED
 
 Array = NDArray[np.float64]
 
 STRIDE = 0.35  # s, over which velocities are averaged before they are compared: a stride's sway is no error
-SETTLED = 6.0  # s, at the start, that distances leave out: the robot stands up to the person first
-BAND = 0.5  # m, round the set distance
 ODOMETRY = 4  # ticks from one odometry to the next
 
 

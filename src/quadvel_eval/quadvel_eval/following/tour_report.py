@@ -15,7 +15,8 @@ from quadvel_sim.world import World
 
 from ..report import write_figure, write_json
 from ..world_map import draw
-from .tour import BAND, Moment, Outcome, summary
+from .stage import BAND
+from .tour import Moment, Outcome, summary
 
 PAPER_XY, PAPER_WZ = 0.077, 0.059  # m/s, rad/s: mean errors of the paper's tour of 3.1 km
 
