@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_follow.clearance import outline_distance
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, State
+from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
 from quadvel_follow.leg_detector import LegDetector
-from quadvel_follow.person_tracker import PersonTracker
-from quadvel_follow.selection import Selection
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput
+from quadvel_sim.laser import Scan
 from quadvel_sim.walker import circles
 
 from ..people.laser import FloorPlan, Laser
+from .follower import Follower
 from .scenes import FollowScene
 
 Array = NDArray[np.float64]
@@ -92,8 +92,7 @@ class Stage:
     ) -> None:
         self._scene, self._rng = scene, np.random.default_rng(seed)
         self.config = config
-        self._planner = FollowPlanner(self.config)
-        self._tracker, self._selection = PersonTracker(detector=detector), Selection()
+        self._follower = Follower(self.config, detector)
         self._mux = CommandMux([FOLLOW], MuxConfig(acceleration=self.config.acceleration))
         first = scene.persons[0].position
         self.robot = Robot(np.array([first[0] - scene.start, first[1], 0.0]))
@@ -109,12 +108,12 @@ class Stage:
         for tick in range(round(self._scene.seconds / STEP)):
             now = tick * STEP
             if tick % 2 == 0:
-                self._planner.on_odometry(now, now, self.robot.pose.tolist(), self.robot.velocity)
+                self._follower.on_odometry(now, self.robot.pose.tolist(), self.robot.velocity)
                 command = self._mux.update(now).velocity
             if tick % often == 0:
                 self._look(now)
                 begin = process_time()
-                plan = self._planner.step(now)
+                plan = self._follower.step(now)
                 took = process_time() - begin
                 if self.mute != "planner":
                     self._mux.receive(FOLLOW.name, now, plan.velocity)
@@ -128,14 +127,10 @@ class Stage:
         ranges = self._hit_ground(LASER.scan(plan, self.robot.sensor, self._rng))
         if self.mute == "scan":
             return
-        self._planner.on_scan(now, now, ranges, LASER.angle_min, LASER.angle_increment)
-        pose = self.robot.sensor
-        tracks = self._tracker.update(now, ranges, LASER.angle_min, LASER.angle_increment, pose.tolist())
-        others = [np.append(track.position, track.velocity) for track in tracks if track.confirmed]
-        meant = self._selection.update(now, tracks, pose.tolist())
-        self._planner.on_others(now, now, np.array(others).reshape(-1, 4))
-        if meant is not None and self.mute != "person":
-            self._planner.on_person(now, now, np.append(meant.position, meant.velocity), meant.deviation)
+        scan = Scan(now, ranges, LASER.angle_min, LASER.angle_increment)
+        meant = self._follower.on_scan(now, scan, self.robot.sensor)
+        if self.mute != "person":
+            self._follower.on_person(now, meant)
 
     def _hit_ground(self, ranges: Array) -> Array:
         """Now and then rays ahead end on the ground, 3 to 6 m away, as the trunk pitches."""

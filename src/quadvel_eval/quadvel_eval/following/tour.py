@@ -19,10 +19,8 @@ from numpy.typing import NDArray
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
-from quadvel_follow.person_tracker import PersonTracker
+from quadvel_follow.follow_planner import PERIOD, FollowConfig, Plan, State
 from quadvel_follow.pose_history import PoseHistory
-from quadvel_follow.selection import Selection
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -31,6 +29,7 @@ from quadvel_sim.world import World
 from ..robot_loop import PERIOD as TICK
 from ..robot_loop import RobotLoop, Sample, make_estimator
 from ..segments import rounded
+from .follower import Follower
 from .obstacles import Clearances
 from .stage import BAND, SETTLED
 
@@ -72,35 +71,6 @@ class Moment:
     gap: float
 
 
-class Follower:
-    """Tracker, selection and planner as their nodes connect them: scans and odometry in, plans out."""
-
-    def __init__(self, config: FollowConfig) -> None:
-        self._planner, self._tracker, self._selection = FollowPlanner(config), PersonTracker(), Selection()
-        self._poses = PoseHistory([config.laser_x, config.laser_y, config.laser_yaw])
-
-    def on_odometry(self, now: float, pose: Array, velocity: Array) -> None:
-        """pose (3,): x, y (m), yaw (rad), by dead reckoning; velocity (3,): vx, vy (m/s), wz (rad/s)."""
-        self._poses.add(now, pose.tolist())
-        self._planner.on_odometry(now, now, pose.tolist(), velocity)
-
-    def on_scan(self, now: float, scan: Any) -> None:
-        """A scan of this instant, after the odometry of it."""
-        self._planner.on_scan(now, now, scan.ranges, scan.angle_min, scan.angle_increment)
-        sensor = self._poses.sensor_at(now)
-        ranges = np.where(scan.ranges > 0.0, scan.ranges, np.inf)
-        tracks = self._tracker.update(now, ranges, scan.angle_min, scan.angle_increment, sensor.tolist())
-        meant = self._selection.update(now, tracks, sensor.tolist())
-        others = [np.append(track.position, track.velocity) for track in tracks if track.confirmed]
-        self._planner.on_others(now, now, np.reshape(others, (-1, 4)))
-        if meant is not None:
-            self._planner.on_person(now, now, np.append(meant.position, meant.velocity), meant.deviation)
-
-    def step(self, now: float) -> Plan:
-        """The plan now."""
-        return self._planner.step(now)
-
-
 class Tour:
     """One walk: `moments` goes through it; what it came to is in the attributes afterwards.
 
@@ -118,6 +88,7 @@ class Tour:
         x, y, _ = laser.position
         self._config = FollowConfig(distance=setup.distance, laser_x=float(x), laser_y=float(y))
         self._follower = Follower(self._config)
+        self._poses = PoseHistory([self._config.laser_x, self._config.laser_y, self._config.laser_yaw])
         self._clearances = Clearances(self.world, self._config)
         self.walked, self.fell = 0.0, False
         self.planning: list[float] = []
@@ -160,9 +131,12 @@ class Tour:
             if tick % ODOMETRY == 0:
                 heading = float(yaw(sample.state.quaternion))
                 motion = np.append(estimated[:2], sample.state.angular_velocity[2])
-                follower.on_odometry(now, np.append(place[:2], heading), motion)
+                pose = [*place[:2].tolist(), heading]
+                self._poses.add(now, pose)
+                follower.on_odometry(now, pose, motion)
                 if (scan := self.simulator.scan()) is not None:
-                    follower.on_scan(now, scan)
+                    meant = follower.on_scan(now, scan, self._poses.sensor_at(now))
+                    follower.on_person(now, meant)
             if tick % often == 0 and tick:
                 begin = process_time()
                 plan = follower.step(now)
