@@ -71,8 +71,13 @@ def test_in_a_world_the_laser_scans_and_persons_are_told(start: Start, peer: Any
     assert people.header.frame_id == "odom"
     assert len(people.poses) == 3
     assert people.poses[0].position.x > 1.8
-    peer.spin_until(lambda: static)
-    (mounted,) = (t for m in static for t in m.transforms if t.child_frame_id == "laser")
+    frames: dict[str, Any] = {}
+    peer.spin_until(
+        lambda: (
+            frames.update({t.child_frame_id: t for m in static for t in m.transforms}) or "laser" in frames
+        )
+    )
+    mounted = frames["laser"]
     assert (mounted.header.frame_id, mounted.transform.translation.x) == ("base_link", 0.25)
     stamps = np.array([seconds(scan.header.stamp) for scan in scans])
     steps = np.diff(stamps) / 0.05
