@@ -9,8 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
-import attrs
-import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -20,8 +18,8 @@ from typer.core import TyperCommand
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .logs.inspect import Inspection, inspect
-from .logs.log import Log, LogError
+from .logs.checks import Inspection
+from .logs.dataset import Dataset
 from .logs.read_log import read_log
 from .memory import give_large_arrays_back, keep_freed_arrays
 
@@ -171,57 +169,15 @@ def _material(
     tell: Tell,
 ) -> tuple[Material, bool]:
     """What of the files is computed on, and whether they hold long logs, which are let go of here."""
-    fitted = read(logs, joints, gains, messages)
-    judged = read(holdout, joints, gains, messages, like=fitted[0])
-    long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
-    from .engine.material import gathered  # what is wrong with the files shows before the engine is loaded
-
     with threadpool_limits(1):
-        return gathered(fitted, judged, gains, progress=tell), long
+        fitted, heldout = ([read_log(path, joints) for path in paths] for paths in (logs, holdout))
+        data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
+        long = sum(log.q.size for log in data.logs) >= _LONG
+        from .engine.material import (
+            gathered,  # what is wrong with the files shows before the engine is loaded
+        )
 
-
-def read(
-    paths: Sequence[Path],
-    joints: Sequence[str] | None,
-    gains: tuple[float, float] | None,
-    messages: Console,
-    like: Log | None = None,
-) -> list[Log]:
-    """The logs as they are, their joints in the order of `like`, the first one; what is found goes to `messages`.
-
-    Raises LogError, one sentence, where a log is refused or does not fit the others.
-    """
-    logs: list[Log] = []
-    for path in paths:
-        log = read_log(path, joints)
-        like = like or log
-        log = _like(log, like)
-        inspection = inspect(_with_gains(log, gains))
-        say(inspection, messages)
-        inspection.raise_refusal()
-        logs.append(log)
-    return logs
-
-
-def _like(log: Log, first: Log) -> Log:
-    """The log with the joints of the first; it must hold torque if that one does."""
-    if (log.tau is None) != (first.tau is None):
-        lacking, other = (log, first) if log.tau is None else (first, log)
-        raise LogError(f"{lacking.name}: tau: the field is missing, expected it as in {other.name}")
-    if len(log.joints) > len(first.joints):
-        extra = next(name for name in log.joints if name not in first.joints)
-        raise LogError(f"{log.name}: joint_names: '{extra}' is not in {first.name}, expected the same joints")
-    return log.select(first.joints)
-
-
-def _with_gains(log: Log, gains: tuple[float, float] | None) -> Log:
-    """The log with the given gains where it holds none. Raises ValueError."""
-    if gains is None:
-        return log
-    if not np.isfinite(gains).all() or min(gains) < 0.0:
-        raise ValueError(f"--gains: found {gains[0]:g} {gains[1]:g}, expected two gains of 0 or more")
-    kp, kd = (np.broadcast_to(gain, log.q_des.shape) for gain in gains)
-    return attrs.evolve(log, kp=kp if log.kp is None else log.kp, kd=kd if log.kd is None else log.kd)
+        return gathered(data, gains, progress=tell), long
 
 
 def say(inspection: Inspection, messages: Console) -> None:

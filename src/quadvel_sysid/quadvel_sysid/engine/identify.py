@@ -14,6 +14,7 @@ import numpy as np
 from quadvel_actuator.parameters import ActuatorParameters
 
 from ..identification import Identification
+from ..logs.dataset import Dataset
 from ..logs.excerpts import evened, jitters
 from ..logs.findings import Finding
 from ..logs.log import Log, LogError
@@ -73,7 +74,8 @@ def identify(
     `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
     """
     options = options or Options()
-    material = gathered(train, heldout, options.gains, options.values, progress)
+    data = Dataset.of(train, heldout, options.gains)
+    material = gathered(data, options.gains, options.values, progress)
     return identified(material, options.base, options.cores, progress)
 
 

@@ -37,7 +37,7 @@ FIELDS = (
     *COMMAND_FIELDS,
     *GAIN_FIELDS,
 )
-NEEDED = ("t", "q", "dq")
+NEEDED = ("t", "q")
 
 LINES = 20_000  # of a CSV file, read at once
 LONGEST_LINE = 1 << 20  # characters
@@ -275,7 +275,12 @@ def _log(path: Path, fields: dict[str, Any], names: list[str] | None, unknown: l
     t_cmd, command = _commands(path, fields, t, len(joints))
     t, state = drop_repeated_times("t", t, state, remarks)
     t_cmd, command = drop_repeated_times("t_cmd", t_cmd, command, remarks)
-    return Log(name=str(path), joints=joints, t=t, t_cmd=t_cmd, **state, **command, remarks=tuple(remarks))
+    made = () if "dq" in state else ("dq",)
+    if made and state["q"].shape == (len(t), len(joints)) and (np.diff(t) > 0.0).all():
+        state["dq"] = np.gradient(state["q"], t, axis=0)
+    return Log(
+        name=str(path), joints=joints, t=t, t_cmd=t_cmd, **state, **command, remarks=tuple(remarks), made=made
+    )
 
 
 def _joints(path: Path, names: list[str] | None, joints: int, remarks: list[str]) -> tuple[str, ...]:
