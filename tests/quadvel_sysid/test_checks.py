@@ -244,12 +244,19 @@ def test_unknown_gains_and_missing_torque_are_said() -> None:
     notes = said(inspect(log(kp=None, kd=None, tau=None)), "note")
     assert "kp: not in the log; it is fitted" in notes
     assert "kd: not in the log; it is fitted" in notes
-    assert not inspect(log(tau=None)).log.tau
-    (text,) = [
-        one for one in said(inspect(log(kp=None, kd=None, tau=None)), "warning") if one.startswith("tau")
-    ]
-    assert text.startswith("tau: not in the log; nor both gains, which would give its scale (--gains KP KD)")
-    assert any(one.startswith("tau: not in the log; effects") for one in said(inspect(log(tau=None)), "note"))
+    assert any(one.startswith("tau: not in the log; effects") for one in notes)
+
+
+def test_without_torque_and_gains_nothing_has_a_scale() -> None:
+    (text,) = said(inspect(log(kd=None, tau=None)), "refusal")
+    assert text.startswith("tau, kd: not in the log; expected the torque, or the commanded gains")
+    assert said(inspect(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
+
+
+def test_gains_that_are_given_are_not_missed() -> None:
+    assert not any(
+        "kp: not in" in text for text in said(inspect(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
+    )
 
 
 def test_a_torque_that_never_changes_is_taken_as_not_logged() -> None:

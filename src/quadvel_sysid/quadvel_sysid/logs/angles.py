@@ -15,6 +15,7 @@ from quadvel_description.robot import JOINT_NAMES
 from .channels import DEGREE, MOVING, REACHES, TURN, names, rows_of, slope_of_q
 from .findings import Finding, Kind, some
 from .log import Array, Bools, Log
+from .response import measured
 from .slopes import smoothed, tick
 
 WRAPPED = 1.0
@@ -102,16 +103,24 @@ def speed(log: Log) -> Iterator[Finding | Log]:
         hit = (coarse > 0.0) & _is_difference(log)
         size = some([f"{1e3 * step:.3g}" for step in dict.fromkeys(np.round(coarse[hit], 7))], 2)
         why = f"q, dq: q counts in steps of {size} mrad, and dq is its difference; both made anew"
-    if hit.any():
-        q, dq, span = smoothed(log.t, log.q)
-        text = f"{why} by cubics over {1e3 * span:.3g} ms"
-        mended = attrs.evolve(
-            log,
-            q=np.where(hit & (coarse > 0.0), q, log.q),
-            dq=np.where(hit, dq, log.dq),
-        )
-        yield Finding(kind, "dq", names(log, hit), text)
-        yield mended
+    if not hit.any():
+        return
+    made = smoothed(log.t, log.q, log.tau)
+    mended = attrs.evolve(
+        log, q=np.where(hit & (coarse > 0.0), made.q, log.q), dq=np.where(hit, made.dq, log.dq)
+    )
+    if kind == "warning" and not unsign.any() and _explained(mended) < _explained(log):
+        text = "q counts in steps, and dq is its difference, which the drive acted on; they stay as logged"
+        yield Finding("note", "dq", names(log, hit), f"dq: {text}")
+        return
+    yield Finding(kind, "dq", names(log, hit), f"{why} by cubics over {1e3 * made.span:.3g} ms")
+    yield mended
+
+
+def _explained(log: Log) -> float:
+    """Share of the torque that commands, angles and speeds explain; 0 without torque."""
+    found = measured(log)
+    return 0.0 if found is None else 1.0 - float(np.mean(found.best))
 
 
 def _is_difference(log: Log) -> Bools:

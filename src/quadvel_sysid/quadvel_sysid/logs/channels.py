@@ -57,7 +57,7 @@ def still(log: Log) -> Iterator[Finding]:
 
 
 def torque(log: Log) -> Iterator[Finding | Log]:
-    """Torque that is not there, or never changes; without torque the gains have to be known."""
+    """Torque that is not there, or never changes."""
     tau = log.tau
     if tau is not None:
         dead = names(log, np.ptp(tau, axis=0) == 0.0)
@@ -69,10 +69,19 @@ def torque(log: Log) -> Iterator[Finding | Log]:
         elif dead:
             yield Finding("warning", "tau", dead, f"tau: never changes: {some(dead)}")
     if tau is None:
-        known = log.kp is not None and log.kd is not None
-        scale = "" if known else "; nor both gains, which would give its scale (--gains KP KD)"
-        text = f"tau: not in the log{scale}; effects are judged by the motion that follows from the commands"
-        yield Finding("note" if known else "warning", "tau", (), text)
+        text = "tau: not in the log; effects are judged by the motion that follows from the commands"
+        yield Finding("note", "tau", (), text)
+
+
+def scaled(log: Log) -> Iterator[Finding]:
+    """Without torque the gains give everything its scale, so they have to be known."""
+    lacking = [name for name in ("kp", "kd") if getattr(log, name) is None]
+    if log.tau is None and lacking:
+        text = (
+            f"tau, {', '.join(lacking)}: not in the log; expected the torque, or the commanded gains in N m/rad and N m s/rad "
+            "(--gains KP KD), as nothing else has a scale; a servo's own numbers do not do"
+        )
+        yield Finding("refusal", "tau", (), text)
 
 
 def gains(log: Log) -> Iterator[Finding]:

@@ -190,11 +190,12 @@ OF_RESPONSE = (
 OF_MOTION = (
     Check(
         response.followed,
-        f"without torque: correlation r of q with commands up to {response.REACH:g} s before; 1 - r^2 of the best order of joints over "
-        "that of the order as it is",
+        f"without torque: correlation r of q with commands up to {response.REACH:g} s before; 1 - r^2 of the best order of joints "
+        "over that of the order as it is",
         f"r below {-response.CLEAR:g} at every lag; {response.BETTER:g} on two joints or more",
         "refusal: the sign, or the order of the joints",
     ),
+    Check(channels.scaled, "tau, kp and kd that are there", "the torque or both gains", "refusal"),
     Check(
         separability.collinear,
         "share of what a parameter does to the torque that no mix of the others does",

@@ -1,18 +1,21 @@
 """Speeds out of positions: the slope of a cubic through the rows around, as many as foretell a row left out best.
 
 This is Savitzky and Golay's filter, its width chosen by leave-one-out cross-validation: an encoder that counts coarse
-steps needs many rows, a fine one few, and neither has to be known.
+steps needs many rows, a fine one few, and neither has to be known. Where torque was measured, what it makes of the motion,
+its second integral times the mobility that fits best, is taken out before and put back after: commands make the torque
+jump, and a slope over many rows would smear that.
 """
 
 from __future__ import annotations
 
+import attrs
 import numpy as np
-from numpy.typing import NDArray
+from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_coeffs, savgol_filter
 
 from .log import Array
 
-WIDTHS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65)
+WIDTHS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65, 91)
 """Rows that are looked at together."""
 ORDER = 3
 """Of the polynomial: its slope at the middle row is free of the second and the fourth derivative."""
@@ -20,8 +23,17 @@ GAP = 3.5
 """Times the usual spacing, beyond which rows are no neighbours."""
 
 
-def smoothed(t: Array, q: Array) -> tuple[Array, Array, float]:
-    """Positions and speeds (N, J) of the angles `q` at the times `t` (N,), and the span that they are taken over, s.
+@attrs.frozen(eq=False)
+class Smooth:
+    """Angles `q` (N, J), their speeds `dq`, and the `span` of time that they are taken over, s."""
+
+    q: Array
+    dq: Array
+    span: float
+
+
+def smoothed(t: Array, q: Array, tau: Array | None = None) -> Smooth:
+    """The angles `q` (N, J) at the times `t` (N,), and their slopes; `tau` (N, J) N m is what drives them, where it is known.
 
     A slope is that over the row's number, divided by that of the time over it, so that stamps may be uneven.
     """
@@ -29,27 +41,40 @@ def smoothed(t: Array, q: Array) -> tuple[Array, Array, float]:
     steps = np.diff(t)
     usual = float(np.median(steps))
     pieces = np.split(np.arange(len(t)), 1 + np.flatnonzero(steps > GAP * usual))
+    pushed = np.zeros((2, *q.shape))  # integrals of the torque: as a speed, as an angle
+    if tau is not None:
+        for piece in pieces:
+            one = np.asarray(tau[piece], dtype=float)
+            for k in range(2):
+                one = cumulative_trapezoid(one - one.mean(axis=0), t[piece], axis=0, initial=0.0)
+                pushed[k, piece] = one = one - one.mean(axis=0)
     longest = max(pieces, key=len)
-    width = min((w for w in WIDTHS if w <= len(longest)), key=lambda w: _left_out(q[longest], w), default=0)
-    level, speed = q.copy(), np.zeros_like(q)
+    tries = [_left_out(q[longest], pushed[1, longest], w) for w in WIDTHS if w <= len(longest)]
+    _, width, mobility = min(tries, key=lambda one: one[0], default=(0.0, 0, np.zeros((q.shape[1],) * 2)))
+    speed, angle = (x @ mobility for x in pushed)
+    rest = q - angle
+    level, slope = rest.copy(), np.zeros_like(q)
     for piece in pieces:
         of_it = max((w for w in WIDTHS if w <= min(width, len(piece))), default=0)
         if of_it:
             rate = savgol_filter(t[piece], of_it, ORDER, deriv=1)[:, None]
-            level[piece] = savgol_filter(q[piece], of_it, ORDER, axis=0)
-            speed[piece] = savgol_filter(q[piece], of_it, ORDER, deriv=1, axis=0) / rate
+            level[piece] = savgol_filter(rest[piece], of_it, ORDER, axis=0)
+            slope[piece] = savgol_filter(rest[piece], of_it, ORDER, deriv=1, axis=0) / rate
         elif len(piece) > 1:
-            speed[piece] = np.gradient(q[piece], t[piece], axis=0)
-    return level, speed, (width - 1) * usual
+            slope[piece] = np.gradient(rest[piece], t[piece], axis=0)
+    return Smooth(level + angle, slope + speed, (width - 1) * usual)
 
 
-def _left_out(q: Array, width: int) -> float:
-    """Mean squared error with which the rows around foretell a row: its residual over 1 less its own weight."""
+def _left_out(q: Array, pushed: Array, width: int) -> tuple[float, int, Array]:
+    """Mean squared error with which the rows around foretell a row, `width` of them; and the mobility (J, J) with which they do.
+
+    The error of a row left out is its residual over 1 less its own weight.
+    """
     own = float(savgol_coeffs(width, ORDER)[width // 2])
     inner = slice(width // 2, len(q) - width // 2)
-    residual = (q - savgol_filter(q, width, ORDER, axis=0))[inner]
-    size: NDArray[np.float64] = np.sqrt(np.var(q, axis=0)) + 1e-12
-    return float(np.mean((residual / size / (1.0 - own)) ** 2))
+    miss, driven = ((x - savgol_filter(x, width, ORDER, axis=0))[inner] / (1.0 - own) for x in (q, pushed))
+    mobility: Array = np.linalg.lstsq(driven, miss, rcond=1e-8)[0]
+    return float(np.mean((miss - driven @ mobility) ** 2)), width, mobility
 
 
 def tick(q: Array) -> Array:
