@@ -115,7 +115,7 @@ def _commands(path: Path, fields: dict[str, Any], t: Array, joints: int) -> tupl
     if own and "t_cmd" not in fields:
         raise LogError(f"{path}: t_cmd: the field is missing, expected the times of q_des_cmd")
     if not own and "q_des" not in fields:
-        text = "expected q_des, or t_cmd and q_des_cmd; --columns MAPFILE reads them under another name, or from a file of their own"
+        text = "expected q_des, or t_cmd and q_des_cmd; --columns MAPFILE reads other names, and files of their own"
         torque = "(a log of torque commands alone says nothing about a position drive)"
         raise LogError(f"{path}: q_des: the field is missing, {text} {torque}")
     t_cmd = fields["t_cmd"] if own else t
