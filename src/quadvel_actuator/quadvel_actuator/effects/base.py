@@ -87,14 +87,14 @@ def staged(field: str, **stages: Stage) -> Any:
     return property(lambda law: stages[getattr(law, field)])
 
 
-def one_of(*words: str, **options: Any) -> Any:
-    """A setting of a law that is one of these words, the first where none is given."""
+def one_of(*words: str) -> Any:
+    """A validator: a setting of a law that is one of these words."""
 
     def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         if value not in words:
             raise ValueError(f"{attribute.name}: found {value!r}, expected one of {', '.join(words)}")
 
-    return attrs.field(default=words[0], validator=check, **options)
+    return check
 
 
 _KINDS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
@@ -130,7 +130,7 @@ class EffectLaw(ABC):
     """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
-    at: str = one_of(DRIVE, JOINT, kw_only=True)
+    at: str = attrs.field(default=DRIVE, kw_only=True, validator=one_of(DRIVE, JOINT))
     """where a torque is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
     @classmethod

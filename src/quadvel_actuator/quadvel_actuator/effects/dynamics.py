@@ -129,7 +129,7 @@ class Armature(AddedLaw):
     signal = "ddq"
     shifts = True
     motion = _FAST
-    of: str = one_of(*_SLOPES)
+    of: str = attrs.field(default="ddq", validator=one_of(*_SLOPES))
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[Armature]:
@@ -163,7 +163,7 @@ class TimestampSkew(ErrorLaw):
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
     shifts = True
     motion = _FAST
-    channel: str = one_of("dq", "q")
+    channel: str = attrs.field(default="dq", validator=one_of("dq", "q"))
 
     @property
     def signal(self) -> str:  # type: ignore[override]

@@ -22,7 +22,7 @@ class _Rubbing(AddedLaw):
     """Friction with a sign that turns as the hyperbolic tangent does, or slower, as the arctangent."""
 
     of_drive = False
-    turn: str = one_of("tanh", "arctan", kw_only=True)
+    turn: str = attrs.field(default="tanh", kw_only=True, validator=one_of("tanh", "arctan"))
 
     @property
     def alternatives(self) -> tuple[EffectLaw, ...]:

@@ -60,7 +60,7 @@ class ThermalDrift(TorqueLaw):
     stage = Stage.GAIN
     signal = "t"
     motion = "one motion repeated from cold until the drives are warm, with their temperature logged"
-    of: str = one_of("time", "temperature")
+    of: str = attrs.field(default="time", validator=one_of("time", "temperature"))
     cold: float = 25.0
 
     @property
@@ -106,9 +106,9 @@ class SupplySag(TorqueLaw):
     signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
     common = _OF_ONE_SUPPLY
-    what: str = one_of("gain", "bound")
+    what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
     full: float = 1.0
-    of: str = one_of("voltage", "power")
+    of: str = attrs.field(default="voltage", validator=one_of("voltage", "power"))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -151,7 +151,7 @@ class PowerSag(MemoryLaw):
     motion = SupplySag.motion
     common = _OF_ONE_SUPPLY
     inputs = ("dq",)
-    what: str = one_of("gain", "bound")
+    what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
