@@ -1,6 +1,6 @@
-"""Makes `simulated_joints`, which lies beside the tests, importable by name."""
+"""Makes `simulated_joints`, which lies beside the tests of quadvel_sysid, importable by name."""
 
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
+sys.path.insert(0, str(Path(__file__).parents[1] / "quadvel_sysid"))

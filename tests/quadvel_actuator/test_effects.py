@@ -8,10 +8,10 @@ from simulated_joints import NAMES, parameters
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.effects.base import of_each
-from quadvel_actuator.identify.delays import SLOPE, jacobian_with_delays
-from quadvel_actuator.identify.log import Log
-from quadvel_actuator.identify.model import Applied, Model, Slots, pack, with_slots
-from quadvel_actuator.identify.signals import Samples
+from quadvel_sysid.engine.delays import SLOPE, jacobian_with_delays
+from quadvel_sysid.engine.model import Applied, Model, Slots, pack, with_slots
+from quadvel_sysid.engine.signals import Samples
+from quadvel_sysid.logs.log import Log
 
 JOINTS = NAMES[:3]
 TRUTH = {

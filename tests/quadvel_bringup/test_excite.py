@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_actuator.identify.excitation import FootLifting
-from quadvel_actuator.identify.read_log import read_log
 from quadvel_bringup.excite import RAMP, MotionError, Player
 from quadvel_description import robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
+from quadvel_sysid.excitation import FootLifting
+from quadvel_sysid.logs.read_log import read_log
 
 PROGRAM = """
 import typer

@@ -127,7 +127,7 @@ def test_the_nodes_follow_the_board_and_the_recording_holds_the_plants_log() -> 
 def test_the_plants_physics_knows_nothing_of_what_identification_fits() -> None:
     tree = ast.parse(Path(plant_module.__file__).read_text())
     imported = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert not any("effects" in str(name) or "identify" in str(name) for name in imported)
+    assert not any("effects" in str(name) or "sysid" in str(name) for name in imported)
     for plant in PLANTS.glob("*.yaml"):
         assert "_friction" not in plant.read_text()
 

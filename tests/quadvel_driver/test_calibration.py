@@ -9,7 +9,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from quadvel_actuator.identify.excitation import Creep
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch, rotate_inverse
 from quadvel_description.mjcf import Plant, load_model
@@ -19,6 +18,7 @@ from quadvel_driver.calibration import Calibration, CalibrationError
 from quadvel_driver.find_calibration import NotFound, Samples, find, holding_torque
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
+from quadvel_sysid.excitation import Creep
 
 DEGREE = np.pi / 180.0
 OFF = Calibration(

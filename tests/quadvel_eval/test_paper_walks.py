@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from quadvel_actuator.identify.eam import fit_eam
-from quadvel_actuator.identify.signals import Samples
 from quadvel_eval.grid import Cell
 from quadvel_eval.paper import conditions, stance, sustained, symmetry
 from quadvel_eval.paper.conditions import walk_under
@@ -21,6 +19,8 @@ from quadvel_eval.paper.section import Row, Section, Study
 from quadvel_eval.paper.stance import Stance
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.symmetry import Symmetry
+from quadvel_sysid.engine.eam import fit_eam
+from quadvel_sysid.engine.signals import Samples
 
 ONE = Study(seeds=1)
 

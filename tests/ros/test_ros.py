@@ -14,9 +14,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from quadvel_actuator.identify.read_log import read_log
 from quadvel_bringup.nodes import NODES
 from quadvel_bringup.stack import Stack
+from quadvel_sysid.logs.read_log import read_log
 
 pytestmark = pytest.mark.ros
 

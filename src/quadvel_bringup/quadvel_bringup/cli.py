@@ -332,7 +332,7 @@ def excite(context: typer.Context) -> None:
 @app.command(context_settings=HANDED_ON, add_help_option=False)
 def identify(context: typer.Context) -> None:
     """Find what the actuator model lacks, from measured logs."""
-    from quadvel_actuator.identify.cli import app as command
+    from quadvel_sysid.cli import app as command
 
     command(context.args, prog_name=context.command_path)
 

@@ -1,6 +1,6 @@
 """`quadvel excite`: moves the joints so that they show what they are, and records state and command.
 
-The motions are `quadvel_actuator.identify.excitation`'s; here they are played on a robot that serves low_state and
+The motions are `quadvel_sysid.excitation`'s; here they are played on a robot that serves low_state and
 low_cmd. The simulated one runs in lockstep at 1 kHz, so that a busy machine leaves no gaps.
 """
 
@@ -19,12 +19,12 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
-from quadvel_actuator.identify.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
 from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
+from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
 
 from .alone import ensure_alone
 from .node_output import PrefixedOutput

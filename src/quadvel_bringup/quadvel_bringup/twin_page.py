@@ -10,9 +10,9 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
-from quadvel_actuator.identify.figures import AFTER, BEFORE, MEASURED, svg
-from quadvel_actuator.identify.page import document, number, table, tiles
 from quadvel_eval.replay import GROWTH
+from quadvel_sysid.report.figures import AFTER, BEFORE, MEASURED, svg
+from quadvel_sysid.report.page import document, number, table, tiles
 
 Entry = Mapping[str, Any]
 

@@ -42,7 +42,7 @@ DRIVE, JOINT = "drive", "joint"
 
 
 class View(Protocol):
-    """What a law may look at: `quadvel_actuator.identify.signals.Signals`, or one step of a running model."""
+    """What a law may look at: `quadvel_sysid.engine.signals.Signals`, or one step of a running model."""
 
     @property
     def t(self) -> Any: ...
@@ -117,7 +117,7 @@ class EffectLaw(ABC):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[EffectLaw]:
-        """The forms of the law to try on the data `about` (`identify.candidates.About`); none where they cannot act."""
+        """The forms of the law to try on the data `about` (`quadvel_sysid.engine.candidates.About`); none where they cannot act."""
         return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
 
     @property
@@ -126,7 +126,7 @@ class EffectLaw(ABC):
         return ()
 
     def forms_beside(self, rest: Any) -> tuple[EffectLaw, ...]:
-        """Its forms, of which one may suit better beside the `rest` of a model (`identify.candidates.Rest`)."""
+        """Its forms, of which one may suit better beside the `rest` of a model (`quadvel_sysid.engine.candidates.Rest`)."""
         return self.forms
 
     @property

@@ -9,15 +9,15 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
-from quadvel_actuator.identify.excitation import FootLifting, within_torque
-from quadvel_actuator.identify.identify import identify
-from quadvel_actuator.identify.log import Log
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
+from quadvel_sysid.engine.identify import identify
+from quadvel_sysid.excitation import FootLifting, within_torque
+from quadvel_sysid.logs.log import Log
 
 from ..robot_loop import PERIOD, STEPS, RobotLoop, make_estimator
 from ..walk import Setup, record_to_the_fall

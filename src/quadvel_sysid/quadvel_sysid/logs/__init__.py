@@ -1,0 +1,1 @@
+"""Measured logs: read from what people have, looked at before anything is fitted."""

@@ -1,0 +1,1 @@
+"""What an identification found, as a page for people and a file for programs."""

@@ -1,0 +1,345 @@
+"""The page of an identification: sections of HTML in the order in which one asks, in one file that needs nothing else.
+
+It shows what the report's numbers and the pictures say; it computes nothing that report.json does not hold.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..excitation import propose
+from ..identification import Identification
+from . import figures
+from .figures import short
+
+_STYLE = """
+:root { color-scheme: light dark; --ink: #1b1f24; --soft: #656d76; --paper: #ffffff; --card: #f5f7f9;
+  --line: #d9dee4; --before: #d9622b; --after: #1a8fc4; --good: #1a7f4b; --bad: #b3391c; }
+@media (prefers-color-scheme: dark) { :root { --ink: #e4e8ec; --soft: #98a2ad; --paper: #14171b;
+  --card: #1d2127; --line: #343b44; --good: #4fc58a; --bad: #f0835f; } }
+* { box-sizing: border-box; }
+body { margin: 0 auto; padding: 2.5rem 1.5rem 5rem; max-width: 66rem; background: var(--paper); color: var(--ink);
+  font: 15px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, sans-serif; }
+h1 { font-size: .95rem; font-weight: 600; color: var(--soft); margin: 0 0 .6rem; }
+h2 { font-size: 1.15rem; margin: 3rem 0 .6rem; }
+.decision { font-size: 1.5rem; line-height: 1.35; font-weight: 600; margin: 0 0 1.6rem; max-width: 50rem; }
+.tiles { display: flex; flex-wrap: wrap; gap: .8rem; }
+.tile { background: var(--card); border: 1px solid var(--line); border-radius: .6rem; padding: .7rem 1rem; min-width: 9rem; }
+.tile b { display: block; font-size: 1.25rem; font-variant-numeric: tabular-nums; }
+.tile span, .note, caption { color: var(--soft); font-size: .87rem; }
+.note { max-width: 50rem; }
+.scroll, .figure { overflow-x: auto; }
+.figure svg { width: 100%; height: auto; display: block; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; margin: .4rem 0; }
+th { text-align: left; font-weight: 600; color: var(--soft); font-size: .85rem; }
+th, td { padding: .28rem .9rem .28rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+td.n, th.n { text-align: right; }
+code { font: .88em ui-monospace, SFMono-Regular, Menlo, monospace; background: var(--card); padding: .1em .35em;
+  border-radius: .3em; }
+details { border-bottom: 1px solid var(--line); padding: .35rem 0; }
+summary { cursor: pointer; font-weight: 600; }
+.bars { position: relative; width: 11rem; height: 1.05rem; margin-top: .2rem; }
+.bars i { position: absolute; left: 0; height: 45%; border-radius: 2px; }
+.interval { position: relative; width: 13rem; height: 1.2rem; }
+.interval i { position: absolute; background: var(--after); }
+.white { color: var(--good); } .structured { color: var(--bad); }
+"""
+
+
+def page(identification: Identification) -> str:
+    """The whole page as HTML text."""
+    report = identification.report
+    sections = [
+        ("Before and after, joint by joint", _joints(identification)),
+        ("Measured and predicted torque", _torques(identification)),
+        ("What the residual depends on", _shapes(identification)),
+        ("Candidates", _candidates(report)),
+        ("Parameters", _parameters(report)),
+        ("What no effect explains", _unexplained(report)),
+        ("What to record next", _next(report)),
+        ("What the log showed before the fit", _findings(report)),
+    ]
+    body = "".join(f"<section><h2>{escape(title)}</h2>{text}</section>" for title, text in sections if text)
+    return document("Identification of the actuators", report["decision"], _tiles(report) + body)
+
+
+def document(title: str, decision: str, body: str) -> str:
+    """A page of its own with the report's style; `title` and `decision` are text, `body` is HTML."""
+    head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
+    top = f'<h1>{escape(title)}</h1><p class="decision">{escape(decision)}</p>'
+    return (
+        f'<!doctype html><html lang="en"><head>{head}<style>{_STYLE}</style></head>'
+        f"<body>{top}{body}</body></html>\n"
+    )
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table; cells are HTML. A column whose title starts with "#" holds numbers."""
+    kinds = [' class="n"' if title.startswith("#") else "" for title in head]
+    first = "".join(
+        f"<th{kind}>{escape(title.removeprefix('#'))}</th>" for kind, title in zip(kinds, head, strict=True)
+    )
+    lines = (
+        "<tr>" + "".join(f"<td{kind}>{cell}</td>" for kind, cell in zip(kinds, row, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table><tr>{first}</tr>{"".join(lines)}</table></div>'
+
+
+def tiles(entries: Iterable[tuple[str, str]]) -> str:
+    """Figures in large type: value (HTML) and what it is."""
+    each = (f'<div class="tile"><b>{value}</b><span>{escape(name)}</span></div>' for value, name in entries)
+    return f'<div class="tiles">{"".join(each)}</div>'
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """A number as people read it; a dash where there is none."""
+    return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
+
+
+def _tiles(report: Mapping[str, Any]) -> str:
+    before, after = report["before"], report["after"]
+    unit = f"{report['units'].get('mse', 'N² m²')}, held out"
+    return tiles(
+        [
+            (number(report["pd"]["heldout_mse"]), f"ideal PD, {unit}"),
+            (number(before["heldout_mse"]), f"plain EAM, {unit}"),
+            (number(after["heldout_mse"]), f"corrected model, {unit}"),
+            (number(report["noise_floor"]), "noise floor, N² m²"),
+            (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM"),
+            (
+                f"{before['input_delay_ms']:.2f} / {before['output_delay_ms']:.2f}",
+                "its delays, ms, in and out",
+            ),
+        ]
+    )
+
+
+def _joints(identification: Identification) -> str:
+    report, traces = identification.report, identification.traces
+    before, after = report["before"]["per_joint"], report["after"]["per_joint"]
+    largest = max([value for value in (*before, *after) if value is not None], default=1.0) or 1.0
+    rows = [
+        (
+            short(joint),
+            number(old),
+            number(new),
+            _cut(old, new),
+            _bars(old, new, largest),
+        )
+        for joint, old, new in zip(report["joints"], before, after, strict=True)
+    ]
+    text = table(("joint", "#plain EAM", "#corrected", "#less", "held-out error, N² m²"), rows)
+    if traces:
+        text += figures.distribution_figure(traces, report["noise_floor"] or 0.0)
+        text += (
+            '<p class="note">Residual of each joint over the held-out samples: bars from 1 to 99 %, 5 to 95 %, '
+            "and the quartiles.</p>"
+        )
+    return text
+
+
+def _cut(old: float | None, new: float | None) -> str:
+    return "–" if not old or new is None else f"{100 * (1 - new / old):.0f} %"
+
+
+def _bars(old: float | None, new: float | None, largest: float) -> str:
+    each = (
+        f'<i style="top:{top}%;width:{100 * (value or 0.0) / largest:.1f}%;background:var(--{colour})"></i>'
+        for value, colour, top in ((old, "before", 0), (new, "after", 50))
+    )
+    return f'<div class="bars">{"".join(each)}</div>'
+
+
+def _torques(identification: Identification) -> str:
+    """A picture a joint, folded up but for the one that gained most."""
+    report, traces = identification.report, identification.traces
+    gains = {
+        joint: (old or 0.0) - (new or 0.0)
+        for joint, old, new in zip(
+            report["joints"], report["before"]["per_joint"], report["after"]["per_joint"], strict=True
+        )
+        if joint in traces
+    }
+    best = max(gains, key=lambda joint: gains[joint], default=None)
+    return "".join(
+        f"<details{' open' if joint == best else ''}><summary>{escape(short(joint))}</summary>"
+        f"{figures.torque_figure(traces[joint])}</details>"
+        for joint in gains
+    )
+
+
+def _shapes(identification: Identification) -> str:
+    """For each effect its joints side by side, three in a row."""
+    text = ""
+    for name in dict.fromkeys(shape.effect for shape in identification.shapes):
+        mine = [shape for shape in identification.shapes if shape.effect == name]
+        text += f"<h3>{escape(name)}</h3>"
+        for first in range(0, len(mine), 3):
+            text += figures.shape_figure(mine[first : first + 3])
+    return text
+
+
+def _candidates(report: Mapping[str, Any]) -> str:
+    taken, rejected = report["effects"], report["rejected"]
+    ranked = sorted([*taken, *rejected], key=lambda entry: -(entry["heldout_gain"] or 0.0))
+    if not ranked:
+        return "<p>No candidate was tried.</p>"
+    picture = figures.candidate_figure(
+        [entry["name"] for entry in ranked],
+        [entry["heldout_gain"] or 0.0 for entry in ranked],
+        [any(entry is one for one in taken) for entry in ranked],
+    )
+    rows = [
+        (
+            escape(entry["name"]),
+            number(entry["heldout_gain"]),
+            number(entry.get("p_value")),
+            escape(entry.get("reason") or _taken(entry, report["joints"])),
+        )
+        for entry in ranked
+    ]
+    return picture + table(("candidate", "#held-out gain, N² m²", "#p", ""), rows)
+
+
+def _taken(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
+    where = "all joints" if len(effect["joints"]) == len(joints) else ", ".join(map(short, effect["joints"]))
+    also = effect["indistinguishable"]
+    return f"added, on {where}" + (f"; not told apart from {', '.join(also)}" if also else "")
+
+
+def _parameters(report: Mapping[str, Any]) -> str:
+    """Gains, delays and the parameters of every effect, with their intervals, and what the fit warns of."""
+    after, joints = report["after"], report["joints"]
+    groups = [
+        (
+            "gains and delays",
+            [
+                row
+                for name, title, unit in _EAM
+                if f"{name}_ci95" in after
+                for row in _values(title, after[name], after[f"{name}_ci95"], unit, joints)
+            ],
+        )
+    ]
+    for effect in report["effects"]:
+        each = effect["params"].items()
+        rows = [
+            r for name, p in each for r in _values(name, p["value"], p["ci95"], p["unit"], effect["joints"])
+        ]
+        groups.append((effect["name"], rows))
+    head = ("parameter", "#value", "#95 % interval", "unit", "from zero")
+    text = "".join(f"<p>{escape(warning)}.</p>" for warning in report.get("warnings", ()))
+    return text + "".join(
+        f"<details{' open' if len(rows) <= _SHORT else ''}><summary>{escape(name)}</summary>{table(head, rows)}</details>"
+        for name, rows in groups
+        if rows
+    )
+
+
+_SHORT = 12  # rows of a table that is shown unfolded
+_EAM = (
+    ("delta_kp", "ΔKp", "N m/rad"),
+    ("delta_kd", "ΔKd", "N m s/rad"),
+    ("input_delay_ms", "input delay", "ms"),
+    ("output_delay_ms", "output delay", "ms"),
+)
+
+
+def _values(name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]) -> list[tuple[str, ...]]:
+    """Rows of the table: one where the joints share the value, else one for each."""
+    values, intervals = np.atleast_1d(value), np.atleast_2d(interval)
+    return [
+        (
+            escape(f"{name} {short(owner)}".strip()),
+            number(one, 4),
+            f"{number(low, 4)} … {number(high, 4)}",
+            escape(unit),
+            _interval(float(one), float(low), float(high)),
+        )
+        for owner, one, (low, high) in zip(_owners(len(values), joints), values, intervals, strict=True)
+    ]
+
+
+def _owners(count: int, joints: Sequence[str]) -> Sequence[str]:
+    """What each of `count` values of one parameter belongs to: the joints, or its place."""
+    if count == 1:
+        return [""]
+    return joints if count == len(joints) else [f"[{place}]" for place in range(count)]
+
+
+def _interval(value: float, low: float, high: float) -> str:
+    """Value and interval on a line that begins or ends at zero."""
+    left, right = min(low, value, 0.0), max(high, value, 0.0)
+    if not np.isfinite([left, right]).all() or right == left:
+        return ""
+
+    def place(x: float) -> float:
+        return 100 * (x - left) / (right - left)
+
+    return (
+        f'<div class="interval"><i style="left:{place(low):.1f}%;width:{place(high) - place(low):.1f}%;'
+        f'top:40%;height:20%;min-width:2px"></i><i style="left:calc({place(value):.1f}% - 1px);width:3px;height:100%">'
+        f'</i><i style="left:{place(0.0):.1f}%;width:1px;height:100%;background:var(--soft)"></i></div>'
+    )
+
+
+def _unexplained(report: Mapping[str, Any]) -> str:
+    rest = report["unexplained"]
+    signals = ", ".join(f"<code>{escape(signal)}</code>" for signal in rest["depends_on"])
+    where = ", ".join(escape(short(joint)) for joint in rest["joints"])
+    share = "" if rest["fraction"] is None else f", {100 * rest['fraction']:.1f} % of what the plain EAM left"
+    text = f'<p>The remainder is <b class="{rest["verdict"]}">{escape(rest["verdict"])}</b>{share}.'
+    if signals:
+        text += (
+            f" Beyond the effects of the registry it depends on {signals}{f' at {where}' if where else ''}."
+        )
+    text += "</p>"
+    learned = next((e for e in report["effects"] if e["name"] == "learned_residual"), None)
+    if learned:
+        inputs = ", ".join(f"<code>{escape(signal)}</code>" for signal in learned["inputs"])
+        text += f"<p>A bounded term took up what it could, with the inputs {inputs}.</p>"
+        text += table(
+            ("term", "inputs", "joints", "#held-out gain, N² m²"),
+            [
+                (
+                    escape(str(term["kind"]).replace("_", " ")),
+                    ", ".join(f"<code>{escape(signal)}</code>" for signal in term["inputs"]),
+                    escape(", ".join(map(short, term["joints"]))),
+                    number(term["heldout_gain"]),
+                )
+                for term in learned.get("terms", ())
+            ],
+        )
+    return text
+
+
+def _next(report: Mapping[str, Any]) -> str:
+    """What could not be told apart, in the effects' own words, and the motions that would do it."""
+    text = "".join(
+        f"<p>{escape(effect['name'])} and {escape(', '.join(effect['indistinguishable']))} come apart with "
+        f"{escape(effect['separated_by'])}.</p>"
+        for effect in report["effects"]
+        if effect.get("separated_by")
+    )
+    rows = [
+        (escape(", ".join(one.separates)), escape(one.reason), f"<code>{escape(one.command)}</code>")
+        for one in propose(report)
+    ]
+    if not rows:
+        return "<p>Nothing is left open that another motion would settle.</p>"
+    return text + table(("not told apart", "a motion that would", "to record it"), rows)
+
+
+def _findings(report: Mapping[str, Any]) -> str:
+    """What the logs said before anything was fitted."""
+    rows = [
+        (escape(Path(finding["log"]).name), escape(finding["kind"]), escape(finding["text"]))
+        for finding in report.get("findings", ())
+    ]
+    return table(("log", "", ""), rows) if rows else ""

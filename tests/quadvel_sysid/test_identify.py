@@ -1,0 +1,179 @@
+"""Identification against injected truth: short logs of two joints, so that it takes seconds."""
+
+import weakref
+
+import attrs
+import numpy as np
+import pytest
+from simulated_joints import NAMES, TABLE_4, parameters, record
+
+from quadvel_actuator import ActuatorParameters, Effect
+from quadvel_sysid.engine.eam import fit_eam
+from quadvel_sysid.engine.identify import Options, identify
+from quadvel_sysid.engine.material import gathered
+from quadvel_sysid.engine.signals import Samples
+
+JOINTS = NAMES[:2]
+
+
+def _truth(*effects):
+    return attrs.evolve(parameters(effects), joints=JOINTS)
+
+
+def test_the_eam_finds_the_truth_of_table_4():
+    samples = Samples([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
+    eam = fit_eam(samples, samples.judged)
+    assert abs((eam.gains[0, 0] - 1) * 30 - -0.706) < 0.05 * 30 * 0.05
+    assert abs(eam.gains[1, 0] * 0.5 - 0.479) < 0.2 * 0.479
+    assert abs(eam.input_delay[0] + eam.output_delay[0] - 0.0081) < 2e-4
+    assert eam.mse < 1.05 * 0.066
+    assert all(pair.mse < 1.5 * eam.mse for pair in eam.pairs)
+
+
+def test_nothing_is_added_to_a_log_that_the_eam_explains():
+    report = identify([record(_truth(), 2, 3.0, 500, seed=4)]).report
+    assert report["effects"] == []
+    assert report["unexplained"] == {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
+    assert report["decision"].startswith("Nothing significant")
+
+
+def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
+    """A bound that the fitted log never reaches."""
+    fitted, held_out = (record(_truth(), 2, 3.0, 500, seed=seed) for seed in (4, 5))
+    bound = 0.6 * np.abs(held_out.tau).max()
+    clipped = attrs.evolve(held_out, tau=held_out.tau.clip(-bound, bound))
+    report = identify([fitted], [clipped]).report
+    assert report["effects"] == []
+    after = report["after"]
+    left = f"held-out data leave {after['heldout_mse']:.3g} N^2 m^2 where the fitted ones leave {after['train_mse']:.3g}:"
+    assert left in report["decision"]
+    plain = identify([fitted], [held_out]).report
+    assert "held-out data leave" not in plain["decision"]
+
+
+def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect():
+    """Both logs follow one script, and both joints are pushed when it begins and when it ends."""
+
+    def pushed(k, q, dq, tau):
+        return tau + 1.0 * (k < 800 or k >= 5200)
+
+    logs = [record(_truth(), 2, 6.0, 500, seed=4, distort=pushed) for _ in range(2)]
+    again = np.random.default_rng(1).normal(0.0, np.sqrt(TABLE_4["noise"]), logs[1].tau.shape)
+    logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
+    report = identify(logs[:1], logs[1:], Options(values=3000)).report  # two pieces of 0.75 s of each
+    assert report["effects"] == []
+
+
+def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
+    log = record(_truth(), 2, 6.0, 500, seed=4)
+    alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
+    material = gathered([log], values=3000)
+    del log
+    assert sum(len(piece.log.t) for piece in material.pieces) == 1500
+    assert [array() for array in alive] == [None] * len(alive)
+
+
+def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
+    """A quarter of the torque's noise again, through kd: whatever averages dq would predict better than the truth."""
+    log = record(parameters(joints=3), joints=3, seed=6)
+    log = attrs.evolve(log, dq=log.dq + np.random.default_rng(6).normal(0.0, 0.25, log.dq.shape))
+    report = identify([log]).report
+    assert report["effects"] == []
+    assert report["after"]["delta_kd"] == pytest.approx(TABLE_4["delta_kd"], abs=0.025)  # 5 % of kd
+    assert any("on which the drive did not act" in finding["text"] for finding in report["findings"])
+
+
+def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
+    truth = _truth(Effect("coulomb_friction", JOINTS, {"c": 0.8, "v_0": 0.05}))
+    log = record(truth, 2, 5.0, 1000, seed=3)
+    noise = np.random.default_rng(0).normal(0.0, 0.04, log.dq.shape)
+    report = identify([attrs.evolve(log, dq=log.dq + noise)]).report
+    assert [one["name"] for one in report["effects"]] in (["coulomb_friction"], ["stribeck_friction"])
+    assert any("noise" in one["text"] and "averaged" in one["text"] for one in report["findings"])
+
+
+def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base():
+    def weaker(k, q, dq, tau):
+        return tau * np.array([1.0, 0.6])
+
+    base = attrs.evolve(ActuatorParameters.default(), torque_limit=2.0)
+    report = identify(
+        [record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], options=Options(base=base)
+    ).report
+    assert report["effects"] == []
+    error = f"{report['after']['heldout_mse']:.3g} N^2 m^2, with one for all to {report['before']['heldout_mse']:.3g}"
+    assert error in report["decision"]
+    assert report["warnings"][0].startswith("FR_hip_joint: up to ")
+    assert report["warnings"][0].endswith("torque_limit in actuator.yaml, which is the base's, is 2.0 N m")
+
+
+@pytest.mark.parametrize(
+    ("name", "truth"),
+    [
+        ("coulomb_friction", {"c": 0.35}),
+        ("quadratic_drag", {"c": 0.05}),
+        ("parallel_spring", {"k": 3.0, "q0": 0.1}),
+    ],
+)
+def test_an_effect_is_named_with_an_interval_that_holds_its_truth(name, truth):
+    injected = truth | ({"v_0": 0.1} if name == "coulomb_friction" else {})
+    found = identify([record(_truth(Effect(name, JOINTS, injected)), 2, 3.0, 500, seed=2)])
+    first = found.report["effects"][0]
+    assert first["name"] == name
+    assert first["joints"] == list(JOINTS)
+    for parameter, value in truth.items():
+        low, high = np.transpose(np.atleast_2d(first["params"][parameter]["ci95"]))
+        spread = (high - low) / 2  # one interval in twenty misses; none by its own width
+        assert np.all((low - spread < value) & (value < high + spread))
+    assert found.report["after"]["heldout_mse"] < 1.15 * 0.066
+    assert [effect.name for effect in found.parameters.effects] == [name]
+
+
+def test_friction_on_one_joint_is_found_there_only():
+    found = identify(
+        [record(_truth(Effect("viscous_friction", JOINTS[:1], {"b": 0.15})), 2, 3.0, 500, seed=1)]
+    )
+    assert [(one["name"], one["joints"]) for one in found.report["effects"]] == [
+        ("viscous_friction", [JOINTS[0]])
+    ]
+
+
+def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
+    """The damping that all joints share stands for it: what is off are the joints without, until it is named."""
+    six = NAMES[:6]
+    drag = Effect("viscous_friction", six[:5], {"b": 0.2})
+    report = identify([record(attrs.evolve(parameters((drag,)), joints=six), 6, 3.0, 500, seed=1)]).report
+    assert [(one["name"], one["joints"]) for one in report["effects"]] == [
+        ("viscous_friction", list(six[:5]))
+    ]
+
+
+def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both():
+    three = NAMES[:3]
+    spring = Effect("parallel_spring", three, {"k": 5.0, "q0": 0.1})
+    cogging = Effect("cogging", three, {"a": 0.5, "n": 12.0, "phi": 0.7})
+    truth = attrs.evolve(parameters((spring, cogging)), joints=three)
+    report = identify([record(truth, 3, 5.0, 500, seed=4)]).report
+    assert {one["name"] for one in report["effects"]} == {"parallel_spring", "cogging"}
+    assert report["after"]["heldout_mse"] < 1.05 * 0.066
+
+
+def test_drives_that_are_stronger_one_way_only_are_not_hidden_in_the_gains_of_all():
+    def stronger(k, q, dq, tau):
+        return tau * np.where((tau > 0.0) & (np.arange(4) < 2), 1.15, 1.0)
+
+    truth = attrs.evolve(parameters(), joints=NAMES[:4])
+    report = identify([record(truth, 4, 5.0, 500, seed=6, distort=stronger)]).report
+    assert [(one["name"], one["joints"]) for one in report["effects"]] == [
+        ("gain_asymmetry", list(NAMES[:2]))
+    ]
+
+
+def test_hum_of_the_mains_is_told_as_a_line_in_time():
+    def hum(k, q, dq, tau):
+        return tau + 0.35 * np.sin(2 * np.pi * 50.0 * k * 0.001)
+
+    report = identify([record(_truth(), 2, 3.0, 500, seed=3, distort=hum)]).report
+    assert report["unexplained"]["verdict"] == "structured"
+    assert report["unexplained"]["depends_on"] == ["t"]
+    assert report["after"]["heldout_mse"] < 1.15 * 0.066

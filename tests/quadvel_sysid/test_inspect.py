@@ -1,0 +1,292 @@
+"""What is found in logs with one thing wrong, nothing in a clean one, and what measured logs say."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import attrs
+import numpy as np
+import pytest
+
+from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
+from quadvel_sysid.logs.inspect import Inspection, inspect
+from quadvel_sysid.logs.log import Log, LogError
+from quadvel_sysid.logs.read_log import read_log
+
+sys.path.insert(0, str(Path(__file__).parent))
+from joint_logs import KD, KP, fields, npz
+
+SHARE = np.pi / 180.0
+
+
+def log(**changes: Any) -> Log:
+    """The clean log with some arrays changed."""
+    given = fields()
+    shape = given["q"].shape
+    values: dict[str, Any] = {
+        **{name: given[name] for name in ("t", "q", "dq", "tau", "q_des")},
+        "t_cmd": given["t"],
+        "valid": np.ones(shape, bool),
+        "kp": np.full(shape, 30.0),
+        "kd": np.full(shape, 0.5),
+    }
+    return Log(name="a.npz", joints=JOINT_NAMES, **(values | changes))
+
+
+def said(inspection: Inspection, kind: str) -> list[str]:
+    return [finding.text for finding in inspection.findings if finding.kind == kind]
+
+
+def exchanged(values: np.ndarray, a: int = 0, b: int = 4) -> np.ndarray:
+    order = list(range(12))
+    order[a], order[b] = b, a
+    return values[:, order]
+
+
+def of_one(values: np.ndarray, factor: float) -> np.ndarray:
+    """Of the second joint alone."""
+    return values * np.where(np.arange(12) == 1, factor, 1.0)
+
+
+def set_back(t: np.ndarray) -> np.ndarray:
+    """A clock that was set in the middle."""
+    return t + np.where(np.arange(len(t)) >= len(t) // 2, 1.7e9, 0.0)
+
+
+def test_what_is_odd_on_one_joint_is_said_of_it() -> None:
+    noise = np.where(np.arange(12) == 1, np.random.default_rng(0).normal(size=(2000, 12)), fields()["tau"])
+    warnings = said(inspect(log(tau=noise)), "warning")
+    assert any(
+        text.startswith("tau: does not answer the position error on FR_thigh_joint") for text in warnings
+    )
+    copied = fields()["q"].copy()
+    copied[:, 1] = copied[:, 0]
+    warnings = said(inspect(log(q=copied)), "warning")
+    assert any(
+        text.startswith("q: FR_thigh_joint and FR_hip_joint are the same to the bit") for text in warnings
+    )
+    found = inspect(log(kp=of_one(np.full((2000, 12), 30.0), 0.0)))
+    assert said(found, "refusal") == []
+    assert "kp: 0 at times on FR_thigh_joint alone; left out there" in said(found, "warning")
+
+
+def test_of_a_clean_log_only_its_rate_is_said() -> None:
+    inspection = inspect(log())
+    assert said(inspection, "warning") == []
+    assert said(inspection, "refusal") == []
+    assert "t: 2000 rows over 4.00 s, 500 Hz" in said(inspection, "note")[0]
+    assert inspection.log.valid.all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"q": fields()["q"] / SHARE}, "dq: the slope of q is 57.3 times dq"),
+        ({"dq": fields()["dq"] / SHARE}, "dq: the slope of q is 0.017"),
+        ({"t": fields()["t"] * 1e3, "t_cmd": fields()["t"] * 1e3}, "dq: the slope of q is 0.001 times dq"),
+        ({name: fields()[name] / SHARE for name in ("q", "dq", "q_des")}, "q: up to "),
+        ({"q_des": fields()["q_des"] / SHARE}, "q_des: about 57 times as large as q: degrees?"),
+        ({"dq": -fields()["dq"]}, "dq: has the opposite sign"),
+        ({"tau": -fields()["tau"]}, "tau: has the wrong sign on"),
+        (
+            {"q_des": exchanged(fields()["q_des"])},
+            "q_des: a joint's q follows another joint's command (FR_hip",
+        ),
+        (
+            {"q_des": exchanged(fields()["q_des"]), "tau": None},
+            "q_des: a joint's q follows another joint's command (",
+        ),
+        (
+            {"q": exchanged(fields()["q"]), "dq": exchanged(fields()["dq"])},
+            "q_des: a joint's q follows another",
+        ),
+        (
+            {"tau": exchanged(fields()["tau"])},
+            "tau: a joint's tau follows another joint's command and motion (FR_",
+        ),
+        ({"tau": 1e3 * fields()["tau"]}, "tau: 1e+03 times what kp asks for on FR_hip_joint"),
+        (
+            {"tau": np.random.default_rng(0).normal(size=(2000, 12))},
+            "tau: does not answer the position error",
+        ),
+        ({"q": np.zeros((2000, 12)), "dq": np.zeros((2000, 12))}, "q: no joint ever moves"),
+        ({"tau": np.zeros((2000, 12))}, "tau: never changes on any joint"),
+        ({"kp": np.zeros((2000, 12))}, "valid: 0.00 s under PD control are left"),
+        ({"kp": np.full((2000, 12), -30.0)}, "kp: found -30"),
+        ({"t": fields()["t"] * 1e6, "t_cmd": fields()["t"] * 1e6}, "dq: the slope of q is 1e-06 times dq"),
+        ({"t": set_back(fields()["t"])}, "t: jumps by 1.7e+09 s from row 999 to row 1000"),
+        ({"t_cmd": fields()["t"] + 1e9}, "t_cmd: 1e+09 to 1e+09 s, t: 0 to 3.998 s: nothing in common"),
+        ({"t_cmd": fields()["t"] * 1e3}, "t_cmd: 0 to 3998 s, t: 0 to 3.998 s: 1e+03 times as long"),
+        ({"t_cmd": fields()["t"] + 0.2}, "t_cmd: the torque answers commands 0.20 s before they were sent"),
+        ({"t_cmd": fields()["t"] - 0.2}, "t_cmd: the torque answers commands 0.20 s after they were sent"),
+        ({"dq": of_one(fields()["dq"], 0.0)}, "dq: is 0 on FR_thigh_joint although q moves"),
+        ({"dq": 2.0 * fields()["dq"]}, "dq: the slope of q is 0.5 times dq on FR_hip_joint"),
+        (
+            {"q": of_one(fields()["q"], -1.0), "dq": of_one(fields()["dq"], -1.0)},
+            "q: has the wrong sign on FR_thigh_joint",
+        ),
+        ({"q_des": of_one(fields()["q_des"], -1.0)}, "q_des: has the wrong sign on FR_thigh_joint"),
+        ({"tau": of_one(fields()["tau"], 1e3)}, "tau: 1e+03 times what kp asks for on FR_thigh_joint"),
+        ({"kp": of_one(np.full((2000, 12), 30.0), 100.0)}, "tau: 0.00999 times what kp asks for on FR_thigh"),
+    ],
+)
+def test_a_log_that_would_mislead_is_refused(changes: dict[str, Any], sentence: str) -> None:
+    inspection = inspect(log(**changes))
+    assert any(text.startswith(sentence) for text in said(inspection, "refusal")), inspection.findings
+    with pytest.raises(LogError, match=r"^a\.npz: "):
+        inspection.raise_refusal()
+
+
+def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
+    t = fields()["t"]
+    keep = ((t < 1.0) | (t > 1.3)) & (np.arange(2000) % 50 != 7)
+    given = {name: fields()[name][keep] for name in ("t", "q", "dq", "tau", "q_des")}
+    for name in ("q", "dq", "tau"):
+        given[name][100:400:10] = given[name][99:399:10]
+    shape = given["q"].shape
+    same = {"kp": np.full(shape, 30.0), "kd": np.full(shape, 0.5), "valid": np.ones(shape, bool)}
+    warnings = said(inspect(log(**given, t_cmd=given["t"], **same)), "warning")
+    assert "t: 1 gap, the longest of 0.304 s at 1.00 s" in warnings
+    assert "t: about 37 rows were dropped, one at a time" in warnings
+    assert any(text.startswith("q: 30 rows (") for text in warnings)
+
+
+def test_clipped_channels_and_joints_at_rest_are_named() -> None:
+    dq, q = fields()["dq"], fields()["q"]
+    q[:, 7] = 0.6
+    dq[:, 7] = 0.0
+    tau = fields()["tau"]
+    tau[:, 2] = np.clip(tau[:, 2], -0.5, 0.5)
+    inspection = inspect(log(q=q, dq=dq, tau=tau))
+    found = {finding.text.split(":")[1].strip(): finding.joints for finding in inspection.findings}
+    assert found["never moves"] == ("RR_thigh_joint",)
+    assert found["clipped (N m)"] == ("FR_calf_joint",)
+
+
+def test_names_that_contradict_the_model_are_said() -> None:
+    order = list(np.roll(np.arange(12), 1))
+    moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}
+    warnings = said(inspect(log(**moved)), "warning")
+    assert any(text.startswith("joint_names: q contradicts the model's range") for text in warnings)
+    strange = attrs.evolve(log(), joints=(*JOINT_NAMES[:11], "RL_knee_joint"))
+    assert "joint_names: RL_knee_joint: not among" in " ".join(said(inspect(strange), "warning"))
+
+
+def test_a_gain_of_zero_is_left_out() -> None:
+    kp = np.full((2000, 12), 30.0)
+    kp[1000:] = 0.0
+    inspection = inspect(log(kp=kp))
+    assert (
+        "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in said(inspection, "warning")[0]
+    )
+    assert inspection.log.valid[:1000].all()
+    assert not inspection.log.valid[1000:].any()
+
+
+@pytest.mark.parametrize("gains_known", [True, False])
+@pytest.mark.parametrize("damping", [0.0, 5.0])
+def test_damping_and_switching_off_show_in_the_torque(gains_known: bool, damping: float) -> None:
+    given = fields()
+    off = given["t"] > 2.5
+    tau = np.where(off[:, None], -damping * given["dq"], given["tau"])
+    tau += np.random.default_rng(1).normal(0.0, 0.05, tau.shape)
+    q_des = np.where(off[:, None], given["q_des"][~off][-1] + 0.1, given["q_des"])
+    gains = {} if gains_known else {"kp": None, "kd": None}
+    inspection = inspect(log(tau=tau, q_des=q_des, **gains))
+    assert any("tau: the torque no longer answers" in text for text in said(inspection, "warning"))
+    valid = inspection.log.valid.any(axis=1)
+    assert not valid[off].any()
+    assert valid[given["t"] < 2.3].all()
+
+
+def test_a_drive_that_something_pushes_against_is_not_switched_off() -> None:
+    """A spring in part of the range takes the mean of its torque, which goes on to follow the error."""
+    t = np.arange(3000) * 0.002
+    error = (0.1 * np.sin(0.5 * np.pi * t) + 0.01 * np.sin(6.0 * np.pi * t))[:, None]
+    q = 0.4 * np.sin(0.9 * t)[:, None]
+    one = {"t": t, "t_cmd": t, "q": q, "dq": np.gradient(q, t, axis=0), "q_des": q + error}
+    gains = {"valid": np.ones(q.shape, bool), "kp": np.full(q.shape, 30.0), "kd": np.full(q.shape, 0.5)}
+    tau = 30.0 * error - 0.5 * one["dq"]
+    pushed = error[:, 0] > 0.07
+    tau[pushed] -= tau[pushed].mean()
+    assert inspect(Log(name="a.npz", joints=("a",), tau=tau, **one, **gains)).log.valid.all()
+
+
+def test_saturation_and_friction_are_not_taken_for_damping() -> None:
+    given = fields()
+    tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)
+    assert inspect(log(tau=tau)).log.valid.all()
+
+
+def test_torque_that_was_fed_forward_is_not_looked_for_in_the_position_error() -> None:
+    given = fields()
+    held = np.clip(given["q_des"], NOMINAL_Q - 0.05, NOMINAL_Q + 0.05)
+    inspection = inspect(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
+    assert said(inspection, "warning") == said(inspection, "refusal") == []
+    assert inspection.log.valid.all()
+    weight = np.full(held.shape, -40.0)
+    inspection = inspect(log(tau=given["tau"] + weight, tau_ff=weight))
+    assert said(inspection, "warning") == said(inspection, "refusal") == []
+
+
+def test_unknown_gains_and_missing_torque_are_said() -> None:
+    notes = said(inspect(log(kp=None, kd=None, tau=None)), "note")
+    assert "kp: not in the log; it is fitted" in notes
+    assert "kd: not in the log; it is fitted" in notes
+    assert any(text.startswith("tau: not in the log") for text in notes)
+
+
+def test_what_the_motion_cannot_tell_apart_is_said() -> None:
+    still = np.tile(fields()["q_des"].mean(axis=0), (2000, 1))
+    warnings = said(inspect(log(q_des=still)), "warning")
+    assert "q_des: the command never changes, so that no delay of the command can be identified" in warnings
+    slow = np.linspace(0.0, 4.0, 2000)[:, None] * np.ones(12)
+    steady = {"q": 0.1 * slow, "dq": np.full((2000, 12), 0.1), "q_des": 0.1 * slow + 0.05}
+    texts = " ".join(finding.text for finding in inspect(log(**steady, tau=None)).findings)
+    assert "kp and torque offset are separable only through changes of the position error" in texts
+
+
+MEASURED = Path(os.environ.get("QUADVEL_MEASURED", ""))
+measured = pytest.mark.skipif(
+    "QUADVEL_MEASURED" not in os.environ, reason="QUADVEL_MEASURED names no folder of measured logs"
+)
+
+
+@measured
+@pytest.mark.parametrize(("number", "begins"), [(1, 9.64), (2, 11.45)])
+@pytest.mark.parametrize("without", [(), ("kp", "kd"), ("tau",)])
+def test_the_damping_after_a_walk_is_noticed(number: int, begins: float, without: tuple[str, ...]) -> None:
+    walk = read_log(MEASURED / f"go2_walk_{number}.npz")
+    inspection = inspect(attrs.evolve(walk, **dict.fromkeys(without)))
+    inspection.raise_refusal()
+    valid = inspection.log.valid.any(axis=1)
+    assert not valid[walk.t > begins + 0.15].any()
+    before = (walk.t > walk.t_cmd[0]) & (walk.t < begins - 0.5)
+    assert valid[before].all()
+
+
+@measured
+def test_measured_logs_with_commands_are_accepted() -> None:
+    for name in ("go2_inair", "go2_replay_50hz"):
+        inspection = inspect(read_log(MEASURED / f"{name}.npz"))
+        inspection.raise_refusal()
+        assert inspection.log.valid.all()
+
+
+@measured
+@pytest.mark.parametrize("name", ["ak80_acrobot", "ak80_pendubot"])
+def test_measured_logs_of_torque_commands_are_refused(name: str) -> None:
+    with pytest.raises(LogError, match=rf"{name}\.npz: q_des: the field is missing"):
+        read_log(MEASURED / f"{name}.npz")
+
+
+def test_speeds_that_commands_ask_for_are_no_clock_that_is_off(tmp_path):
+    """kd dq_des leads kp q_des, as a torque before its command would."""
+    log, kd = fields(), 4.0
+    dq_des = np.gradient(log["q_des"], log["t"], axis=0)
+    tau = log["tau"] + kd * (dq_des - log["dq"]) + KD * log["dq"]
+    found = inspect(read_log(npz(tmp_path / "log.npz", dq_des=dq_des, tau=tau, kd=kd)))
+    assert not [one.text for one in found.findings if one.kind == "refusal"]

@@ -1,0 +1,31 @@
+"""Identification on measured walks of a Go2: fit one, judge on the other; one leg, so that it takes seconds."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from quadvel_sysid.engine.identify import Options, identify
+from quadvel_sysid.logs.read_log import read_log
+
+LEG = ("FR_hip", "FR_thigh", "FR_calf")
+GAINS = (35.0, 0.5)  # the recording lab's driver; the logs hold none
+
+
+@pytest.fixture(scope="module")
+def walks():
+    folder = Path(os.environ.get("QUADVEL_MEASURED", ""))
+    paths = [folder / f"go2_walk_{k}.npz" for k in (1, 2)]
+    if "QUADVEL_MEASURED" not in os.environ or not all(path.is_file() for path in paths):
+        pytest.skip("QUADVEL_MEASURED names no folder with go2_walk_1.npz and go2_walk_2.npz")
+    return [read_log(path, LEG) for path in paths]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["1 to 2", "2 to 1"])
+def test_a_walk_explains_the_other_with_at_most_half_of_the_error_of_the_eam(walks, order):
+    fitted, judged = (walks[k] for k in order)
+    report = identify([fitted], [judged], Options(gains=GAINS)).report
+    effects = [effect["name"] for effect in report["effects"]]
+    assert "armature" in effects[:2]
+    assert report["after"]["heldout_mse"] < 0.5 * report["before"]["heldout_mse"]
