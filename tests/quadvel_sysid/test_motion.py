@@ -112,6 +112,7 @@ def test_a_leg_that_swings_is_carried_as_one_body():
 
 
 @pytest.mark.skipif("QUADVEL_MEASURED" not in os.environ, reason="QUADVEL_MEASURED names no measured logs")
+@pytest.mark.long
 def test_a_measured_leg_in_the_air_is_never_replayed_worse_than_before():
     log = read_log(Path(os.environ["QUADVEL_MEASURED"]) / "go2_inair.npz")
     leg = [name.startswith("FL") for name in log.joints]
