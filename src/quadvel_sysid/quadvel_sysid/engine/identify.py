@@ -13,6 +13,8 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
+from ..baselines import baselines
+from ..contradictions import contradictions
 from ..identification import Identification
 from ..logs.dataset import Dataset
 from ..logs.excerpts import evened, jitters
@@ -129,8 +131,11 @@ def identified(
         outcome, motion = _steadiest(tries, body)
         found = identification(outcome, findings)
         found = attrs.evolve(found, report=_with_motion(found.report, motion, body))
+    logs = [one.log for one in samples.logs]
+    report = {**found.report, "baselines": baselines(logs, judge.fit, judge.judge)}
+    report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
-    return found
+    return attrs.evolve(found, report=report)
 
 
 def _whole(model: Model, judge: Judge, learned: Learned | None) -> Model:

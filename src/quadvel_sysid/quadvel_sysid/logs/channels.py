@@ -88,7 +88,8 @@ def gains(log: Log) -> Iterator[Finding]:
     """Gains that are not there, change, or are negative."""
     for field, values in (("kp", log.kp), ("kd", log.kd)):
         if values is None:
-            yield Finding("note", field, (), f"{field}: not in the log; it is fitted")
+            fitted = "" if log.tau is None else "; it is fitted"
+            yield Finding("note", field, (), f"{field}: not in the log{fitted}")
             continue
         if (values < 0.0).any():
             text = f"{field}: found {values.min():g}, expected gains of 0 or more"

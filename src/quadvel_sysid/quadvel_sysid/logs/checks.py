@@ -40,10 +40,10 @@ class Inspection:
     findings: tuple[Finding, ...]
 
     def raise_refusal(self) -> None:
-        """Raises LogError with the first refusal, if there is one."""
-        for finding in self.findings:
-            if finding.kind == "refusal":
-                raise LogError(f"{self.log.name}: {finding.text}")
+        """Raises LogError with what was refused, if anything was."""
+        refused = [finding.text for finding in self.findings if finding.kind == "refusal"]
+        if refused:
+            raise LogError(f"{self.log.name}: {'; and '.join(refused)}")
 
 
 def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
@@ -66,8 +66,8 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     found = None if _refused(findings) else response.measured(log)
     for check in OF_RESPONSE if found else ():
         log = _looked(check, findings, log, found)
-    for check in OF_MOTION:
-        log = _looked(check, findings, log)
+    if not _refused(findings):  # these say nothing of each other: all are heard
+        findings += [one for check in OF_MOTION for one in check.look(log) if isinstance(one, Finding)]
     return Inspection(log, tuple(findings))
 
 
