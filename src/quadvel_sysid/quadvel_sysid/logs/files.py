@@ -29,7 +29,7 @@ LONG = 16_000_000
 """Values (128 MB in double precision) above which a log is kept in single precision."""
 LARGEST = 120_000_000
 """Values: 20 minutes of 12 joints at 1 kHz with 8 quantities."""
-LARGEST_DOCUMENT = 200_000_000
+LARGEST_DOCUMENT = 100_000_000
 """Characters of a JSON document, which is read whole."""
 LINES = 20_000  # of a table, read at once
 LONGEST_LINE = 1 << 20  # characters

@@ -22,6 +22,7 @@ LOST = 0.2
 SHORTEST = 0.15  # s, of a stretch out of PD control
 MARGIN = 0.1  # s, on both sides of it
 LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
+ENOUGH = 40_000  # rows, of which the lag is read
 
 
 def without_position_gain(log: Log) -> Bools:
@@ -47,7 +48,9 @@ def _unanswered(log: Log) -> Bools:
     """Torque against position error, in short windows over all joints: where is the gain far below its usual size?"""
     steps = np.diff(((log.t - log.t[0]) / BIN).astype(np.intp), prepend=0)
     bins = np.cumsum(np.minimum(steps, WINDOW))  # a gap is as good as one that no window bridges
-    lag, sums = max(((lag, _sums(log, bins, lag)) for lag in LAGS), key=lambda one: _explained(one[1]))
+    some = np.flatnonzero(bins % max(1, len(bins) // ENOUGH) == 0)
+    lag = max(LAGS, key=lambda lag: _explained(_sums(log, bins, some, lag)))
+    sums = _sums(log, bins, np.arange(len(bins)), lag)
     count, ee, ed, dd, et, dt, _ = (np.convolve(row, np.ones(WINDOW), "same") for row in sums)
     determinant = ee * dd - ed**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -99,12 +102,12 @@ def _answers(log: Log, rows: NDArray[np.intp], lag: float) -> Iterator[tuple[Arr
         yield use, e, -use * log.dq[row, j], use * log.tau[rows, j]
 
 
-def _sums(log: Log, bins: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
-    """Sums in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
+def _sums(log: Log, bins: NDArray[np.intp], rows: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+    """Sums of `rows` in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
     total = np.zeros((7, bins[-1] + 1))
-    for use, e, d, tau in _answers(log, np.arange(len(log.t)), lag):
+    for use, e, d, tau in _answers(log, rows, lag):
         for k, product in enumerate((use, e * e, e * d, d * d, e * tau, d * tau, tau * tau)):
-            total[k] += np.bincount(bins, product, len(total[k]))
+            total[k] += np.bincount(bins[rows], product, len(total[k]))
     return total
 
 

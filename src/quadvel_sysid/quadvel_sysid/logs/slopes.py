@@ -19,6 +19,8 @@ WIDTHS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65, 91)
 """Rows that are looked at together."""
 ORDER = 3
 """Of the polynomial: its slope at the middle row is free of the second and the fourth derivative."""
+ENOUGH = 20_000
+"""Rows in a row, of which the width is read."""
 GAP = 3.5
 """Times the usual spacing, beyond which rows are no neighbours."""
 
@@ -49,20 +51,22 @@ def smoothed(t: Array, q: Array, tau: Array | None = None) -> Smooth:
                 one = cumulative_trapezoid(one - one.mean(axis=0), t[piece], axis=0, initial=0.0)
                 pushed[k, piece] = one = one - one.mean(axis=0)
     longest = max(pieces, key=len)
+    longest = longest[max(0, len(longest) - ENOUGH) // 2 :][:ENOUGH]
     tries = [_left_out(q[longest], pushed[1, longest], w) for w in WIDTHS if w <= len(longest)]
     _, width, mobility = min(tries, key=lambda one: one[0], default=(0.0, 0, np.zeros((q.shape[1],) * 2)))
-    speed, angle = (x @ mobility for x in pushed)
-    rest = q - angle
-    level, slope = rest.copy(), np.zeros_like(q)
+    level, slope = q.copy(), np.zeros_like(q)
     for piece in pieces:
         of_it = max((w for w in WIDTHS if w <= min(width, len(piece))), default=0)
-        if of_it:
-            rate = savgol_filter(t[piece], of_it, ORDER, deriv=1)[:, None]
-            level[piece] = savgol_filter(rest[piece], of_it, ORDER, axis=0)
-            slope[piece] = savgol_filter(rest[piece], of_it, ORDER, deriv=1, axis=0) / rate
-        elif len(piece) > 1:
-            slope[piece] = np.gradient(rest[piece], t[piece], axis=0)
-    return Smooth(level + angle, slope + speed, (width - 1) * usual)
+        for j in range(q.shape[1]) if len(piece) > 1 else ():  # one by one: a log may be long
+            speed, angle = (x[piece] @ mobility[:, j] for x in pushed)
+            rest = q[piece, j] - angle
+            if of_it:
+                rate = savgol_filter(t[piece], of_it, ORDER, deriv=1)
+                level[piece, j] = savgol_filter(rest, of_it, ORDER) + angle
+                slope[piece, j] = savgol_filter(rest, of_it, ORDER, deriv=1) / rate + speed
+            else:
+                slope[piece, j] = np.gradient(q[piece, j], t[piece])
+    return Smooth(level, slope, max(width - 1, 2) * usual)
 
 
 def _left_out(q: Array, pushed: Array, width: int) -> tuple[float, int, Array]:
