@@ -143,8 +143,10 @@ def _is_wanted(plain: bool, sources: Mapping[str, Source], name: str) -> bool:
     base = name.partition("/")[0]
     if any(base == column or name == column for one in sources.values() for column in one.columns):
         return True
+    if not plain:
+        return False
     usual = (*FIELDS, NAMES, *(alias for names in ALIASES.values() for alias in names))
-    return plain and base in usual and base not in sources
+    return base in usual
 
 
 def _plain(
@@ -157,7 +159,7 @@ def _plain(
 ) -> list[str] | None:
     """Adds the fields that no map names, by their own names or aliases; the joints as q's columns name them."""
     there = {name.partition("/")[0] for name in raw.arrays}
-    used = {column for source in names.sources.values() for column in source.columns}
+    used = {column for one in names.sources.values() if one.file is None for column in one.columns}
     for name in FIELDS:
         if name in names.sources:
             continue
@@ -185,18 +187,16 @@ def _stacked(
     own = None
     if len(columns) == 1 and columns[0] not in arrays:
         of_joints = {name.partition("/")[2]: name for name in arrays if name.startswith(f"{columns[0]}/")}
-        own = list(of_joints) or None
-        if joints and own and sorted(own) == sorted(joints):
+        own = list(of_joints)
+        if own and joints and sorted(own) == sorted(joints):
             own = joints
-        elif joints and own and field != "q":
+        elif own and joints and field != "q":
             odd = sorted(set(own) ^ set(joints))
             raise LogError(f"{path}: {field}/{odd[0]}: the columns of {field} and of q name different joints")
-        columns = tuple(of_joints[joint] for joint in own or ())
-    missing = [name for name in columns if name not in arrays]
-    if missing or not columns:
-        raise LogError(
-            f"{path}: {field}: no '{(missing or columns or ('',))[0]}' in it, found {some(list(arrays), 12)}"
-        )
+        columns = tuple(of_joints[joint] for joint in own) or columns
+    for name in columns:
+        if name not in arrays:
+            raise LogError(f"{path}: {field}: no '{name}' in it, found {some(list(arrays), 12)}")
     values = (
         arrays[columns[0]]
         if len(columns) == 1 and own is None

@@ -22,6 +22,8 @@ ROWS = 4000
 """Rows that are looked at, spread over the log."""
 LAG_STEP, REACH = 0.002, 0.1
 """s between the lags that are looked at, a row of the log at least, and how far they go to either side."""
+ROUNDING = 1e-9
+"""s, by which a command may be later than the instant at which it counts, a sum of rounded numbers."""
 CLOCK_STEP, CLOCK_REACH = 0.02, 1.0
 """The same, more coarsely, for clocks that differ."""
 AT_REST = 0.05
@@ -68,7 +70,8 @@ class Response:
 def measured(log: Log) -> Response | None:
     """The response in the valid rows of a log with torque; None where it is too short or nothing moves."""
     log = log.without_feed_forward()
-    row = np.flatnonzero(log.valid.any(axis=1))
+    known = (log.t > log.t_cmd[0] + REACH) & (log.t < log.t_cmd[-1] - REACH)
+    row = np.flatnonzero(log.valid.any(axis=1) & known)
     row = row[:: max(1, len(row) // ROWS)]
     if log.tau is None or len(row) < 50:
         return None
@@ -76,7 +79,7 @@ def measured(log: Log) -> Response | None:
     fine = step * np.arange(-int(REACH / step + 0.5), int(REACH / step + 0.5) + 1)
     coarse = np.arange(-CLOCK_REACH, CLOCK_REACH + 0.5 * CLOCK_STEP, CLOCK_STEP)
     lags = np.sort(np.concatenate([fine, coarse[np.abs(coarse) > REACH + step]]))
-    at = [log.command_rows(log.t[row] - lag) for lag in lags]
+    at = [log.command_rows(log.t[row] - lag + ROUNDING) for lag in lags]
     found = [_of_joint(log, row, at, j, np.abs(lags) <= REACH + 1e-9) for j in range(len(log.joints))]
     left, command, angle, gain, answer, errors = zip(*found, strict=True)
     return Response(
@@ -183,7 +186,7 @@ def _left(found: Response, j: int, k: int, m: int) -> float:
     tau, q, dq = (np.asarray(x, dtype=float) for x in (log.tau[row, j], log.q[row, m], log.dq[row, m]))
     shares = []
     for lag in (0.0, 0.006, 0.012):
-        q_des = np.asarray(log.q_des[log.command_rows(log.t[row] - lag), k], dtype=float)
+        q_des = np.asarray(log.q_des[log.command_rows(log.t[row] - lag + ROUNDING), k], dtype=float)
         y, error = (_without(_motion(q, dq), x) for x in (tau, q_des - q))
         shares.append(float(np.var(_residual(y, error) if error @ y > 0.0 else y) / (np.var(tau) + 1e-12)))
     return min(shares)
@@ -292,7 +295,10 @@ def followed(log: Log) -> Iterator[Finding]:
     row = row[:: max(1, len(row) // ROWS)]
     q = _unit(log.q[row])
     alike = np.stack(
-        [q.T @ _unit(log.q_des[log.command_rows(log.t[row] - lag)]) for lag in np.arange(0.0, REACH, 0.01)]
+        [
+            q.T @ _unit(log.q_des[log.command_rows(log.t[row] - lag + ROUNDING)])
+            for lag in np.arange(0.0, REACH, 0.01)
+        ]
     )  # (L, J, J)
     most, least = alike.max(axis=0), alike.min(axis=0)
     opposite = least.diagonal()
