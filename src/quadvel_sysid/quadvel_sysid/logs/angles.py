@@ -26,6 +26,8 @@ DOWN_TO_ZERO = 0.1
 """Of its usual largest size: what a quantity comes below in one row of twenty where it comes down to 0."""
 ALIKE, OFF = 0.95, 1.4
 """Correlation of dq with the slope of q from which their ratio is a unit, and how far, as a factor, that may be off 1."""
+UNLIKE = 0.3
+"""Correlation of dq with the slope of q below which they have nothing to do with each other."""
 DEAD = 2e-4
 """Of the slope of q, that a speed of 0 may be by its noise."""
 TURNS = 10.0
@@ -35,9 +37,11 @@ UNITS_OF_SPEED = (
     (DEGREE, "dq is in degrees/s where q is in rad"),
     (1e-3, "q is in units of 1000 rad, or t in milliseconds"),
     (1e3, "dq is in units of 1000 rad/s, or t in 1000 s"),
-    (60.0 / TURN, "q is in rad where dq is in turns a minute, or the other way round"),
+    (TURN / 60.0, "dq is in turns a minute where q is in rad"),
 )
-"""What the slope of q divided by dq may be, when it is not 1, within a factor of 1.7 or less: the mistake behind it."""
+"""What the slope of q divided by dq may be, when it is not 1: the mistake behind it."""
+WITHIN = np.log(1.7)
+"""Of the logarithm of such a ratio, that noisy speeds may be off it."""
 
 
 def wrapped(log: Log) -> Iterator[Finding | Log]:
@@ -57,7 +61,13 @@ def wrapped(log: Log) -> Iterator[Finding | Log]:
             f"q: jumps by {unit} in one row, {int(jumps.sum())} times on {some(names(log, hit))}; unwrapped"
         )
         yield Finding("warning", "q", names(log, hit), text)
-        yield attrs.evolve(log, q=q, q_des=np.where(hit, q_des, log.q_des))
+        leap = (
+            np.diff(q - log.q, axis=0, prepend=0.0 * q[:1])
+            / np.diff(log.t, prepend=log.t[0] - log.period)[:, None]
+        )
+        differs = np.abs(log.dq + leap) < 0.5 * np.abs(leap)  # dq that was taken over the jump
+        dq = np.where(differs, log.dq + leap, log.dq)
+        yield attrs.evolve(log, q=q, dq=dq, q_des=np.where(hit, q_des, log.q_des))
         return
 
 
@@ -89,32 +99,43 @@ def sign_of_torque(log: Log) -> Iterator[Finding]:
 
 
 def speed(log: Log) -> Iterator[Finding | Log]:
-    """Speeds that are not there, have no sign, or are the difference of coarse angles: made anew from the angles."""
+    """Speeds that are not there, have no sign, are not the slope of q, or are the difference of coarse angles: made anew."""
     row = rows_of(log)
-    unsign = unsigned(np.asarray(log.dq[row], dtype=float), slope_of_q(log, row))
+    slope, dq = slope_of_q(log, row), np.asarray(log.dq[row], dtype=float)
+    moving = (np.minimum(_size(slope), _size(dq)) > MOVING) & (np.ptp(log.q, axis=0) > REACHES)
     coarse = tick(log.q)
-    kind: Kind = "warning"
-    if "dq" in log.made:
-        hit, kind, why = np.ones(len(log.joints), bool), "note", "dq: not in the log; made from q"
-    elif unsign.any():
-        hit = unsign
-        why = f"dq: has no sign on {some(names(log, unsign))}: it is never negative, though q goes both ways; made from q"
-    else:
-        hit = (coarse > 0.0) & _is_difference(log)
-        size = some([f"{1e3 * step:.3g}" for step in dict.fromkeys(np.round(coarse[hit], 7))], 2)
-        why = f"q, dq: q counts in steps of {size} mrad, and dq is its difference; both made anew"
-    if not hit.any():
-        return
-    made = smoothed(log.t, log.q, log.tau)
-    mended = attrs.evolve(
-        log, q=np.where(hit & (coarse > 0.0), made.q, log.q), dq=np.where(hit, made.dq, log.dq)
-    )
-    if kind == "warning" and not unsign.any() and _explained(mended) < _explained(log):
-        text = "q counts in steps, and dq is its difference, which the drive acted on; they stay as logged"
-        yield Finding("note", "dq", names(log, hit), f"dq: {text}")
-        return
-    yield Finding(kind, "dq", names(log, hit), f"{why} by cubics over {1e3 * made.span:.3g} ms")
-    yield mended
+    size = some([f"{1e3 * step:.3g}" for step in dict.fromkeys(np.round(coarse[coarse > 0.0], 7))], 2)
+    counts = f"q, dq: q counts in steps of {size} mrad, dq is its difference; made anew"
+    cases: tuple[tuple[Kind, Bools, str], ...] = (
+        ("note", np.full(len(coarse), "dq" in log.made), "dq: not in the log; made from q"),
+        ("warning", unsigned(dq, slope), "dq: has no sign on {}: it is never negative, though q goes both ways; made from q"),
+        ("warning", moving & (np.abs(_alike(slope, dq)) < UNLIKE), "dq: is not the slope of q on {}; made from q"),
+        ("warning", (coarse > 0.0) & _is_difference(log), counts),
+    )  # fmt: skip
+    for kind, hit, text in cases:
+        if hit.any():
+            made = smoothed(log.t, log.q, log.tau)
+            mended = attrs.evolve(
+                log, q=np.where(hit & (coarse > 0.0), made.q, log.q), dq=np.where(hit, made.dq, log.dq)
+            )
+            if "dq" not in log.made and _explained(mended) < _explained(log):
+                text += ": but the drive acted on it, and it stays as logged"
+                yield Finding("note", "dq", names(log, hit), text.format(some(names(log, hit))))
+            else:
+                text += f" by cubics over {1e3 * made.span:.3g} ms"
+                yield Finding(kind, "dq", names(log, hit), text.format(some(names(log, hit))))
+                yield mended
+            return
+
+
+def _size(x: Array) -> Array:
+    """Root mean square of each column."""
+    return np.asarray(np.sqrt(np.mean(x**2, axis=0)))
+
+
+def _alike(a: Array, b: Array) -> Array:
+    """Correlation of each column about 0; that of nothing is 0."""
+    return np.asarray(np.mean(a * b, axis=0) / (_size(a) * _size(b) + 1e-12))
 
 
 def _explained(log: Log) -> float:
@@ -135,33 +156,33 @@ def units(log: Log) -> Iterator[Finding]:
     """What dq is beside the slope of q: nothing, a multiple of it, its opposite, or something else."""
     row = rows_of(log)
     slope, dq = slope_of_q(log, row), np.asarray(log.dq[row], dtype=float)
-    turning, size = (np.sqrt(np.mean(x**2, axis=0)) for x in (slope, dq))
+    turning, size, alike = _size(slope), _size(dq), _alike(slope, dq)
     moving = (size > MOVING) & (np.ptp(log.q, axis=0) > REACHES)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = np.mean(slope * dq, axis=0) / size**2
-        alike = ratio * size / turning
-        off = np.abs(np.log(np.maximum(ratio, 1e-12)))
-    times = "the slope of q is {number:.3g} times dq on {joints}"
-    table: list[tuple[Kind, Bools, str, Array]] = [
-        (
-            "refusal",
-            moving & (np.abs(np.log(np.maximum(ratio, 1e-12) / factor)) < np.log(1.7)),
-            f"{times}: {mistake}",
-            ratio,
-        )
-        for factor, mistake in UNITS_OF_SPEED
-    ]
-    table += [
-        ("refusal", (turning > MOVING) & (size < DEAD * turning), "is 0 on {joints} although q moves; expected rad/s", ratio),
-        ("refusal", moving & (ratio < -0.3), "has the opposite sign of the slope of q on {joints}", ratio),
-        ("refusal", moving & (alike > ALIKE) & (off > np.log(OFF)), f"{times}; expected q in rad, dq in rad/s, t in s", ratio),
-        ("warning", moving & ((ratio < 0.5) | (ratio > 2.0)), "is not the slope of q on {joints}: correlation {number:.2f}", alike),
-    ]  # fmt: skip
-    for kind, hit, text, numbers in table:
+    ratio = alike * turning / (size + 1e-12)
+    off = np.abs(np.log(np.maximum(ratio, 1e-12)))
+    known = np.any(
+        [np.abs(np.log(np.maximum(ratio, 1e-12) / factor)) < WITHIN for factor, _ in UNITS_OF_SPEED], axis=0
+    )
+    clear = (alike > ALIKE) & (off > np.log(OFF))
+    cases: tuple[tuple[Kind, Bools, str], ...] = (
+        ("refusal", (turning > MOVING) & (size < DEAD * turning), "is 0 on {joints} although q moves; expected rad/s"),
+        ("refusal", moving & (alike < -UNLIKE), "has the opposite sign of the slope of q on {joints}"),
+        ("refusal", moving & (clear | known), "the slope of q is {number:.3g} times dq on {joints}: {unit}"),
+        ("warning", moving & (off > np.log(2.0)), "on {joints} the slope of q is {number:.2f} times dq: a noisy speed?"),
+    )  # fmt: skip
+    for kind, hit, text in cases:
         if hit.any():
-            joints = names(log, hit)
-            said = text.format(joints=some(joints), number=float(np.median(numbers[hit])))
-            yield Finding(kind, "dq", joints, f"dq: {said}")
+            number = float(np.median(ratio[hit]))
+            unit = next(
+                (
+                    text
+                    for factor, text in UNITS_OF_SPEED
+                    if abs(np.log(max(number, 1e-12) / factor)) < WITHIN
+                ),
+                "expected q in rad, dq in rad/s, t in s",
+            )
+            said = text.format(joints=some(names(log, hit)), number=number, unit=unit)
+            yield Finding(kind, "dq", names(log, hit), f"dq: {said}")
             return
 
 

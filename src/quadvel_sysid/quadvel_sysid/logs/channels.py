@@ -125,7 +125,15 @@ def held(log: Log) -> Iterator[Finding | Log]:
         )
         yield Finding("warning", "q", (), text)
         yield fresh
-    elif repeated:
+        return
+    if log.tau is not None:
+        late = (np.diff(log.tau, axis=0) == 0.0).all(axis=1)
+        if late[moving].mean() > MOSTLY:
+            share = 100.0 * late[moving].mean()
+            text = f"tau: {share:.0f} % of the rows repeat the torque before; those in which it changed are judged"
+            yield Finding("warning", "tau", (), text)
+            yield attrs.evolve(log, valid=log.valid & ~np.concatenate([[False], late])[:, None])
+    if repeated:
         text = f"q: {repeated} rows ({100 * share:.1f} % of those in motion) repeat the row before"
         yield Finding("warning" if share > 0.01 else "note", "q", (), text)
 

@@ -11,15 +11,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import attrs
-import numpy as np
 
 from . import angles, channels, response, separability, slopes, stamps
-from .findings import Finding, some
-from .log import Array, Bools, Log, LogError
-from .pd_control import in_words, out_of_control, stretches, without_position_gain
-
-LEAST_VALID = 0.5
-"""s, of states that a model may be judged on."""
+from .findings import Finding
+from .log import Log, LogError
+from .pd_control import explainable
 
 
 @attrs.frozen
@@ -60,7 +56,7 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     if _refused(findings):
         return Inspection(log, tuple(findings))
     answer = log.without_feed_forward()
-    valid, why = _explainable(answer)
+    valid, why = explainable(answer)
     findings += why
     log = attrs.evolve(log, valid=valid)
     found = None if _refused(findings) else response.measured(log)
@@ -87,57 +83,24 @@ def _refused(findings: list[Finding]) -> bool:
 
 
 OF_ROWS = (
-    Check(
-        stamps.clocks,
-        "spacing of the rows, s; its longest step; the spans of t and t_cmd",
-        f"{stamps.FASTEST:g} to {stamps.SLOWEST:g} s; a day; {stamps.LONGEST_SPAN:g} times as long",
-        "refusal",
-    ),
+    Check(stamps.clocks, "spacing of the rows, s; its longest step; the spans of t and t_cmd",
+          f"{stamps.FASTEST:g} to {stamps.SLOWEST:g} s; a day; {stamps.LONGEST_SPAN:g} times as long", "refusal"),
     Check(stamps.rates, "spacings, in times of the usual one", f"{slopes.GAP:g}", "note, warning of gaps"),
     Check(channels.still, "span of q, rad", f"{channels.REACHES:g}", "warning; on all joints a refusal"),
-    Check(
-        channels.held,
-        "share of the rows in motion that repeat the whole state before",
-        f"{channels.MOSTLY:.0%}",
-        "the rows in which it changed are used, with a warning",
-    ),
-    Check(
-        angles.wrapped,
-        "steps of q from one row to the next, rad off a full turn",
-        f"{angles.WRAPPED:g}",
-        "unwrapped, with a warning",
-    ),
-    Check(
-        angles.speed,
-        "dq that is not there; that never changes its sign while the slope of q does; that is the difference of an encoder's steps",
-        f"each sign in {angles.BOTH_WAYS:.0%} of the rows",
-        "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays",
-    ),
-    Check(
-        angles.sign_of_torque,
-        "share of the rows with the rarer sign of the position error, where tau has one sign and comes down to 0",
-        f"{angles.BOTH_WAYS:.0%}",
-        "refusal",
-    ),
-    Check(
-        angles.units,
-        "slope of q over dq, and their correlation",
-        f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}",
-        "refusal, with the unit that would explain it",
-    ),
-    Check(
-        angles.degrees,
-        "size of q_des over that of q; size of q, rad",
-        f"25 to 130; {angles.TURNS:g}",
-        "refusal",
-    ),
+    Check(channels.held, "share of the rows in motion that repeat the whole state before, or its torque", f"{channels.MOSTLY:.0%}",
+          "the rows in which it changed are used, with a warning"),
+    Check(angles.wrapped, "steps of q from one row to the next, rad off a full turn", f"{angles.WRAPPED:g}",
+          "unwrapped, with a warning"),
+    Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
+          f"each sign in {angles.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
+          "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
+    Check(angles.sign_of_torque, "share of the rows with the rarer sign of the position error, where tau has one and comes down to 0",
+          f"{angles.BOTH_WAYS:.0%}", "refusal"),
+    Check(angles.units, "slope of q over dq, and their correlation",
+          f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
+    Check(angles.degrees, "size of q_des over that of q; size of q, rad", f"25 to 130; {angles.TURNS:g}", "refusal"),
     Check(channels.copies, "joints whose q or tau is the same to the bit", "all rows", "warning"),
-    Check(
-        channels.ranges,
-        "q beyond the range that the model's joint of that name has, rad",
-        f"{channels.REACH:g}",
-        "warning",
-    ),
+    Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
     Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
     Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
     Check(channels.gains, "kp and kd: there, constant, not negative", "0", "note; refusal of negative ones"),
@@ -145,126 +108,34 @@ OF_ROWS = (
 """What is asked of all rows."""
 
 OF_CLOCKS = Check(
-    response.clock,
-    "lag from command to torque that leaves least, s; what it leaves over what one near 0 leaves",
-    f"{response.REACH:g} s; {response.BETTER:g}",
-    "refusal",
-)
+    response.clock, "lag from command to torque that leaves least, s; what it leaves over what one near 0 leaves",
+    f"{response.REACH:g} s; {response.BETTER:g}", "refusal",
+)  # fmt: skip
 """What is asked of all rows of a log with torque, whatever the drives did."""
 
 OF_RESPONSE = (
-    Check(
-        response.signs,
-        "partial correlation of torque and own command, beside the joint's angle, speed and direction, at the best lag",
-        f"below {-response.CLEAR:g}",
-        "refusal: which of q, q_des and tau has the opposite sign",
-    ),
-    Check(
-        response.columns,
-        "share of the torque left by the best order of joints, over that left by the order as it is",
-        f"{response.BETTER:g} on two joints or more whose commands differ (correlation below {response.SAME:g})",
-        "refusal",
-    ),
-    Check(
-        response.early,
-        "lag from command to torque that leaves least, s; what it explains more than the best one that a drive can have, in "
-        f"standard errors over pieces of {response.PIECE:g} s",
-        f"0; {response.EARLY:g}",
-        "refusal",
-    ),
-    Check(
-        response.deaf,
-        "share of the torque, beside speed and friction, that the position error explains",
-        f"{response.UNANSWERED:.0%}",
-        "warning; on all joints a refusal",
-    ),
-    Check(
-        response.scale,
-        "gain that the torque shows over the one commanded",
-        f"a factor of {response.FAR_OFF:g}",
-        "refusal where a unit or one joint explains it; else the gains are in a servo's own unit and are fitted, with a warning",
-    ),
+    Check(response.columns, "share of the torque left by the best order of joints, over that left by the order as it is",
+          f"{response.BETTER:g} on two joints or more whose commands differ (correlation below {response.SAME:g})", "refusal"),
+    Check(response.signs, "partial correlation of torque and own command, beside the joint's angle, speed and direction",
+          f"below {-response.SURE:g}", "refusal: which of q, q_des and tau has the opposite sign"),
+    Check(response.early, "lag from command to torque that leaves least, s; what it explains more than the best one from 0 on, "
+          f"in standard errors over pieces of {response.PIECE:g} s", f"0; {response.EARLY:g}", "refusal"),
+    Check(response.deaf, "share of the torque, beside speed and friction, that the position error explains",
+          f"{response.UNANSWERED:.0%}", "warning; on all joints a refusal"),
+    Check(response.scale, "gain that the torque shows over the one commanded", f"a factor of {response.FAR_OFF:g}",
+          "refusal where a unit or one joint explains it; else the gains are in a servo's own unit and are fitted, with a warning"),
 )  # fmt: skip
 """What is asked of logs with torque, in the rows under PD control."""
 
 OF_MOTION = (
-    Check(
-        response.followed,
-        f"without torque: correlation r of q with commands up to {response.REACH:g} s before; 1 - r^2 of the best order of joints "
-        "over that of the order as it is",
-        f"r below {-response.CLEAR:g} at every lag; {response.BETTER:g} on two joints or more",
-        "refusal: the sign, or the order of the joints",
-    ),
+    Check(response.followed, f"without torque: correlation r of q with commands up to {response.REACH:g} s before; 1 - r^2 "
+          "of the best order of joints over that of the order as it is",
+          f"r below {-response.CLEAR:g} at every lag; {response.BETTER:g} on two joints", "refusal: the sign, or the order"),
     Check(channels.scaled, "tau, kp and kd that are there", "the torque or both gains", "refusal"),
-    Check(
-        separability.collinear,
-        "share of what a parameter does to the torque that no mix of the others does",
-        f"{separability.APART:g}",
-        "note or warning, with the motion that would separate them",
-    ),
-)
-"""What is asked of the motion, in the rows under PD control."""
-
-
-def _explainable(log: Log) -> tuple[Bools, list[Finding]]:
-    """The rows that a PD model can explain, and what was left out of the others."""
-    findings: list[Finding] = []
-    for exclude in (_as_the_log_says, _before_commands, _without_gain, _unanswered):
-        out, why = exclude(log)
-        log = attrs.evolve(log, valid=log.valid & ~out)
-        findings += why
-    seconds = float(log.valid.any(axis=1).sum()) * log.period
-    if seconds < LEAST_VALID:
-        text = f"valid: {seconds:.2f} s under PD control are left, expected {LEAST_VALID} s or more"
-        findings.append(Finding("refusal", "valid", (), text))
-    return log.valid, findings
-
-
-def _as_the_log_says(log: Log) -> tuple[Bools, list[Finding]]:
-    masked: Bools = ~log.valid
-    if not masked.any():
-        return masked, []
-    text = f"valid: false {_spans(masked.any(axis=1), log.t)}; left out, as the log says"
-    return masked, [Finding("note", "valid", (), text)]
-
-
-def _before_commands(log: Log) -> tuple[Bools, list[Finding]]:
-    early: Bools = (log.t < log.t_cmd[0])[:, None]
-    text = f"t_cmd: no command before {log.t_cmd[0]:.3f} s; left out"
-    return early, [Finding("note", "t_cmd", (), text)] if early.any() else []
-
-
-def _without_gain(log: Log) -> tuple[Bools, list[Finding]]:
-    off = without_position_gain(log)
-    everywhere: Any = off.all(axis=1)
-    findings = []
-    if everywhere.any():
-        text = f"kp: 0 (damping, switched off or torque control) {_spans(everywhere, log.t)}; left out"
-        findings.append(Finding("warning", "kp", (), text))
-    alone = tuple(log.joints[j] for j in np.flatnonzero((off & ~everywhere[:, None]).any(axis=0)))
-    if alone:
-        text = f"kp: 0 at times on {some(alone)} alone; left out there"
-        findings.append(Finding("warning", "kp", alone, text))
-    return off, findings
-
-
-def _unanswered(log: Log) -> tuple[Bools, list[Finding]]:
-    lost = out_of_control(log)
-    if not lost.any():
-        return lost[:, None], []
-    field, what = (
-        ("q", "the joints no longer follow") if log.tau is None else ("tau", "the torque no longer answers")
-    )
-    text = (
-        f"{field}: {what} the position error {_spans(lost, log.t)}: not under PD control "
-        "(damping or switched off); left out"
-    )
-    return lost[:, None], [Finding("warning", field, (), text)]
-
-
-def _spans(rows: Any, t: Array) -> str:
-    spans = stretches(rows, t)
-    return f"{in_words(spans, t)} ({sum(last - first for first, last in spans):.2f} s)"
+    Check(separability.collinear, "share of what a parameter does to the torque that no mix of the others does",
+          f"{separability.APART:g}", "note or warning, with the motion that would separate them"),
+)  # fmt: skip
+"""What is asked of the motion, in the rows under PD control; each is asked, whatever the others say."""
 
 
 def table() -> str:

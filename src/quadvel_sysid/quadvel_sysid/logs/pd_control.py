@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from .findings import Finding, some
 from .log import Array, Bools, Log
 
 BIN = 0.02  # s
@@ -21,8 +23,70 @@ LOST = 0.2
 """Share of the usual position gain below which the position error is no longer answered."""
 SHORTEST = 0.15  # s, of a stretch out of PD control
 MARGIN = 0.1  # s, on both sides of it
+LEAST_VALID = 0.5  # s, of states that a model may be judged on
 LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
 ENOUGH = 40_000  # rows, of which the lag is read
+
+
+def explainable(log: Log) -> tuple[Bools, list[Finding]]:
+    """The rows that a PD model can explain, and what was left out of the others."""
+    findings: list[Finding] = []
+    for exclude in (_as_the_log_says, _before_commands, _without_gain, _no_longer):
+        out, why = exclude(log)
+        log = attrs.evolve(log, valid=log.valid & ~out)
+        findings += why
+    seconds = float(log.valid.any(axis=1).sum()) * log.period
+    if seconds < LEAST_VALID:
+        text = f"valid: {seconds:.2f} s under PD control are left, expected {LEAST_VALID} s or more"
+        findings.append(Finding("refusal", "valid", (), text))
+    return log.valid, findings
+
+
+def _as_the_log_says(log: Log) -> tuple[Bools, list[Finding]]:
+    masked: Bools = ~log.valid
+    if not masked.any():
+        return masked, []
+    text = f"valid: false {_spans(masked.any(axis=1), log.t)}; left out, as the log says"
+    return masked, [Finding("note", "valid", (), text)]
+
+
+def _before_commands(log: Log) -> tuple[Bools, list[Finding]]:
+    early: Bools = (log.t < log.t_cmd[0])[:, None]
+    text = f"t_cmd: no command before {log.t_cmd[0]:.3f} s; left out"
+    return early, [Finding("note", "t_cmd", (), text)] if early.any() else []
+
+
+def _without_gain(log: Log) -> tuple[Bools, list[Finding]]:
+    off = without_position_gain(log)
+    everywhere: Any = off.all(axis=1)
+    findings = []
+    if everywhere.any():
+        text = f"kp: 0 (damping, switched off or torque control) {_spans(everywhere, log.t)}; left out"
+        findings.append(Finding("warning", "kp", (), text))
+    alone = tuple(log.joints[j] for j in np.flatnonzero((off & ~everywhere[:, None]).any(axis=0)))
+    if alone:
+        text = f"kp: 0 at times on {some(alone)} alone; left out there"
+        findings.append(Finding("warning", "kp", alone, text))
+    return off, findings
+
+
+def _no_longer(log: Log) -> tuple[Bools, list[Finding]]:
+    lost = out_of_control(log)
+    if not lost.any():
+        return lost[:, None], []
+    field, what = (
+        ("q", "the joints no longer follow") if log.tau is None else ("tau", "the torque no longer answers")
+    )
+    text = (
+        f"{field}: {what} the position error {_spans(lost, log.t)}: not under PD control "
+        "(damping or switched off); left out"
+    )
+    return lost[:, None], [Finding("warning", field, (), text)]
+
+
+def _spans(rows: Any, t: Array) -> str:
+    spans = stretches(rows, t)
+    return f"{in_words(spans, t)} ({sum(last - first for first, last in spans):.2f} s)"
 
 
 def without_position_gain(log: Log) -> Bools:
