@@ -94,7 +94,7 @@ OF_ROWS = (
     Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
           f"each sign in {angles.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
           "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(angles.sign_of_torque, "share of the rows with the rarer sign of the position error, where tau has one and comes down to 0",
+    Check(angles.sign_of_torque, "share of the rows with the rarer sign of the position error, where tau has one and reaches 0",
           f"{angles.BOTH_WAYS:.0%}", "refusal"),
     Check(angles.units, "slope of q over dq, and their correlation",
           f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
