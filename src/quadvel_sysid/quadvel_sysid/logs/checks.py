@@ -51,7 +51,7 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     for check in OF_ROWS:
         log = _looked(check, findings, log)
-    if not _refused(findings) and (found := response.measured(log)):
+    if not _refused(findings) and (found := response.measured(log, response.FAR)):
         log = _looked(OF_CLOCKS, findings, log, found)
     if _refused(findings):
         return Inspection(log, tuple(findings))
