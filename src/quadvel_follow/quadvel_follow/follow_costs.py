@@ -126,10 +126,11 @@ class FollowCost:
         return np.array([outline_distance(place, poses, half) - BODY for place in ahead(persons)])
 
     def _persons(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
+        """Nobody is met; past others, of whom one does not know where they go, the robot is slow."""
         every = np.vstack([situation.person[None], situation.others])
-        gap = self.gaps(every, rollouts.poses).min(0)
-        least = gap.min(1)
-        near = np.maximum(1.0 - gap, 0.0)
+        gaps = self.gaps(every, rollouts.poses)
+        least = gaps.min(axis=(0, 2))
+        near = np.maximum(1.0 - gaps[1:].min(0, initial=np.inf), 0.0)
         return (
             COLLISION * (least < GUARD) + 40.0 * np.maximum(0.5 - least, 0.0) ** 2 + (speed**2 * near).mean(1)
         )
