@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from .clearance import Clearance
 from .clusters import Scan
 from .dynamic_window import DynamicWindow
-from .follow_costs import BODY, FollowCost, Situation, ahead
+from .follow_costs import BODY, FollowCost, Situation, led_ahead
 from .obstacle_memory import ObstacleMemory
 from .pose_history import PoseHistory
 from .pursuit import pursue
@@ -390,7 +390,7 @@ class FollowPlanner:
 
     def _guesses(self, situation: Situation) -> Array:
         """Towards the goal, as if nothing stood about, (n, STEPS, 3)."""
-        person, pose = ahead(situation.person[None])[0], situation.pose
+        person, pose = led_ahead(situation.person), situation.pose
         start = np.broadcast_to(pose, (1, STEPS, 3))
         far = self._cost.errors(situation, start, person)[0][0]
         goal = self._cost.place(situation)
@@ -405,9 +405,8 @@ class FollowPlanner:
         braking[0, 0] = targets[0]
         stopping = attrs.evolve(situation.limits, deceleration=self.config.stop_deceleration)
         poses = roll_out(braking, situation.pose, situation.velocity, situation.command, stopping).poses
-        every = np.vstack([situation.person[None], situation.others])
         for way in (poses, planned):
-            gaps = self._cost.gaps(every, way)[..., TIMES < SOON]
+            gaps = self._cost.gaps(situation, way)[..., TIMES < SOON]
             if min(situation.clearance.of(way).min(), gaps.min()) > 0.0:
                 return True
         return False
