@@ -29,7 +29,7 @@ ROUNDING = 1e-9
 AT_REST = 0.05
 """rad/s, within which friction turns its sign."""
 
-# What the limits rest on prints `python -m tests.identification.limits FOLDER`, here with two walks and a replay of a Go2: 342 joints.
+# `python -m tests.identification.limits FOLDER` prints what the limits rest on, here with two walks and a replay of a Go2.
 CLEAR = 0.5
 """Share of the torque that a joint's command, angle and speed leave, below which they explain it: so for 95 % of the joints."""
 SURE = 0.8
