@@ -31,7 +31,7 @@ ENOUGH = 40_000  # rows, of which the lag is read
 def explainable(log: Log) -> tuple[Bools, list[Finding]]:
     """The rows that a PD model can explain, and what was left out of the others."""
     findings: list[Finding] = []
-    for exclude in (_as_the_log_says, _before_commands, _without_gain, _no_longer):
+    for exclude in (_before_commands, _without_gain, _no_longer):
         out, why = exclude(log)
         log = attrs.evolve(log, valid=log.valid & ~out)
         findings += why
@@ -40,14 +40,6 @@ def explainable(log: Log) -> tuple[Bools, list[Finding]]:
         text = f"valid: {seconds:.2f} s under PD control are left, expected {LEAST_VALID} s or more"
         findings.append(Finding("refusal", "valid", (), text))
     return log.valid, findings
-
-
-def _as_the_log_says(log: Log) -> tuple[Bools, list[Finding]]:
-    masked: Bools = ~log.valid
-    if not masked.any():
-        return masked, []
-    text = f"valid: false {_spans(masked.any(axis=1), log.t)}; left out, as the log says"
-    return masked, [Finding("note", "valid", (), text)]
 
 
 def _before_commands(log: Log) -> tuple[Bools, list[Finding]]:
@@ -72,16 +64,18 @@ def _without_gain(log: Log) -> tuple[Bools, list[Finding]]:
 
 def _no_longer(log: Log) -> tuple[Bools, list[Finding]]:
     lost = out_of_control(log)
-    if not lost.any():
-        return lost[:, None], []
     field, what = (
         ("q", "the joints no longer follow") if log.tau is None else ("tau", "the torque no longer answers")
     )
-    text = (
-        f"{field}: {what} the position error {_spans(lost, log.t)}: not under PD control "
-        "(damping or switched off); left out"
-    )
-    return lost[:, None], [Finding("warning", field, (), text)]
+    text = f"{field}: {what} the position error {_spans(lost, log.t)}: not under PD control (damping or switched off); left out"
+    return lost[:, None], [Finding("warning", field, (), text)] if lost.any() else []
+
+
+def masked(log: Log) -> Iterator[Finding]:
+    """Rows that the log itself says are not to be explained."""
+    out = ~log.valid.all(axis=1)
+    if out.any():
+        yield Finding("note", "valid", (), f"valid: false {_spans(out, log.t)}; left out, as the log says")
 
 
 def _spans(rows: Any, t: Array) -> str:
