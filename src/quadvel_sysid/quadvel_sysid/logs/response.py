@@ -109,7 +109,9 @@ def _of_joint(
     beside, of_c = _residual(y, p), c - np.outer(p, p @ c) / (p @ p + 1e-12)
     size = np.sqrt(np.sum(of_c**2, axis=0)) + 1e-9 * np.sqrt(len(row))
     r = beside @ of_c / size / (np.linalg.norm(beside) + 1e-12)
-    k = int(np.argmax(np.where(near, np.abs(r), -1.0)))
+    # Waves answer with either sign, half a period apart: the opposite one has to explain clearly more.
+    right, opposite = (int(np.argmax(np.where(near, sign * r, -1.0))) for sign in (1.0, -1.0))
+    k = opposite if 1.0 - r[opposite] ** 2 < BETTER * (1.0 - max(r[right], 0.0) ** 2) else right
     other = _residual(p, c[:, k])
     angle = float(other @ _residual(y, c[:, k]) / (np.linalg.norm(other) * np.linalg.norm(y) + 1e-12))
     error = c[:, k] - p
