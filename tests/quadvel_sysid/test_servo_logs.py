@@ -164,6 +164,18 @@ def test_joints_that_are_led_by_one_command_are_not_told_apart(tmp_path: Path) -
     assert not [text for text in said(looked_at(tmp_path, log | one), "refusal") if "columns" in text]
 
 
+def test_a_wave_that_would_answer_with_either_sign_has_its_own(tmp_path: Path) -> None:
+    """Half a period apart a wave is its opposite."""
+    t = 0.002 * np.arange(3000)
+    wave = np.sin(10.0 * np.pi * t[:, None] + [0.0, 1.0, 2.0])
+    q, dq = 0.1 * np.sin(10.0 * np.pi * t[:, None] - 0.5), np.pi * np.cos(10.0 * np.pi * t[:, None] - 0.5)
+    tau = (
+        KP * (np.roll(wave, 4, axis=0) - q) - 0.5 * dq + np.random.default_rng(0).normal(0.0, 0.3, wave.shape)
+    )
+    log = {"t": t, "q": np.tile(q, 3), "dq": np.tile(dq, 3), "q_des": wave, "tau": tau, "kp": KP, "kd": 0.5}
+    assert said(looked_at(tmp_path, log), "refusal") == []
+
+
 def test_damping_that_was_not_commanded_is_told(tmp_path: Path) -> None:
     found = looked_at(tmp_path, recorded(3) | {"kd": 0.0})
     assert "kd: 0 was commanded; the damping that the drive has of its own is fitted" in said(found, "note")
