@@ -410,6 +410,18 @@ def following(context: typer.Context) -> None:
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)
+def plot(context: typer.Context) -> None:
+    """Draw what was recorded of a run: velocity, joints, torques, the controller's loop."""
+    _hand_on(context, "quadvel_eval.recording_plot:plot_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def replay(context: typer.Context) -> None:
+    """Ask the actuator model and the estimator offline what they say of a recording."""
+    _hand_on(context, "quadvel_eval.offline:replay_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
 def bench(context: typer.Context) -> None:
     """Measure the speed of simulator, policy and loop on this machine."""
     _hand_on(context, "quadvel_eval.cli:bench_command")
