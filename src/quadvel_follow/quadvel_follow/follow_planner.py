@@ -5,6 +5,7 @@ Plain numbers and times; it knows no ROS. `follow_costs` says which ways are goo
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from enum import Enum
 from typing import Any
@@ -142,7 +143,7 @@ class FollowPlanner:
         self._poses = PoseHistory(self._mounting.tolist())
         self._memory = ObstacleMemory()
         self._trail = Trail()
-        self._waiting: _Heard | None = None  # a scan that is newer than the odometry
+        self._waiting: deque[_Heard] = deque(maxlen=5)  # scans that are newer than the odometry
         self._scan: _Heard | None = None
         self._odometry: _Heard | None = None
         self._person: _Heard | None = None
@@ -163,13 +164,13 @@ class FollowPlanner:
         if not np.isfinite(motion).all():
             raise ValueError(f"velocity is {motion.tolist()}, expected finite numbers")
         if stamp <= self._poses.newest:
-            self._scan = self._waiting = None
+            self._scan = None
+            self._waiting.clear()
             self._memory = ObstacleMemory()
         self._poses.add(stamp, pose)
         self._odometry = _Heard(now, stamp, (np.array(pose, float), motion))
-        if self._waiting is not None and self._waiting.stamp <= stamp:
-            waiting, self._waiting = self._waiting, None
-            self._use(waiting)
+        while self._waiting and self._waiting[0].stamp <= stamp:
+            self._use(self._waiting.popleft())
 
     def on_scan(
         self, now: float, stamp: float, ranges: ArrayLike, angle_min: float, angle_increment: float
@@ -179,7 +180,7 @@ class FollowPlanner:
         if stamp <= self._poses.newest:
             self._use(heard)
         else:
-            self._waiting = heard
+            self._waiting.append(heard)
 
     def _use(self, heard: _Heard) -> None:
         pose = self._poses.sensor_at(heard.stamp)
