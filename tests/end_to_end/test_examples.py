@@ -146,6 +146,7 @@ LEFT_OUT_KINDS = {
     r"mkdir -p out/training/.*": "copies a checkpoint that a training goes on from",
     r"(description|dds|recordings|driver's|view|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"(driver|controller|command_mux):.*": "a part of a parameter file",
+    r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }
 
 

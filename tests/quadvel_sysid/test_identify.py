@@ -12,6 +12,7 @@ from quadvel_sysid.engine.eam import fit_eam
 from quadvel_sysid.engine.identify import Options, identify
 from quadvel_sysid.engine.material import gathered
 from quadvel_sysid.engine.signals import Samples
+from quadvel_sysid.logs.dataset import Dataset
 
 JOINTS = NAMES[:2]
 
@@ -67,7 +68,7 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect(
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    material = gathered([log], values=3000)
+    material = gathered(Dataset.of([log]), values=3000)
     del log
     assert sum(len(piece.log.t) for piece in material.pieces) == 1500
     assert [array() for array in alive] == [None] * len(alive)

@@ -49,7 +49,7 @@ def test_joint_friction_shows_in_the_motion_and_the_replay_gains_by_it():
 
 def test_without_torque_and_gains_nothing_has_a_scale():
     log = attrs.evolve(_swinging(), kp=None, kd=None)
-    with pytest.raises(LogError, match="tau, kp: both are missing"):
+    with pytest.raises(LogError, match="tau, kp, kd: not in the log"):
         identify([log])
     assert identify([log], options=Options(gains=(30.0, 0.5))).report["effects"] == []
 

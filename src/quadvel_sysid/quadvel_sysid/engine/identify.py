@@ -13,7 +13,10 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
+from ..baselines import baselines
+from ..contradictions import contradictions
 from ..identification import Identification
+from ..logs.dataset import Dataset
 from ..logs.excerpts import evened, jitters
 from ..logs.findings import Finding
 from ..logs.log import Log, LogError
@@ -73,7 +76,8 @@ def identify(
     `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
     """
     options = options or Options()
-    material = gathered(train, heldout, options.gains, options.values, progress)
+    data = Dataset.of(train, heldout, options.gains)
+    material = gathered(data, options.gains, options.values, progress)
     return identified(material, options.base, options.cores, progress)
 
 
@@ -127,8 +131,11 @@ def identified(
         outcome, motion = _steadiest(tries, body)
         found = identification(outcome, findings)
         found = attrs.evolve(found, report=_with_motion(found.report, motion, body))
+    logs = [one.log for one in samples.logs]
+    report = {**found.report, "baselines": baselines(logs, judge.fit, judge.judge)}
+    report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
-    return found
+    return attrs.evolve(found, report=report)
 
 
 def _whole(model: Model, judge: Judge, learned: Learned | None) -> Model:
