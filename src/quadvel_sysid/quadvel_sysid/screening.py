@@ -49,7 +49,10 @@ class Screened:
 
 
 class Screen:
-    """The model that candidates are held against, on some of the fitted rows."""
+    """The model that candidates are held against, on some of the fitted rows.
+
+    Laws that remember are followed over all rows; for others these rows are enough.
+    """
 
     def __init__(self, context: Context) -> None:
         self.context = context
@@ -59,28 +62,38 @@ class Screen:
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
         self.share = context.parts.fit.sum(axis=0) / np.maximum((self.weight > 0).sum(axis=0), 1)
-        here = _Spot(self, context.model)
-        self._here = [here]
-        self._grid = [_Spot(self, at) for at in _around(context.model)]
-        self.bare = np.min([spot.bare for spot in self.grid], axis=0)
+        self._remembers = any(one.law.remembers for one in context.model.applied)
+        self._few = context.samples.taken(self.rows)
+        self._spots: dict[bool, list[_Spot]] = {}
 
-    @property
-    def grid(self) -> list[_Spot]:
-        return [*self._here, *self._grid]
+    def grid(self, whole: bool) -> list[_Spot]:
+        """The model as it is, and at the points of the grid of delays; on all rows, or on those that are looked at."""
+        whole = whole or self._remembers
+        if whole not in self._spots:
+            model = self.context.model
+            if not whole:
+                model = attrs.evolve(model, samples=self._few)
+            self._spots[whole] = [_Spot(self, at, whole) for at in (model, *_around(model))]
+        return self._spots[whole]
+
+    @cached_property
+    def bare(self) -> Array:
+        """Squared error (J,) of the model without a candidate, at its best delays."""
+        least: Array = np.min([spot.bare for spot in self.grid(False)], axis=0)
+        return least
 
     def laws(self, candidates: Iterable[EffectLaw]) -> Iterator[Screened]:
         """Laws, each on every spot of the grid."""
         for law in candidates:
             table = self._table(law)
             if table is not None:
-                found = [spot.best(law, table) for spot in self.grid]
+                found = [spot.best(law, table) for spot in self.grid(law.remembers)]
                 yield from sorted(found, key=lambda one: -one.promise)[:1]
 
     def terms(self, candidates: Iterable[SignalTerm]) -> Iterator[Screened]:
         """Terms, at the delays of the model."""
-        table = np.zeros((1, 0, len(self.joints)))
         for law in candidates:
-            yield self._here[0].best(law, np.zeros((1, law.shape.count, table.shape[2])))
+            yield self.grid(law.remembers)[0].best(law, np.zeros((1, law.shape.count, len(self.joints))))
 
     def _table(self, law: EffectLaw) -> Array | None:
         """The starting values (S, P, J) of a law; None where there are none."""
@@ -106,11 +119,12 @@ def _around(model: Model) -> Iterator[Model]:
 class _Spot:
     """The model at one pair of delays: what its own slopes explain is projected out of everything."""
 
-    def __init__(self, screen: Screen, model: Model) -> None:
+    def __init__(self, screen: Screen, model: Model, whole: bool) -> None:
         self.screen, self.model = screen, model
+        self.rows = screen.rows if whole else slice(None)
         unknowns = Unknowns.of(model)
         predicted, slopes = jacobian(model, unknowns)
-        rows, weight = screen.rows, screen.weight
+        rows, weight = self.rows, screen.weight
         left = (model.samples.tau - predicted)[rows] * weight  # (n, J)
         slopes = slopes[:, :, rows] * weight.T[:, None]  # (J, A, n)
         shared = [0, 1, slopes.shape[1] - 2, slopes.shape[1] - 1]
@@ -155,7 +169,7 @@ class _Spot:
             x = self.driven(Applied(law, every, table[0], groups))
             for values in table:
                 one = Applied(law, every, values, groups)
-                found.append(linear_columns(model, one, x)[:, self.screen.rows].transpose(2, 0, 1))
+                found.append(linear_columns(model, one, x)[:, self.rows].transpose(2, 0, 1))
         else:
             base = self.torque
             for first in range(0, len(table), _BATCH):
@@ -163,7 +177,7 @@ class _Spot:
                 grown = model.plus(Applied(law, every, values[0], groups))
                 batch = [np.repeat(one.values[None], len(values), axis=0) for one in model.applied]
                 torque = grown.evaluate(np.repeat(model.gains[None], len(values), axis=0), [*batch, values])
-                found += list((torque - base)[:, self.screen.rows].transpose(0, 2, 1)[:, :, None])
+                found += list((torque - base)[:, self.rows].transpose(0, 2, 1)[:, :, None])
         return np.stack(found) * self.screen.weight.T[None, :, None]
 
     def best(self, law: EffectLaw, table: Array) -> Screened:
@@ -245,7 +259,7 @@ class _Spot:
         groups = np.zeros(len(joint), dtype=np.intp) if law.common else joint
         one = Applied(law, may_act(law, self.screen.joints), values, groups)
         moved = attrs.evolve(model, gains=model.gains + change[:2]).with_delays(model.delays + change[2:])
-        return moved.plus(one)
+        return attrs.evolve(moved.plus(one), samples=self.screen.context.samples)
 
 
 def _solved(hessian: Array, gradient: Array) -> Array:

@@ -7,7 +7,7 @@ against the alternatives beside the others (swap), and left out (drop), as long 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property
 
 import attrs
@@ -91,6 +91,8 @@ class Search:
     def __init__(self, parts: Parts, noise: Array, tick: Tick = lambda text: None) -> None:
         self.parts, self.noise, self.tick = parts, noise, tick
         self.rejected: dict[str, tuple[float, str]] = {}
+        self.tried = 1
+        self._known: dict[tuple[object, ...], _Pool] = {}
 
     def fitted(self, model: Model) -> Account:
         """The model fitted to the rows for that."""
@@ -129,44 +131,14 @@ class Search:
             return f"worth {100 * worth:.1f} % of the noise, below {100 * WORTH:.0f} %"
         return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
 
-    tried = 1
-
     def _candidates(self, before: Account, with_terms: bool, most: int) -> list[Account]:
-        """The most promising candidates on top of an account, fitted."""
-        context = Context(before.model, self.parts, self.noise)
-        screen = Screen(context)
-        found: list[Screened] = list(screen.laws(library.laws(context)))
-        self.tried = len({one.law.name for one in found}) or 1
-        chosen = _distinct(best_first(found), most)
-        if with_terms:
-            every = best_first(screen.terms(library.terms(context)))
-            self.tried += len({one.law.inputs for one in every})  # type: ignore[attr-defined]
-            chosen += [self._refined(screen, one) for one in _distinct(every, most)]
-        return [one for start in chosen for one in self._tried(before, start)]
-
-    def _refined(self, screen: Screen, one: Screened) -> Screened:
-        """A term with its place and time constants where it promises most."""
-        for _ in range(3):
-            assert isinstance(one.law, SignalTerm)
-            better = max(
-                screen.terms(library.refined(one.law)), key=lambda other: other.promise, default=one
-            )
-            if better.promise <= one.promise:
-                break
-            one = better
-        return one
-
-    def _tried(self, before: Account, one: Screened) -> Iterator[Account]:
-        """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
-        model = one.model
-        if one.law.gainlike:
-            fewer = _without_weakest(fit(model, self.parts.fit, 4))
-            if fewer is None:
-                return
-            model = fewer
-        starts = [model, model.with_delays(before.model.delays)] if one.law.shifts else [model]
-        every = min((self.fitted(start) for start in starts), key=lambda one: one.criterion)
-        yield self.narrowed(every, len(every.model.applied) - 1)
+        """The most promising candidates on top of an account, fitted; kept, as several searches come by."""
+        key = _described(before.model)
+        if key not in self._known:
+            self._known[key] = _Pool(before, self)
+        pool = self._known[key]
+        self.tried = pool.tried(with_terms)
+        return [*pool.laws[: 2 * most], *(pool.terms[:most] if with_terms else ())]
 
     def narrowed(self, every: Account, index: int) -> Account:
         """The account with an effect on the joints alone that need it, where that is better."""
@@ -260,6 +232,74 @@ class Search:
             if one.last.law.name != name and (lost.joint_gain < TIE * self.noise).all():
                 found.append(one.last.law.name)
         return tuple(dict.fromkeys(found))
+
+
+class _Pool:
+    """The candidates on top of an account, fitted, the most promising first."""
+
+    def __init__(self, before: Account, search: Search) -> None:
+        self._before, self._search = before, search
+        self._context = Context(before.model, search.parts, search.noise)
+        self._screen = Screen(self._context)
+
+    def tried(self, with_terms: bool) -> int:
+        """How many laws, and sets of signals, were looked at."""
+        return self._laws[1] + (self._terms[1] if with_terms else 0)
+
+    @property
+    def laws(self) -> list[Account]:
+        return self._laws[0]
+
+    @property
+    def terms(self) -> list[Account]:
+        return self._terms[0]
+
+    @cached_property
+    def _laws(self) -> tuple[list[Account], int]:
+        found = list(self._screen.laws(library.laws(self._context)))
+        count = len({one.law.name for one in found}) or 1
+        return self._fitted(_distinct(best_first(found), FITTED)), count
+
+    @cached_property
+    def _terms(self) -> tuple[list[Account], int]:
+        found = list(self._screen.terms(library.terms(self._context)))
+        best = [self._refined(one) for one in _distinct(best_first(found), FITTED)]
+        return self._fitted(best), len({_key(one) for one in found})
+
+    def _refined(self, one: Screened) -> Screened:
+        """A term with its place and time constants where it promises most."""
+        for _ in range(3):
+            assert isinstance(one.law, SignalTerm)
+            near = self._screen.terms(library.refined(one.law))
+            better = max(near, key=lambda other: other.promise, default=one)
+            if better.promise <= one.promise:
+                break
+            one = better
+        return one
+
+    def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
+        return [account for one in chosen if (account := self._fit(one)) is not None]
+
+    def _fit(self, one: Screened) -> Account | None:
+        """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
+        search, model = self._search, one.model
+        if one.law.gainlike:
+            fewer = _without_weakest(fit(model, search.parts.fit, 4))
+            if fewer is None:
+                return None
+            model = fewer
+        starts = [model, model.with_delays(self._before.model.delays)] if one.law.shifts else [model]
+        every = min((search.fitted(start) for start in starts), key=lambda one: one.criterion)
+        return search.narrowed(every, len(every.model.applied) - 1)
+
+
+def _described(model: Model) -> tuple[object, ...]:
+    """What tells two fitted models apart: their laws, forms and joints, and what is shared."""
+    effects = [
+        (one.law.name, str(one.law.settings), one.active.tobytes(), one.groups.tobytes())
+        for one in model.applied
+    ]
+    return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes(), model.gains_held)
 
 
 def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:

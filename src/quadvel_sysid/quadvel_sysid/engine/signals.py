@@ -242,6 +242,10 @@ class Samples:
             self._finer = part
         return self._finer
 
+    def taken(self, rows: NDArray[np.intp]) -> Samples:
+        """These rows alone; `dt` and `start` are those they had."""
+        return self._of(rows)
+
     def _of(self, rows: NDArray[np.intp]) -> Samples:
         part = copy(self)
         for name in _OF_ROWS:
