@@ -105,6 +105,27 @@ class Comparison:
         return float(min(together, 1.0, self.p_joints.min() * self.rows.shape[1]))
 
 
+WHITE_LEVEL = 0.001
+"""p-value of the whiteness test below which a residual holds structure"""
+_LAGS = 20
+"""Rows over which its correlation is looked at"""
+
+
+def whiteness(residual: Array, rows: Bools, start: Bools) -> Array:
+    """p-values (J,) of Ljung and Box's test that a residual (N, J) is white on `rows`; `start` (N,): where stretches begin."""
+    left = np.where(rows, residual, 0.0)
+    left = left - np.where(rows, left.sum(axis=0) / np.maximum(rows.sum(axis=0), 1), 0.0)
+    power = np.sum(left * left, axis=0) + 1e-300
+    count, total = rows.sum(axis=0), np.zeros(left.shape[1])
+    stretch = np.cumsum(start)
+    for lag in range(1, _LAGS + 1):
+        same = (stretch[lag:] == stretch[:-lag])[:, None]
+        pairs = rows[lag:] & rows[:-lag] & same
+        r = np.sum(left[lag:] * left[:-lag] * pairs, axis=0) / power
+        total += r * r * count**2 / np.maximum(pairs.sum(axis=0), 1)
+    return np.asarray(stats.chi2.sf(total, _LAGS))
+
+
 def clusters(samples: Samples) -> NDArray[np.intp]:
     """The rows at which clusters begin: where a log does, or after CLUSTER s in which some joint has moved by STILL."""
     at = np.floor(samples.t / CLUSTER).astype(int) + 10**7 * samples.log_of_row

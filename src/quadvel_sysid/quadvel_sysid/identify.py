@@ -38,19 +38,10 @@ def identify(train, heldout=(), options=None, progress=lambda share, text: None)
     start = fit(start, parts.fit)
     noise = noise_variance(samples, parts.every, start.residual())
     search = Search(parts, noise)
-    before = search.fitted(start)
-    laws = search.run(before.model, False)
     import os
-    if os.environ.get("V"): print("laws", [(o.law.name, o.active.astype(int), o.law.at) for o in laws.model.applied], before.criterion, laws.criterion, laws.left)
-    best = laws
-    if (laws.left > 1.05).any() or len(laws.model.applied) > 1:
-        with_t = search.run(laws.model, True)
-        alone = search.run(before.model, True)
-        if os.environ.get("V"):
-            for a in (with_t, alone): print("terms", [(getattr(o.law,'inputs',o.law.name), o.active.astype(int)) for o in a.model.applied], a.criterion, a.left)
-        best = min((laws, with_t, alone), key=lambda a: a.criterion)
+    before = search.fitted(start)
+    best = search.best(before.model)
     best = search.dropped(best)
-    best = search.tied(best)
     if os.environ.get("V"): print("final", best.model.gains, best.model.delays*1e3, [(o.law.name, o.values) for o in best.model.applied if not isinstance(o.law, SignalTerm)])
     # report
     rep = parts.report
@@ -61,7 +52,7 @@ def identify(train, heldout=(), options=None, progress=lambda share, text: None)
     for k, o in enumerate(best.model.applied):
         less = search.fitted(best.model.without(k))
         c = parts.compare(less.residual, best.residual, rep)
-        riv = () if isinstance(o.law, SignalTerm) else search.rivals(best, k)
+        riv = search.rivals(best, k)
         effects.append({"name": o.law.name, "joints": names[o.active].tolist(), "params": {p.name: {"value": v[o.active].tolist(), "unit": p.unit} for p, v in zip(o.law.parameters, o.values)} if not isinstance(o.law, SignalTerm) else {}, "indistinguishable": list(riv), "heldout_gain": c.gain, "p_value": c.p, **o.law.observed(), **({"inputs": list(o.law.inputs)} if isinstance(o.law, SignalTerm) else {})})
     effects.sort(key=lambda e: -e["heldout_gain"])
     terms=[o for o in best.model.applied if isinstance(o.law, SignalTerm)]

@@ -36,6 +36,8 @@ from .engine.signals import Array, Bools, Signals
 from .lost_commands import lost_commands
 from .model import Applied, Model
 
+_KEPT = 4
+"""Sets of a term's regressors that are kept"""
 _COMMANDED = "q_des", "error", "tau"
 _SIGNAL_COST, _WEIGHT_COST = 3.0, 0.1
 """In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
@@ -50,6 +52,11 @@ class SignalTerm(AddedLaw):
     times: str
     shape: Shape
     joints: tuple[str, ...]
+    _kept: dict[tuple[int, ...], tuple[Any, Array]] = attrs.field(factory=dict, init=False, repr=False)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        return {"of": self.of, "times": self.times, "shape": repr(self.shape), "at": self.at}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -95,7 +102,17 @@ class SignalTerm(AddedLaw):
         return [{}]
 
     def regressors(self, x: Array, s: Signals) -> Array:
-        """What its weights are factors of, (K, N, J)."""
+        """What its weights are factors of, (K, N, J); the latest are kept where they hang on signals alone."""
+        if self.reads_total or self.of.endswith("ddq"):
+            return self._regressors(x, s)
+        key = id(s.q), id(s.dq), id(s.q_des)
+        if key not in self._kept:
+            if len(self._kept) >= _KEPT:
+                self._kept.pop(next(iter(self._kept)))
+            self._kept[key] = (s, self._regressors(x, s))
+        return self._kept[key][1]
+
+    def _regressors(self, x: Array, s: Signals) -> Array:
         view = _past_only(s) if self.of.endswith("ddq") else s
         u = read(self.of, view, x, self.joints)
         columns = self.shape.columns(u, s.start[:, 0], float(np.median(s.dt)))  # (N, K, C)

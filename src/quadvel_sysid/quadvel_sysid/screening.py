@@ -17,11 +17,12 @@ import numpy as np
 from quadvel_actuator.effects import EffectLaw, Stage
 
 from .criterion import PER_PARAMETER
-from .engine.signals import Array, Bools, scattered
+from .engine.signals import Array, Samples, scattered
 from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
 
 _SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004)
+_FEW_SHIFTS = (0.0,)
 _OUTPUTS = (0.0005, 0.0025, 0.0045)
 """s: the grid of delays, as changes of their sum and as output delays"""
 _FARTHEST = 0.0015
@@ -73,8 +74,14 @@ class Screen:
             model = self.context.model
             if not whole:
                 model = attrs.evolve(model, samples=self._few)
-            self._spots[whole] = [_Spot(self, at, whole) for at in (model, *_around(model))]
+            around = _around(model, _SHIFTS if not self._remembers else _FEW_SHIFTS)
+            self._spots[whole] = [_Spot(self, at, whole) for at in (model, *around)]
         return self._spots[whole]
+
+    @property
+    def few(self) -> Samples:
+        """The rows that are looked at, alone."""
+        return self._few
 
     @cached_property
     def bare(self) -> Array:
@@ -106,10 +113,10 @@ class Screen:
         return np.array(rows) if rows else None
 
 
-def _around(model: Model) -> Iterator[Model]:
+def _around(model: Model, shifts: Sequence[float]) -> Iterator[Model]:
     """The model at the points of the grid of delays."""
     total = model.delays.sum(axis=0)
-    for shift in _SHIFTS:
+    for shift in shifts:
         for output in _OUTPUTS:
             delays = np.stack([total + shift - output, np.full_like(total, output)])
             if (delays > -1e-9).all() and (delays <= LONGEST[:, None] + 1e-9).all():
@@ -166,10 +173,13 @@ class _Spot:
         found = []
         model, groups = self.model, np.arange(joints)
         if law.stage == Stage.ADDED:
-            x = self.driven(Applied(law, every, table[0], groups))
+            x, rows = self.driven(Applied(law, every, table[0], groups)), self.rows
+            if len(x) > len(self.screen.rows) and not law.remembers:
+                x, rows = x[rows], slice(None)
+                model = attrs.evolve(model, samples=self.screen.few)
             for values in table:
                 one = Applied(law, every, values, groups)
-                found.append(linear_columns(model, one, x)[:, self.rows].transpose(2, 0, 1))
+                found.append(linear_columns(model, one, x)[:, rows].transpose(2, 0, 1))
         else:
             base = self.torque
             for first in range(0, len(table), _BATCH):

@@ -7,14 +7,17 @@ against the alternatives beside the others (swap), and left out (drop), as long 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cached_property
+from typing import TypeVar
 
 import attrs
 import numpy as np
 
+from quadvel_actuator.effects import EffectLaw
+
 from . import library
-from .criterion import LEVEL, PER_PARAMETER, WORTH, Comparison, Parts
+from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, WORTH, Comparison, Parts, whiteness
 from .engine.signals import Array, Bools
 from .fit import fit
 from .library import Context, SignalTerm, complexity
@@ -23,14 +26,16 @@ from .screening import Screen, Screened, best_first
 
 MOST = 5
 """Effects of one log at most"""
-FITTED = 6
-"""Candidates that are fitted after a screening"""
-RIVALS = 3
-"""Candidates that are fitted in the place of an effect that is there"""
+FITTED, FITTED_TERMS = 6, 4
+"""Laws, and terms, that are fitted after a screening"""
+NEAR = 0.5
+"""Of the best candidate's worth: what is worth so much is its rival, and tried in its place once more is known"""
 TIE = 0.02
 """Of the noise variance: laws whose errors differ by less cannot be told apart"""
 
+LAWS, TERMS = "laws", "terms"
 Tick = Callable[[str], None]
+L = TypeVar("L", bound=EffectLaw)
 
 
 @attrs.frozen(eq=False)
@@ -62,6 +67,13 @@ class Account:
         """On the rows that select."""
         return self.search.parts.compare(before.residual, self.residual, self.search.parts.select)
 
+    @cached_property
+    def white(self) -> bool:
+        """Is nothing left but noise, on the rows that fit and select?"""
+        parts, samples = self.search.parts, self.model.samples
+        p = whiteness(self.residual, parts.chosen_on, samples.start)
+        return bool((p * len(p) > WHITE_LEVEL).all())
+
     @property
     def last(self) -> Applied:
         return self.model.applied[-1]
@@ -75,16 +87,6 @@ def parameters(model: Model) -> float:
     return total
 
 
-@attrs.frozen(eq=False)
-class Found:
-    """What the search chose: effects in the order of model.applied, with the names of their equals."""
-
-    account: Account
-    rivals: tuple[tuple[str, ...], ...]
-    rejected: tuple[tuple[str, float, str], ...]
-    """law, gain (N^2 m^2), reason"""
-
-
 class Search:
     """Searches on one set of data."""
 
@@ -92,33 +94,65 @@ class Search:
         self.parts, self.noise, self.tick = parts, noise, tick
         self.rejected: dict[str, tuple[float, str]] = {}
         self.tried = 1
+        self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         self._known: dict[tuple[object, ...], _Pool] = {}
 
     def fitted(self, model: Model) -> Account:
         """The model fitted to the rows for that."""
         return Account(fit(model, self.parts.fit), self)
 
-    def run(self, start: Model, with_terms: bool) -> Account:
-        """The best account from a start, with laws alone or with terms, too."""
-        best = self.fitted(start)
-        while len(best.model.applied) < MOST:
+    def best(self, start: Model) -> Account:
+        """The account of the data with the least criterion.
+
+        Terms of named signals alone are one search, laws another, which ends where laws cost more than what terms leave;
+        terms on top of the laws are the third. Nothing is sought where a residual is white.
+        """
+        plain = self.fitted(start)
+        if plain.white:
+            return plain
+        first = self.run(plain, LAWS, most=1)
+        if first.white:
+            return self.tied(first)
+        terms = self.run(plain, TERMS)
+        laws = self.tied(self.run(first, LAWS, bound=terms.criterion))
+        accounts = [terms, laws, self.merged(laws)]
+        if not laws.white:
+            accounts.append(self.run(laws, TERMS))
+        best = min(accounts, key=lambda one: one.criterion)
+        return self.tied(self.dropped(best))
+
+    def run(self, best: Account, kinds: str, most: int = MOST, bound: float = np.inf) -> Account:
+        """The account with candidates of these kinds added while it pays and might come below `bound`."""
+        while len(best.model.applied) < most and not best.white:
             self.tick(f"effect {len(best.model.applied) + 1}")
-            more = self._added(best, with_terms)
+            more = self._added(best, kinds)
             if more is None:
                 break
-            best = self._floated(more, with_terms)
+            best = self._floated(more, kinds)
+            if len(best.left) + PER_PARAMETER * parameters(best.model) > bound:
+                break
         return best
 
-    def _added(self, before: Account, with_terms: bool) -> Account | None:
+    def _added(self, before: Account, kinds: str) -> Account | None:
         """The account with the candidate more that has the least criterion; None where none passes."""
-        candidates = [*self._candidates(before, with_terms, FITTED), *self._regrouped(before)]
-        for one in sorted(candidates, key=lambda one: one.criterion):
+        candidates = [*self._candidates(before, kinds), *self._regrouped(before)]
+        candidates.sort(key=lambda one: one.criterion)
+        self._note_rivals(before, candidates)
+        for one in candidates:
             reason = self._reason(before, one)
             if not reason:
                 return one
             if len(one.model.applied) > len(before.model.applied):
                 self.rejected.setdefault(one.last.law.name, (one.against(before).gain, reason))
         return None
+
+    def _note_rivals(self, before: Account, candidates: Sequence[Account]) -> None:
+        """Keep in mind what is worth nearly as much as the best candidate: it may be right beside what comes later."""
+        fall = [before.criterion - one.criterion for one in candidates]
+        if fall:
+            near = {_key(one.last.law) for one, by in zip(candidates, fall, strict=True) if one.model.applied and by > NEAR * fall[0]}
+            for key in near:
+                self._near.setdefault(key, set()).update(near)
 
     def _reason(self, before: Account, after: Account) -> str:
         """Why what was added does not count; nothing where it does."""
@@ -131,14 +165,18 @@ class Search:
             return f"worth {100 * worth:.1f} % of the noise, below {100 * WORTH:.0f} %"
         return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
 
-    def _candidates(self, before: Account, with_terms: bool, most: int) -> list[Account]:
-        """The most promising candidates on top of an account, fitted; kept, as several searches come by."""
+    def _pool(self, before: Account) -> _Pool:
+        """The candidates on top of an account; kept, as several searches come by."""
         key = _described(before.model)
         if key not in self._known:
             self._known[key] = _Pool(before, self)
-        pool = self._known[key]
-        self.tried = pool.tried(with_terms)
-        return [*pool.laws[: 2 * most], *(pool.terms[:most] if with_terms else ())]
+        return self._known[key]
+
+    def _candidates(self, before: Account, kinds: str) -> list[Account]:
+        """The most promising candidates of these kinds on top of an account, fitted."""
+        pool = self._pool(before)
+        self.tried = pool.tried(kinds)
+        return pool.laws if kinds == LAWS else pool.terms
 
     def narrowed(self, every: Account, index: int) -> Account:
         """The account with an effect on the joints alone that need it, where that is better."""
@@ -164,12 +202,12 @@ class Search:
                 found.append(attrs.evolve(model, delay_groups=groups))
         return [self.fitted(one) for one in found]
 
-    def _floated(self, account: Account, with_terms: bool) -> Account:
-        """The account after swaps and drops that lessen the criterion."""
+    def _floated(self, account: Account, kinds: str) -> Account:
+        """The account after drops, and swaps while its residual is not white, that lessen the criterion."""
         for _ in range(MOST):
             before = account
             account = self.dropped(account)
-            account = self._swapped(account, with_terms)
+            account = account if account.white else self._swapped(account, kinds)
             if account is before:
                 return account
         return account
@@ -189,19 +227,31 @@ class Search:
         worth = float(np.max(found.joint_gain / self.noise))
         return account.criterion < without.criterion and worth > WORTH and found.p < LEVEL
 
-    def _swapped(self, account: Account, with_terms: bool) -> Account:
+    def _swapped(self, account: Account, kinds: str) -> Account:
         """With one effect in another's place, if that lessens the criterion."""
         if len(account.model.applied) < 2:
             return account
         for k in range(len(account.model.applied) - 1):
+            one = account.model.applied[k].law
             rest = self.fitted(account.model.without(k))
-            name = account.model.applied[k].law.name
-            for one in self._candidates(rest, with_terms, RIVALS):
-                other = one.last.law
-                same = other.name == name and not isinstance(other, SignalTerm)
-                if one.criterion < account.criterion - (0.0 if same else PER_PARAMETER):
-                    account = one
-                    return account
+            names = {name for name in self._near.get(_key(one), ()) if name != _key(one)}
+            pool = _Pool(rest, self, names)
+            for other in pool.laws if kinds == LAWS else pool.terms:
+                if other.criterion < account.criterion - PER_PARAMETER:
+                    return other
+        return account
+
+    def merged(self, account: Account) -> Account:
+        """With a curve over a signal in the place of several laws of that signal, if that lessens the criterion.
+
+        Laws of one signal add up to any shape of it: a spring and cogging to a stop, for one.
+        """
+        signals = [one.law.signal for one in account.model.applied if not isinstance(one.law, SignalTerm)]
+        for signal in {one for one in signals if signals.count(one) > 1}:
+            kept = tuple(one for one in account.model.applied if one.law.signal != signal)
+            rest = self.fitted(attrs.evolve(account.model, applied=kept))
+            every = [account, *_Pool(rest, self, {(signal,)}).terms]
+            account = min(every, key=lambda one: one.criterion)
         return account
 
     def tied(self, account: Account) -> Account:
@@ -224,27 +274,37 @@ class Search:
 
     def rivals(self, account: Account, index: int) -> tuple[str, ...]:
         """The laws that say the same in the place of an effect, to what rows that select can tell."""
-        name = account.model.applied[index].law.name
+        one = account.model.applied[index].law
+        if isinstance(one, SignalTerm):
+            return ()
         rest = self.fitted(account.model.without(index))
+        alone = len(account.model.applied) == 1
+        pool = self._pool(rest) if alone else _Pool(rest, self, self._near.get(_key(one), set()))
         found = []
-        for one in self._candidates(rest, False, RIVALS):
-            lost = account.against(one)
-            if one.last.law.name != name and (lost.joint_gain < TIE * self.noise).all():
-                found.append(one.last.law.name)
+        for other in pool.laws:
+            lost = account.against(other)
+            if other.last.law.name != one.name and (lost.joint_gain < TIE * self.noise).all():
+                found.append(other.last.law.name)
         return tuple(dict.fromkeys(found))
 
 
 class _Pool:
     """The candidates on top of an account, fitted, the most promising first."""
 
-    def __init__(self, before: Account, search: Search) -> None:
-        self._before, self._search = before, search
+    def __init__(
+        self, before: Account, search: Search, among: Collection[tuple[str, ...]] | None = None
+    ) -> None:
+        """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
+        self._before, self._search, self._among = before, search, among
         self._context = Context(before.model, search.parts, search.noise)
         self._screen = Screen(self._context)
 
-    def tried(self, with_terms: bool) -> int:
-        """How many laws, and sets of signals, were looked at."""
-        return self._laws[1] + (self._terms[1] if with_terms else 0)
+    def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
+        return (one for one in candidates if self._among is None or _key(one) in self._among)
+
+    def tried(self, kinds: str) -> int:
+        """How many laws, or sets of signals, were looked at."""
+        return self._laws[1] if kinds == LAWS else self._terms[1]
 
     @property
     def laws(self) -> list[Account]:
@@ -256,15 +316,15 @@ class _Pool:
 
     @cached_property
     def _laws(self) -> tuple[list[Account], int]:
-        found = list(self._screen.laws(library.laws(self._context)))
+        found = list(self._screen.laws(self._asked(library.laws(self._context))))
         count = len({one.law.name for one in found}) or 1
         return self._fitted(_distinct(best_first(found), FITTED)), count
 
     @cached_property
     def _terms(self) -> tuple[list[Account], int]:
-        found = list(self._screen.terms(library.terms(self._context)))
-        best = [self._refined(one) for one in _distinct(best_first(found), FITTED)]
-        return self._fitted(best), len({_key(one) for one in found})
+        found = list(self._screen.terms(self._asked(library.terms(self._context))))
+        best = [self._refined(one) for one in _distinct(best_first(found), FITTED_TERMS)]
+        return self._fitted(best), len({_key(one.law) for one in found})
 
     def _refined(self, one: Screened) -> Screened:
         """A term with its place and time constants where it promises most."""
@@ -306,16 +366,16 @@ def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:
     """The first so many with different names, or signals, and of each name at most two forms."""
     chosen: list[Screened] = []
     for one in found:
-        key = _key(one)
-        if sum(_key(other) == key for other in chosen) < (1 if isinstance(one.law, SignalTerm) else 2):
+        key = _key(one.law)
+        if sum(_key(other.law) == key for other in chosen) < (1 if isinstance(one.law, SignalTerm) else 2):
             chosen.append(one)
         if len(chosen) == most:
             break
     return chosen
 
 
-def _key(one: Screened) -> tuple[str, ...]:
-    return one.law.inputs if isinstance(one.law, SignalTerm) else (one.law.name,)
+def _key(law: EffectLaw) -> tuple[str, ...]:
+    return law.inputs if isinstance(law, SignalTerm) else (law.name,)
 
 
 def _without_weakest(model: Model) -> Model | None:
