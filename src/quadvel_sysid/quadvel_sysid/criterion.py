@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from .engine.signals import Array, Bools, Samples
+from .signals import Array, Bools, Samples
 
 CLUSTER = 0.1
 """s: what residuals add up to over so long counts as independent"""

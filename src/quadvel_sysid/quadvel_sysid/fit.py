@@ -10,8 +10,8 @@ import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
-from .engine.signals import Array, Bools
 from .model import Model, Unknowns, jacobian, pack, with_slots
+from .signals import Array, Bools
 
 _SETTLED = 2e-5
 """Relative fall of the error below which a fit has converged"""

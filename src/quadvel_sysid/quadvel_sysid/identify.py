@@ -1,65 +1,185 @@
-"""scratch pipeline"""
+"""From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
+
+`readings` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
+`selection` searches for effects; the chosen model is fitted to all rows, `confidence` says how sure its values are, and
+`outcome` makes the report.
+"""
+
 from __future__ import annotations
-import attrs, numpy as np
-from .engine.identify import Options, gathered, _read
-from .engine.eam import WINDOWS, pd_torque
-from .criterion import Parts, clusters, noise_variance, LEVEL
-from .model import Model
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_actuator.parameters import ActuatorParameters
+
+from .confidence import intervals
+from .criterion import noise_variance
+from .delays import in_steps, latest
+from .eam import WINDOWS, pd_torque
 from .fit import fit
+from .identification import Identification
 from .library import SignalTerm
-from .selection import Search, Account
-from . import engine
+from .logs.findings import Finding
+from .logs.log import Log
+from .material import VALUES, Material, Progress, gathered
+from .model import Model
+from .motion import STRETCH, Body, Replay, replayed
+from .outcome import Chosen, Outcome, identification, parameters
+from .readings import Reading, read, reference_gains
+from .selection import Account, Search
 
-def parts_of(samples, material):
-    if material.heldout:
-        report = (samples.log_of_row >= material.fitted)[:, None]
-    spans = [one.log.duration for one in samples.logs]
-    length = float(np.clip(min(spans) / 20, 0.2, 2.0))
-    at = np.floor(samples.t / length).astype(int) % 4
-    if material.heldout:
-        at = np.floor(samples.t / length).astype(int) % 3
-        sel = (at == 1)[:, None] & ~report
-        fitr = (at != 1)[:, None] & ~report
-    else:
-        report = (at == 3)[:, None]; sel = (at == 1)[:, None]; fitr = (at % 2 == 0)[:, None]
-    j = samples.judged
-    return Parts(j & fitr, j & sel, j & report, clusters(samples))
+_CLEARLY = 0.97
+"""of the error of a replay: what an account of motion has to leave at most"""
 
-class R: pass
 
-def identify(train, heldout=(), options=None, progress=lambda share, text: None):
+@attrs.frozen
+class Options:
+    """What a user may ask for."""
+
+    gains: tuple[float, float] | None = None
+    """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
+    base: ActuatorParameters | None = None
+    """its torque limits go into the corrected model"""
+    values: int = VALUES
+    """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
+    cores: int = 1
+    """that work side by side; the report is the same"""
+
+
+def identify(
+    train: Sequence[Log],
+    heldout: Sequence[Log] = (),
+    options: Options | None = None,
+    progress: Progress = lambda share, text: None,
+) -> Identification:
+    """Fit `train`, report on `heldout`, or on blocks of `train` kept aside where there is none.
+
+    `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
+    """
     options = options or Options()
     material = gathered(train, heldout, options.gains, options.values, progress)
-    samples, judge, eam, remark = _read(material, WINDOWS)
-    parts = parts_of(samples, material)
-    joints = len(samples.joints)
-    one = np.zeros(joints, dtype=np.intp)
-    start = Model(samples, eam.window, eam.gains, np.array([one, one]), np.stack([eam.input_delay, eam.output_delay]), one)
-    start = fit(start, parts.fit)
-    noise = noise_variance(samples, parts.every, start.residual())
-    search = Search(parts, noise)
-    import os
-    before = search.fitted(start)
-    best = search.best(before.model)
-    best = search.dropped(best)
-    if os.environ.get("V"): print("final", best.model.gains, best.model.delays*1e3, [(o.law.name, o.values) for o in best.model.applied if not isinstance(o.law, SignalTerm)])
-    # report
-    rep = parts.report
-    def mse(e, rows): return float(np.sum(np.where(rows, e, 0)**2)/max(rows.sum(),1))
-    b = before.residual; a = best.model.foretold().residual()
-    effects=[]
-    names=np.array(samples.joints)
-    for k, o in enumerate(best.model.applied):
-        less = search.fitted(best.model.without(k))
-        c = parts.compare(less.residual, best.residual, rep)
-        riv = search.rivals(best, k)
-        effects.append({"name": o.law.name, "joints": names[o.active].tolist(), "params": {p.name: {"value": v[o.active].tolist(), "unit": p.unit} for p, v in zip(o.law.parameters, o.values)} if not isinstance(o.law, SignalTerm) else {}, "indistinguishable": list(riv), "heldout_gain": c.gain, "p_value": c.p, **o.law.observed(), **({"inputs": list(o.law.inputs)} if isinstance(o.law, SignalTerm) else {})})
-    effects.sort(key=lambda e: -e["heldout_gain"])
-    terms=[o for o in best.model.applied if isinstance(o.law, SignalTerm)]
-    r=R()
-    r.report={"joints": list(samples.joints), "effects": effects, "noise_floor": float(noise.mean()),
-      "before": {"heldout_mse": mse(b, rep), "per_joint":[mse(b[:,[j]],rep[:,[j]]) for j in range(joints)]},
-      "after": {"heldout_mse": mse(a, rep), "per_joint":[mse(a[:,[j]],rep[:,[j]]) for j in range(joints)]},
-      "unexplained": {"verdict": "structured" if terms else "white", "depends_on": list(dict.fromkeys(n for o in terms for n in o.law.inputs))},
-      "decision": ""}
-    return r
+    return identified(material, options.base, options.cores, progress)
+
+
+def identified(
+    material: Material,
+    base: ActuatorParameters | None = None,
+    cores: int = 1,
+    progress: Progress = lambda share, text: None,
+) -> Identification:
+    """The same of `material`: who does not hold the whole of a long log has more memory for it."""
+    body = material.body
+    progress(0.02, "gains and delays")
+    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    reading, notes = read(material, windows)
+    steps = iter(range(10**6))
+
+    def tick(text: str) -> None:
+        progress(min(0.1 + 0.04 * next(steps), 0.85), text)
+
+    plain = _plain(reading)
+    noise = noise_variance(reading.samples, reading.parts.every, plain.residual())
+    search = Search(reading.parts, noise, tick, cores)
+    before = search.fitted(plain)
+    best = search.best(plain)
+    progress(0.88, "intervals")
+
+    def told(account: Account) -> Outcome:
+        return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
+
+    findings = [*material.findings, *notes]
+    outcome = told(best)
+    if body is None:
+        found = identification(outcome, findings)
+    else:
+        progress(0.95, "replays")
+        tries = [outcome, *(told(one) for one in (search.laws_alone(best), before) if one is not best)]
+        found = _with_motion(tries, body, findings)
+    progress(1.0, "done")
+    return found
+
+
+def _plain(reading: Reading) -> Model:
+    """The EAM as a model that effects can be added to."""
+    eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
+    delays = np.stack([eam.input_delay, eam.output_delay])
+    return Model(reading.samples, eam.window, eam.gains, np.array([one, one]), delays, one)
+
+
+def _outcome(
+    account: Account,
+    before: Account,
+    search: Search,
+    reading: Reading,
+    material: Material,
+    base: ActuatorParameters,
+) -> Outcome:
+    """The chosen model with values of all rows, and errors of the rows that chose nothing."""
+    parts, samples = search.parts, reading.samples
+    every = parts.chosen_on if material.heldout else parts.every
+    late = [latest(one.model, parts.fit) for one in (before, account)]
+    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
+    effects = tuple(_chosen(account, k, search) for k in range(len(account.model.applied)))
+    has_terms = any(isinstance(one.law, SignalTerm) for one in account.model.applied)
+    leaning = () if account.white or has_terms else search.leaning(account)
+    names = {one.law.name for one in account.model.applied}
+    rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
+    ideal = pd_torque(samples, np.ones_like(whole.gains), 0.0, 0.0, 0.0)
+    return Outcome(
+        late[0], before_whole, late[1], whole, effects, rejected, leaning,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.noise, parts,
+        material.pieces, *reference_gains(samples), base,
+    )  # fmt: skip
+
+
+def _chosen(account: Account, index: int, search: Search) -> Chosen:
+    """An effect with what it is worth on the rows that chose nothing."""
+    without = search.fitted(account.model.without(index))
+    worth = search.parts.compare(without.residual, account.residual, search.parts.report)
+    return Chosen(worth.gain, worth.p, search.rivals(account, index))
+
+
+def _with_motion(
+    tries: Sequence[Outcome], body: Body, findings: Sequence[tuple[str, Finding]]
+) -> Identification:
+    """The account with which the commands replay the motion best, with before and after in rad and rad/s, too.
+
+    The torque that a motion implies holds the encoders' errors, which terms can mistake for an effect; a replay does not.
+    """
+    logs = [piece.log for piece in tries[0].pieces]
+
+    def replay(o: Outcome, model: Model) -> Replay:
+        return replayed(logs, parameters(o, model), body, o.parts.report)
+
+    plain = tries[-1]
+    before = after = replay(plain, plain.before)
+    best = plain
+    for one in tries[:-1]:
+        found = replay(one, one.model)
+        if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
+            best, after = one, found
+    identified_one = identification(best, findings)
+    return attrs.evolve(identified_one, report=_told_of_motion(identified_one.report, before, after, body))
+
+
+def _told_of_motion(report: Mapping[str, Any], before: Replay, after: Replay, body: Body) -> dict[str, Any]:
+    motion = {
+        "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
+        "replayed_s": STRETCH,
+        "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
+        "the inertia and an encoder bias part of the torque offset.",
+    }
+    decision = (
+        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
+        f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
+    )
+    return {
+        **report,
+        "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
+        "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
+        "motion": motion,
+        "decision": decision,
+    }

@@ -32,9 +32,9 @@ from quadvel_actuator.effects.terms import (
 from quadvel_actuator.running import SLOPE
 
 from .criterion import Parts
-from .engine.signals import Array, Bools, Signals
 from .lost_commands import lost_commands
 from .model import Applied, Model
+from .signals import Array, Bools, Signals
 
 _KEPT = 4
 """Sets of a term's regressors that are kept"""

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from quadvel_actuator.effects.commands import MOST, CommandHold
 
 from .criterion import Parts
-from .engine.signals import Array, Bools
 from .fit import fit, squared_error
 from .model import Applied, Model
+from .signals import Array, Bools
+
 LOST = 6.0
 """nats by which a command has to look lost or late on its own"""
 _LEAST_SHARE = 0.003
@@ -96,7 +97,9 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
             break
         every = np.ones(len(noise), dtype=bool)
         law = CommandHold(odds, usual)
-        losing = fit(at.plus(Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))), parts.fit, 3)
+        losing = fit(
+            at.plus(Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))), parts.fit, 3
+        )
         error = squared_error(losing, parts.select)
         if error < least:
             best, least, foretold = (odds, usual), error, squared_error(losing.foretold(), parts.fit)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from quadvel_actuator.effects.base import distinct
 
-from .engine.signals import BETWEEN, Array, Bools, Samples, Signals
+from .signals import BETWEEN, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
 

@@ -17,9 +17,9 @@ import numpy as np
 from quadvel_actuator.effects import EffectLaw, Stage
 
 from .criterion import PER_PARAMETER
-from .engine.signals import Array, Samples, scattered
 from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
+from .signals import Array, Samples, scattered
 
 _SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004)
 _FEW_SHIFTS = (0.0,)
@@ -94,8 +94,8 @@ class Screen:
         for law in candidates:
             table = self._table(law)
             if table is not None:
-                found = [spot.best(law, table) for spot in self.grid(law.remembers)]
-                yield from sorted(found, key=lambda one: -one.promise)[:1]
+                found = (spot.best(law, table) for spot in self.grid(law.remembers))
+                yield max(found, key=lambda one: one.promise)
 
     def terms(self, candidates: Iterable[SignalTerm]) -> Iterator[Screened]:
         """Terms, at the delays of the model."""
@@ -257,9 +257,7 @@ class _Spot:
         change[2:] = change[2:].clip(-_FARTHEST, _FARTHEST)
         return change
 
-    def _started(
-        self, law: EffectLaw, table: Array, choice: Array, change: Array, weights: Array
-    ) -> Model:
+    def _started(self, law: EffectLaw, table: Array, choice: Array, change: Array, weights: Array) -> Model:
         """The model with the law at the chosen starts, gains and delays changed."""
         model, joint = self.model, np.arange(table.shape[2])
         values = table[choice, :, joint].T.copy()

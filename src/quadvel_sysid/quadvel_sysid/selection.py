@@ -18,11 +18,12 @@ from quadvel_actuator.effects import EffectLaw
 
 from . import library
 from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, WORTH, Comparison, Parts, whiteness
-from .engine.signals import Array, Bools
 from .fit import fit
 from .library import Context, SignalTerm, complexity
 from .model import Applied, Groups, Model
+from .parallel import side_by_side
 from .screening import Screen, Screened, best_first
+from .signals import Array, Bools
 
 MOST = 5
 """Effects of one log at most"""
@@ -90,8 +91,8 @@ def parameters(model: Model) -> float:
 class Search:
     """Searches on one set of data."""
 
-    def __init__(self, parts: Parts, noise: Array, tick: Tick = lambda text: None) -> None:
-        self.parts, self.noise, self.tick = parts, noise, tick
+    def __init__(self, parts: Parts, noise: Array, tick: Tick = lambda text: None, cores: int = 1) -> None:
+        self.parts, self.noise, self.tick, self.cores = parts, noise, tick, cores
         self.rejected: dict[str, tuple[float, str]] = {}
         self.tried = 1
         self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
@@ -112,14 +113,40 @@ class Search:
             return plain
         first = self.run(plain, LAWS, most=1)
         if first.white:
-            return self.tied(first)
+            return self.simplified(first)
         terms = self.run(plain, TERMS)
-        laws = self.tied(self.run(first, LAWS, bound=terms.criterion))
+        laws = self.simplified(self.run(first, LAWS, bound=terms.criterion))
         accounts = [terms, laws, self.merged(laws)]
         if not laws.white:
             accounts.append(self.run(laws, TERMS))
-        best = min(accounts, key=lambda one: one.criterion)
-        return self.tied(self.dropped(best))
+        return self.simplified(min(accounts, key=lambda one: one.criterion))
+
+    def laws_alone(self, account: Account) -> Account:
+        """The account without its terms."""
+        laws = tuple(one for one in account.model.applied if not isinstance(one.law, SignalTerm))
+        return self.fitted(attrs.evolve(account.model, applied=laws))
+
+    def leaning(self, account: Account) -> tuple[str, ...]:
+        """The signals that what is left goes with most, whether or not a term of them would pay."""
+        terms = self._pool(account).terms
+        best = min(terms, key=lambda one: one.criterion, default=None)
+        return () if best is None else best.last.law.inputs  # type: ignore[attr-defined]
+
+    def simplified(self, account: Account) -> Account:
+        """Without what costs more than it is worth: effects, joints of effects, values and gains of each joint."""
+        account = self.dropped(account)
+        for k in range(len(account.model.applied)):
+            account = self.narrowed(account, k)
+        model, one = account.model, np.zeros(len(self.noise), dtype=np.intp)
+        if model.gain_groups.any():
+            shared = self.fitted(
+                attrs.evolve(model, gains=_shared(model.gains), gain_groups=np.array([one, one]))
+            )
+            account = min(account, shared, key=lambda each: each.criterion)
+        if model.delay_groups.any():
+            same = attrs.evolve(account.model, delay_groups=one).with_delays(_shared(model.delays))
+            account = min(account, self.fitted(same), key=lambda each: each.criterion)
+        return self.tied(account)
 
     def run(self, best: Account, kinds: str, most: int = MOST, bound: float = np.inf) -> Account:
         """The account with candidates of these kinds added while it pays and might come below `bound`."""
@@ -150,7 +177,11 @@ class Search:
         """Keep in mind what is worth nearly as much as the best candidate: it may be right beside what comes later."""
         fall = [before.criterion - one.criterion for one in candidates]
         if fall:
-            near = {_key(one.last.law) for one, by in zip(candidates, fall, strict=True) if one.model.applied and by > NEAR * fall[0]}
+            near = {
+                _key(one.last.law)
+                for one, by in zip(candidates, fall, strict=True)
+                if one.model.applied and by > NEAR * fall[0]
+            }
             for key in near:
                 self._near.setdefault(key, set()).update(near)
 
@@ -160,7 +191,9 @@ class Search:
         p = found.p * self.tried
         worth = float(np.max(found.joint_gain / self.noise))
         if p >= LEVEL:
-            return f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self.tried} candidates)"
+            return (
+                f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self.tried} candidates)"
+            )
         if worth <= WORTH:
             return f"worth {100 * worth:.1f} % of the noise, below {100 * WORTH:.0f} %"
         return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
@@ -258,7 +291,10 @@ class Search:
         """With the values of each effect shared by its joints, or by those of a kind, where that costs nothing."""
         for k in range(len(account.model.applied)):
             one = account.model.applied[k]
-            for groups in (np.zeros(len(one.active), dtype=np.intp), *_groupings(account.model.samples.joints)):
+            for groups in (
+                np.zeros(len(one.active), dtype=np.intp),
+                *_groupings(account.model.samples.joints),
+            ):
                 if len(np.unique(groups[one.active])) >= len(np.unique(one.groups[one.active])):
                     continue
                 values = one.values.copy()
@@ -338,9 +374,11 @@ class _Pool:
         return one
 
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
-        return [account for one in chosen if (account := self._fit(one)) is not None]
+        search, samples = self._search, self._context.samples
+        models = side_by_side(lambda k: self._fit(chosen[k]), len(chosen), search.cores, samples)
+        return [Account(one, search) for one in models if one is not None]
 
-    def _fit(self, one: Screened) -> Account | None:
+    def _fit(self, one: Screened) -> Model | None:
         """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
         search, model = self._search, one.model
         if one.law.gainlike:
@@ -350,7 +388,7 @@ class _Pool:
             model = fewer
         starts = [model, model.with_delays(self._before.model.delays)] if one.law.shifts else [model]
         every = min((search.fitted(start) for start in starts), key=lambda one: one.criterion)
-        return search.narrowed(every, len(every.model.applied) - 1)
+        return search.narrowed(every, len(every.model.applied) - 1).model
 
 
 def _described(model: Model) -> tuple[object, ...]:
@@ -376,6 +414,11 @@ def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:
 
 def _key(law: EffectLaw) -> tuple[str, ...]:
     return law.inputs if isinstance(law, SignalTerm) else (law.name,)
+
+
+def _shared(values: Array) -> Array:
+    """The mean over the joints, for each of them."""
+    return np.repeat(values.mean(axis=-1, keepdims=True), values.shape[-1], axis=-1)
 
 
 def _without_weakest(model: Model) -> Model | None:

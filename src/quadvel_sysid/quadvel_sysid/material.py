@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from ..logs.excerpts import Piece, pieces
-from ..logs.findings import Finding
-from ..logs.inspect import inspect
-from ..logs.log import Log, LogError
+from .logs.excerpts import Piece, pieces
+from .logs.findings import Finding
+from .logs.inspect import inspect
+from .logs.log import Log, LogError
 from .motion import Body, implied
 from .signals import Array
 

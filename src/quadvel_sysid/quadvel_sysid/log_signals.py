@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..logs.log import Log
 from . import reading
 from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
+from .logs.log import Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]
