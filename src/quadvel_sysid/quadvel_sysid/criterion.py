@@ -126,6 +126,13 @@ def whiteness(residual: Array, rows: Bools, start: Bools) -> Array:
     return np.asarray(stats.chi2.sf(total, _LAGS))
 
 
+def normality(residual: Array, rows: Bools) -> Array:
+    """p-values (J,) of a residual's kurtosis on `rows`: an effect that comes and goes within rows shows by it alone."""
+    return np.array(
+        [stats.kurtosistest(one[keep]).pvalue for one, keep in zip(residual.T, rows.T, strict=True)]
+    )
+
+
 def clusters(samples: Samples) -> NDArray[np.intp]:
     """The rows at which clusters begin: where a log does, or after CLUSTER s in which some joint has moved by STILL."""
     at = np.floor(samples.t / CLUSTER).astype(int) + 10**7 * samples.log_of_row

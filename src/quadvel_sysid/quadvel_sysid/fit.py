@@ -6,11 +6,14 @@ linear least-squares problem (`scipy.optimize.lsq_linear`).
 
 from __future__ import annotations
 
+from itertools import product
+
+import attrs
 import numpy as np
 from scipy.linalg import LinAlgError, cholesky, solve_triangular
 from scipy.optimize import lsq_linear
 
-from .model import Model, Unknowns, jacobian, pack, with_slots
+from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
 from .signals import Array, Bools
 
 _SETTLED = 2e-5
@@ -35,11 +38,31 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
     return tidied(model)
 
 
+_SUMS = np.arange(-0.003, 0.0031, 0.0005)
+_OUTPUTS = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
+"""s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
+_DEEPEST = 3
+"""Points of the grid that a fit starts from"""
+
+
+def profiled(model: Model, rows: Bools) -> Model:
+    """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
+    unknowns = Unknowns.of(model, delays=False)
+    found = []
+    for more, later in product(_SUMS, _OUTPUTS):
+        delays = model.delays + np.array([[more - later], [later]])
+        if (delays >= 0.0).all() and (delays <= LONGEST[:, None]).all():
+            at = model.with_delays(delays)
+            error = squared_error(at, rows)
+            found.append(_step(at, unknowns, rows, error) or (at, error))
+    deepest = sorted(found, key=lambda one: one[1])[:_DEEPEST]
+    tried = [fit(one, rows) for one in (model, *(at for at, _ in deepest))]
+    return min(tried, key=lambda one: squared_error(one, rows))
+
+
 def tidied(model: Model) -> Model:
     """With every law's parameters in their unique order."""
-    from attrs import evolve
-
-    return evolve(model, applied=tuple(one.tidied() for one in model.applied))
+    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
 
 
 def squared_error(model: Model, rows: Bools) -> float:

@@ -130,7 +130,7 @@ class SignalTerm(AddedLaw):
                 ]
             )
         columns = self.regressors(x if x.ndim == 2 else x[0], s)
-        total: Array = sum(w * c for w, c in zip(weights, columns, strict=True))  # type: ignore[assignment]
+        total: Array = sum(w * c for w, c in zip(weights, columns, strict=True))
         return total
 
     def term(self, one: Applied, bound: Array) -> Term:
@@ -293,7 +293,8 @@ class _Maker:
 
 def refined(term: SignalTerm) -> list[SignalTerm]:
     """The same term with its time constant, frequency or damping, or its place, a little otherwise."""
-    shape, near = term.shape, []
+    shape = term.shape
+    near: list[Shape] = []
     if isinstance(shape, Lag):
         near = [Lag(shape.time * by) for by in (0.7, 0.85, 1.18, 1.4)]
     elif isinstance(shape, Resonance):

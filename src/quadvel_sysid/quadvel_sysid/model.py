@@ -161,7 +161,8 @@ class Model:
 
     def with_delays(self, delays: Array) -> Model:
         """The same model with other delays (2, J)."""
-        return attrs.evolve(self, delays=np.round(np.clip(delays, 0.0, LONGEST[:, None]), 7))
+        within = np.asarray(np.clip(delays, 0.0, LONGEST[:, None]), dtype=float).round(7)
+        return attrs.evolve(self, delays=within)
 
     def plus(self, applied: Applied) -> Model:
         """With one more effect."""
@@ -237,7 +238,10 @@ class Unknowns:
     @classmethod
     def of(cls, model: Model, delays: bool = True) -> Unknowns:
         """All parameters of the model; its delays only if asked for."""
-        rows, low, high, step = [], [], [], []
+        rows: list[Groups] = []
+        low: list[float] = []
+        high: list[float] = []
+        step: list[float] = []
         for groups, free, bounds, size in _slots(model, delays):
             names = np.unique(groups[free])
             rows.append(np.where(free, len(low) + np.searchsorted(names, groups), -1))

@@ -206,7 +206,7 @@ class _Spot:
         self, columns: Array, law: EffectLaw | None, penalty: Array | None = None
     ) -> tuple[Array, Array, tuple[Array, Array]]:
         """Squared error (J,), the best start of each joint, the shared change (4, J) and the columns' weights (J, L)."""
-        count, joints, size, _ = columns.shape
+        joints, size = columns.shape[1:3]
         cc = columns @ columns.swapaxes(-1, -2)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
         ridge = 1e-8 * np.eye(size) if penalty is None else 1e-4 * penalty

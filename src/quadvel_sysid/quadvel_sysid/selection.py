@@ -17,8 +17,8 @@ import numpy as np
 from quadvel_actuator.effects import EffectLaw
 
 from . import library
-from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, WORTH, Comparison, Parts, whiteness
-from .fit import fit
+from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, WORTH, Comparison, Parts, normality, whiteness
+from .fit import fit, profiled
 from .library import Context, SignalTerm, complexity
 from .model import Applied, Groups, Model
 from .parallel import side_by_side
@@ -73,7 +73,8 @@ class Account:
         """Is nothing left but noise, on the rows that fit and select?"""
         parts, samples = self.search.parts, self.model.samples
         p = whiteness(self.residual, parts.chosen_on, samples.start)
-        return bool((p * len(p) > WHITE_LEVEL).all())
+        p = np.minimum(p, normality(self.residual, parts.chosen_on))
+        return bool((p * 2 * len(p) > WHITE_LEVEL).all())
 
     @property
     def last(self) -> Applied:
@@ -108,7 +109,7 @@ class Search:
         Terms of named signals alone are one search, laws another, which ends where laws cost more than what terms leave;
         terms on top of the laws are the third. Nothing is sought where a residual is white.
         """
-        plain = self.fitted(start)
+        plain = self.profiled(self.fitted(start))
         if plain.white:
             return plain
         first = self.run(plain, LAWS, most=1)
@@ -120,6 +121,12 @@ class Search:
         if not laws.white:
             accounts.append(self.run(laws, TERMS))
         return self.simplified(min(accounts, key=lambda one: one.criterion))
+
+    def profiled(self, account: Account) -> Account:
+        """With its delays sought on a grid once more: what was added may have hidden the right ones."""
+        return min(
+            account, Account(profiled(account.model, self.parts.fit), self), key=lambda one: one.criterion
+        )
 
     def laws_alone(self, account: Account) -> Account:
         """The account without its terms."""
@@ -155,7 +162,7 @@ class Search:
             more = self._added(best, kinds)
             if more is None:
                 break
-            best = self._floated(more, kinds)
+            best = self.profiled(self._floated(more, kinds))
             if len(best.left) + PER_PARAMETER * parameters(best.model) > bound:
                 break
         return best
