@@ -16,7 +16,7 @@ import numpy as np
 from quadvel_actuator.parameters import ActuatorParameters
 
 from .confidence import intervals
-from .criterion import noise_variance
+from .criterion import Parts, noise_variance
 from .delays import in_steps, latest
 from .eam import WINDOWS, pd_torque
 from .fit import fit
@@ -120,9 +120,13 @@ def _outcome(
     """The chosen model with values of all rows, and errors of the rows that chose nothing."""
     parts, samples = search.parts, reading.samples
     every = parts.chosen_on if material.heldout else parts.every
-    late = [latest(one.model, parts.fit) for one in (before, account)]
+    chosen = parts.chosen_on
+    late = [latest(fit(one.model, chosen), chosen) for one in (before, account)]
     before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
-    effects = tuple(_chosen(account, k, search) for k in range(len(account.model.applied)))
+    effects = tuple(
+        Chosen(*_worth(late[1], k, parts), search.rivals(account, k))
+        for k in range(len(account.model.applied))
+    )
     has_terms = any(isinstance(one.law, SignalTerm) for one in account.model.applied)
     leaning = () if account.white or has_terms else search.leaning(account)
     names = {one.law.name for one in account.model.applied}
@@ -135,11 +139,11 @@ def _outcome(
     )  # fmt: skip
 
 
-def _chosen(account: Account, index: int, search: Search) -> Chosen:
-    """An effect with what it is worth on the rows that chose nothing."""
-    without = search.fitted(account.model.without(index))
-    worth = search.parts.compare(without.residual, account.residual, search.parts.report)
-    return Chosen(worth.gain, worth.p, search.rivals(account, index))
+def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
+    """What an effect takes off the error of the rows that chose nothing, and its p-value there."""
+    without = fit(model.without(index), parts.chosen_on)
+    worth = parts.compare(without.residual(), model.residual(), parts.report)
+    return worth.gain, worth.p
 
 
 def _with_motion(

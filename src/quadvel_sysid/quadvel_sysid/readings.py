@@ -72,15 +72,15 @@ def read(material: Material, windows: Sequence[float]) -> tuple[Reading, list[tu
 
 
 def divided(samples: Samples, material: Material) -> Parts:
-    """Blocks of the logs in turn: fitted, selecting, fitted, reported; where a log is held out that one alone is reported."""
+    """Blocks of the logs in turn: two are fitted, two select, one is reported; a log that is held out is the only one reported."""
     spans = [one.log.duration for one in samples.logs]
     length = float(np.clip(min(spans) / _BLOCKS, _SHORTEST, _LONGEST))
     block = np.floor(samples.t / length).astype(int)
     if material.heldout:
         report = samples.log_of_row >= material.fitted
-        select = (block % 3 == 1) & ~report
+        select = (block % 2 == 1) & ~report
     else:
-        report, select = block % 4 == 3, block % 4 == 1
+        report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
     rows = {"fitted": ~(select | report), "selecting": select, "reported": report}
     parts = {word: samples.judged & chosen[:, None] for word, chosen in rows.items()}
     for word, chosen in parts.items():
