@@ -15,6 +15,7 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
+from .account import Account, Judge
 from .confidence import intervals
 from .criterion import Parts, noise_variance
 from .delays import in_steps, latest
@@ -29,7 +30,7 @@ from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Chosen, Outcome, identification, parameters
 from .readings import Reading, read, reference_gains
-from .selection import Account, Search
+from .selection import Search
 
 _CLEARLY = 0.97
 """of the error of a replay: what an account of motion has to leave at most"""
@@ -82,8 +83,8 @@ def identified(
 
     plain = _plain(reading)
     noise = noise_variance(reading.samples, reading.parts.every, plain.residual())
-    search = Search(reading.parts, noise, tick, cores)
-    before = search.fitted(plain)
+    judge = Judge(reading.parts, noise)
+    search, before = Search(judge, tick, cores), judge.fitted(plain)
     best = search.best(plain)
     progress(0.88, "intervals")
 
@@ -118,7 +119,7 @@ def _outcome(
     base: ActuatorParameters,
 ) -> Outcome:
     """The chosen model with values of all rows, and errors of the rows that chose nothing."""
-    parts, samples = search.parts, reading.samples
+    parts, samples = search.judge.parts, reading.samples
     every = parts.chosen_on if material.heldout else parts.every
     chosen = parts.chosen_on
     late = [latest(fit(one.model, chosen), chosen) for one in (before, account)]
@@ -134,7 +135,7 @@ def _outcome(
     ideal = pd_torque(samples, np.ones_like(whole.gains), 0.0, 0.0, 0.0)
     return Outcome(
         late[0], before_whole, late[1], whole, effects, rejected, leaning,
-        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.noise, parts,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
         material.pieces, *reference_gains(samples), base,
     )  # fmt: skip
 
