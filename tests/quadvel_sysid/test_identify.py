@@ -8,10 +8,10 @@ import pytest
 from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_sysid.engine.eam import fit_eam
-from quadvel_sysid.engine.identify import Options, identify
-from quadvel_sysid.engine.material import gathered
-from quadvel_sysid.engine.signals import Samples
+from quadvel_sysid.eam import fit_eam
+from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.material import gathered
+from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:2]
 
