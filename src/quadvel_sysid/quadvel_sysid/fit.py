@@ -45,19 +45,68 @@ _DEEPEST = 3
 """Points of the grid that a fit starts from"""
 
 
+_PROFILES, _DEEPER = 4, 0.01
+"""Grids at most, one about what the other found, while each takes so much of the error off"""
+
+
+_FACTORS = np.array([1.0, 0.8, 0.9, 0.95, 0.98, 0.99, 1.01, 1.02, 1.05, 1.1, 1.25])
+"""Times a parameter: the values around it that are tried"""
+
+
 def profiled(model: Model, rows: Bools) -> Model:
     """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
+    error = squared_error(model, rows)
+    for _ in range(_PROFILES):
+        found = _around(model, rows)
+        before, error = error, squared_error(found, rows)
+        model = found if error < before else model
+        if error > (1.0 - _DEEPER) * before:
+            break
+    return model
+
+
+def _around(model: Model, rows: Bools) -> Model:
+    """The best fit from the points of the grid about the model's delays."""
     unknowns = Unknowns.of(model, delays=False)
     found = []
     for more, later in product(_SUMS, _OUTPUTS):
         delays = model.delays + np.array([[more - later], [later]])
-        if (delays >= 0.0).all() and (delays <= LONGEST[:, None]).all():
+        if (delays >= -1e-9).all() and (delays <= LONGEST[:, None] + 1e-9).all():
             at = model.with_delays(delays)
             error = squared_error(at, rows)
             found.append(_step(at, unknowns, rows, error) or (at, error))
     deepest = sorted(found, key=lambda one: one[1])[:_DEEPEST]
-    tried = [fit(one, rows) for one in (model, *(at for at, _ in deepest))]
+    tried = [fit(_searched(one, rows), rows) for one in (model, *(at for at, _ in deepest))]
     return min(tried, key=lambda one: squared_error(one, rows))
+
+
+def _searched(model: Model, rows: Bools) -> Model:
+    """The model with every parameter that is not linear at the best of some values around it, one after the other.
+
+    Where a torque jumps with a parameter, as at the edge of a deadband, slopes say little of what a step does.
+    """
+    for k, one in enumerate(model.applied):
+        linear = getattr(one.law, "linear", ())
+        for p, parameter in enumerate(one.law.parameters):
+            if parameter.name not in linear:
+                values = np.repeat(one.values[None], len(_FACTORS), axis=0)
+                values[:, p] = np.clip(values[:, p] * _FACTORS[:, None], parameter.low, parameter.high)
+                one = attrs.evolve(one, values=_best_of(model, k, values, rows))
+                model = model.replacing(k, one)
+    return model
+
+
+def _best_of(model: Model, index: int, values: Array, rows: Bools) -> Array:
+    """Of a batch of values (B, P, J) of an effect the one with the least error, for each group of joints: (P, J)."""
+    every = [np.repeat(one.values[None], len(values), axis=0) for one in model.applied]
+    every[index] = values
+    torque = model.evaluate(np.repeat(model.gains[None], len(values), axis=0), every)
+    error = np.einsum("bnj->bj", np.where(rows, model.samples.tau - torque, 0.0) ** 2)
+    groups = model.applied[index].groups
+    for g in np.unique(groups):
+        error[:, groups == g] = error[:, groups == g].sum(axis=1, keepdims=True)
+    best: Array = values[np.argmin(error, axis=0), :, np.arange(len(groups))].T
+    return best
 
 
 def tidied(model: Model) -> Model:

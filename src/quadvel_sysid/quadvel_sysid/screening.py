@@ -31,7 +31,7 @@ _ROWS = 1500
 """Of each joint that a score test looks at"""
 _BATCH = 8
 """Starting values evaluated at once"""
-_AMPLITUDE = (0.2, 3.0)
+_AMPLITUDE = (0.7, 1.4)
 """Times a start that is not linear: how far it is followed"""
 
 
