@@ -121,17 +121,14 @@ class SignalTerm(AddedLaw):
         return np.broadcast_to(found, (len(found), *s.q.shape))
 
     def torque(self, x: Array, s: Any, p: Params) -> Array:
-        weights = [p[name] for name in self.names]
-        if self.reads_total and x.ndim == 3:
-            return np.stack(
-                [
-                    self.torque(x[b], s, {n: w[b] if np.ndim(w) > 2 else w for n, w in p.items()})
-                    for b in range(len(x))
-                ]
-            )
-        columns = self.regressors(x if x.ndim == 2 else x[0], s)
-        total: Array = sum(w * c for w, c in zip(weights, columns, strict=True))
-        return total
+        weights = np.stack(
+            np.broadcast_arrays(*(p[name] for name in self.names)), axis=-2
+        )  # (K, J), or (B, 1, K, J)
+        columns = self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(one, s) for one in x])
+        if columns.ndim == 3 and weights.ndim == 2:
+            return np.einsum("kj,knj->nj", weights, columns)
+        batch: Array = np.einsum("...kj,...knj->...nj", weights.reshape(-1, *weights.shape[-2:]), columns)
+        return batch
 
     def term(self, one: Applied, bound: Array) -> Term:
         """As a running model has it; its torque stays within `bound` (J,), N m."""

@@ -312,35 +312,38 @@ def _unpack(model: Model, theta: Array) -> tuple[Array, list[Array]]:
 
 
 def jacobian(model: Model, unknowns: Unknowns) -> tuple[Array, Array]:
-    """Prediction (N, J) and its slopes (J, A, N) along every slot; 0 where a slot is not fitted."""
+    """Prediction (N, J) and its slopes (J, A, N) along every slot; 0 where a slot is not fitted.
+
+    Terms that read the torque of the laws are taken not to move with these: they are small beside them.
+    """
     theta, free = pack(model), np.any(unknowns.index >= 0, axis=1)
     high = np.where(unknowns.index >= 0, unknowns.high[unknowns.index], np.inf)
     steps = np.where(theta + unknowns.step[:, None] > high, -unknowns.step[:, None], unknowns.step[:, None])
     slopes = np.zeros((theta.shape[1], len(theta), len(model.samples.t)))
-    known = np.zeros(len(theta), dtype=bool)
-    first = 2
+    numeric, first, read = free.copy(), 2, np.zeros(model.samples.tau.shape)
+    numeric[-2:] = False
     for one in model.applied:
         mine = first + np.arange(len(one.values))
         first += len(mine)
-        if not _adds(one):
-            continue
-        linear = mine[[one.law.names.index(name) for name in one.law.linear]]  # type: ignore[attr-defined]
-        feeds = any(other.last for other in model.applied) and not one.last and _read_by_terms(model)
-        if not feeds:
-            slopes[:, linear] = linear_columns(model, one).transpose(2, 0, 1)
-            known[linear] = True
-    rest = np.flatnonzero(free[:-2] & ~known[:-2])
+        if _adds(one):
+            columns = linear_columns(model, one)
+            linear = mine[[one.law.names.index(name) for name in one.law.linear]]  # type: ignore[attr-defined]
+            slopes[:, linear] = columns.transpose(2, 0, 1)
+            numeric[linear] = False
+            if one.last:
+                numeric[mine] = False
+                read = read + np.einsum("kj,knj->nj", theta[mine], columns)
+    rest = np.flatnonzero(numeric)
     batch = np.repeat(theta[None], len(rest) + 1, axis=0)
     batch[1 + np.arange(len(rest)), rest] += steps[rest]
-    torque = model.evaluate(*_unpack(model, batch[:, :-2]))
+    laws = attrs.evolve(model, applied=tuple(one for one in model.applied if not one.last))
+    gains, values = _unpack(model, batch[:, :-2])
+    kept = [value for one, value in zip(model.applied, values, strict=True) if not one.last]
+    torque = laws.evaluate(gains, kept)
     slopes[:, rest] = ((torque[1:] - torque[0]) / steps[rest][:, None, :]).transpose(2, 0, 1)
     for k in np.flatnonzero(free[-2:]):
         slopes[:, len(theta) - 2 + k] = _delay_slope(model, int(k)).T
-    return torque[0], slopes
-
-
-def _read_by_terms(model: Model) -> bool:
-    return any(one.last and getattr(one.law, "of_drive", True) for one in model.applied)
+    return torque[0] + read, slopes
 
 
 def _delay_slope(model: Model, which: int) -> Array:

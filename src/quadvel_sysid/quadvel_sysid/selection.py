@@ -42,8 +42,9 @@ class Search:
     def best(self, start: Model) -> Account:
         """The account of the data with the least criterion.
 
-        Terms of named signals alone are one search, laws another, which ends where laws cost more than what terms leave;
-        terms on top of the laws are the third. Nothing is sought where a residual is white.
+        Nothing is sought where a residual is white. Laws are added until it is, or until they cost more than a term of
+        named signals in their place. Where they leave more than noise, terms alone, and terms on top of the laws, come
+        into question, too.
         """
         plain = self.judge.profiled(self.judge.fitted(start))
         if plain.white:
@@ -51,11 +52,11 @@ class Search:
         first = self.run(plain, LAWS, most=1)
         if first.white:
             return self.simplified(first)
-        terms = self.run(plain, TERMS)
-        laws = self.simplified(self.run(first, LAWS, bound=terms.criterion))
-        accounts = [terms, laws, self.merged(laws)]
+        term = self.run(plain, TERMS, most=1)
+        laws = self.simplified(self.run(first, LAWS, bound=term.criterion))
+        accounts = [laws, self.merged(laws), term]
         if not laws.white:
-            accounts.append(self.run(laws, TERMS))
+            accounts += [self.run(term, TERMS), self.run(laws, TERMS)]
         return self.simplified(min(accounts, key=lambda one: one.criterion))
 
     def laws_alone(self, account: Account) -> Account:
