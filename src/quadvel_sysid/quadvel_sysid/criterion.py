@@ -46,6 +46,11 @@ class Parts:
         """The rows that fit and select."""
         return self.fit | self.select
 
+    def first(self, count: int) -> Parts:
+        """The parts of the first `count` rows."""
+        rows = (one[:count] for one in (self.fit, self.select, self.report))
+        return Parts(*rows, self.starts[self.starts < count])
+
     def sums(self, values: Array) -> Array:
         """Values (N, ...) summed over each cluster."""
         total: Array = np.add.reduceat(values, self.starts, axis=0)

@@ -83,7 +83,10 @@ def identified(
 
     plain = _plain(reading)
     noise = noise_variance(reading.samples, reading.parts.every, plain.residual())
-    judge = Judge(reading.parts, noise)
+    # A log that is held out stays outside of the search.
+    samples = reading.samples.reaching(reading.parts.chosen_on)
+    judge = Judge(reading.parts.first(len(samples.t)), noise)
+    plain = attrs.evolve(plain, samples=samples)
     search, before = Search(judge, tick, cores), judge.fitted(plain)
     best = search.best(plain)
     progress(0.88, "intervals")
@@ -119,10 +122,11 @@ def _outcome(
     base: ActuatorParameters,
 ) -> Outcome:
     """The chosen model with values of all rows, and errors of the rows that chose nothing."""
-    parts, samples = search.judge.parts, reading.samples
+    parts, samples = reading.parts, reading.samples
     every = parts.chosen_on if material.heldout else parts.every
     chosen = parts.chosen_on
-    late = [latest(fit(one.model, chosen), chosen) for one in (before, account)]
+    models = [attrs.evolve(one.model, samples=samples) for one in (before, account)]
+    late = [latest(fit(one, chosen), chosen) for one in models]
     before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
     effects = tuple(
         Chosen(*_worth(late[1], k, parts), search.rivals(account, k))

@@ -17,7 +17,7 @@ from .signals import Array
 Progress = Callable[[float, str], None]
 """Told now and then which share is done, and what is done next."""
 
-VALUES = 144_000
+VALUES = 60_000
 """Of torque that are looked at, of all logs and joints."""
 
 

@@ -281,7 +281,7 @@ def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[fl
     """Of each slot: who shares it, where it is free, bounds, and the step of its slope."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
     for groups in model.gain_groups:
-        yield groups, everywhere & (not model.gains_held), (-1e6, 1e6), SLOPE
+        yield groups, everywhere & (not model.gains_held), (0.0, 1e6), SLOPE
     for one in model.applied:
         for parameter in one.law.parameters:
             yield one.groups, one.active, (parameter.low, parameter.high), SLOPE * parameter.scale
