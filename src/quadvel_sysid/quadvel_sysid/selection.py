@@ -42,21 +42,24 @@ class Search:
     def best(self, start: Model) -> Account:
         """The account of the data with the least criterion.
 
-        Nothing is sought where a residual is white. Laws are added until it is, or until they cost more than a term of
-        named signals in their place. Where they leave more than noise, terms alone, and terms on top of the laws, come
-        into question, too.
+        Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these laws leave
+        more than noise, terms alone come into question, and where those do as well, or cost more, further laws and terms on top of the laws.
         """
         plain = self.judge.profiled(self.judge.fitted(start))
         if plain.white:
             return plain
-        first = self.run(plain, LAWS, most=1)
-        if first.white:
-            return self.simplified(first)
-        term = self.run(plain, TERMS, most=1)
-        laws = self.simplified(self.run(first, LAWS, bound=term.criterion))
-        accounts = [laws, self.merged(laws), term]
+        laws = self.run(plain, LAWS, most=1)
+        if laws.white:
+            return self.simplified(laws)
+        terms = self.run(plain, TERMS, most=1)
+        laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
         if not laws.white:
-            accounts += [self.run(term, TERMS), self.run(laws, TERMS)]
+            terms = self.run(terms, TERMS)
+        accounts = [terms]
+        if laws.white or not terms.white or laws.criterion < terms.criterion:
+            laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
+            accounts += [laws, self.merged(laws)]
+            accounts += [] if laws.white else [self.run(laws, TERMS)]
         return self.simplified(min(accounts, key=lambda one: one.criterion))
 
     def laws_alone(self, account: Account) -> Account:
