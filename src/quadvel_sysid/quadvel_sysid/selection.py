@@ -42,8 +42,9 @@ class Search:
     def best(self, start: Model) -> Account:
         """The account of the data with the least criterion.
 
-        Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these laws leave
-        more than noise, terms alone come into question, and where those do as well, or cost more, further laws and terms on top of the laws.
+        Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these
+        laws leave more than noise, terms alone come into question; and where those do so, too, or cost more, further laws,
+        and terms on top of the laws.
         """
         plain = self.judge.profiled(self.judge.fitted(start))
         if plain.white:
