@@ -82,7 +82,7 @@ def identified(
         progress(min(0.1 + 0.04 * next(steps), 0.85), text)
 
     plain = _plain(reading)
-    noise = noise_variance(reading.samples, reading.parts.every, plain.residual())
+    noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
     # A log that is held out stays outside of the search.
     samples = reading.samples.reaching(reading.parts.chosen_on)
     judge = Judge(reading.parts.first(len(samples.t)), noise)

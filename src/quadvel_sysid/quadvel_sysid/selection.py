@@ -78,7 +78,7 @@ class Search:
         """Without what costs more than it is worth: effects, joints of effects, values and gains of each joint."""
         account = self.dropped(account)
         for k in range(len(account.model.applied)):
-            account = self.judge.narrowed(account, k)
+            account = self.judge.narrowed(self._nested(account, k), k)
         model, one = account.model, np.zeros(len(self.judge.noise), dtype=np.intp)
         if model.gain_groups.any():
             shared = self.judge.fitted(
@@ -89,6 +89,17 @@ class Search:
             same = attrs.evolve(account.model, delay_groups=one).with_delays(_shared(model.delays))
             account = min(account, self.judge.fitted(same), key=lambda each: each.criterion)
         return self.tied(account)
+
+    def _nested(self, account: Account, index: int) -> Account:
+        """With the law that an effect's is at the end of one of its parameters, unless the rows that select tell them apart."""
+        one = account.model.applied[index]
+        less = one.law.simpler(dict(zip(one.law.names, one.values, strict=True)))
+        if less is None:
+            return account
+        law, start = less
+        values = np.array([start[name] for name in law.names])
+        other = self.judge.fitted(account.model.replacing(index, attrs.evolve(one, law=law, values=values)))
+        return account if self._needed(other, account) else other
 
     def run(self, best: Account, kinds: str, most: int = MOST, bound: float = np.inf) -> Account:
         """The account with candidates of these kinds added while it pays and might come below `bound`."""
