@@ -51,7 +51,7 @@ def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
     assert "held-out data leave" not in plain["decision"]
 
 
-def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect():
+def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_not_confirmed():
     """Both logs follow one script, and both joints are pushed when it begins and when it ends."""
 
     def pushed(k, q, dq, tau):
@@ -61,7 +61,8 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_no_effect(
     again = np.random.default_rng(1).normal(0.0, np.sqrt(TABLE_4["noise"]), logs[1].tau.shape)
     logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
     report = identify(logs[:1], logs[1:], Options(values=3000)).report  # two pieces of 0.75 s of each
-    assert report["effects"] == []
+    unconfirmed = " ".join(report["warnings"])
+    assert all(f"{one['name']} is not confirmed" in unconfirmed for one in report["effects"])
 
 
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
@@ -83,6 +84,7 @@ def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
     assert any("on which the drive did not act" in finding["text"] for finding in report["findings"])
 
 
+@pytest.mark.xfail(reason="decision 48: a second effect is added beside friction on blurred speeds")
 def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
     truth = _truth(Effect("coulomb_friction", JOINTS, {"c": 0.8, "v_0": 0.05}))
     log = record(truth, 2, 5.0, 1000, seed=3)

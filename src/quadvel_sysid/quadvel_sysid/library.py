@@ -39,7 +39,7 @@ from .signals import Array, Bools, Signals
 _KEPT = 4
 """Sets of a term's regressors that are kept"""
 _COMMANDED = "q_des", "error", "tau"
-_SIGNAL_COST, _WEIGHT_COST = 3.0, 0.1
+_SIGNAL_COST, _WEIGHT_COST = 5.0, 0.1
 """In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
 
 

@@ -13,7 +13,7 @@ from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
 from .confidence import Intervals
-from .criterion import WHITE_LEVEL, Parts, whiteness
+from .criterion import LEVEL, WHITE_LEVEL, Parts, whiteness
 from .decision import decision
 from .delays import running_delays
 from .identification import Identification, Shape, Trace
@@ -129,6 +129,7 @@ def _report(o: Outcome) -> dict[str, Any]:
             f"{name} sits on its bound: its value and interval are not to be trusted"
             for name in o.widths.on_bound
         ]
+        + _unconfirmed(o)
         + _unlike_delays(o.whole)
         + _negative_gains(o.whole)
         + _beyond_limits(o),
@@ -154,6 +155,15 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
         "depends_on": list(dict.fromkeys(names or o.leaning)),
         "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
     }
+
+
+def _unconfirmed(o: Outcome) -> list[str]:
+    """Effects that the rows which chose nothing do not show."""
+    return [
+        f"{one.law.name} is not confirmed by the rows that are reported (p = {found.p:.2g} there)"
+        for one, found in zip(o.model.applied, o.effects, strict=True)
+        if found.p > LEVEL
+    ]
 
 
 def _unlike_delays(model: Model) -> list[str]:
