@@ -150,6 +150,7 @@ def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
     ]
 
 
+@pytest.mark.xfail(reason="decision 48: one curve over the angle says as much in fewer parameters")
 def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both():
     three = NAMES[:3]
     spring = Effect("parallel_spring", three, {"k": 5.0, "q0": 0.1})
