@@ -48,8 +48,8 @@ class Parts:
 
     def first(self, count: int) -> Parts:
         """The parts of the first `count` rows."""
-        rows = (one[:count] for one in (self.fit, self.select, self.report))
-        return Parts(*rows, self.starts[self.starts < count])
+        starts = self.starts[self.starts < count]
+        return Parts(self.fit[:count], self.select[:count], self.report[:count], starts)
 
     def sums(self, values: Array) -> Array:
         """Values (N, ...) summed over each cluster."""
