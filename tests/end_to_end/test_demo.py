@@ -11,7 +11,9 @@ from xml.etree import ElementTree
 
 import pytest
 from mcap.reader import make_reader
+from typer.testing import CliRunner
 
+from quadvel_bringup import cli
 from quadvel_recordings.reading import read_messages
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
@@ -81,6 +83,27 @@ def test_its_recording_alone_shows_the_robot(out: Path) -> None:
     for name in [*links, "base_footprint"]:
         while name != "odom":
             name = frames[name]
+
+
+def test_its_recording_is_drawn_and_asked_what_model_and_estimator_say_of_it(out: Path) -> None:
+    if not (out / "demo.mcap").exists():
+        pytest.skip("the demo made no recording")
+    runner = CliRunner()
+    drawn = runner.invoke(cli.app, ["plot", str(out / "demo.mcap"), "--out", str(out / "plot")])
+    assert drawn.exit_code == 0, drawn.output
+    assert {path.name for path in (out / "plot").iterdir()} == {
+        "velocity.png",
+        "joints.png",
+        "torques.png",
+        "loop.png",
+    }
+    asked = runner.invoke(cli.app, ["replay", str(out / "demo.mcap"), "--out", str(out / "replay")])
+    assert asked.exit_code == 0, asked.output
+    said = json.loads((out / "replay" / "replay.json").read_text())
+    # The simulated drives are those of the model: what is left is the noise of their torque.
+    assert max(said["torque_error_nm"].values()) < 0.35 < min(said["torque_rms_nm"].values())
+    assert max(said["velocity_error"]["recorded estimate"]) < 1e-3
+    assert max(said["velocity_error"]["truth"]) < 0.08
 
 
 def test_a_demo_whose_folder_is_a_file_starts_nothing(tmp_path: Path) -> None:

@@ -96,6 +96,9 @@ LEFT_OUT = {
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
     "quadvel view": "the same page, beside a robot that runs",
     "quadvel view out/demo/demo.mcap": "tests/quadvel_view/test_page.py plays one",
+    "quadvel plot out/demo/demo.mcap --out out/plot": "tests/end_to_end/test_demo.py draws it",
+    "quadvel replay out/demo/demo.mcap --out out/replay": "tests/end_to_end/test_demo.py asks it",
+    "quadvel record --ring 30 --out out/faults": "tests/quadvel_bringup/test_recorder.py has a fault recorded",
     "quadvel view --foxglove": "tests/quadvel_view/test_foxglove.py asks such a server",
     "quadvel teleop": "tests/end_to_end/test_operator.py types its keys",
     "quadvel teleop gamepad": "needs a gamepad; tests/quadvel_view/test_hands.py has its events",
@@ -143,6 +146,7 @@ LEFT_OUT_KINDS = {
     r"mkdir -p out/training/.*": "copies a checkpoint that a training goes on from",
     r"(description|dds|recordings|driver's|view|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"(driver|controller|command_mux):.*": "a part of a parameter file",
+    r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }
 
 

@@ -17,14 +17,18 @@ from tests.identification.judge import judge
         pytest.param(
             "quadratic_drag", 1, 18, marks=pytest.mark.long
         ),  # every second row met commands at 500 Hz alike, which hid a wrong delay
-        ("backlash", 0, 21),  # the right form keeps little of what it promises at delays that are not its own
+        pytest.param(
+            "backlash", 0, 21, marks=pytest.mark.long
+        ),  # the right form keeps little of what it promises at delays that are not its own
         pytest.param(
             "close_pair", 1, 21, marks=pytest.mark.long
         ),  # cogging on three joints, a spring on one of them
         pytest.param(
             "close_pair", 3, 27, marks=pytest.mark.long
         ),  # the drag of a hip that moves slowly was out of bounds
-        ("close_pair", 1, 27),  # given up before a spring replaced the offset
+        pytest.param(
+            "close_pair", 1, 27, marks=pytest.mark.long
+        ),  # given up before a spring replaced the offset
         pytest.param("pair", 2, 27, marks=pytest.mark.long),  # a lag that one joint shows alone
         pytest.param(
             "table_4", 5, 27, marks=pytest.mark.long
@@ -32,7 +36,9 @@ from tests.identification.judge import judge
         pytest.param(
             "speed_band_drag", 0, 28, marks=pytest.mark.long
         ),  # a drag that was read off the torque as commands that are lost
-        ("table_4", 6, 17),  # the rows of the held-out log lie otherwise between their commands
+        pytest.param(
+            "table_4", 6, 17, marks=pytest.mark.long
+        ),  # the rows of the held-out log lie otherwise between their commands
     ],
 )
 def test_it_is_named_now(kind, index, seed, tmp_path):
@@ -42,8 +48,10 @@ def test_it_is_named_now(kind, index, seed, tmp_path):
 @pytest.mark.parametrize(
     ("kind", "index", "seed"),
     [
-        ("armature", 14, 28)
-    ],  # feet that are lifted hardly tell which part of the delays comes after an inertia
+        pytest.param(
+            "armature", 14, 28, marks=pytest.mark.long
+        ),  # feet that are lifted hardly tell which part of the delays comes after an inertia
+    ],
 )
 def test_its_intervals_hold_the_truth_now(kind, index, seed, tmp_path):
     assert [one["covered"] for one in _judged(kind, index, seed, tmp_path)["intervals"]] == [True]

@@ -263,6 +263,22 @@ def test_effects_survive_the_file(tmp_path):
         (Effect("armature", ["wheel"], {"J": 0.1}), "effects/armature/joints: found wheel, expected one of"),
         (Effect("armature", JOINTS, {}), "effects/armature/parameters: J is missing"),
         (Effect("armature", JOINTS, {"J": [0.1, 0.2]}), "found 2 numbers, expected 1 or 3"),
+        (
+            Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.1, "c_2": 0.1}),
+            "effects/coulomb_friction/parameters/c_2: unknown, expected one of c, v_0, at, turn",
+        ),
+        (
+            Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.1, "turn": "slow"}),
+            "effects/coulomb_friction/parameters/turn: found 'slow', expected one of tanh, arctan",
+        ),
+        (
+            Effect("thermal_drift", JOINTS, {"of": "temperature", "rate": 0.1, "cold": "ice"}),
+            "effects/thermal_drift/parameters/cold: found 'ice', expected a number",
+        ),
+        (
+            Effect("gain_asymmetry", JOINTS, {"a": 0.1, "at": "joint"}),
+            "effects/gain_asymmetry/parameters/at: unknown, expected one of a",
+        ),
     ],
 )
 def test_an_effect_that_cannot_run_is_refused_by_name(effect, message):
@@ -310,3 +326,17 @@ def test_an_interval_the_wrong_way_round_is_refused_by_name():
     effect = Effect("coulomb_friction", JOINTS, {"c": 0.3, "v_0": 0.1}, {}, {"c": [0.4, 0.2]})
     with pytest.raises(ValueError, match=r"coulomb_friction/intervals/c: found \[0.4, 0.2\]"):
         ActuatorModel(parameters([effect]))
+
+
+def test_a_setting_that_is_a_number_counts():
+    """A drive of 25 degrees Celsius, which the model takes for granted, is colder than `cold`, and stronger for it."""
+    effect = {"of": "temperature", "rate": -0.01}
+    torques = []
+    for cold in ({}, {"cold": 40.0}):
+        drift = Effect("thermal_drift", JOINTS, effect | cold)
+        model = ActuatorModel(
+            attrs.evolve(parameters([drift], input_delay=0.0, output_delay=0.0, noise=0.0), joints=JOINTS),
+            (3,),
+        )
+        torques.append(model.step(np.zeros(3), np.zeros(3), np.full(3, 0.1), 30.0, 0.5))
+    np.testing.assert_allclose(torques[1], 1.15 * torques[0])

@@ -17,6 +17,7 @@ import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
+from quadvel_bringup.recording_file import RecordingFile  # noqa: E402
 from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver.calibration import Calibration  # noqa: E402
@@ -38,7 +39,7 @@ def record_standing(path: Path, seconds: float) -> None:
     simulator = Simulator()
     simulator.reset("stand")
     hold = JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
-    with Recorder(node, path) as recorder:
+    with Recorder(node, RecordingFile(path)) as recorder:
         recorder.record("/low_state", "quadvel_msgs/msg/LowState")
         for _ in range(round(200 * seconds)):
             simulator.command(hold)

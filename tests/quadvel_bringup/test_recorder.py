@@ -26,8 +26,9 @@ from geometry_msgs.msg import Twist  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
-from quadvel_msgs.msg import LowState  # noqa: E402
-from quadvel_recordings.reading import read_messages  # noqa: E402
+from quadvel_bringup.recording_file import Heard, RecordingFile, Ring  # noqa: E402
+from quadvel_msgs.msg import ControllerState, LowState  # noqa: E402
+from quadvel_recordings.reading import read_messages, unread_messages  # noqa: E402
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def low_state(tick: int) -> Any:
 
 def record_low_states(node: Node, path: Path, number: int) -> None:
     publisher = node.create_publisher(LowState, "low_state", 10)
-    with Recorder(node, path) as recorder:
+    with Recorder(node, RecordingFile(path)) as recorder:
         recorder.record("/low_state", "quadvel_msgs/msg/LowState")
         spin_until(node, lambda: publisher.get_subscription_count() > 0, "discovery")
         for tick in range(number):
@@ -91,13 +92,13 @@ def test_a_recording_follows_the_ros2_profile_of_mcap(node: Node, tmp_path: Path
 
 
 def test_a_type_without_definition_is_refused_by_name(node: Node, tmp_path: Path) -> None:
-    recorder = Recorder(node, tmp_path / "x.mcap")
+    recorder = Recorder(node, RecordingFile(tmp_path / "x.mcap"))
     with recorder, pytest.raises(ValueError, match=r"topic /scan2 has the type 'laser_msgs/msg/Scan'"):
         recorder.record("/scan2", "laser_msgs/msg/Scan")
 
 
 def test_recording_all_takes_topics_as_they_come(node: Node, tmp_path: Path) -> None:
-    with Recorder(node, tmp_path / "all.mcap") as recorder:
+    with Recorder(node, RecordingFile(tmp_path / "all.mcap")) as recorder:
         recorder.record_all()
         publisher = node.create_publisher(Twist, "cmd_vel", 10)
 
@@ -172,7 +173,7 @@ def test_it_looks_up_in_time_although_more_comes_than_it_can_write(node: Node, t
         def spin_once(self, timeout_sec: float) -> None:
             recorder.counts["/low_state"] += 1
 
-    with Recorder(node, tmp_path / "walk.mcap") as recorder:
+    with Recorder(node, RecordingFile(tmp_path / "walk.mcap")) as recorder:
         began = time.monotonic()
         recorder.serve(Busy(), 0.2)  # type: ignore[arg-type]
         assert time.monotonic() - began < 10.0
@@ -206,3 +207,41 @@ def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> Non
     assert recording.returncode == 1
     assert "nothing came on /low_state on ROS domain" in said
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_ring_keeps_the_last_seconds_and_what_is_published_once(tmp_path: Path) -> None:
+    ring = Ring(2.0)
+    blank = bytes(300)
+    ring.keep(Heard("/robot_description", "std_msgs/msg/String", 0, 0, bytes(12)))
+    for tenth in range(100):
+        ring.keep(Heard("/low_state", "quadvel_msgs/msg/LowState", tenth * 10**8, tenth * 10**8, blank))
+    assert ring.save(tmp_path / "fault.mcap") == 22
+    found = [
+        (topic, time) for topic, time, _ in unread_messages(tmp_path / "fault.mcap", lambda topic, kind: True)
+    ]
+    assert found == [("/robot_description", 0), *(("/low_state", tenth * 10**8) for tenth in range(79, 100))]
+
+
+def test_a_fault_leaves_a_recording_of_what_led_to_it(node: Node, tmp_path: Path) -> None:
+    recording = start_recording("--ring", "2", "--out", str(tmp_path / "faults"))
+    states = node.create_publisher(LowState, "low_state", 10)
+    modes = node.create_publisher(ControllerState, "controller/state", 10)
+    walking = ControllerState(mode=ControllerState.WALK, mode_name="walk")
+    fault = ControllerState(mode=ControllerState.FAULT, fault="tilt", reason="the trunk leans by 1.2 rad")
+    spin_until(
+        node, lambda: states.get_subscription_count() and modes.get_subscription_count() > 1, "recorder", 60.0
+    )
+    for tick in range(200):
+        states.publish(low_state(tick))
+        modes.publish(walking if tick < 150 else fault)
+        time.sleep(0.01)
+    recording.send_signal(signal.SIGINT)  # sooner than it would write by itself
+    _, said = recording.communicate(timeout=60)
+    assert recording.returncode == 0
+    (file,) = (tmp_path / "faults").glob("*_tilt.mcap")
+    assert re.search(r"_tilt\.mcap: \d+ messages; the trunk leans by 1\.2 rad", said)
+    assert "1 fault recorded" in said
+    ticks = [
+        message.tick for topic, _, message in read_messages(file, lambda topic, kind: topic == "/low_state")
+    ]
+    assert ticks[0] < 100 < 190 < ticks[-1]

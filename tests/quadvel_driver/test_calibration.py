@@ -82,6 +82,7 @@ def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None
     assert not found.calibration.joint_zeros.any()
 
 
+@pytest.mark.long
 def test_a_robot_whose_sensors_are_right_is_found_to_be_so() -> None:
     right = Calibration()
     found = find(Samples.of(recorded(True, 60.0, right)), Samples.of(recorded(False, 3.0, right)))

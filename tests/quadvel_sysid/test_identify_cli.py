@@ -78,7 +78,7 @@ def test_ctrl_c_leaves_the_folder_as_it_was(tmp_path: Path, monkeypatch: pytest.
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "inspect", interrupted)
+    monkeypatch.setattr(cli, "read_log", interrupted)
     kept = tmp_path / "out" / "kept"
     kept.parent.mkdir()
     kept.write_text("kept")

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.robot import JOINT_NAMES
-from quadvel_sysid.logs import tables
+from quadvel_sysid.logs import files
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
 
@@ -298,5 +298,5 @@ def test_a_file_of_nothing_but_zeros_is_refused_within_little_memory(tmp_path: P
 
 
 def test_a_long_log_is_kept_in_single_precision() -> None:
-    assert tables.precision(tables.LONG + 1) == np.float32
-    assert tables.precision(tables.LONG) == np.float64
+    assert files.precision(files.LONG + 1) == np.float32
+    assert files.precision(files.LONG) == np.float64

@@ -24,6 +24,7 @@ REPORT: dict[str, Any] = {
     "units": {"mse": "N² m²"},
     "noise_floor": 0.066,
     "pd": {"train_mse": 0.8, "heldout_mse": 0.82},
+    "baselines": {"joint_pd": {"heldout_mse": 2.5}, "ridge": {"heldout_mse": 1.5}},
     "before": {
         "train_mse": 0.3,
         "heldout_mse": 0.31,

@@ -77,10 +77,14 @@ class _Running:
                 f"effects/{effect.name}/joints: found {unknown[0]}, expected one of {', '.join(joints)}"
             )
         where = [joints.index(name) for name in effect.joints]
-        numbers = {name: value for name, value in effect.parameters.items() if name not in _settings(effect)}
-        settings = {name: value for name, value in effect.parameters.items() if name in _settings(effect)}
-        settings = {name: _everywhere(value, where, len(joints)) for name, value in settings.items()}
-        form = registry()[effect.name].configured(settings, tuple(joints))
+        given = {
+            name: _everywhere(value, where, len(joints)) if _is_words(value) else value
+            for name, value in effect.parameters.items()
+        }
+        try:
+            form, numbers = registry()[effect.name].read(given, tuple(joints))
+        except ValueError as error:
+            raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
         self.law: EffectLaw = form.running(rng)
         self.active = np.array([name in effect.joints for name in joints])
         self.everywhere = bool(self.active.all())
@@ -138,25 +142,16 @@ class _Running:
         return np.where(self.active, after, x)
 
 
-def _everywhere(value: Any, where: Sequence[int], joints: int) -> Any:
+def _everywhere(values: Sequence[Any], where: Sequence[int], joints: int) -> list[Any]:
     """A list with a word for each joint of the effect, as one with a word for each joint of the robot."""
-    if not isinstance(value, (list, tuple)):
-        return value
-    every = [value[0]] * joints
-    for joint, one in zip(where, value, strict=True):
+    every = [values[0]] * joints
+    for joint, one in zip(where, values, strict=True):
         every[joint] = one
     return every
 
 
-def _settings(effect: Effect) -> list[str]:
-    """The parameters that say which form of the law it is, rather than how strong."""
-    return [name for name, value in effect.parameters.items() if _is_word(value) or name == "full"]
-
-
-def _is_word(value: Any) -> bool:
-    return isinstance(value, str) or (
-        isinstance(value, (list, tuple)) and any(isinstance(one, str) for one in value)
-    )
+def _is_words(value: Any) -> bool:
+    return isinstance(value, (list, tuple)) and any(isinstance(one, str) for one in value)
 
 
 def _column(

@@ -300,19 +300,37 @@ def push(
 @app.command()
 def record(
     topics: Annotated[list[str] | None, typer.Argument(help="Topics to record.", show_default="all")] = None,
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("out/record.mcap"),
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            help="The file to write; with --ring the folder.", show_default="out/record.mcap, out/faults"
+        ),
+    ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after these.")] = None,
+    ring: Annotated[
+        float | None,
+        typer.Option(
+            min=1.0, help="Write only faults: each with so many seconds before it.", metavar="SECONDS"
+        ),
+    ] = None,
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.
 
+    With --ring what came last is kept in memory, and written to a file of its own whenever the robot goes into fault.
     Exit code 1, and no file, where nothing came. Of a recorder that was killed all but the last second can be read.
 
     \b
     For example:
       quadvel record low_state low_cmd --out walk.mcap
+      quadvel record --ring 30 --out out/faults
     """
     from .record import record as run_record
+    from .record import record_faults
 
+    if ring is not None:
+        record_faults(out or Path("out/faults"), topics or [], ring, seconds)
+        return
+    out = out or Path("out/record.mcap")
     if not run_record(out, topics or [], seconds):
         raise typer.Exit(1)
 
@@ -389,6 +407,18 @@ def world(context: typer.Context) -> None:
 def following(context: typer.Context) -> None:
     """Measure how well a person is followed, in simulated scenes in the plane."""
     _hand_on(context, "quadvel_eval.following.cli:following_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def plot(context: typer.Context) -> None:
+    """Draw what was recorded of a run: velocity, joints, torques, the controller's loop."""
+    _hand_on(context, "quadvel_eval.recording_plot:plot_command")
+
+
+@app.command(context_settings=HANDED_ON, add_help_option=False)
+def replay(context: typer.Context) -> None:
+    """Ask the actuator model and the estimator offline what they say of a recording."""
+    _hand_on(context, "quadvel_eval.offline:replay_command")
 
 
 @app.command(context_settings=HANDED_ON, add_help_option=False)

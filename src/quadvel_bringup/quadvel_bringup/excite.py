@@ -286,13 +286,14 @@ class _Session:
         from rclpy.executors import SingleThreadedExecutor
 
         from .recorder import Recorder
+        from .recording_file import RecordingFile
 
         task = bar.add_task("", total=self._player.total)
         playing, recording = SingleThreadedExecutor(), SingleThreadedExecutor()  # neither waits for the other
         playing.add_node(self._node)
         recording.add_node(self._recorder_node)
         try:
-            with Recorder(self._recorder_node, draft) as recorder:
+            with Recorder(self._recorder_node, RecordingFile(draft)) as recorder:
                 for topic, kind in RECORDED.items():
                     recorder.record(topic, kind)
                 while not self._player.done:

@@ -15,7 +15,8 @@ from quadvel_view.foxglove_live import FoxgloveServer
 from quadvel_view.view_node import NICENESS
 
 from .processes import StopSignals
-from .recorder import ANY_QOS, HIDDEN, LATCHED, LATCHED_QOS
+from .recorder import ANY_QOS, HIDDEN, LATCHED_QOS
+from .recording_file import LATCHED
 from .session import Session
 
 LOOK = 0.5  # s, between two looks for new topics

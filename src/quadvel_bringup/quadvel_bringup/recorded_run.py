@@ -79,6 +79,7 @@ class RecordedRun(ABC):
         from rclpy.signals import SignalHandlerOptions
 
         from .recorder import Recorder
+        from .recording_file import RecordingFile
 
         rclpy.init(args=["--ros-args", *enclave("recorder")], signal_handler_options=SignalHandlerOptions.NO)
         use_sim_time = Parameter("use_sim_time", value=self._lockstep)
@@ -88,7 +89,11 @@ class RecordedRun(ABC):
         try:
             ensure_alone(node)
             self.listen(node)
-            with StopSignals() as signals, Recorder(node, self._recording) as recorder, self._bar:
+            with (
+                StopSignals() as signals,
+                Recorder(node, RecordingFile(self._recording)) as recorder,
+                self._bar,
+            ):
                 for topic, kind in {**RECORDED, **self._topics}.items():
                     recorder.record(topic, kind)
                 with ProcessGroup(self._say) as group:

@@ -70,11 +70,11 @@ class ReplayError:
     growth: tuple[float, ...]
 
 
-def read_joints(path: Path) -> Joints:
+def read_joints(path: Path, longest: float = DT) -> Joints:
     """The joints' part of a recording at 1 kHz; states that the recorder missed are marked, and interpolated.
 
-    A command counts from the instant of the state that it answers, whatever its own stamp says. ValueError where
-    the recording holds nothing of that rate.
+    longest: s, from one state to the next, usually. A command counts from the instant of the state that it answers, whatever
+    its own stamp says. ValueError where the recording holds nothing of that rate.
     """
     states: dict[int, Any] = {}
     commands: dict[int, Any] = {}
@@ -82,9 +82,10 @@ def read_joints(path: Path) -> Joints:
         (states if topic == "/low_state" else commands)[message.tick] = message
     ticks = np.array(sorted(states))
     period = np.median(np.diff(ticks)) * 1e-3 if len(ticks) > 1 else np.nan
-    if period != DT or not commands:
+    if not period <= longest or not commands:
         raise ValueError(
-            f"{path}: low_state: found a period of {period:g} s, expected {DT:g} s, and commands"
+            f"{path}: low_state: found a period of {period:g} s and {len(commands)} commands, expected {longest:g} s"
+            " at most, and commands"
         )
     every = np.arange(ticks[0], ticks[-1] + 1)
     rows = [states[tick] for tick in ticks.tolist()]
@@ -108,20 +109,31 @@ def _held(commands: Mapping[int, Any], ticks: Array) -> Array:
     return held
 
 
+def modelled_torque(actuator: ActuatorParameters, joints: Joints, first: int, stop: int) -> Array:
+    """What `actuator` says of the recorded commands and motion, (rows, 12) N m, for the rows from `first` to before `stop`.
+
+    Noise of encoders is averaged out. What lies before `first` is not known to the drives' delays.
+    """
+    q, dq = (savgol_filter(values, 2 * STEADY + 1, 1, axis=0) for values in (joints.q, joints.dq))
+    model = ActuatorModel(attrs.evolve(actuator, torque_noise=0.0), dt=DT)
+    found = np.empty((stop - first, 12))
+    for row in range(first, stop):
+        c = _command(joints, row)
+        found[row - first] = model.step(q[row], dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
+    return found
+
+
 def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end: float) -> float:
     """Mean square of measured minus modelled torque, N^2 m^2, on the recorded motion between `start` and `end`.
 
     The drives acted on the motion itself, so that what encoders add to it is averaged out.
     """
-    q, dq = (savgol_filter(values, 2 * STEADY + 1, 1, axis=0) for values in (joints.q, joints.dq))
-    model = ActuatorModel(attrs.evolve(actuator, torque_noise=0.0), dt=DT)
-    begin, stop = np.searchsorted(joints.time, [start, end])
-    squares = []
-    for row in range(max(begin - PAST, 0), stop):
-        c = _command(joints, row)
-        torque = model.step(q[row], dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
-        if row >= begin and joints.whole(row - PAST, row + 1):
-            squares.append(np.mean((joints.tau[row] - torque) ** 2))
+    begin, stop = np.searchsorted(joints.time, [start, end]).tolist()
+    first = max(begin - PAST, 0)
+    off = joints.tau[first:stop] - modelled_torque(actuator, joints, first, stop)
+    squares = [
+        np.mean(off[row - first] ** 2) for row in range(begin, stop) if joints.whole(row - PAST, row + 1)
+    ]
     if not squares:
         raise ValueError(f"nothing was recorded without gaps between {start:.2f} and {end:.2f} s")
     return float(np.mean(squares))

@@ -13,13 +13,14 @@ from .rollouts import TIMES, Limits, Rollouts
 
 Array = NDArray[np.float64]
 
-FORGETS = 2.0  # s, in which a person's velocity is taken to fade
+FADES = 2.0  # s, in which the velocity of the person who is followed is taken to fade, as it may stop; others walk on
 BODY = 0.25  # m, from the middle of a person to its outside
 SOFT = 0.3  # m, up to which an error of the distance counts by its square, and then by itself
 TURNS = 0.7  # m, from its place beside the person, up to which the robot turns as the person does
 CHANGES = np.array([3.0, 10.0, 15.0])  # cost of the squared change of vx, vy, wz from one step to the next
 USE = np.array([0.0, 2.0, 0.3])  # of their squares
 COLLISION = 1000.0
+CLOSE = 100.0  # 1/m^2, cost of the least distance to a person, as far as it is below 0.5 m
 GUARD = 0.05  # m, below which a clearance counts as a collision
 
 
@@ -50,10 +51,10 @@ class Situation:
         return self.rest == 0.0
 
 
-def ahead(persons: Array) -> Array:
-    """Where persons (n, 4) will be at `TIMES`, (n, STEPS, 2)."""
-    walked = FORGETS * (1.0 - np.exp(-TIMES / FORGETS))
-    return persons[:, None, :2] + walked[:, None] * persons[:, None, 2:]
+def led_ahead(person: Array) -> Array:
+    """Where the person (4,) who is followed will be at `TIMES`, (STEPS, 2)."""
+    walked = FADES * (1.0 - np.exp(-TIMES / FADES))
+    return person[:2] + walked[:, None] * person[2:]
 
 
 @attrs.frozen
@@ -109,7 +110,7 @@ class FollowCost:
         return situation.goal + self._beside(situation) if situation.direct else situation.goal
 
     def _following(self, situation: Situation, rollouts: Rollouts) -> Array:
-        far, turn = self.errors(situation, rollouts.poses, ahead(situation.person[None])[0])
+        far, turn = self.errors(situation, rollouts.poses, led_ahead(situation.person))
         return (10.0 * (np.sqrt(far**2 + SOFT**2) - SOFT) + 6.0 * (1.0 - np.cos(turn))).mean(1)
 
     def _obstacles(self, clearance: Array, speed: Array) -> Array:
@@ -120,19 +121,20 @@ class FollowCost:
             COLLISION * (least < GUARD) + 200.0 * short**2 + (20.0 * near**2 + 1.5 * speed**2 * near).mean(1)
         )
 
-    def gaps(self, persons: Array, poses: Array) -> Array:
-        """Between the outline at poses (K, STEPS, 3) and persons (n, 4) who walk on, (n, K, STEPS) in m."""
+    def gaps(self, situation: Situation, poses: Array) -> Array:
+        """Between the outline at poses (K, STEPS, 3) and everybody, who is followed first, (persons, K, STEPS) in m."""
         half = (0.5 * self.length, 0.5 * self.width)
-        return np.array([outline_distance(place, poses, half) - BODY for place in ahead(persons)])
+        others = situation.others[:, None, :2] + TIMES[:, None] * situation.others[:, None, 2:]
+        every = [led_ahead(situation.person), *others]
+        return np.array([outline_distance(place, poses, half) - BODY for place in every])
 
     def _persons(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
-        every = np.vstack([situation.person[None], situation.others])
-        gap = self.gaps(every, rollouts.poses).min(0)
-        least = gap.min(1)
-        near = np.maximum(1.0 - gap, 0.0)
-        return (
-            COLLISION * (least < GUARD) + 40.0 * np.maximum(0.5 - least, 0.0) ** 2 + (speed**2 * near).mean(1)
-        )
+        """Nobody is met; past others, of whom one does not know where they go, the robot is slow."""
+        gaps = self.gaps(situation, rollouts.poses)
+        least = gaps.min(axis=(0, 2))
+        near = np.maximum(1.0 - gaps[1:].min(0, initial=np.inf), 0.0)
+        met = COLLISION * (least < GUARD) + CLOSE * np.maximum(0.5 - least, 0.0) ** 2
+        return met + (speed**2 * near).mean(1)
 
     def _unseen(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
         """Fast into what the scan does not show."""

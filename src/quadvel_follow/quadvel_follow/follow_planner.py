@@ -5,6 +5,7 @@ Plain numbers and times; it knows no ROS. `follow_costs` says which ways are goo
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Sequence
 from enum import Enum
 from typing import Any
@@ -16,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from .clearance import Clearance
 from .clusters import Scan
 from .dynamic_window import DynamicWindow
-from .follow_costs import BODY, FollowCost, Situation, ahead
+from .follow_costs import BODY, FollowCost, Situation, led_ahead
 from .obstacle_memory import ObstacleMemory
 from .pose_history import PoseHistory
 from .pursuit import pursue
@@ -36,10 +37,14 @@ SURE = (
 )
 UNSURE = 1.0  # m, from which the robot is as slow as it gets
 SLOWEST = 0.4  # of its speed, where the person is unsure
-NEAREST = 0.6  # m, from the person to the robot's middle, where it has to have stopped if the person stops
-REACTS, BRAKES = 0.3, 2.5  # s, m/s^2, until it brakes and how, as measured with the shipped policy
+NEAREST = 0.7  # of the distance, where the robot has to have stopped if the person stops at once
+REACTS, BRAKES = (
+    0.4,
+    1.8,
+)  # s, m/s^2, until it brakes for a person who stops, the tracker's delay included, and how
 AT_EASE = (0.25, 0.5)  # m, rad, errors of a standing robot that it leaves alone
 ARRIVED = (0.12, 0.2)  # m, rad, those of a walking robot that may stand
+CROWDED = 0.4  # of the distance, by which the robot may stand too near
 STANDS = 0.25  # m/s, below which a person stands
 NEARLY = 0.4  # m, of the distance that is too large, up to which nothing is in the way
 TRIES = 0.6  # s, without a way, after which the robot says that it is blocked
@@ -88,7 +93,7 @@ class FollowConfig:
         (1.2, 0.8, 1.5), "largest change of a command away from zero, m/s^2, rad/s^2"
     )
     deceleration: Axes = _described(
-        (2.0, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2"
+        (2.5, 1.5, 3.0), "largest change of a command towards zero, m/s^2, rad/s^2"
     )
     stop_deceleration: Axes = _described(
         (5.0, 4.0, 8.0), "the same where the robot has to stop at once, m/s^2, rad/s^2"
@@ -138,10 +143,11 @@ class FollowPlanner:
         self._poses = PoseHistory(self._mounting.tolist())
         self._memory = ObstacleMemory()
         self._trail = Trail()
-        self._waiting: _Heard | None = None  # a scan that is newer than the odometry
+        self._waiting: deque[_Heard] = deque(maxlen=5)  # scans that are newer than the odometry
         self._scan: _Heard | None = None
         self._odometry: _Heard | None = None
         self._person: _Heard | None = None
+        self._deviation = 0.0  # m, of its position
         self._others: _Heard | None = None
         self._command = np.zeros(3)
         self._rate = np.zeros(3)  # of the command
@@ -158,13 +164,13 @@ class FollowPlanner:
         if not np.isfinite(motion).all():
             raise ValueError(f"velocity is {motion.tolist()}, expected finite numbers")
         if stamp <= self._poses.newest:
-            self._scan = self._waiting = None
+            self._scan = None
+            self._waiting.clear()
             self._memory = ObstacleMemory()
         self._poses.add(stamp, pose)
         self._odometry = _Heard(now, stamp, (np.array(pose, float), motion))
-        if self._waiting is not None and self._waiting.stamp <= stamp:
-            waiting, self._waiting = self._waiting, None
-            self._use(waiting)
+        while self._waiting and self._waiting[0].stamp <= stamp:
+            self._use(self._waiting.popleft())
 
     def on_scan(
         self, now: float, stamp: float, ranges: ArrayLike, angle_min: float, angle_increment: float
@@ -174,12 +180,14 @@ class FollowPlanner:
         if stamp <= self._poses.newest:
             self._use(heard)
         else:
-            self._waiting = heard
+            self._waiting.append(heard)
 
     def _use(self, heard: _Heard) -> None:
         pose = self._poses.sensor_at(heard.stamp)
-        persons = [np.asarray(h.value)[..., :2].reshape(-1, 2) for h in (self._person, self._others) if h]
-        self._memory.add(heard.stamp, heard.value, pose, np.concatenate(persons) if persons else ())
+        known = [
+            _moved(_persons(h.value), heard.stamp - h.stamp)[:, :2] for h in (self._person, self._others) if h
+        ]
+        self._memory.add(heard.stamp, heard.value, pose, np.concatenate(known) if known else ())
         self._scan = _Heard(heard.now, heard.stamp, (heard.value, pose))
 
     def on_person(self, now: float, stamp: float, person: ArrayLike, deviation: float) -> None:
@@ -190,7 +198,7 @@ class FollowPlanner:
         found = _persons(person)[0]
         if not deviation >= 0.0:
             raise ValueError(f"deviation is {deviation}, expected 0 m or more")
-        self._person = _Heard(now, stamp, np.append(found, deviation))
+        self._person, self._deviation = _Heard(now, stamp, found), deviation
         if deviation < SURE:
             self._trail.add(found[:2])
 
@@ -316,7 +324,7 @@ class FollowPlanner:
         pose, velocity = self._now(now)
         # The stamps' clock, as far as the odometry tells.
         stamp = self._odometry.stamp + now - self._odometry.now
-        person = _moved(self._person.value[None, :4], stamp - self._person.stamp)[0]
+        person = _moved(self._person.value[None], stamp - self._person.stamp)[0]
         others = np.zeros((0, 4))
         if self._others is not None and now - self._others.now <= self.config.person_timeout:
             others = _moved(self._others.value, stamp - self._others.stamp)
@@ -341,9 +349,9 @@ class FollowPlanner:
     def _limits_now(self, scan: Scan, off: Array) -> Limits:
         """Slower for a person who is unsure or, at `off` (2,) m, near; backwards only where the scan shows what is there."""
         assert self._person is not None
-        share = np.interp(self._person.value[4], (SURE, UNSURE), (1.0, SLOWEST))
+        share = np.interp(self._deviation, (SURE, UNSURE), (1.0, SLOWEST))
         vx, vy, wz = self.config.max_velocity
-        vx = min(vx, _speed_to_stop(float(np.hypot(*off)) - NEAREST))
+        vx = min(vx, _speed_to_stop(float(np.hypot(*off)) - NEAREST * self.config.distance))
         seen = scan.at(BEHIND - self._mounting[2])
         backward = BACKWARD if (seen > self.config.length).all() else 0.0
         return attrs.evolve(self._limits, velocity=(share * vx, share * vy, wz), backward=backward)
@@ -379,11 +387,11 @@ class FollowPlanner:
         if np.hypot(*situation.person[2:]) > STANDS or not situation.direct:
             return False
         far, off = ARRIVED if self._command.any() else AT_EASE
-        return (abs(error) < far or -0.6 * self.config.distance < error < 0.0) and abs(turn) < off
+        return (abs(error) < far or -CROWDED * self.config.distance < error < 0.0) and abs(turn) < off
 
     def _guesses(self, situation: Situation) -> Array:
         """Towards the goal, as if nothing stood about, (n, STEPS, 3)."""
-        person, pose = ahead(situation.person[None])[0], situation.pose
+        person, pose = led_ahead(situation.person), situation.pose
         start = np.broadcast_to(pose, (1, STEPS, 3))
         far = self._cost.errors(situation, start, person)[0][0]
         goal = self._cost.place(situation)
@@ -398,9 +406,8 @@ class FollowPlanner:
         braking[0, 0] = targets[0]
         stopping = attrs.evolve(situation.limits, deceleration=self.config.stop_deceleration)
         poses = roll_out(braking, situation.pose, situation.velocity, situation.command, stopping).poses
-        every = np.vstack([situation.person[None], situation.others])
         for way in (poses, planned):
-            gaps = self._cost.gaps(every, way)[..., TIMES < SOON]
+            gaps = self._cost.gaps(situation, way)[..., TIMES < SOON]
             if min(situation.clearance.of(way).min(), gaps.min()) > 0.0:
                 return True
         return False

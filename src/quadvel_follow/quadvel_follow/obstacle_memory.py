@@ -20,7 +20,7 @@ BELIEVED = 3  # readings of a place farther off, less those that found it empty,
 SURE = 4  # most that are counted, so that what has left is soon forgotten
 BEHIND = 0.2  # m, from a place to a reading beyond it that finds it empty
 AGE = 30.0  # s, after which what was not seen again is forgotten
-PERSON = 0.35  # m, from the middle of a person to readings of it
+PERSON = 0.45  # m, from the middle of a person to readings of it: a leg that leads is half a step ahead
 LONGEST = 8.0  # m, up to which a ray without a reading says that nothing is there
 _ROW = 1 << 20  # cells, far more than any way leads
 

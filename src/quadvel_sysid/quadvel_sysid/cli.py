@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import TYPE_CHECKING, Annotated, Any
 
-import attrs
-import numpy as np
 import typer
 from rich.console import Console
 from rich.markup import escape
@@ -20,8 +18,10 @@ from typer.core import TyperCommand
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .logs.inspect import Inspection, inspect
-from .logs.log import Log, LogError
+from .baselines import SPAN
+from .logs.checks import Inspection
+from .logs.columns import ColumnMap
+from .logs.dataset import Dataset
 from .logs.read_log import read_log
 from .memory import give_large_arrays_back, keep_freed_arrays
 
@@ -64,7 +64,8 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 @app.command(cls=_SeveralValues, no_args_is_help=True)
 def identify(
     logs: Annotated[
-        list[Path], typer.Argument(metavar="LOG...", help="Logs to fit: .mcap, rosbag2 folder, .npz or .csv.")
+        list[Path],
+        typer.Argument(metavar="LOG...", help="Logs to fit: .mcap, rosbag2 folder, .npz, .csv or .json."),
     ],
     out: Annotated[Path, typer.Option(help="Folder for report.html, report.json and actuator.yaml.")],
     holdout: Annotated[
@@ -87,6 +88,14 @@ def identify(
     ] = None,
     joints: Annotated[
         list[str] | None, typer.Option(metavar="NAME...", help="Use these joints only.", show_default="all")
+    ] = None,
+    columns: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MAPFILE",
+            help="YAML file that says what the logs call the fields.",
+            show_default="as below, or as PACE and JointState do",
+        ),
     ] = None,
     cores: Annotated[
         int | None,
@@ -115,12 +124,13 @@ def identify(
       t (N,)   q, dq (N, J)   q_des (N, J), or t_cmd (M,) with q_des_cmd (M, J)
       and if known: tau, kp, kd, dq_des, tau_ff, temperature, voltage, joint_names, valid
     A CSV file has the same as columns: t, q/FR_hip_joint, dq/FR_hip_joint, ...
+    Other names, units and signs, in a map file: t: {from: timestamp, scale: 1.0e-6}
 
     What is in the folder besides the three files stays. Ctrl-C leaves the folder as it was.
     """
     messages = Console(stderr=True)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, cores, messages)
+        _run(logs, holdout or [], out, base, gains, joints, columns, cores, messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
@@ -133,20 +143,22 @@ def _run(
     base: Path | None,
     gains: tuple[float, float] | None,
     joints: Sequence[str] | None,
+    columns: Path | None,
     cores: int | None,
     messages: Console,
 ) -> None:
     _check_folder(out)
+    names = ColumnMap() if columns is None else ColumnMap.load(columns)
     give_large_arrays_back()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
-    columns = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    with Progress(*columns, console=messages, transient=True) as bar:
+    parts = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    with Progress(*parts, console=messages, transient=True) as bar:
         task = bar.add_task("reading", total=1.0)
 
         def tell(share: float, text: str) -> None:
             bar.update(task, completed=share, description=text)
 
-        material, long = _material(logs, holdout, joints, gains, messages, tell)
+        material, long = _material(logs, holdout, joints, names, gains, messages, tell)
         if not long:
             keep_freed_arrays()
         from .identify import identified
@@ -159,6 +171,9 @@ def _run(
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
+    console.print(errors(found.report), soft_wrap=True, highlight=False)
+    for text in found.report["warnings"]:
+        messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
 
 
@@ -166,62 +181,32 @@ def _material(
     logs: Sequence[Path],
     holdout: Sequence[Path],
     joints: Sequence[str] | None,
+    names: ColumnMap,
     gains: tuple[float, float] | None,
     messages: Console,
     tell: Tell,
 ) -> tuple[Material, bool]:
     """What of the files is computed on, and whether they hold long logs, which are let go of here."""
-    fitted = read(logs, joints, gains, messages)
-    judged = read(holdout, joints, gains, messages, like=fitted[0])
-    long = sum(log.q.size for log in (*fitted, *judged)) >= _LONG
-    from .material import gathered  # what is wrong with the files shows before the engine is loaded
-
     with threadpool_limits(1):
-        return gathered(fitted, judged, gains, progress=tell), long
+        fitted, heldout = ([read_log(path, joints, names) for path in paths] for paths in (logs, holdout))
+        data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
+        long = sum(log.q.size for log in data.logs) >= _LONG
+        from .material import gathered  # what is wrong with the files shows before the engine is loaded
+
+        return gathered(data, gains, progress=tell), long
 
 
-def read(
-    paths: Sequence[Path],
-    joints: Sequence[str] | None,
-    gains: tuple[float, float] | None,
-    messages: Console,
-    like: Log | None = None,
-) -> list[Log]:
-    """The logs as they are, their joints in the order of `like`, the first one; what is found goes to `messages`.
-
-    Raises LogError, one sentence, where a log is refused or does not fit the others.
-    """
-    logs: list[Log] = []
-    for path in paths:
-        log = read_log(path, joints)
-        like = like or log
-        log = _like(log, like)
-        inspection = inspect(_with_gains(log, gains))
-        say(inspection, messages)
-        inspection.raise_refusal()
-        logs.append(log)
-    return logs
-
-
-def _like(log: Log, first: Log) -> Log:
-    """The log with the joints of the first; it must hold torque if that one does."""
-    if (log.tau is None) != (first.tau is None):
-        lacking, other = (log, first) if log.tau is None else (first, log)
-        raise LogError(f"{lacking.name}: tau: the field is missing, expected it as in {other.name}")
-    if len(log.joints) > len(first.joints):
-        extra = next(name for name in log.joints if name not in first.joints)
-        raise LogError(f"{log.name}: joint_names: '{extra}' is not in {first.name}, expected the same joints")
-    return log.select(first.joints)
-
-
-def _with_gains(log: Log, gains: tuple[float, float] | None) -> Log:
-    """The log with the given gains where it holds none. Raises ValueError."""
-    if gains is None:
-        return log
-    if not np.isfinite(gains).all() or min(gains) < 0.0:
-        raise ValueError(f"--gains: found {gains[0]:g} {gains[1]:g}, expected two gains of 0 or more")
-    kp, kd = (np.broadcast_to(gain, log.q_des.shape) for gain in gains)
-    return attrs.evolve(log, kp=kp if log.kp is None else log.kp, kd=kd if log.kd is None else log.kd)
+def errors(report: Mapping[str, Any]) -> str:
+    """The held-out errors in a line, those of what needs no model beside them."""
+    entries = (
+        ("PD as commanded", report["pd"]),
+        ("a PD law of each joint", report["baselines"]["joint_pd"]),
+        (f"a linear filter over {1e3 * SPAN:.0f} ms", report["baselines"]["ridge"]),
+        ("plain EAM", report["before"]),
+        ("corrected model", report["after"]),
+    )
+    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}" for name, entry in entries)
+    return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
 
 
 def say(inspection: Inspection, messages: Console) -> None:

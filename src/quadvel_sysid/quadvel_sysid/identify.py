@@ -16,13 +16,16 @@ import numpy as np
 from quadvel_actuator.parameters import ActuatorParameters
 
 from .account import Account, Judge
+from .baselines import baselines
 from .confidence import intervals
+from .contradictions import contradictions
 from .criterion import Parts, noise_variance
 from .delays import in_steps, latest
 from .eam import WINDOWS, pd_torque
 from .fit import fit
 from .identification import Identification
 from .library import SignalTerm
+from .logs.dataset import Dataset
 from .logs.findings import Finding
 from .logs.log import Log
 from .material import VALUES, Material, Progress, gathered
@@ -61,7 +64,8 @@ def identify(
     `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
     """
     options = options or Options()
-    material = gathered(train, heldout, options.gains, options.values, progress)
+    data = Dataset.of(train, heldout, options.gains)
+    material = gathered(data, options.gains, options.values, progress)
     return identified(material, options.base, options.cores, progress)
 
 
@@ -102,8 +106,12 @@ def identified(
         progress(0.95, "replays")
         tries = [outcome, *(told(one) for one in (search.laws_alone(best), before) if one is not best)]
         found = _with_motion(tries, body, findings)
+    parts, samples = reading.parts, reading.samples
+    logs = [one.log for one in samples.logs]
+    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
+    report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
-    return found
+    return attrs.evolve(found, report=report)
 
 
 def _plain(reading: Reading) -> Model:
@@ -136,7 +144,9 @@ def _outcome(
     leaning = () if account.white or has_terms else search.leaning(account)
     names = {one.law.name for one in account.model.applied}
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
-    ideal = pd_torque(samples, np.ones_like(whole.gains), 0.0, 0.0, 0.0)
+    asked = np.ones_like(whole.gains)
+    asked[1] = 0.0 if samples.logs[0].undamped else 1.0
+    ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
         late[0], before_whole, late[1], whole, effects, rejected, leaning,
         intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,

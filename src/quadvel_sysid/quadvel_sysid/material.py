@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
+from .logs.dataset import Dataset
 from .logs.excerpts import Piece, pieces
 from .logs.findings import Finding
-from .logs.inspect import inspect
-from .logs.log import Log, LogError
+from .logs.log import Log
 from .motion import Body, implied
 from .signals import Array
 
@@ -44,14 +44,13 @@ class Material:
 
 
 def gathered(
-    train: Sequence[Log],
-    heldout: Sequence[Log] = (),
+    data: Dataset,
     gains: tuple[float, float] | None = None,
     values: int = VALUES,
     progress: Progress = lambda share, text: None,
 ) -> Material:
     """Of the logs to fit and to judge on as many `values` of torque in all. Raises LogError where they can't be used together."""
-    logs, findings = _checked([*train, *heldout])
+    logs, train = data.logs, len(data.fitted)
     kp, kd = (np.array([gain]) for gain in gains) if gains else (None, None)
     body = None
     if logs[0].tau is None:
@@ -59,25 +58,10 @@ def gathered(
         logs, body = _moving(logs, kp, kd)
     rows = values // (len(logs) * len(logs[0].joints))
     # One script may have led all logs: what judges comes from other instants of it than what is fitted.
-    parts = [pieces(log, rows * log.period, between=k >= len(train)) for k, log in enumerate(logs)]
+    parts = [pieces(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
     chosen = tuple(piece for part in parts for piece in part)
-    fitted = sum(len(part) for part in parts[: len(train)]) if heldout else len(chosen)
-    return Material(chosen, fitted, kp, kd, body, tuple(findings))
-
-
-def _checked(logs: Sequence[Log]) -> tuple[list[Log], list[tuple[str, Finding]]]:
-    """The logs, `valid` narrowed to what a PD model can explain, and what was seen; refuses what cannot be used."""
-    inspected = [inspect(log) for log in logs]
-    for one in inspected:
-        one.raise_refusal()
-        if (one.log.tau is None) != (logs[0].tau is None):
-            raise LogError(f"{one.log.name}: tau: expected it in every log or in none, as in {logs[0].name}")
-        if one.log.joints != logs[0].joints:
-            raise LogError(
-                f"{one.log.name}: joint_names: found {', '.join(one.log.joints)}, "
-                f"expected those of {logs[0].name}: {', '.join(logs[0].joints)}"
-            )
-    return [one.log for one in inspected], [(one.log.name, f) for one in inspected for f in one.findings]
+    fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)
+    return Material(chosen, fitted, kp, kd, body, data.findings)
 
 
 def _moving(logs: Sequence[Log], kp: Array | None, kd: Array | None) -> tuple[list[Log], Body]:

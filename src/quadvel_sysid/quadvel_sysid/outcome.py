@@ -76,6 +76,11 @@ class Outcome:
     base: ActuatorParameters
 
     @property
+    def commanded_kd(self) -> float:
+        """In units of `kd_ref`: 0 where none was commanded, so that the deviation is all of the drive's damping."""
+        return 0.0 if self.before.samples.logs[0].undamped else 1.0
+
+    @property
     def after(self) -> Array:
         """Torque that the corrected model foretells, (N, J)."""
         return self.model.foretold().predict()
@@ -117,7 +122,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         "before": mses["before"]
         | {
             "delta_kp": float((o.before_whole.gains[0, 0] - 1.0) * o.kp_ref),
-            "delta_kd": float((o.before_whole.gains[1, 0] - 1.0) * o.kd_ref),
+            "delta_kd": float((o.before_whole.gains[1, 0] - o.commanded_kd) * o.kd_ref),
             "input_delay_ms": 1e3 * float(o.before_whole.delays[0, 0]),
             "output_delay_ms": 1e3 * float(o.before_whole.delays[1, 0]),
         },
@@ -213,7 +218,7 @@ def _gains(o: Outcome) -> dict[str, Any]:
     found: dict[str, Any] = {}
     rows = {
         "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
-        "delta_kd": ((model.gains[1] - 1.0) * o.kd_ref, widths.gains[1] * o.kd_ref),
+        "delta_kd": ((model.gains[1] - o.commanded_kd) * o.kd_ref, widths.gains[1] * o.kd_ref),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
         "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
     }
@@ -330,8 +335,12 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         effects.append(Effect(TERMS, acts, {"terms": saved}))
     deviations: dict[str, Any] = {
         "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
-        "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
+        "delta_kd": (model.gains[1] - o.commanded_kd) * o.kd_ref,
     }
+    if o.commanded_kd == 0.0:  # a deviation is relative to what is commanded: of nothing it would be nothing
+        own = {"b": np.maximum(deviations.pop("delta_kd"), 0.0).tolist()}
+        effects.append(Effect("viscous_friction", joints, own, {"b": "N m s/rad"}))
+        deviations["delta_kd"] = np.zeros(len(joints))
     deviations = {
         name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()
     }

@@ -87,6 +87,24 @@ def staged(field: str, **stages: Stage) -> Any:
     return property(lambda law: stages[getattr(law, field)])
 
 
+def one_of(*words: str) -> Any:
+    """A validator: a setting of a law that is one of these words."""
+
+    def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+        if value not in words:
+            raise ValueError(f"{attribute.name}: found {value!r}, expected one of {', '.join(words)}")
+
+    return check
+
+
+_KINDS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
+    "str": (str, "a word"),
+    "float": ((int, float), "a number"),
+    "tuple[str, ...]": ((list, tuple), "a list with a word for each joint"),
+}
+"""Of the fields of a law, by what they are annotated with, those that a parameter file may set; and what stands there."""
+
+
 Start = Mapping[str, Any]
 """a guess of every parameter but the `linear` ones: a number, or one for each joint (J,)"""
 
@@ -112,7 +130,7 @@ class EffectLaw(ABC):
     """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
-    at: str = attrs.field(default=DRIVE, kw_only=True, validator=attrs.validators.in_((DRIVE, JOINT)))
+    at: str = attrs.field(default=DRIVE, kw_only=True, validator=one_of(DRIVE, JOINT))
     """where a torque is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
     @classmethod
@@ -139,8 +157,36 @@ class EffectLaw(ABC):
         return None
 
     @classmethod
+    def read(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectLaw, dict[str, Any]]:
+        """The form of the law and its parameters, by name, as a parameter file gives both; the robot's `joints`.
+
+        Raises ValueError, which names the entry, for one that the law does not have or that is of another kind.
+        """
+        schema, settings = cls.schema(), {}
+        for name, value in given.items():
+            if name in schema:
+                kind, expected = _KINDS[schema[name]]
+                if not isinstance(value, kind) or isinstance(value, bool):
+                    raise ValueError(f"{name}: found {value!r}, expected {expected}")
+                settings[name] = value
+        form = cls.configured(settings, joints)
+        numbers = {name: value for name, value in given.items() if name not in settings}
+        for name in numbers:
+            if name not in form.names:
+                raise ValueError(f"{name}: unknown, expected one of {', '.join((*form.names, *schema))}")
+        return form, numbers
+
+    @classmethod
+    def schema(cls) -> dict[str, str]:
+        """What of the law a parameter file may set beside its parameters: the annotation of each."""
+        fields = {field.name: str(field.type) for field in attrs.fields(cls) if str(field.type) in _KINDS}
+        if cls.stage != Stage.ADDED:
+            del fields["at"]
+        return fields
+
+    @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
-        """The form that a parameter file names: of its parameters those that are no numbers; the robot's `joints`."""
+        """The form with these settings, each of a kind that `schema` names; the robot's `joints`."""
         return cls(**settings)
 
     @property

@@ -23,6 +23,7 @@ from .base import (
     Stage,
     Start,
     View,
+    one_of,
 )
 
 _FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
@@ -128,7 +129,7 @@ class Armature(AddedLaw):
     signal = "ddq"
     shifts = True
     motion = _FAST
-    of: str = "ddq"
+    of: str = attrs.field(default="ddq", validator=one_of(*_SLOPES))
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[Armature]:
@@ -162,7 +163,7 @@ class TimestampSkew(ErrorLaw):
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
     shifts = True
     motion = _FAST
-    channel: str = attrs.field(default="dq", validator=attrs.validators.in_(("q", "dq")))
+    channel: str = attrs.field(default="dq", validator=one_of("dq", "q"))
 
     @property
     def signal(self) -> str:  # type: ignore[override]

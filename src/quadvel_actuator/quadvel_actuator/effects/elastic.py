@@ -23,6 +23,7 @@ from .base import (
     Start,
     View,
     of_each,
+    one_of,
     rms,
     staged,
 )
@@ -134,7 +135,7 @@ class Deadband(ErrorLaw):
     parameters = (Parameter("width", "rad", 0.0005, 0.5, 0.01),)
     signal = "q_des"
     motion = _STILL
-    edge: str = attrs.field(default="soft", validator=attrs.validators.in_(("soft", "hard")))
+    edge: str = attrs.field(default="soft", validator=one_of("soft", "hard"))
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[Deadband]:
@@ -156,7 +157,7 @@ class Backlash(MemoryLaw):
 
     name = "backlash"
     stage = staged("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.FLOW)
-    on: str = "error"
+    on: str = attrs.field(default="error", validator=one_of("error", "q", "torque"))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 import attrs
 import numpy as np
 
-from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, of_each, smooth_sign
+from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, of_each, one_of, smooth_sign
 
 _WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
 _WIDTHS = (0.02, 0.06, 0.2)
@@ -22,7 +22,7 @@ class _Rubbing(AddedLaw):
     """Friction with a sign that turns as the hyperbolic tangent does, or slower, as the arctangent."""
 
     of_drive = False
-    turn: str = attrs.field(default="tanh", kw_only=True, validator=attrs.validators.in_(("tanh", "arctan")))
+    turn: str = attrs.field(default="tanh", kw_only=True, validator=one_of("tanh", "arctan"))
 
     @property
     def alternatives(self) -> tuple[EffectLaw, ...]:

@@ -23,6 +23,7 @@ from .base import (
     Start,
     TorqueLaw,
     View,
+    one_of,
     staged,
 )
 from .dynamics import lag, lagged
@@ -59,7 +60,7 @@ class ThermalDrift(TorqueLaw):
     stage = Stage.GAIN
     signal = "t"
     motion = "one motion repeated from cold until the drives are warm, with their temperature logged"
-    of: str = "time"
+    of: str = attrs.field(default="time", validator=one_of("time", "temperature"))
     cold: float = 25.0
 
     @property
@@ -105,8 +106,9 @@ class SupplySag(TorqueLaw):
     signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
     common = _OF_ONE_SUPPLY
-    what: str = "gain"
+    what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
     full: float = 1.0
+    of: str = attrs.field(default="voltage", validator=one_of("voltage", "power"))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
@@ -122,8 +124,8 @@ class SupplySag(TorqueLaw):
 
     @classmethod
     def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
-        own = {name: value for name, value in settings.items() if name != "of"}
-        return PowerSag(**own) if settings.get("of") == "power" else cls(**own)
+        form = cls(**settings)
+        return PowerSag(form.what) if form.of == "power" else form
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return _sags(self.what, self._strain(s), torque)
@@ -149,7 +151,7 @@ class PowerSag(MemoryLaw):
     motion = SupplySag.motion
     common = _OF_ONE_SUPPLY
     inputs = ("dq",)
-    what: str = "gain"
+    what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]

@@ -1,7 +1,7 @@
 """A measured log of joints, whatever file it came from; `read_log` makes one of a path.
 
 Here stands what a log has to be before anything can be computed from it: shapes that fit, finite numbers, times
-that rise. What a well-formed log says about the robot is for `inspect.py`; the formats are in `recordings.py`
+that rise. What a well-formed log says about the robot is for `checks.py`; the formats are in `recordings.py`
 (MCAP, rosbag2) and `tables.py` (NPZ, CSV).
 """
 
@@ -55,6 +55,7 @@ class Log:
     kp: Array | None = None  # (M, J) N m/rad
     kd: Array | None = None  # (M, J) N m s/rad
     remarks: tuple[str, ...] = ()  # what the reader had to assume
+    made: tuple[str, ...] = ()  # fields that the file did not hold, such as a dq that is made from q
 
     def __attrs_post_init__(self) -> None:
         for name in self.joints:
@@ -92,6 +93,23 @@ class Log:
             return self
         tau = self.tau - np.sum(asked, axis=0)[self.command_rows(self.t)]
         return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=self.dq_des if speed is None else None)
+
+    def with_gains(self, gains: tuple[float, float] | None) -> Log:
+        """The log with these commanded gains, kp and kd, where it holds none. Raises ValueError."""
+        if gains is None:
+            return self
+        if not np.isfinite(gains).all() or min(gains) < 0.0:
+            raise ValueError(f"--gains: found {gains[0]:g} {gains[1]:g}, expected two gains of 0 or more")
+        kp, kd = (np.broadcast_to(gain, self.q_des.shape) for gain in gains)
+        return attrs.evolve(
+            self, kp=kp if self.kp is None else self.kp, kd=kd if self.kd is None else self.kd
+        )
+
+    def of_rows(self, keep: Bools) -> Log:
+        """The log with the state rows that `keep` (N,) names; the commands stay."""
+        fields = ("t", "q", "dq", "valid", "tau", "temperature", "voltage")
+        taken = {name: getattr(self, name)[keep] for name in fields if getattr(self, name) is not None}
+        return attrs.evolve(self, **taken)
 
     def select(self, joints: Sequence[str]) -> Log:
         """The log with these joints only, in this order. Raises LogError for one that it does not hold."""

@@ -10,9 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import attrs
 import numpy as np
 from numpy.typing import NDArray
 
+from .findings import Finding, some
 from .log import Array, Bools, Log
 
 BIN = 0.02  # s
@@ -21,7 +23,64 @@ LOST = 0.2
 """Share of the usual position gain below which the position error is no longer answered."""
 SHORTEST = 0.15  # s, of a stretch out of PD control
 MARGIN = 0.1  # s, on both sides of it
+LEAST_VALID = 0.5  # s, of states that a model may be judged on
 LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
+ENOUGH = 40_000  # rows, of which the lag is read
+
+
+def explainable(log: Log) -> tuple[Bools, list[Finding]]:
+    """The rows that a PD model can explain, and what was left out of the others."""
+    findings: list[Finding] = []
+    for exclude in (_before_commands, _without_gain, _no_longer):
+        out, why = exclude(log)
+        log = attrs.evolve(log, valid=log.valid & ~out)
+        findings += why
+    seconds = float(log.valid.any(axis=1).sum()) * log.period
+    if seconds < LEAST_VALID:
+        text = f"valid: {seconds:.2f} s under PD control are left, expected {LEAST_VALID} s or more"
+        findings.append(Finding("refusal", "valid", (), text))
+    return log.valid, findings
+
+
+def _before_commands(log: Log) -> tuple[Bools, list[Finding]]:
+    early: Bools = (log.t < log.t_cmd[0])[:, None]
+    text = f"t_cmd: no command before {log.t_cmd[0]:.3f} s; left out"
+    return early, [Finding("note", "t_cmd", (), text)] if early.any() else []
+
+
+def _without_gain(log: Log) -> tuple[Bools, list[Finding]]:
+    off = without_position_gain(log)
+    everywhere: Any = off.all(axis=1)
+    findings = []
+    if everywhere.any():
+        text = f"kp: 0 (damping, switched off or torque control) {_spans(everywhere, log.t)}; left out"
+        findings.append(Finding("warning", "kp", (), text))
+    alone = tuple(log.joints[j] for j in np.flatnonzero((off & ~everywhere[:, None]).any(axis=0)))
+    if alone:
+        text = f"kp: 0 at times on {some(alone)} alone; left out there"
+        findings.append(Finding("warning", "kp", alone, text))
+    return off, findings
+
+
+def _no_longer(log: Log) -> tuple[Bools, list[Finding]]:
+    lost = out_of_control(log)
+    field, what = (
+        ("q", "the joints no longer follow") if log.tau is None else ("tau", "the torque no longer answers")
+    )
+    text = f"{field}: {what} the position error {_spans(lost, log.t)}: not under PD control (damping or switched off); left out"
+    return lost[:, None], [Finding("warning", field, (), text)] if lost.any() else []
+
+
+def masked(log: Log) -> Iterator[Finding]:
+    """Rows that the log itself says are not to be explained."""
+    out = ~log.valid.all(axis=1)
+    if out.any():
+        yield Finding("note", "valid", (), f"valid: false {_spans(out, log.t)}; left out, as the log says")
+
+
+def _spans(rows: Any, t: Array) -> str:
+    spans = stretches(rows, t)
+    return f"{in_words(spans, t)} ({sum(last - first for first, last in spans):.2f} s)"
 
 
 def without_position_gain(log: Log) -> Bools:
@@ -47,7 +106,9 @@ def _unanswered(log: Log) -> Bools:
     """Torque against position error, in short windows over all joints: where is the gain far below its usual size?"""
     steps = np.diff(((log.t - log.t[0]) / BIN).astype(np.intp), prepend=0)
     bins = np.cumsum(np.minimum(steps, WINDOW))  # a gap is as good as one that no window bridges
-    lag, sums = max(((lag, _sums(log, bins, lag)) for lag in LAGS), key=lambda one: _explained(one[1]))
+    some = np.flatnonzero(bins % max(1, len(bins) // ENOUGH) == 0)
+    lag = max(LAGS, key=lambda lag: _explained(_sums(log, bins, some, lag)))
+    sums = _sums(log, bins, np.arange(len(bins)), lag)
     count, ee, ed, dd, et, dt, _ = (np.convolve(row, np.ones(WINDOW), "same") for row in sums)
     determinant = ee * dd - ed**2
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -99,12 +160,12 @@ def _answers(log: Log, rows: NDArray[np.intp], lag: float) -> Iterator[tuple[Arr
         yield use, e, -use * log.dq[row, j], use * log.tau[rows, j]
 
 
-def _sums(log: Log, bins: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
-    """Sums in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
+def _sums(log: Log, bins: NDArray[np.intp], rows: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+    """Sums of `rows` in each bin, over the joints: 1, ee, e dq, dq dq, e tau, dq tau, tau tau; e and dq `lag` s earlier."""
     total = np.zeros((7, bins[-1] + 1))
-    for use, e, d, tau in _answers(log, np.arange(len(log.t)), lag):
+    for use, e, d, tau in _answers(log, rows, lag):
         for k, product in enumerate((use, e * e, e * d, d * d, e * tau, d * tau, tau * tau)):
-            total[k] += np.bincount(bins, product, len(total[k]))
+            total[k] += np.bincount(bins[rows], product, len(total[k]))
     return total
 
 

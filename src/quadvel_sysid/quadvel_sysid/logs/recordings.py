@@ -16,8 +16,9 @@ from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_SERVO
 from quadvel_recordings.reading import RecordingError, read_messages
 
+from .files import precision
 from .log import Array, Log, LogError
-from .tables import drop_repeated_times, precision
+from .tables import drop_repeated_times
 
 STATE, COMMAND = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 STATE_FIELDS = ("q", "dq", "tau")
@@ -83,7 +84,9 @@ def read(path: Path) -> Log:
         name=str(path),
         joints=JOINT_NAMES,
         t=t,
-        **state,
+        q=state["q"],
+        dq=state["dq"],
+        tau=state["tau"],
         valid=np.ones(state["q"].shape, bool),
         t_cmd=t_cmd,
         q_des=command["q"],

@@ -109,6 +109,8 @@ def _tiles(report: Mapping[str, Any]) -> str:
         [
             (number(report["pd"]["heldout_mse"]), f"ideal PD, {unit}"),
             (number(before["heldout_mse"]), f"plain EAM, {unit}"),
+            (number(report["baselines"]["joint_pd"]["heldout_mse"]), "a PD law of each joint"),
+            (number(report["baselines"]["ridge"]["heldout_mse"]), "a linear filter over 16 ms"),
             (number(after["heldout_mse"]), f"corrected model, {unit}"),
             (number(report["noise_floor"]), "noise floor, N² m²"),
             (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM"),

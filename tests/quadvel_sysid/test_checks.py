@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from quadvel_description.robot import JOINT_NAMES, NOMINAL_Q
-from quadvel_sysid.logs.inspect import Inspection, inspect
+from quadvel_sysid.logs.checks import Inspection, inspect
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 
@@ -86,11 +86,14 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
     [
         ({"q": fields()["q"] / SHARE}, "dq: the slope of q is 57.3 times dq"),
         ({"dq": fields()["dq"] / SHARE}, "dq: the slope of q is 0.017"),
-        ({"t": fields()["t"] * 1e3, "t_cmd": fields()["t"] * 1e3}, "dq: the slope of q is 0.001 times dq"),
+        (
+            {"t": fields()["t"] * 1e3, "t_cmd": fields()["t"] * 1e3},
+            "t: a row comes every 2 s; is t in milliseconds",
+        ),
         ({name: fields()[name] / SHARE for name in ("q", "dq", "q_des")}, "q: up to "),
         ({"q_des": fields()["q_des"] / SHARE}, "q_des: about 57 times as large as q: degrees?"),
         ({"dq": -fields()["dq"]}, "dq: has the opposite sign"),
-        ({"tau": -fields()["tau"]}, "tau: has the wrong sign on"),
+        ({"tau": -fields()["tau"]}, "tau: has the opposite sign on FR_hip"),
         (
             {"q_des": exchanged(fields()["q_des"])},
             "q_des: a joint's q follows another joint's command (FR_hip",
@@ -101,7 +104,7 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ),
         (
             {"q": exchanged(fields()["q"]), "dq": exchanged(fields()["dq"])},
-            "q_des: a joint's q follows another",
+            "q: a joint's torque answers its own command at another joint's angle (FR_hip",
         ),
         (
             {"tau": exchanged(fields()["tau"])},
@@ -113,10 +116,12 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
             "tau: does not answer the position error",
         ),
         ({"q": np.zeros((2000, 12)), "dq": np.zeros((2000, 12))}, "q: no joint ever moves"),
-        ({"tau": np.zeros((2000, 12))}, "tau: never changes on any joint"),
         ({"kp": np.zeros((2000, 12))}, "valid: 0.00 s under PD control are left"),
         ({"kp": np.full((2000, 12), -30.0)}, "kp: found -30"),
-        ({"t": fields()["t"] * 1e6, "t_cmd": fields()["t"] * 1e6}, "dq: the slope of q is 1e-06 times dq"),
+        (
+            {"t": fields()["t"] * 1e6, "t_cmd": fields()["t"] * 1e6},
+            "t: a row comes every 2000 s; is t in",
+        ),
         ({"t": set_back(fields()["t"])}, "t: jumps by 1.7e+09 s from row 999 to row 1000"),
         ({"t_cmd": fields()["t"] + 1e9}, "t_cmd: 1e+09 to 1e+09 s, t: 0 to 3.998 s: nothing in common"),
         ({"t_cmd": fields()["t"] * 1e3}, "t_cmd: 0 to 3998 s, t: 0 to 3.998 s: 1e+03 times as long"),
@@ -126,9 +131,12 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ({"dq": 2.0 * fields()["dq"]}, "dq: the slope of q is 0.5 times dq on FR_hip_joint"),
         (
             {"q": of_one(fields()["q"], -1.0), "dq": of_one(fields()["dq"], -1.0)},
-            "q: has the wrong sign on FR_thigh_joint",
+            "q: FR_thigh_joint has the opposite sign of its command and its torque",
         ),
-        ({"q_des": of_one(fields()["q_des"], -1.0)}, "q_des: has the wrong sign on FR_thigh_joint"),
+        (
+            {"q_des": of_one(fields()["q_des"], -1.0)},
+            "q_des: FR_thigh_joint answers its own command with the opposite sign",
+        ),
         ({"tau": of_one(fields()["tau"], 1e3)}, "tau: 1e+03 times what kp asks for on FR_thigh_joint"),
         ({"kp": of_one(np.full((2000, 12), 30.0), 100.0)}, "tau: 0.00999 times what kp asks for on FR_thigh"),
     ],
@@ -233,10 +241,29 @@ def test_torque_that_was_fed_forward_is_not_looked_for_in_the_position_error() -
 
 
 def test_unknown_gains_and_missing_torque_are_said() -> None:
-    notes = said(inspect(log(kp=None, kd=None, tau=None)), "note")
+    notes = said(inspect(log(kp=None, kd=None)), "note")
     assert "kp: not in the log; it is fitted" in notes
     assert "kd: not in the log; it is fitted" in notes
-    assert any(text.startswith("tau: not in the log") for text in notes)
+    notes = said(inspect(log(tau=None)), "note")
+    assert any(one.startswith("tau: not in the log; effects") for one in notes)
+
+
+def test_without_torque_and_gains_nothing_has_a_scale() -> None:
+    (text,) = said(inspect(log(kd=None, tau=None)), "refusal")
+    assert text.startswith("tau, kd: not in the log; expected the torque, or the commanded gains")
+    assert said(inspect(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
+
+
+def test_gains_that_are_given_are_not_missed() -> None:
+    assert not any(
+        "kp: not in" in text for text in said(inspect(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
+    )
+
+
+def test_a_torque_that_never_changes_is_taken_as_not_logged() -> None:
+    inspection = inspect(log(tau=np.zeros((2000, 12))))
+    assert inspection.log.tau is None
+    assert "tau: is 0 throughout, which is no measurement; taken as not logged" in said(inspection, "warning")
 
 
 def test_what_the_motion_cannot_tell_apart_is_said() -> None:

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from .channels import rows_of
 from .findings import Finding
 from .log import Log
-from .plausible import rows_of
 
 APART = 0.3
 """Share (of the root mean square) of a trace that no mix of the others gives; below it a sentence is due."""
@@ -64,8 +64,8 @@ def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
     dq = log.dq[row].astype(float)
     ddq = (log.dq[last] - log.dq[first]) / span
     slope = (log.q_des[log.command_rows(log.t[last])] - log.q_des[log.command_rows(log.t[first])]) / span
-    kp = KP if log.kp is None else np.asarray(log.kp)[command]
-    kd = KD if log.kd is None else np.asarray(log.kd)[command]
+    kp = KP if log.kp is None or not log.kp.any() else np.asarray(log.kp)[command]
+    kd = KD if log.kd is None or not log.kd.any() else np.asarray(log.kd)[command]
     traces = {
         "kp": q_des - log.q[row],
         "kd": -dq,

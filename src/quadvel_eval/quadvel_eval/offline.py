@@ -1,0 +1,188 @@
+"""`quadvel replay`: a recording through the actuator model and the velocity estimator, offline. What would they have said?"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import attrs
+import numpy as np
+import typer
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.table import Table
+
+from quadvel_actuator import ActuatorParameters
+from quadvel_description.robot import JOINT_NAMES
+from quadvel_estimator.features import previous_action
+from quadvel_estimator.kalman import KalmanEstimator
+from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
+from quadvel_estimator.tracker import Estimator, VelocityTracker
+from quadvel_nodes.messages import MessageError, read_low_state
+from quadvel_nodes.robot_time import RobotTime
+from quadvel_recordings.reading import RecordingError, read_messages
+
+from .output import output_folder, replacing
+from .recording_plot import Run, add_legend, panels_over, read_run
+from .replay import PAST, Joints, modelled_torque, read_joints
+from .segments import rounded
+
+Array = NDArray[np.float64]
+
+SLOWEST = 0.005  # s, from one state to the next
+AXES = ("vx", "vy", "vz")
+
+
+@attrs.frozen(eq=False)
+class Torques:
+    """What the drives measured and what the model says, (n, 12) N m, at `time` (n,) s, where states and their past are whole."""
+
+    time: Array
+    measured: Array
+    modelled: Array
+
+    @property
+    def errors(self) -> Array:
+        """RMS of measured minus modelled, (12,) N m."""
+        found: Array = np.sqrt(np.mean((self.measured - self.modelled) ** 2, axis=0))
+        return found
+
+
+def torques(joints: Joints, actuator: ActuatorParameters) -> Torques:
+    """Raises ValueError where no row of the recording has its past."""
+    modelled = modelled_torque(actuator, joints, 0, len(joints.time))
+    rows = joints.seen.copy()
+    rows[:PAST] = False
+    if not rows.any():
+        raise ValueError(f"joints: found {len(rows)} ms of states, expected more than {PAST}")
+    return Torques(joints.time[rows], joints.tau[rows], modelled[rows])
+
+
+def estimated(path: Path, estimator: Estimator) -> tuple[Array, Array]:
+    """What `estimator` says of the recorded states and commands: times (n,), s, and velocities (n, 3), m/s, body frame.
+
+    States that it can't use are left out. Raises RecordingError where none can be.
+    """
+    tracker, clock = VelocityTracker(estimator), RobotTime()
+    times, found = [], []
+    for topic, _, message in read_messages(path, lambda topic, _: topic in ("/low_state", "/low_cmd")):
+        if topic == "/low_cmd":
+            tracker.command(previous_action(np.asarray(message.q, float), message.mode))
+            continue
+        try:
+            state = read_low_state(message)
+            stamp, state.time = state.time, clock.follow(state.time, state.tick)
+            estimate = tracker.take(state)
+        except (MessageError, FloatingPointError):
+            continue
+        if estimate is not None:
+            times.append(stamp)
+            found.append(estimate.velocity)
+    if not times:
+        raise RecordingError(f"{path}: low_state: found no state that an estimator can use")
+    return np.array(times), np.array(found)
+
+
+def velocity_errors(run: Run, times: Array, found: Array) -> Mapping[str, Array]:
+    """RMS (2,) of vx and vy, m/s: of the velocities found minus what the robot's own estimator said, and minus the true ones, where
+    these were recorded.
+    """
+    errors = {}
+    for name, topic in (("recorded estimate", "/velocity_estimate"), ("truth", "/ground_truth/odom")):
+        if topic in run.lines:
+            time, value = run.lines[topic]
+            then = np.column_stack([np.interp(times - run.begin, time, axis) for axis in value.T])
+            errors[name] = np.sqrt(np.mean((found[:, :2] - then[:, :2]) ** 2, axis=0))
+    return errors
+
+
+def torque_figure(run: Run, said: Torques) -> Figure:
+    """Measured and modelled torque of each joint."""
+    figure, panels = panels_over(run, 4, 3, (13.0, 9.0))
+    for joint, panel in enumerate(panels.ravel()):
+        for label, value, colour in (
+            ("measured", said.measured, "black"),
+            ("modelled", said.modelled, "tab:blue"),
+        ):
+            panel.plot(said.time - run.begin, value[:, joint], color=colour, lw=0.5, label=label)
+        name = JOINT_NAMES[joint].removesuffix("_joint")
+        panel.set_title(f"{name}, N m: off by {said.errors[joint]:.2f}", fontsize="small", loc="left")
+    add_legend(figure, run, panels[0, 0])
+    return figure
+
+
+def velocity_figure(run: Run, times: Array, found: Array) -> Figure:
+    """Velocities found offline over those that were recorded."""
+    figure, panels = panels_over(run, 2, 1, (11.0, 5.0))
+    recorded = {
+        "/ground_truth/odom": ("true", "tab:blue"),
+        "/velocity_estimate": ("recorded estimate", "tab:orange"),
+    }
+    for axis, panel in enumerate(panels[:, 0]):
+        for topic, (label, colour) in recorded.items():
+            if topic in run.lines:
+                panel.plot(
+                    run.lines[topic][0], run.lines[topic][1][:, axis], color=colour, lw=0.8, label=label
+                )
+        panel.plot(times - run.begin, found[:, axis], color="black", lw=0.8, label="offline")
+        panel.set_ylabel(f"{AXES[axis]}, m/s")
+    add_legend(figure, run, panels[0, 0])
+    return figure
+
+
+def replay_command(
+    recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
+    out: Annotated[Path, typer.Option(help="Folder for replay.json and pictures.")] = Path("out/replay"),
+    actuator: Annotated[
+        Path | None, typer.Option(help="An actuator.yaml.", show_default="the shipped one")
+    ] = None,
+    estimator: Annotated[
+        Literal["learned", "kalman"], typer.Option(help="Which estimator of the velocity.")
+    ] = "learned",
+    estimator_file: Annotated[
+        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+    ] = SHIPPED_MODEL,
+) -> None:
+    """Ask the actuator model and the estimator offline what they say of a recording of low_state and low_cmd.
+
+    \\b
+    For example, whether a corrected model says more of a walk than the shipped one:
+      quadvel replay walk.mcap --actuator out/identify/actuator.yaml
+    To see a recording in 3-D: quadvel view walk.mcap
+    """
+    model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
+    output_folder(out)
+    run = read_run(recording)
+    said = torques(read_joints(recording, SLOWEST), model)
+    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
+    times, found = estimated(recording, asked)
+    errors = velocity_errors(run, times, found)
+    _show(said, errors)
+    result: dict[str, Any] = {
+        "schema": 1,
+        "torque_rms_nm": dict(
+            zip(JOINT_NAMES, map(rounded, np.sqrt((said.measured**2).mean(0)).tolist()), strict=True)
+        ),
+        "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, said.errors.tolist()), strict=True)),
+        "velocity_error": {name: [rounded(one) for one in error.tolist()] for name, error in errors.items()},
+    }
+    with replacing(out / "replay.json") as draft:
+        draft.write_text(json.dumps(result, indent=1))
+    pictures = {"torque": torque_figure(run, said), "velocity": velocity_figure(run, times, found)}
+    for name, figure in pictures.items():
+        with replacing(out / f"{name}.png") as draft:
+            figure.savefig(draft, dpi=110)
+    typer.echo(f"written: {out}/replay.json, torque.png, velocity.png")
+
+
+def _show(said: Torques, errors: Mapping[str, Array]) -> None:
+    table = Table("torque, RMS in N m", "measured", "off by", title="actuator model on the recorded motion")
+    for joint, name in enumerate(JOINT_NAMES):
+        rms = np.sqrt(np.mean(said.measured[:, joint] ** 2))
+        table.add_row(name.removesuffix("_joint"), f"{rms:.2f}", f"{said.errors[joint]:.2f}")
+    Console().print(table)
+    for name, (x, y) in errors.items():
+        typer.echo(f"estimator, offline, beside the {name}: RMS {x:.3f} m/s in vx, {y:.3f} in vy")

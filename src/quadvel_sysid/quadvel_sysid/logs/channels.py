@@ -1,0 +1,190 @@
+"""Checks of single channels: what rests, repeats, is clipped, copied or not there, and joints' names and gains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
+
+from .findings import Finding, some
+from .log import Array, Bools, Log
+
+ROWS = 20_000
+"""So many rows tell as much as all, in bounded memory."""
+TURN = 2.0 * np.pi
+DEGREE = np.pi / 180.0
+HALF_WIDTH = 0.005
+"""s to either side over which a slope of q is taken, one row at least."""
+MOVING = 0.05
+"""rad/s from which a joint moves."""
+REACHES = 1e-3
+"""rad; a joint whose q spans less rests."""
+MOSTLY = 0.5
+"""Share of the rows in motion that repeat the one before, from which the logger is faster than the state."""
+REACH = 0.4
+"""rad beyond the model's range, before its name is doubted."""
+
+
+def rows_of(log: Log) -> NDArray[np.intp]:
+    """At most ROWS rows of the log, evenly spread."""
+    return np.unique(np.linspace(0, len(log.t) - 1, min(ROWS, len(log.t))).astype(np.intp))
+
+
+def slope_of_q(log: Log, row: NDArray[np.intp]) -> Array:
+    """(rows, J) rad/s, over HALF_WIDTH to either side."""
+    reach = max(1, round(HALF_WIDTH / log.period))
+    first, last = np.maximum(row - reach, 0), np.minimum(row + reach, len(log.t) - 1)
+    return np.asarray((log.q[last] - log.q[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
+
+
+def names(log: Log, hit: Bools) -> tuple[str, ...]:
+    """Of the joints that `hit` (J,) marks."""
+    return tuple(name for name, one in zip(log.joints, hit, strict=True) if one)
+
+
+def still(log: Log) -> Iterator[Finding]:
+    """Joints that never move."""
+    resting = names(log, np.ptp(log.q, axis=0) < REACHES)
+    if len(resting) == len(log.joints):
+        yield Finding("refusal", "q", resting, "q: no joint ever moves, so nothing can be identified")
+    elif resting:
+        text = f"q: never moves: {some(resting)}; of these only the torque at rest is seen"
+        yield Finding("warning", "q", resting, text)
+
+
+def torque(log: Log) -> Iterator[Finding | Log]:
+    """Torque that is not there, or never changes."""
+    tau = log.tau
+    if tau is not None:
+        dead = names(log, np.ptp(tau, axis=0) == 0.0)
+        if len(dead) == len(log.joints):
+            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; taken as not logged"
+            yield Finding("warning", "tau", dead, text)
+            tau, log = None, attrs.evolve(log, tau=None)
+            yield log
+        elif dead:
+            yield Finding("warning", "tau", dead, f"tau: never changes: {some(dead)}")
+    if tau is None:
+        text = "tau: not in the log; effects are judged by the motion that follows from the commands"
+        yield Finding("note", "tau", (), text)
+
+
+def scaled(log: Log) -> Iterator[Finding]:
+    """Without torque the gains give everything its scale, so they have to be known."""
+    lacking = [name for name in ("kp", "kd") if getattr(log, name) is None]
+    if log.tau is None and lacking:
+        text = (
+            f"tau, {', '.join(lacking)}: not in the log; expected the torque, or the commanded gains in N m/rad and N m s/rad "
+            "(--gains KP KD), as nothing else has a scale; a servo's own numbers do not do"
+        )
+        yield Finding("refusal", "tau", (), text)
+
+
+def gains(log: Log) -> Iterator[Finding]:
+    """Gains that are not there, change, or are negative."""
+    for field, values in (("kp", log.kp), ("kd", log.kd)):
+        if values is None:
+            fitted = "" if log.tau is None else "; it is fitted"
+            yield Finding("note", field, (), f"{field}: not in the log{fitted}")
+            continue
+        if (values < 0.0).any():
+            text = f"{field}: found {values.min():g}, expected gains of 0 or more"
+            yield Finding("refusal", field, (), text)
+        used = values[(values > 0.0).any(axis=1)]
+        if len(used) and (np.ptp(used, axis=0) > 1e-6 * used.max()).any():
+            text = f"{field}: changes in the log, {used.min():g} to {used.max():g}"
+            yield Finding("note", field, (), text)
+        if field == "kd" and not len(used):
+            text = "kd: 0 was commanded; the damping that the drive has of its own is fitted"
+            yield Finding("note", field, (), text)
+
+
+def held(log: Log) -> Iterator[Finding | Log]:
+    """Rows that repeat the whole state before although the joints move: where most do, the others are the log."""
+    parts = [log.q, log.tau, None if "dq" in log.made else log.dq]
+    same = np.all([(np.diff(x, axis=0) == 0.0).all(axis=1) for x in parts if x is not None], axis=0)
+    runs = np.diff(
+        np.flatnonzero(np.concatenate([[True], ~same, [True]]))
+    )  # rows from one change to the next
+    low, usual, high = np.percentile(runs, [25, 50, 75])
+    if usual >= 2 and high - low <= 0.25 * usual:
+        moving = ~same | same  # a steady beat is the logger's, whatever moves
+    else:
+        moving = np.abs(log.dq[1:]).max(axis=1) > MOVING
+    repeated, total = int((same & moving).sum()), max(1, int(moving.sum()))
+    share = repeated / total
+    if share > MOSTLY:
+        fresh = log.of_rows(np.concatenate([[True], ~same]))
+        text = (
+            f"q: {100 * share:.0f} % of the rows repeat the state before (usually {usual:.0f} rows show one state); those "
+            f"in which it changed are used, {1.0 / fresh.period:.3g} Hz"
+        )
+        yield Finding("warning", "q", (), text)
+        yield fresh
+        return
+    if log.tau is not None:
+        late = (np.diff(log.tau, axis=0) == 0.0).all(axis=1)
+        if late[moving].mean() > MOSTLY:
+            share = 100.0 * late[moving].mean()
+            text = f"tau: {share:.0f} % of the rows repeat the torque before; those in which it changed are judged"
+            yield Finding("warning", "tau", (), text)
+            yield attrs.evolve(log, valid=log.valid & ~np.concatenate([[False], late])[:, None])
+    if repeated:
+        text = f"q: {repeated} rows ({100 * share:.1f} % of those in motion) repeat the row before"
+        yield Finding("warning" if share > 0.01 else "note", "q", (), text)
+
+
+def copies(log: Log) -> Iterator[Finding]:
+    """Two joints whose measurements are the same to the bit."""
+    row = rows_of(log)
+    for field in ("q", "tau"):
+        values = getattr(log, field)
+        seen: dict[bytes, str] = {}
+        for j, joint in enumerate(log.joints if values is not None else ()):
+            column = np.ascontiguousarray(values[row, j])
+            other = seen.setdefault(column.tobytes(), joint)
+            if other != joint and np.ptp(column) > 0.0:
+                text = f"{field}: {joint} and {other} are the same to the bit: one measured joint under two names?"
+                yield Finding("warning", field, (other, joint), text)
+                return
+
+
+def ranges(log: Log) -> Iterator[Finding]:
+    """Names of the model on joints that move where the model's joint cannot; names that it does not have."""
+    named = [name for name in log.joints if name in JOINT_NAMES]
+    if named and len(named) < len(log.joints):
+        strange = tuple(name for name in log.joints if name not in JOINT_NAMES)
+        text = f"joint_names: {some(strange)}: not among the model's joints, though {named[0]} is"
+        yield Finding("warning", "joint_names", strange, text)
+    outside = {}
+    for name in named:
+        low, high = np.percentile(log.q[:, log.joints.index(name)], [1, 99])
+        lower, upper = LOWER[JOINT_NAMES.index(name)], UPPER[JOINT_NAMES.index(name)]
+        if low < lower - REACH or high > upper + REACH:
+            outside[name] = f"{name} {low:.2f} to {high:.2f} (the model's: {lower:.2f} to {upper:.2f})"
+    if outside:
+        text = (
+            f"joint_names: q contradicts the model's range, rad: {some(list(outside.values()), 2)}: "
+            "another order of names, or another robot?"
+        )
+        yield Finding("warning", "joint_names", tuple(outside), text)
+
+
+def clipped(log: Log) -> Iterator[Finding]:
+    """Channels that stay at one extreme value again and again."""
+    for field, unit in (("q", "rad"), ("dq", "rad/s"), ("tau", "N m"), ("q_des", "rad")):
+        values = getattr(log, field)
+        hit: dict[str, str] = {}
+        for j, joint in enumerate(log.joints if values is not None else ()):
+            for bound in (float(values[:, j].min()), float(values[:, j].max())):
+                at = values[:, j] == bound
+                runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[0], at, [0]]))))[::2]
+                if np.sum(runs >= 3) >= 3 and 0.002 < at.mean() < 0.5:
+                    hit[joint] = f"{joint} at {bound:.4g} in {100 * at.mean():.1f} %"
+        if hit:
+            text = f"{field}: clipped ({unit}): {some(list(hit.values()))} of the rows"
+            yield Finding("note" if field == "q_des" else "warning", field, tuple(hit), text)

@@ -1,0 +1,66 @@
+"""How far good logs stay from the limits of the checks: what the constants of `quadvel_sysid.logs.response` rest on.
+
+    python -m tests.identification.limits [FOLDER of further logs, .npz]
+
+Looks at two logs of every kind of the blind test, whose effects nobody declared, and at those in FOLDER.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from quadvel_sysid.logs.checks import inspect
+from quadvel_sysid.logs.log import LogError
+from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.logs.response import REACH, Response, measured
+from tests.identification.hidden.cases import GROUP_OF, make_case
+
+SEED, INDICES = 77, (900, 901)
+SHARES = (0, 1, 5, 50, 95, 99, 100)
+
+
+def responses(folder: Path) -> list[Response]:
+    """Of the logs in the folder that have torque and are not refused."""
+    found = []
+    for path in sorted(folder.glob("*.npz")):
+        try:
+            inspection = inspect(read_log(path))
+            inspection.raise_refusal()
+        except LogError as error:
+            print(f"refused: {error}")
+            continue
+        response = measured(inspection.log)
+        found += [response] if response else []
+    return found
+
+
+def report(found: list[Response]) -> None:
+    """Percentiles over the joints, and of the lag over the logs."""
+    near = [np.flatnonzero(np.abs(one.lags) <= REACH) for one in found]
+    lags = [
+        one.lags[k][np.log(one.left[k] + 1e-6).mean(axis=1).argmin()]
+        for one, k in zip(found, near, strict=True)
+    ]
+    gains = [one.gain / np.median(one.log.kp, axis=0) for one in found if one.log.kp is not None]
+    rows = {
+        "share of the torque that is left": np.concatenate([one.best for one in found]),
+        "partial correlation with the command": np.concatenate([one.command for one in found]),
+        "share that the position error explains": np.concatenate([one.answer for one in found]),
+        "gain over the one commanded": np.concatenate(gains),
+        "best lag, ms": 1e3 * np.array(lags),
+    }
+    print(f"{len(found)} logs; percentiles {', '.join(map(str, SHARES))}:")
+    for name, values in rows.items():
+        print(f"{name} ({len(values)}): {', '.join(f'{x:.3g}' for x in np.percentile(values, SHARES))}")
+
+
+if __name__ == "__main__":
+    with TemporaryDirectory() as name:
+        for kind in GROUP_OF:
+            for index in INDICES:
+                make_case(kind, index, SEED).save(Path(name))
+        report([one for folder in (name, *sys.argv[1:]) for one in responses(Path(folder))])

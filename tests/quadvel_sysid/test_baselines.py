@@ -1,0 +1,61 @@
+"""What needs no model, and what is said of a model that it beats."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from quadvel_sysid.baselines import baselines
+from quadvel_sysid.cli import errors
+from quadvel_sysid.contradictions import contradictions
+from quadvel_sysid.logs.read_log import read_log
+
+sys.path.insert(0, str(Path(__file__).parent))
+from servo_logs import recorded
+
+
+def test_a_pd_law_of_each_joint_leaves_friction_and_a_filter_less_of_it(tmp_path: Path) -> None:
+    given = recorded(3)
+    np.savez(tmp_path / "log.npz", **given)
+    log = read_log(tmp_path / "log.npz")
+    first = np.broadcast_to((log.t < 4.0)[:, None], log.q.shape)
+    found = {name: one["heldout_mse"] for name, one in baselines([log], first, ~first).items()}
+    assert 0.05**2 < found["ridge"] < found["joint_pd"] < 0.6**2
+    smooth = given["tau"] + 0.6 * np.tanh(given["dq"] / 0.05)
+    np.savez(tmp_path / "log.npz", **given | {"tau": smooth * [1.0, 0.9, 1.1]})
+    (error,) = {
+        one["joint_pd"]["heldout_mse"] for one in [baselines([read_log(tmp_path / "log.npz")], first, ~first)]
+    }
+    assert error < 0.1**2
+
+
+REPORT = {
+    "pd": {"heldout_mse": 2.0},
+    "before": {"heldout_mse": 1.0},
+    "after": {"heldout_mse": 0.3, "heldout_q_rms_rad": 0.01},
+    "baselines": {"joint_pd": {"heldout_mse": 0.8}, "ridge": {"heldout_mse": 0.5}},
+    "noise_floor": 0.25,
+}
+
+
+def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
+    assert errors(REPORT) == (
+        "held-out error, N^2 m^2: PD as commanded 2, a PD law of each joint 0.8, a linear filter over 16 ms 0.5, plain EAM 1, "
+        "corrected model 0.3 (noise 0.25)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("after", "sentence"),
+    [
+        ({"heldout_mse": 0.6}, "a ridge regression over 16 ms leaves less of the held-out torque, 0.5"),
+        ({"heldout_mse": 0.9}, "a PD law of each joint leaves less"),
+        ({"heldout_mse": 0.3, "heldout_q_rms_rad": 1.5}, "replayed, the commands lead 1.5 rad away"),
+    ],
+)
+def test_a_model_that_says_less_than_none_is_called_that(after: dict[str, float], sentence: str) -> None:
+    assert list(contradictions(REPORT)) == []
+    assert any(text.startswith(sentence) for text in contradictions(REPORT | {"after": after}))
