@@ -35,8 +35,8 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
     from .session import Session
 
     console = Console(stderr=True, soft_wrap=True)
-    wanted = [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
-    ends = float("inf") if seconds is None else time.monotonic() + seconds
+    wanted = _absolute(topics)
+    ends = _end(seconds)
     with (
         StopSignals() as signals,
         console.status("recording; Ctrl-C stops") as status,
@@ -79,8 +79,8 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
     from .session import Session
 
     console, ring = Console(stderr=True, soft_wrap=True), Ring(before + AFTER)
-    wanted = [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
-    ends = float("inf") if seconds is None else time.monotonic() + seconds
+    wanted = _absolute(topics)
+    ends = _end(seconds)
     faults = Faults(ControllerState.FAULT)
 
     def save() -> None:
@@ -142,6 +142,16 @@ class Faults:
         """It is written."""
         self._due = float("inf")
         self.count += 1
+
+
+def _absolute(topics: Sequence[str]) -> list[str]:
+    """Topics of the root namespace, as the graph names them."""
+    return [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
+
+
+def _end(seconds: float | None) -> float:
+    """When so many seconds have passed, on the monotonic clock; never, for None."""
+    return float("inf") if seconds is None else time.monotonic() + seconds
 
 
 def _summary(counts: Counter[str]) -> str:

@@ -25,6 +25,7 @@ from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.robot_time import RobotTime
 from quadvel_recordings.reading import RecordingError, read_messages
 
+from .demo_figures import AXES
 from .output import output_folder, replacing
 from .recording_plot import Run, add_legend, panels_over, read_run
 from .replay import PAST, Joints, modelled_torque, read_joints
@@ -33,7 +34,6 @@ from .segments import rounded
 Array = NDArray[np.float64]
 
 SLOWEST = 0.005  # s, from one state to the next
-AXES = ("vx", "vy", "vz")
 
 
 @attrs.frozen(eq=False)
@@ -128,7 +128,7 @@ def velocity_figure(run: Run, times: Array, found: Array) -> Figure:
                     run.lines[topic][0], run.lines[topic][1][:, axis], color=colour, lw=0.8, label=label
                 )
         panel.plot(times - run.begin, found[:, axis], color="black", lw=0.8, label="offline")
-        panel.set_ylabel(f"{AXES[axis]}, m/s")
+        panel.set_ylabel(AXES[axis])
     add_legend(figure, run, panels[0, 0])
     return figure
 

@@ -90,8 +90,8 @@ def read_recording(path: Path) -> Recording:
             raise ValueError(f"{path}: nothing was recorded on {topic}")
     truth = messages["/ground_truth/odom"]
     return Recording(
-        planned=_by_arrival(messages["/cmd_vel"], _planar),
-        commanded=_by_stamp(messages["/command"], lambda m: _planar(m.twist), lambda m: m.stamp),
+        planned=_by_arrival(messages["/cmd_vel"], planar),
+        commanded=_by_stamp(messages["/command"], lambda m: planar(m.twist), lambda m: m.stamp),
         position=_by_stamp(truth, lambda m: _xyz(m.pose.pose.position)),
         quaternion=_by_stamp(truth, lambda m: [m.pose.pose.orientation.w, *_xyz(m.pose.pose.orientation)]),
         velocity=_by_stamp(truth, lambda m: [*_xyz(m.twist.twist.linear), *_xyz(m.twist.twist.angular)]),
@@ -141,5 +141,6 @@ def _xyz(vector: Any) -> list[float]:
     return [vector.x, vector.y, vector.z]
 
 
-def _planar(twist: Any) -> list[float]:
+def planar(twist: Any) -> list[float]:
+    """vx, vy (m/s), wz (rad/s) of a geometry_msgs/Twist."""
     return [twist.linear.x, twist.linear.y, twist.angular.z]

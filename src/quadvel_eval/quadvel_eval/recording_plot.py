@@ -22,12 +22,13 @@ from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import RecordingError, read_messages
 
+from .demo_figures import AXES
 from .output import output_folder, replacing
+from .recording import planar
 
 Array = NDArray[np.float64]
 
 POINTS = 4000  # of a line at most: more are not seen
-AXES = ("vx, m/s", "vy, m/s", "wz, rad/s")
 LOOP = {"rate_hz": "rate, Hz", "compute_p99_us": "computing, 99 %, us", "overruns": "deadlines missed"}
 SHADES = {
     "fault": "tab:red",
@@ -36,10 +37,6 @@ SHADES = {
     "stand_up": "tab:cyan",
     "lie_down": "tab:cyan",
 }
-
-
-def _planar(twist: Any) -> list[float]:
-    return [twist.linear.x, twist.linear.y, twist.angular.z]
 
 
 def _joints(message: Any) -> list[float]:
@@ -55,9 +52,9 @@ class _Kind:
 
 
 KINDS: Mapping[str, _Kind] = {
-    "/command": _Kind(lambda m: m.stamp, lambda m: _planar(m.twist)),
-    "/velocity_estimate": _Kind(lambda m: m.header.stamp, lambda m: _planar(m.twist.twist)),
-    "/ground_truth/odom": _Kind(lambda m: m.header.stamp, lambda m: _planar(m.twist.twist)),
+    "/command": _Kind(lambda m: m.stamp, lambda m: planar(m.twist)),
+    "/velocity_estimate": _Kind(lambda m: m.header.stamp, lambda m: planar(m.twist.twist)),
+    "/ground_truth/odom": _Kind(lambda m: m.header.stamp, lambda m: planar(m.twist.twist)),
     "/low_state": _Kind(lambda m: m.stamp, _joints),
     "/low_cmd": _Kind(lambda m: m.stamp, lambda m: list(m.q)),
     "/controller/state": _Kind(lambda m: m.stamp, lambda m: [getattr(m, name) for name in LOOP]),

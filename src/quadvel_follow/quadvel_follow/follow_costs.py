@@ -91,11 +91,7 @@ class FollowCost:
             far = np.hypot(off[..., 0], off[..., 1]) - self.distance
             return far, _wrapped(np.arctan2(off[..., 1], off[..., 0]) - poses[..., 2])
         heading = np.arctan2(situation.person[3], situation.person[2])
-        off = (
-            person
-            + self.side * self.distance * np.array([-np.sin(heading), np.cos(heading)])
-            - poses[..., :2]
-        )
+        off = person + self._beside(situation) - poses[..., :2]
         far = np.hypot(off[..., 0], off[..., 1])
         wanted = np.where(far < TURNS, heading, np.arctan2(off[..., 1], off[..., 0]))
         return far, _wrapped(wanted - poses[..., 2])
