@@ -137,6 +137,25 @@ def test_a_robot_whose_physics_blows_up_lies_fallen_and_every_number_stays_finit
     assert np.isfinite(env.batch.qpos).all()
 
 
+def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_beginning():
+    env = VelocityEnv(CALM)
+    past, error = Past(env), np.array([0.4, -0.2, 0.3])
+    command = np.zeros((4, 4))
+    command[:, :2], command[:, 2] = env.velocity[:, :2] + error[:2], env.angular_velocity[:, 2] + error[2]
+    env.changed[:] = False
+    for _ in range(round(privileged.TRANSIENT / env.config.period)):
+        past.advance(command)
+    assert (past.lasting == 0.0).all()
+    for _ in range(round(10 * privileged.LONG / env.config.period)):
+        past.advance(command)
+    assert past.lasting == pytest.approx(np.tile(error, (4, 1)), rel=1e-3)
+    env.changed[1] = True
+    past.advance(command)
+    env.changed[:] = False
+    past.advance(command)
+    assert (past.lasting[:, 0] == 0.0).tolist() == [False, True, False, False]
+
+
 def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():
     ground = Terrain(kind="rough", roughness=0.01, size=8.0)
     env = VelocityEnv(attrs.evolve(CALM, terrain=ground))
@@ -184,7 +203,7 @@ def test_following_turns_pays_as_following_speeds_does():
     env.velocity[2, 0] = env.angular_velocity[3, 2] = 0.8
     past.advance(command)
     terms = rewards.terms(command, past, past.air, np.zeros((3, 4, 12)))
-    total = sum(terms[name] for name in ("linear", "angular", "stride", "steady"))
+    total = sum(terms[name] for name in ("linear", "angular", "stride", "lasting", "steady"))
     assert total[2] > total[0] + 0.5
     assert total[3] > total[1] + 0.5
 

@@ -31,7 +31,7 @@ ACTION_SCALE = 0.4  # rad a unit of the network's output
 ACTION_BOUND = 4.0  # of the network's unit
 STRIDE = 0.35  # s, over which errors are low-passed: about a stride
 LONG = 1.5  # s, the same for what lasts
-TRANSIENT = 1.0  # s after a new command that its judgement leaves out
+TRANSIENT = 1.0  # s after a new command that what lasts, and the judgement of the command, leave out
 TALL = 0.38  # m, about the height of a walking trunk
 
 
@@ -61,8 +61,8 @@ CRITIC_EXTRA = 4 + 4 + 1
 class Past:
     """What `n` robots have done: errors, low-passed, and how long each foot has been in the air or down.
 
-    stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG. air, down
-    (n, 4): s since the foot left the ground or touched it.
+    stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG; the latter
+    starts at zero with every new command, TRANSIENT after it. air, down (n, 4): s since the foot left the ground or touched it.
     """
 
     def __init__(self, env: VelocityEnv) -> None:
@@ -70,10 +70,11 @@ class Past:
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
+        self._age = np.zeros(n)  # s, of the command
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
-        for array in (self.stride, self.lasting, self.air, self.down):
+        for array in (self.stride, self.lasting, self.air, self.down, self._age):
             array[ids] = 0.0
 
     def advance(self, command: np.ndarray) -> None:
@@ -81,7 +82,10 @@ class Past:
         env, period = self.env, self.env.config.period
         error = velocity_error(env, command)
         self.stride += (error - self.stride) * period / STRIDE
-        self.lasting += (error - self.lasting) * period / LONG
+        self._age += period
+        settled = (self._age > TRANSIENT)[:, None]
+        self.lasting += (error - self.lasting) * settled * period / LONG
+        self.lasting[env.changed] = self._age[env.changed] = 0.0
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
 

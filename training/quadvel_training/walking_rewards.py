@@ -25,6 +25,7 @@ class Past(Protocol):
     """What `privileged.Past` keeps."""
 
     stride: np.ndarray
+    lasting: np.ndarray
     air: np.ndarray
     down: np.ndarray
 
@@ -38,7 +39,9 @@ class WalkingWeights:
     angular: float = 0.6  # exp(-e^2 / (0.25 rad^2/s^2 (1 + |c| / 4)))
     angular_narrow: float = 0.25  # exp(-e^2 / 0.04)
     stride_linear: float = 1.0  # fine, s/m, of the error over a stride,
-    stride_angular: float = 0.5  # s/rad, the same of yaw,
+    stride_angular: float = 0.5  # s/rad, the same of yaw
+    lasting_linear: float = 1.0  # fine, s/m, of the error that lasts,
+    lasting_angular: float = 0.5  # s/rad, the same of yaw,
     steady: float = 0.3  # and exp(-(e / 0.06)^2) of it, xy and yaw
     bounce: float = 0.6  # fine: vertical speed squared
     rocking: float = 0.03  # fine: roll and pitch rate squared
@@ -96,14 +99,17 @@ class WalkingRewards:
         xy = np.sum((command[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
         wz = (command[:, 2] - env.angular_velocity[:, 2]) ** 2
         speed, turn = np.hypot(command[:, 0], command[:, 1]), np.abs(command[:, 2])
-        stride_xy, stride_wz = np.hypot(past.stride[:, 0], past.stride[:, 1]), np.abs(past.stride[:, 2])
+        (stride_xy, stride_wz), (lasting_xy, lasting_wz) = (
+            (np.hypot(e[:, 0], e[:, 1]), np.abs(e[:, 2])) for e in (past.stride, past.lasting)
+        )
         return {
             "linear": w.linear * np.exp(-xy / (0.25 * (1 + 0.5 * speed)))
             + w.linear_narrow * np.exp(-xy / 0.04),
             "angular": w.angular * np.exp(-wz / (0.25 * (1 + 0.25 * turn)))
             + w.angular_narrow * np.exp(-wz / 0.04),
             "stride": -w.stride_linear * stride_xy - w.stride_angular * stride_wz,
-            "steady": w.steady * (np.exp(-((stride_xy / 0.06) ** 2)) + np.exp(-((stride_wz / 0.06) ** 2))),
+            "lasting": -w.lasting_linear * lasting_xy - w.lasting_angular * lasting_wz,
+            "steady": w.steady * (np.exp(-((lasting_xy / 0.06) ** 2)) + np.exp(-((lasting_wz / 0.06) ** 2))),
         }
 
     def _body(self, command: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
