@@ -143,7 +143,7 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     command = np.zeros((4, 4))
     command[:, :2], command[:, 2] = env.velocity[:, :2] + error[:2], env.angular_velocity[:, 2] + error[2]
     env.changed[:] = False
-    for _ in range(round(privileged.TRANSIENT / env.config.period)):
+    for _ in range(round(0.9 * privileged.TRANSIENT / env.config.period)):
         past.advance(command)
     assert (past.lasting == 0.0).all()
     for _ in range(round(10 * privileged.LONG / env.config.period)):
