@@ -70,6 +70,15 @@ def test_the_teacher_knows_what_was_done_20_ms_ago(run):
     assert PrivilegedConfig().period == dagger.AGO * dagger.TICK
 
 
+def test_what_the_teacher_says_comes_as_late_as_actions_that_are_held_and_forgets_who_starts_over(run):
+    teacher, values = run.teacher, iter([0.3, 0.6, 0.9, 1.2])
+    teacher.actor = lambda obs: (torch.full((8, 12), next(values)), None)
+    said = [teacher.action()[:, 0] for _ in range(3)]
+    assert [one[0] for one in said] == pytest.approx([0.3, 0.4, 0.6])
+    teacher.reset(np.array([5]))
+    assert teacher.action()[[0, 5], 0] == pytest.approx([0.9, 1.2])
+
+
 def test_who_drives_changes_with_an_episode_alone(run):
     before = run.driven.copy()
     run.samples = 10**9  # the student is to drive nearly all

@@ -32,6 +32,8 @@ from .privileged import ACTION_BOUND, ACTION_SCALE, Past
 from .randomisation import Randomisation, actuator
 
 AGO = 4  # ticks between the teacher's actions as it learned them
+SPREAD = 3
+"""Ticks over which what it says is averaged: it learned with actions that are held, which come so much later than at once"""
 
 
 @attrs.frozen
@@ -59,26 +61,38 @@ class DaggerConfig:
 
 
 class Teacher:
-    """The teacher of a checkpoint in a batch of environments, evaluated at every tick."""
+    """The teacher of a checkpoint in a batch of environments, evaluated at every tick, its actions averaged over SPREAD of them.
+
+    Evaluated at every tick and not averaged, a teacher that learned with actions held for 20 ms fell in 5 of 88 runs where it
+    fell in none held or averaged (decision 43).
+    """
 
     def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv) -> None:
         self.actor = Gaussian(Mlp(privileged.SIZE, 12), 12, 1.0)
         self.actor.load_state_dict(checkpoint["actor"])
         self.env, self.past = env, Past(env)
-        self._executed = deque([np.zeros((env.config.n, 12), np.float32) for _ in range(AGO)], AGO)
+        n = env.config.n
+        self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(AGO)], AGO)
+        self._said = np.zeros((SPREAD, n, 12), np.float32)  # the newest first
+        self._starts = np.ones(n, bool)
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
         self.past.reset(ids)
         for action in self._executed:
             action[ids] = 0.0
+        self._starts[ids] = True
 
     def action(self) -> np.ndarray:
-        """What it would do now, (n, 12)."""
+        """What it would do now, (n, 12); asked once a tick."""
         obs = privileged.observe(self.env, self.past, self._executed[0])
         with torch.no_grad():
-            action: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy()
-        return action.clip(-ACTION_BOUND, ACTION_BOUND)
+            now: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy().clip(-ACTION_BOUND, ACTION_BOUND)
+        self._said = np.concatenate([now[None], self._said[:-1]])
+        self._said[:, self._starts] = now[self._starts]
+        self._starts[:] = False
+        mean: np.ndarray = self._said.mean(axis=0)
+        return mean
 
     def advance(self, command: np.ndarray, executed: np.ndarray) -> None:
         """After a tick under `command` (n, 4) in which the actions `executed` (n, 12) were taken."""
