@@ -13,10 +13,10 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import Simulator
-from quadvel_sysid.engine.identify import Options, identify
-from quadvel_sysid.engine.motion import implied
+from quadvel_sysid.identify import Options, identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.motion import implied
 
 JOINTS = NAMES[:2]
 

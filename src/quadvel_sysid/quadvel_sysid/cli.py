@@ -26,8 +26,8 @@ from .logs.read_log import read_log
 from .memory import give_large_arrays_back, keep_freed_arrays
 
 if TYPE_CHECKING:
-    from .engine.material import Material
-    from .engine.material import Progress as Tell
+    from .material import Material
+    from .material import Progress as Tell
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
@@ -161,7 +161,7 @@ def _run(
         material, long = _material(logs, holdout, joints, names, gains, messages, tell)
         if not long:
             keep_freed_arrays()
-        from .engine.identify import identified
+        from .identify import identified
 
         cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
         with threadpool_limits(1):  # of each copy of this process: they share the cores
@@ -191,9 +191,7 @@ def _material(
         fitted, heldout = ([read_log(path, joints, names) for path in paths] for paths in (logs, holdout))
         data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
         long = sum(log.q.size for log in data.logs) >= _LONG
-        from .engine.material import (
-            gathered,  # what is wrong with the files shows before the engine is loaded
-        )
+        from .material import gathered  # what is wrong with the files shows before the engine is loaded
 
         return gathered(data, gains, progress=tell), long
 

@@ -2,7 +2,7 @@
 
 A hidden Markov model of "how many commands is the drive behind": the chances of a loss are found from the log itself
 (Baum and Welch), then those of each row. Commands are lost for all joints at once, so what the others' torque says of a
-row stands in for the torque of a joint that is to be judged there.
+row stands in for the torque of a joint where that is not to be looked at.
 """
 
 from __future__ import annotations
@@ -11,11 +11,22 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .model import Model
+from quadvel_actuator.effects.commands import MOST, CommandHold
+
+from .criterion import Parts
+from .fit import fit, squared_error
+from .model import Applied, Model
 from .signals import Array, Bools
 
 LOST = 6.0
 """nats by which a command has to look lost or late on its own"""
+_LEAST_SHARE = 0.003
+"""Of the commands: they are not looked at as lost where fewer lag behind"""
+_TURNS = 5
+"""Earlier delays that are looked at, over one time between two commands"""
+_FORETOLD = 1.25
+"""Times the error of the model without: losses at random leave, all alike, about what a longer delay left in their place.
+Where much more is left than that, what was read off the torque as losses was something else."""
 
 _PIECE, _AROUND = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
@@ -66,15 +77,46 @@ def _share(part: float, whole: float) -> float:
     return float(np.clip(part / (whole + 1e-12), _RARE, 1.0 - _RARE))
 
 
-def suspicious(model: Model, noise: Array, least: float) -> bool:
-    """Do more than `least` of the commands look lost or late, each on its own? If not, the search finds nothing."""
+def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array, Array]]:
+    """How likely the drive lags by 0 to MOST commands: at each row, (N, J, MOST + 1), and at any; none if it rarely does.
+
+    For each joint without a look at its torque where that selects or is reported. Losses at random delay the commands by
+    what they do so on average, which is in the delay of a model without them: earlier ones are looked at, in steps of a
+    part of the time between two commands, and rows that select decide.
+    """
+    if len(noise) < 2 or not _suspicious(model, noise):
+        return []
+    period = float(np.median(np.concatenate([np.diff(log.t_cmd) for log in model.samples.logs])))
+    best: tuple[Array, Array] | None = None
+    least = np.inf
+    for turn in range(_TURNS):
+        at = model.with_delays(model.delays - np.array([[turn * period / _TURNS], [0.0]]))
+        odds = backlog(at, noise, MOST, ~parts.fit)
+        usual = odds[parts.fit].mean(axis=0)
+        if 1.0 - usual[0] < _LEAST_SHARE:
+            break
+        every = np.ones(len(noise), dtype=bool)
+        law = CommandHold(odds, usual)
+        losing = fit(
+            at.plus(Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))), parts.fit, 3
+        )
+        error = squared_error(losing, parts.select)
+        if error < least:
+            best, least, foretold = (odds, usual), error, squared_error(losing.foretold(), parts.fit)
+    if best is None or foretold > _FORETOLD * squared_error(model, parts.fit):
+        return []
+    return [best]
+
+
+def _suspicious(model: Model, noise: Array) -> bool:
+    """Do some of the commands look lost or late, each on its own? If not, the search finds nothing."""
     s = model.signals
     gain = np.where(model.samples.judged, -np.diff(_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
     gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all together
     first = np.flatnonzero(np.diff(s.packet[:, 0], prepend=-1))
     total = np.cumsum(gain, axis=0)
     most = np.maximum.reduceat(total, first) - total[first] + gain[first]
-    return bool(((most > LOST).mean(axis=0) > least).any())
+    return bool(((most > LOST).mean(axis=0) > _LEAST_SHARE).any())
 
 
 def backlog(model: Model, noise: Array, most: int, unread: Bools) -> Array:

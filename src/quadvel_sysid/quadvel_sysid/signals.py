@@ -11,15 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import copy
 from functools import cached_property, partial
-from itertools import pairwise
 from typing import Any, TypeVar
 
 import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from ..logs.log import Log
 from .log_signals import ALL, Joints, LogSignals, double
+from .logs.log import Log
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -30,9 +29,6 @@ GAP = 3.5
 
 SETTLING = 0.03
 """Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
-
-STRETCH, FILLING = 0.75, 0.25
-"""Rows that belong together come in stretches so long (s), of which the first part only fills memories."""
 
 _CACHED = 2, 64
 """sets of signals that are kept, at least and at most;"""
@@ -196,45 +192,11 @@ class Samples:
             self._parts[count] = part
         return self._parts[count]
 
-    def thinned(self, every: int) -> tuple[Samples, NDArray[np.intp]]:
-        """One row of `every` of each log, and which these are; `dt` and `start` of the rows are those they had."""
-        edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
-        rows = np.concatenate([a + scattered(b - a, every) for a, b in pairwise(edges)])
-        return self._of(rows), rows
-
-    def stretches(self, most: int, weight: Array) -> tuple[Samples, NDArray[np.intp], Bools]:
-        """At most some `most` rows in stretches, which these are, and those that count.
-
-        Half of the stretches are spread evenly over the logs, half lie where most of `weight` (N,) is. The rows that do not
-        count fill memories: what was before a stretch is not known there.
-        """
-        long, filling = round(STRETCH / self.period), round(FILLING / self.period)
-        count = max(most // long, 2)
-        if len(self.t) <= (count + 1) * long:
-            return self, self.row, np.ones(len(self.t), dtype=bool)
-        starts = np.linspace(0, len(self.t) - long, count - count // 2).astype(np.intp).tolist()
-        left = weight.copy()
-        for begin in starts:
-            left[begin + filling : begin + long] = 0.0
-        for _ in range(count // 2):
-            total = np.concatenate([[0.0], np.cumsum(left)])
-            begin = int(np.argmax(total[long:] - total[filling : len(total) - long + filling]))
-            left[begin + filling : begin + long] = 0.0
-            starts.append(begin)
-        first = np.array(sorted(starts))
-        place = np.tile(np.arange(long), count)
-        rows = np.repeat(first, long) + place
-        in_order = np.argsort(self.log_of_row[rows], kind="stable")  # where stretches overlap at a log's end
-        rows, place = rows[in_order], place[in_order]
-        part = self._of(rows)
-        part.start = part.start | (place == 0)
-        return part, rows, place * self.period >= FILLING
-
     @property
     def finer(self) -> Samples:
         """These rows, each with BETWEEN - 1 instants before it, evenly over the time since the row before."""
         if self._finer is None:
-            part = self._of(np.repeat(np.arange(len(self.t)), BETWEEN))
+            part = self.taken(np.repeat(np.arange(len(self.t)), BETWEEN))
             before = np.tile(np.arange(BETWEEN)[::-1], len(self.t)) / BETWEEN
             part.early = np.where(part.start, 0.0, before * part.dt)
             part.dt = part.dt / BETWEEN
@@ -242,7 +204,8 @@ class Samples:
             self._finer = part
         return self._finer
 
-    def _of(self, rows: NDArray[np.intp]) -> Samples:
+    def taken(self, rows: NDArray[np.intp]) -> Samples:
+        """These rows alone; `dt` and `start` are those they had."""
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])

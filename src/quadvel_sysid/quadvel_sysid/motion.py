@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 
-from ..logs.log import Log, LogError
 from .eam import LONGEST_INPUT
+from .logs.log import Log, LogError
 from .signals import Array, Bools, Samples
 
 STRETCH = 0.05

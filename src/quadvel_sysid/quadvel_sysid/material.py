@@ -7,17 +7,17 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from ..logs.dataset import Dataset
-from ..logs.excerpts import Piece, pieces
-from ..logs.findings import Finding
-from ..logs.log import Log
+from .logs.dataset import Dataset
+from .logs.excerpts import Piece, pieces
+from .logs.findings import Finding
+from .logs.log import Log
 from .motion import Body, implied
 from .signals import Array
 
 Progress = Callable[[float, str], None]
 """Told now and then which share is done, and what is done next."""
 
-VALUES = 144_000
+VALUES = 60_000
 """Of torque that are looked at, of all logs and joints."""
 
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..logs.log import Log
 from . import reading
 from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
+from .logs.log import Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]
@@ -51,6 +51,10 @@ class LogSignals:
                 double(log.kd) if kd is None and log.kd is not None else _or_one(kd), shape
             ),
         }
+        self.undamped = not self.gains["kd"].any()
+        """was kd commanded as 0 throughout? Then its deviation is the drive's own damping, in units of 1 N m s/rad"""
+        if self.undamped:
+            self.gains["kd"] = np.ones(shape)
         self.gains_known = kp is not None or log.kp is not None
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
         self.sums = {

@@ -12,19 +12,16 @@ from quadvel_actuator.effects.terms import NAME as TERMS
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
-from ..identification import Identification, Shape, Trace
-from ..logs.excerpts import Piece
-from ..logs.findings import Finding as LogFinding
+from .confidence import Intervals
+from .criterion import LEVEL, WHITE_LEVEL, Parts, whiteness
 from .decision import decision
-from .diagnosis import Diagnosis, Finding
-from .eam import Eam
-from .intervals import Intervals
-from .judging import Judge
-from .learned import Learned
-from .model import Applied, Model
-from .residual import Remainder
-from .signals import Array
-from .stepped import stepped_delays
+from .delays import running_delays
+from .identification import Identification, Shape, Trace
+from .library import SignalTerm
+from .logs.excerpts import Piece
+from .logs.findings import Finding as LogFinding
+from .model import Applied, Model, linear_columns
+from .signals import Array, Bools
 
 SCHEMA = 1
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
@@ -46,36 +43,52 @@ _SIGNAL_UNITS = {
 
 
 @attrs.frozen(eq=False)
-class Outcome:
-    """What the steps of an identification found."""
+class Chosen:
+    """An effect that was chosen, of the corrected model the one of the same index, on the rows that are reported."""
 
-    eam: Eam
+    gain: float
+    """error without it, everything else fitted anew, less that with it, N^2 m^2"""
+    p: float
+    rivals: tuple[str, ...]
+    """laws that say the same"""
+
+
+@attrs.frozen(eq=False)
+class Outcome:
+    """What the steps of an identification found. Models `whole` are fitted to every row, the others to those that chose."""
+
     before: Model
-    before_whole: Model  # as `before`, but fitted to every row, held-out ones too: its values are reported
-    diagnosis: Diagnosis
-    whole: Model  # as `model`, likewise
-    learned: Learned | None
-    learned_gain: tuple[float, float]  # held-out gain and p-value of all terms together
-    rest: Remainder
+    before_whole: Model
+    model: Model
+    whole: Model
+    effects: tuple[Chosen, ...]
+    rejected: tuple[tuple[str, float, str], ...]
+    """law, gain on the rows that select, reason"""
+    leaning: tuple[str, ...]
+    """the signals that what is left goes with most, where it is not white and no term says more of it"""
     widths: Intervals
     ideal: Array  # (N, J), torque of the PD law as commanded
     noise: Array  # (J,)
-    judge: Judge
+    parts: Parts
     pieces: Sequence[Piece]
     kp_ref: float
     kd_ref: float
     base: ActuatorParameters
 
     @property
-    def model(self) -> Model:
-        """The corrected model, without the learned terms."""
-        return self.diagnosis.model
+    def commanded_kd(self) -> float:
+        """In units of `kd_ref`: 0 where none was commanded, so that the deviation is all of the drive's damping."""
+        return 0.0 if self.before.samples.logs[0].undamped else 1.0
 
     @property
     def after(self) -> Array:
-        """Torque that the corrected model foretells, learned terms included, (N, J)."""
-        torque = self.model.foretold().predict()
-        return torque if self.learned is None else torque + self.learned.torque
+        """Torque that the corrected model foretells, (N, J)."""
+        return self.model.foretold().predict()
+
+    @property
+    def terms(self) -> list[tuple[int, Applied]]:
+        """The terms of named signals, and which of the effects they are."""
+        return [(k, one) for k, one in enumerate(self.model.applied) if isinstance(one.law, SignalTerm)]
 
 
 def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
@@ -86,24 +99,20 @@ def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]])
 
 
 def _report(o: Outcome) -> dict[str, Any]:
-    samples, judge = o.model.samples, o.judge
-    before, after = o.before.predict(), o.after
+    samples, parts = o.model.samples, o.parts
     errors = {
-        name: samples.tau - torque for name, torque in (("pd", o.ideal), ("before", before), ("after", after))
+        name: samples.tau - torque
+        for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.after))
     }
     mses: dict[str, dict[str, Any]] = {
-        name: {"train_mse": _mse(error, judge.fit), "heldout_mse": _mse(error, judge.judge)}
+        name: {"train_mse": _mse(error, parts.chosen_on), "heldout_mse": _mse(error, parts.report)}
         for name, error in errors.items()
     }
     for name in ("before", "after"):
         mses[name]["per_joint"] = [
-            _mse(errors[name][:, [j]], judge.judge[:, [j]]) for j in range(len(samples.joints))
+            _mse(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
         ]
-    floor = float(np.average(o.noise, weights=np.maximum(judge.judge.sum(axis=0), 1)))
-    removable = mses["before"]["heldout_mse"] - floor
-    left = mses["after"]["heldout_mse"] - floor
-    names = np.array(samples.joints)
-    effects = sorted(_effects(o), key=lambda one: -one["heldout_gain"])
+    floor = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
     report = {
         "schema": SCHEMA,
         "joints": list(samples.joints),
@@ -113,37 +122,58 @@ def _report(o: Outcome) -> dict[str, Any]:
         "before": mses["before"]
         | {
             "delta_kp": float((o.before_whole.gains[0, 0] - 1.0) * o.kp_ref),
-            "delta_kd": float((o.before_whole.gains[1, 0] - 1.0) * o.kd_ref),
-            "input_delay_ms": 1e3 * float(o.before_whole.input_delay[0]),
-            "output_delay_ms": 1e3 * float(o.before_whole.output_delay[0]),
+            "delta_kd": float((o.before_whole.gains[1, 0] - o.commanded_kd) * o.kd_ref),
+            "input_delay_ms": 1e3 * float(o.before_whole.delays[0, 0]),
+            "output_delay_ms": 1e3 * float(o.before_whole.delays[1, 0]),
         },
         "after": mses["after"] | _gains(o),
-        "effects": effects,
-        "rejected": [
-            {"name": one.name, "heldout_gain": one.gain, "reason": one.reason} for one in o.diagnosis.rejected
-        ],
-        "unexplained": {
-            "verdict": "structured" if o.rest.structured else "white",
-            "fraction": float(np.clip(left / removable, 0.0, 1.0)) if removable > _REMOVABLE * floor else 0.0,
-            "depends_on": list(o.rest.depends_on),
-            "joints": names[o.rest.joints].tolist(),
-        },
+        "effects": sorted(_effects(o), key=lambda one: -one["heldout_gain"]),
+        "rejected": [{"name": name, "heldout_gain": gain, "reason": why} for name, gain, why in o.rejected],
+        "unexplained": _unexplained(o, mses["before"]["heldout_mse"], mses["after"]["heldout_mse"], floor),
         "warnings": [
             f"{name} sits on its bound: its value and interval are not to be trusted"
             for name in o.widths.on_bound
         ]
+        + _unconfirmed(o)
         + _unlike_delays(o.whole)
         + _negative_gains(o.whole)
         + _beyond_limits(o),
-        "fitted_seconds": float(judge.fit.any(axis=1).sum() * samples.period),
+        "fitted_seconds": float(parts.chosen_on.any(axis=1).sum() * samples.period),
     }
     report["decision"] = decision(report)
     return report
 
 
+def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
+    """What no law explains: terms of named signals, or a residual that is not white."""
+    parts, samples = o.parts, o.model.samples
+    coloured = whiteness(samples.tau - o.model.predict(), parts.every, samples.start) < WHITE_LEVEL
+    names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
+    joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
+    removable = before - floor
+    structured = bool(names) or bool(o.leaning)
+    return {
+        "verdict": "structured" if structured else "white",
+        "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
+        if removable > _REMOVABLE * floor
+        else 0.0,
+        "depends_on": list(dict.fromkeys(names or o.leaning)),
+        "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
+    }
+
+
+def _unconfirmed(o: Outcome) -> list[str]:
+    """Effects that the rows which chose nothing do not show."""
+    return [
+        f"{one.law.name} is not confirmed by the rows that are reported (p = {found.p:.2g} there)"
+        for one, found in zip(o.model.applied, o.effects, strict=True)
+        if found.p > LEVEL
+    ]
+
+
 def _unlike_delays(model: Model) -> list[str]:
     """A model that runs has one pair of delays."""
-    spread = 1e3 * float(max(np.ptp(model.input_delay), np.ptp(model.output_delay)))
+    spread = 1e3 * float(np.ptp(model.delays, axis=1).max())
     if spread < _ALIKE:
         return []
     return [
@@ -188,9 +218,9 @@ def _gains(o: Outcome) -> dict[str, Any]:
     found: dict[str, Any] = {}
     rows = {
         "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
-        "delta_kd": ((model.gains[1] - 1.0) * o.kd_ref, widths.gains[1] * o.kd_ref),
-        "input_delay_ms": (1e3 * model.input_delay, 1e3 * widths.delays[0]),
-        "output_delay_ms": (1e3 * model.output_delay, 1e3 * widths.delays[1]),
+        "delta_kd": ((model.gains[1] - o.commanded_kd) * o.kd_ref, widths.gains[1] * o.kd_ref),
+        "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
+        "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
     }
     for name, (values, half) in rows.items():
         least = -np.inf if name.startswith("delta") else 0.0
@@ -211,52 +241,59 @@ def _with_interval(
 
 def _effects(o: Outcome) -> list[dict[str, Any]]:
     joints = o.model.samples.joints
-    found = []
-    for finding, one, half in zip(o.diagnosis.findings, o.whole.applied, o.widths.effects, strict=True):
-        found.append(_effect(finding, one, half, joints))
-    if o.learned is not None:
-        found.append(
-            {
-                "name": TERMS,
-                "joints": [name for name, acts in zip(joints, o.learned.joints, strict=True) if acts],
-                "params": {},
-                "indistinguishable": [],
-                "heldout_gain": o.learned_gain[0],
-                "p_value": o.learned_gain[1],
-                "inputs": o.learned.inputs,
-                "terms": [
-                    {
-                        "kind": term.shape.kind,
-                        "inputs": list(term.inputs),
-                        "at": term.at,
-                        "joints": [name for name, acts in zip(joints, term.active, strict=True) if acts],
-                        "heldout_gain": gain,
-                    }
-                    for term, gain in zip(o.learned.terms, o.learned.gains, strict=True)
-                ],
-            }
-        )
+    found = [
+        _effect(of_it, one, half, joints)
+        for of_it, one, half in zip(o.effects, o.whole.applied, o.widths.effects, strict=True)
+        if not isinstance(one.law, SignalTerm)
+    ]
+    if o.terms:
+        found.append(_terms(o, joints))
     return found
 
 
-def _effect(finding: Finding, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
+def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
+    """All terms as one effect."""
+    ranked = sorted(o.terms, key=lambda pair: -o.effects[pair[0]].gain)
+    acts = np.any([one.active for _, one in ranked], axis=0)
+    return {
+        "name": TERMS,
+        "joints": [name for name, on in zip(joints, acts, strict=True) if on],
+        "params": {},
+        "indistinguishable": [],
+        "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
+        "p_value": min(o.effects[k].p for k, _ in ranked),
+        "inputs": list(dict.fromkeys(name for _, one in ranked for name in one.law.inputs)),  # type: ignore[attr-defined]
+        "terms": [
+            {
+                "kind": one.law.shape.kind,  # type: ignore[attr-defined]
+                "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
+                "at": one.law.at,
+                "joints": [name for name, on in zip(joints, one.active, strict=True) if on],
+                "heldout_gain": o.effects[k].gain,
+            }
+            for k, one in ranked
+        ],
+    }
+
+
+def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
     params = {}
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
         value, ci = _with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
         params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
     settings = _settings(one)
     entry: dict[str, Any] = {
-        "name": finding.name,
+        "name": one.law.name,
         "joints": [name for name, acts in zip(joints, one.active, strict=True) if acts],
         "params": params,
-        "indistinguishable": list(finding.indistinguishable),
-        "heldout_gain": finding.gain,
-        "p_value": finding.p,
+        "indistinguishable": list(of_it.rivals),
+        "heldout_gain": of_it.gain,
+        "p_value": of_it.p,
         **one.law.observed(),
     }
     if settings:
         entry["form"] = settings
-    if finding.indistinguishable:
+    if of_it.rivals:
         entry["separated_by"] = one.law.motion
     return entry
 
@@ -272,14 +309,15 @@ def _settings(one: Applied) -> dict[str, Any]:
 
 
 def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
-    """The corrected model as the stack loads it, or another one of the outcome's: its terms belong to all but the plain one."""
+    """The corrected model as the stack loads it, or another one of the outcome's."""
     model = o.whole if model is None else model
-    learned = None if model is o.before else o.learned
     joints = model.samples.joints
-    mse = _mse(model.samples.tau - (o.before.predict() if model is o.before else o.after), o.judge.fit)
-    pair = DelayPair(*stepped_delays(model, learned, o.judge.fit), mse)
+    mse = _mse(model.foretold().residual(), o.parts.chosen_on)
+    pair = DelayPair(*running_delays(model, o.parts.chosen_on), mse)
     effects = []
     for one, half in zip(model.applied, o.widths.effects, strict=False):
+        if isinstance(one.law, SignalTerm):
+            continue
         values: dict[str, Any] = {}
         ranges = {}
         for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
@@ -289,13 +327,20 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
         units = {parameter.name: parameter.unit for parameter in one.law.parameters}
         acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
         effects.append(Effect(one.law.name, acts, values, units, ranges))
-    if learned is not None:
-        acts = tuple(name for name, on in zip(joints, learned.joints, strict=True) if on)
-        effects.append(Effect(TERMS, acts, {"terms": [one.saved(joints) for one in learned.terms]}))
+    terms = [one for one in model.applied if isinstance(one.law, SignalTerm)]
+    if terms:
+        on = np.any([one.active for one in terms], axis=0)
+        acts = tuple(name for name, acting in zip(joints, on, strict=True) if acting)
+        saved = [one.law.term(one, _largest(model, one, o.parts.fit)).saved(joints) for one in terms]  # type: ignore[attr-defined]
+        effects.append(Effect(TERMS, acts, {"terms": saved}))
     deviations: dict[str, Any] = {
         "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
-        "delta_kd": (model.gains[1] - 1.0) * o.kd_ref,
+        "delta_kd": (model.gains[1] - o.commanded_kd) * o.kd_ref,
     }
+    if o.commanded_kd == 0.0:  # a deviation is relative to what is commanded: of nothing it would be nothing
+        own = {"b": np.maximum(deviations.pop("delta_kd"), 0.0).tolist()}
+        effects.append(Effect("viscous_friction", joints, own, {"b": "N m s/rad"}))
+        deviations["delta_kd"] = np.zeros(len(joints))
     deviations = {
         name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()
     }
@@ -313,6 +358,12 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
     )
 
 
+def _largest(model: Model, one: Applied, rows: Bools) -> Array:
+    """The largest torque (J,) that a term had on `rows` (N, J): a running model's stays within it."""
+    torque = np.einsum("kj,knj->nj", one.values, linear_columns(model, one))
+    return np.max(np.abs(torque) * rows, axis=0)
+
+
 def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
     """The base's torque limits for these joints: each its own where the base knows it, else the largest."""
     limit = base.torque_limit
@@ -324,34 +375,27 @@ def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[fl
 
 
 def _traces(o: Outcome) -> dict[str, Trace]:
-    samples, judge = o.model.samples, o.judge
-    before, after = o.before.predict(), o.after
-    rows = np.flatnonzero(judge.judge.any(axis=1))[:_SHOWN]
-    found = {}
-    for j, joint in enumerate(samples.joints):
-        series = [
-            np.where(judge.judge[rows, j], x[rows, j], np.nan) for x in (samples.tau, o.ideal, before, after)
-        ]
-        found[joint] = Trace(samples.t[rows], *series)
-    return found
+    samples, reported = o.model.samples, o.parts.report
+    series = (samples.tau, o.ideal, o.before.predict(), o.after)
+    rows = np.flatnonzero(reported.any(axis=1))[:_SHOWN]
+    return {
+        joint: Trace(samples.t[rows], *(np.where(reported[rows, j], x[rows, j], np.nan) for x in series))
+        for j, joint in enumerate(samples.joints)
+    }
 
 
 def _shapes(o: Outcome) -> tuple[Shape, ...]:
     """The residual over the signal that explains it, of up to three joints an effect."""
-    samples, judge = o.model.samples, o.judge
+    samples = o.model.samples
     before, after = samples.tau - o.before.predict(), samples.tau - o.after
-    rows = np.flatnonzero(judge.judge.any(axis=1))
+    rows = np.flatnonzero(o.parts.report.any(axis=1))
     rows = rows[:: max(1, len(rows) // _SHOWN)]
     found = []
-    entries = [(one.law.name, one.law.signal, one.active) for one in o.model.applied]
-    if o.learned is not None:
-        entries += [(TERMS, term.inputs[0], term.active) for term in o.learned.terms]
-    for name, signal, active in entries:
-        for j in np.flatnonzero(active)[:3]:
-            x, unit = _signal(o, signal, int(j))
-            found.append(
-                Shape(name, samples.joints[j], signal, unit, x[rows], before[rows, j], after[rows, j])
-            )
+    for one in o.model.applied:
+        for j in np.flatnonzero(one.active)[:3]:
+            x, unit = _signal(o, one.law.signal, int(j))
+            x, e0, e1 = x[rows], before[rows, j], after[rows, j]
+            found.append(Shape(one.law.name, samples.joints[j], one.law.signal, unit, x, e0, e1))
     return tuple(found)
 
 

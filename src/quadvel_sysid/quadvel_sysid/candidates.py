@@ -1,0 +1,118 @@
+"""The candidates on top of an account: screened, and the most promising fitted with everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from functools import cached_property
+from typing import TypeVar
+
+import attrs
+import numpy as np
+
+from quadvel_actuator.effects import EffectLaw
+
+from . import library
+from .account import Account
+from .library import Context, SignalTerm
+from .model import Model
+from .parallel import side_by_side
+from .screening import Screen, Screened, best_first
+from .signals import Bools
+
+FITTED, FITTED_TERMS = 6, 4
+"""Laws, and terms, that are fitted after a screening"""
+LAWS, TERMS = "laws", "terms"
+L = TypeVar("L", bound=EffectLaw)
+
+
+class Candidates:
+    """The candidates on top of an account, fitted, the most promising first."""
+
+    def __init__(
+        self, before: Account, cores: int = 1, among: Collection[tuple[str, ...]] | None = None
+    ) -> None:
+        """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
+        self._before, self._judge, self._cores, self._among = before, before.judge, cores, among
+        self._context = Context(before.model, before.judge.parts, before.judge.noise)
+        self._screen = Screen(self._context)
+
+    def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
+        return (one for one in candidates if self._among is None or key(one) in self._among)
+
+    def tried(self, kinds: str) -> int:
+        """How many laws, or sets of signals, were looked at."""
+        return self._laws[1] if kinds == LAWS else self._terms[1]
+
+    @property
+    def laws(self) -> list[Account]:
+        return self._laws[0]
+
+    @property
+    def terms(self) -> list[Account]:
+        return self._terms[0]
+
+    @cached_property
+    def _laws(self) -> tuple[list[Account], int]:
+        found = list(self._screen.laws(self._asked(library.laws(self._context))))
+        count = len({one.law.name for one in found}) or 1
+        return self._fitted(_distinct(best_first(found), FITTED)), count
+
+    @cached_property
+    def _terms(self) -> tuple[list[Account], int]:
+        found = list(self._screen.terms(self._asked(library.terms(self._context))))
+        best = [self._refined(one) for one in _distinct(best_first(found), FITTED_TERMS)]
+        return self._fitted(best), len({key(one.law) for one in found})
+
+    def _refined(self, one: Screened) -> Screened:
+        """A term with its place and time constants where it promises most."""
+        for _ in range(3):
+            assert isinstance(one.law, SignalTerm)
+            near = self._screen.terms(library.refined(one.law))
+            better = max(near, key=lambda other: other.promise, default=one)
+            if better.promise <= one.promise:
+                break
+            one = better
+        return one
+
+    def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
+        samples = self._context.samples
+        models = side_by_side(lambda k: self._fit(chosen[k]), len(chosen), self._cores, samples)
+        return [Account(one, self._judge) for one in models if one is not None]
+
+    def _fit(self, one: Screened) -> Model | None:
+        """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
+        judge, model = self._judge, one.model
+        if one.law.gainlike:
+            fewer = _without_weakest(judge.fitted(model, 4).model)
+            if fewer is None:
+                return None
+            model = fewer
+        starts = [model, model.with_delays(self._before.model.delays)] if one.law.shifts else [model]
+        every = min((judge.fitted(start) for start in starts), key=lambda one: one.criterion)
+        return judge.narrowed(every, len(every.model.applied) - 1).model
+
+
+def key(law: EffectLaw) -> tuple[str, ...]:
+    """The name of a law, the signals of a term."""
+    return law.inputs if isinstance(law, SignalTerm) else (law.name,)
+
+
+def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:
+    """The first so many with different names, or signals, and of each name at most two forms."""
+    chosen: list[Screened] = []
+    for one in found:
+        mine = key(one.law)
+        if sum(key(other.law) == mine for other in chosen) < (1 if isinstance(one.law, SignalTerm) else 2):
+            chosen.append(one)
+        if len(chosen) == most:
+            break
+    return chosen
+
+
+def _without_weakest(model: Model) -> Model | None:
+    """The last effect off the joint where it is weakest, which gains or delays then stand for; None of one joint."""
+    last = model.applied[-1]
+    if last.active.sum() < 2:
+        return None
+    active: Bools = last.active & (np.arange(len(last.active)) != np.argmin(np.abs(last.values[0])))
+    return model.replacing(len(model.applied) - 1, attrs.evolve(last, active=active))

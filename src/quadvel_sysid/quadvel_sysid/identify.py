@@ -1,0 +1,204 @@
+"""From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
+
+`readings` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
+`selection` searches for effects; the chosen model is fitted to all rows, `confidence` says how sure its values are, and
+`outcome` makes the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_actuator.parameters import ActuatorParameters
+
+from .account import Account, Judge
+from .baselines import baselines
+from .confidence import intervals
+from .contradictions import contradictions
+from .criterion import Parts, noise_variance
+from .delays import in_steps, latest
+from .eam import WINDOWS, pd_torque
+from .fit import fit
+from .identification import Identification
+from .library import SignalTerm
+from .logs.dataset import Dataset
+from .logs.findings import Finding
+from .logs.log import Log
+from .material import VALUES, Material, Progress, gathered
+from .model import Model
+from .motion import STRETCH, Body, Replay, replayed
+from .outcome import Chosen, Outcome, identification, parameters
+from .readings import Reading, read, reference_gains
+from .selection import Search
+
+_CLEARLY = 0.97
+"""of the error of a replay: what an account of motion has to leave at most"""
+
+
+@attrs.frozen
+class Options:
+    """What a user may ask for."""
+
+    gains: tuple[float, float] | None = None
+    """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
+    base: ActuatorParameters | None = None
+    """its torque limits go into the corrected model"""
+    values: int = VALUES
+    """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
+    cores: int = 1
+    """that work side by side; the report is the same"""
+
+
+def identify(
+    train: Sequence[Log],
+    heldout: Sequence[Log] = (),
+    options: Options | None = None,
+    progress: Progress = lambda share, text: None,
+) -> Identification:
+    """Fit `train`, report on `heldout`, or on blocks of `train` kept aside where there is none.
+
+    `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
+    """
+    options = options or Options()
+    data = Dataset.of(train, heldout, options.gains)
+    material = gathered(data, options.gains, options.values, progress)
+    return identified(material, options.base, options.cores, progress)
+
+
+def identified(
+    material: Material,
+    base: ActuatorParameters | None = None,
+    cores: int = 1,
+    progress: Progress = lambda share, text: None,
+) -> Identification:
+    """The same of `material`: who does not hold the whole of a long log has more memory for it."""
+    body = material.body
+    progress(0.02, "gains and delays")
+    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    reading, notes = read(material, windows)
+    steps = iter(range(10**6))
+
+    def tick(text: str) -> None:
+        progress(min(0.1 + 0.04 * next(steps), 0.85), text)
+
+    plain = _plain(reading)
+    noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
+    # A log that is held out stays outside of the search.
+    samples = reading.samples.reaching(reading.parts.chosen_on)
+    judge = Judge(reading.parts.first(len(samples.t)), noise)
+    plain = attrs.evolve(plain, samples=samples)
+    search, before = Search(judge, tick, cores), judge.fitted(plain)
+    best = search.best(plain)
+    progress(0.88, "intervals")
+
+    def told(account: Account) -> Outcome:
+        return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
+
+    findings = [*material.findings, *notes]
+    outcome = told(best)
+    if body is None:
+        found = identification(outcome, findings)
+    else:
+        progress(0.95, "replays")
+        tries = [outcome, *(told(one) for one in (search.laws_alone(best), before) if one is not best)]
+        found = _with_motion(tries, body, findings)
+    parts, samples = reading.parts, reading.samples
+    logs = [one.log for one in samples.logs]
+    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
+    report["warnings"] = [*report["warnings"], *contradictions(report)]
+    progress(1.0, "done")
+    return attrs.evolve(found, report=report)
+
+
+def _plain(reading: Reading) -> Model:
+    """The EAM as a model that effects can be added to."""
+    eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
+    delays = np.stack([eam.input_delay, eam.output_delay])
+    return Model(reading.samples, eam.window, eam.gains, np.array([one, one]), delays, one)
+
+
+def _outcome(
+    account: Account,
+    before: Account,
+    search: Search,
+    reading: Reading,
+    material: Material,
+    base: ActuatorParameters,
+) -> Outcome:
+    """The chosen model with values of all rows, and errors of the rows that chose nothing."""
+    parts, samples = reading.parts, reading.samples
+    every = parts.chosen_on if material.heldout else parts.every
+    chosen = parts.chosen_on
+    models = [attrs.evolve(one.model, samples=samples) for one in (before, account)]
+    late = [latest(fit(one, chosen), chosen) for one in models]
+    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
+    effects = tuple(
+        Chosen(*_worth(late[1], k, parts), search.rivals(account, k))
+        for k in range(len(account.model.applied))
+    )
+    has_terms = any(isinstance(one.law, SignalTerm) for one in account.model.applied)
+    leaning = () if account.white or has_terms else search.leaning(account)
+    names = {one.law.name for one in account.model.applied}
+    rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
+    asked = np.ones_like(whole.gains)
+    asked[1] = 0.0 if samples.logs[0].undamped else 1.0
+    ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
+    return Outcome(
+        late[0], before_whole, late[1], whole, effects, rejected, leaning,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
+        material.pieces, *reference_gains(samples), base,
+    )  # fmt: skip
+
+
+def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
+    """What an effect takes off the error of the rows that chose nothing, and its p-value there."""
+    without = fit(model.without(index), parts.chosen_on)
+    worth = parts.compare(without.residual(), model.residual(), parts.report)
+    return worth.gain, worth.p
+
+
+def _with_motion(
+    tries: Sequence[Outcome], body: Body, findings: Sequence[tuple[str, Finding]]
+) -> Identification:
+    """The account with which the commands replay the motion best, with before and after in rad and rad/s, too.
+
+    The torque that a motion implies holds the encoders' errors, which terms can mistake for an effect; a replay does not.
+    """
+    logs = [piece.log for piece in tries[0].pieces]
+
+    def replay(o: Outcome, model: Model) -> Replay:
+        return replayed(logs, parameters(o, model), body, o.parts.report)
+
+    plain = tries[-1]
+    before = after = replay(plain, plain.before)
+    best = plain
+    for one in tries[:-1]:
+        found = replay(one, one.model)
+        if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
+            best, after = one, found
+    identified_one = identification(best, findings)
+    return attrs.evolve(identified_one, report=_told_of_motion(identified_one.report, before, after, body))
+
+
+def _told_of_motion(report: Mapping[str, Any], before: Replay, after: Replay, body: Body) -> dict[str, Any]:
+    motion = {
+        "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
+        "replayed_s": STRETCH,
+        "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
+        "the inertia and an encoder bias part of the torque offset.",
+    }
+    decision = (
+        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
+        f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
+    )
+    return {
+        **report,
+        "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
+        "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
+        "motion": motion,
+        "decision": decision,
+    }
