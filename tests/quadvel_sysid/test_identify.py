@@ -10,6 +10,7 @@ from simulated_joints import NAMES, TABLE_4, parameters, record
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_sysid.eam import fit_eam
 from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.logs.dataset import Dataset
 from quadvel_sysid.material import gathered
 from quadvel_sysid.signals import Samples
 
@@ -68,7 +69,7 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_not_confir
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    material = gathered([log], values=3000)
+    material = gathered(Dataset.of([log]), values=3000)
     del log
     assert sum(len(piece.log.t) for piece in material.pieces) == 1500
     assert [array() for array in alive] == [None] * len(alive)
@@ -145,9 +146,10 @@ def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
     six = NAMES[:6]
     drag = Effect("viscous_friction", six[:5], {"b": 0.2})
     report = identify([record(attrs.evolve(parameters((drag,)), joints=six), 6, 3.0, 500, seed=1)]).report
-    assert [(one["name"], one["joints"]) for one in report["effects"]] == [
-        ("viscous_friction", list(six[:5]))
-    ]
+    (one,) = report["effects"]
+    # A late speed on the sixth says the same: which of the two it is, is chance.
+    assert "viscous_friction" in {one["name"], *one["indistinguishable"]}
+    assert one["joints"] == list(six[:5] if one["name"] == "viscous_friction" else six[5:])
 
 
 @pytest.mark.xfail(reason="decision 48: one curve over the angle says as much in fewer parameters")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from functools import cached_property
 
 import attrs
@@ -10,7 +11,7 @@ import numpy as np
 from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, Comparison, Parts, normality, whiteness
 from .fit import fit, profiled
 from .library import complexity
-from .model import Applied, Model
+from .model import Applied, Groups, Model
 from .signals import Array
 
 
@@ -47,7 +48,7 @@ class Account:
     def white(self) -> bool:
         """Is nothing left but noise, on the rows that fit and select?"""
         parts, samples = self.judge.parts, self.model.samples
-        p = whiteness(self.residual, parts.chosen_on, samples.start)
+        p = whiteness(self.residual, parts.chosen_on, samples.start, parts.overlap)
         p = np.minimum(p, normality(self.residual, parts.chosen_on))
         return bool((p * 2 * len(p) > WHITE_LEVEL).all())
 
@@ -93,3 +94,34 @@ class Judge:
             return every
         fewer = self.fitted(every.model.replacing(index, attrs.evolve(one, active=needed)))
         return min(every, fewer, key=lambda one: one.criterion)
+
+    def tied(self, account: Account, index: int) -> Account:
+        """With the values of an effect shared by its joints, or by those of a kind, where that costs nothing."""
+        one = account.model.applied[index]
+        every = np.zeros(len(one.active), dtype=np.intp)
+        for groups in (every, *groupings(account.model.samples.joints)):
+            if len(np.unique(groups[one.active])) >= len(np.unique(one.groups[one.active])):
+                continue
+            values = one.values.copy()
+            for g in np.unique(groups[one.active]):
+                alike = one.active & (groups == g)
+                values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
+            shared = attrs.evolve(one, groups=groups, values=values)
+            tied = self.fitted(account.model.replacing(index, shared))
+            if tied.criterion < account.criterion:
+                return tied
+        return account
+
+
+def kinds(joints: Iterable[str]) -> Groups:
+    """The same number for joints whose names differ in their first part only: FR_hip_joint, FL_hip_joint."""
+    names = [name.partition("_")[2] or name for name in joints]
+    found: Groups = np.unique(names, return_inverse=True)[1]
+    return found
+
+
+def groupings(joints: Sequence[str]) -> list[Groups]:
+    """By kind, and each joint for itself; by kind only where several joints are of one."""
+    each = np.arange(len(joints))
+    by_kind = kinds(joints)
+    return [by_kind, each] if by_kind.max() + 1 < len(joints) else [each]

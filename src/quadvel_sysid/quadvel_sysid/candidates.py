@@ -13,6 +13,7 @@ from quadvel_actuator.effects import EffectLaw
 
 from . import library
 from .account import Account
+from .fit import fit
 from .library import Context, SignalTerm
 from .model import Model
 from .parallel import side_by_side
@@ -53,14 +54,18 @@ class Candidates:
 
     @cached_property
     def _laws(self) -> tuple[list[Account], int]:
-        found = list(self._screen.laws(self._asked(library.laws(self._context))))
+        several = len(self._context.samples.joints) > 1
+        asked = (one for one in self._asked(library.laws(self._context)) if several or not one.gainlike)
+        found = list(self._screen.laws(asked))
         count = len({one.law.name for one in found}) or 1
         return self._fitted(_distinct(best_first(found), FITTED)), count
 
     @cached_property
     def _terms(self) -> tuple[list[Account], int]:
         found = list(self._screen.terms(self._asked(library.terms(self._context))))
-        best = [self._refined(one) for one in _distinct(best_first(found), FITTED_TERMS)]
+        best = _distinct(best_first(found), FITTED_TERMS)
+        finer = [self._refined(one) for one in best]
+        best += [one for one in finer if one not in best]
         return self._fitted(best), len({key(one.law) for one in found})
 
     def _refined(self, one: Screened) -> Screened:
@@ -77,19 +82,20 @@ class Candidates:
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
         samples = self._context.samples
         models = side_by_side(lambda k: self._fit(chosen[k]), len(chosen), self._cores, samples)
-        return [Account(one, self._judge) for one in models if one is not None]
+        return [Account(one, self._judge) for one in models]
 
-    def _fit(self, one: Screened) -> Model | None:
+    def _fit(self, one: Screened) -> Model:
         """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
-        judge, model = self._judge, one.model
-        if one.law.gainlike:
-            fewer = _without_weakest(judge.fitted(model, 4).model)
-            if fewer is None:
-                return None
-            model = fewer
-        starts = [model, model.with_delays(self._before.model.delays)] if one.law.shifts else [model]
+        judge, model, law = self._judge, one.model, one.law
+        near = model.with_delays(self._before.model.delays)
+        if law.gainlike:
+            # What all joints share is a gain's or a delay's.
+            rows = judge.parts.fit
+            model, near = (_without_weakest(fit(start, rows, 4, delays=False)) for start in (model, near))
+        starts = [model, near] if law.shifts or law.gainlike else [model]
         every = min((judge.fitted(start) for start in starts), key=lambda one: one.criterion)
-        return judge.narrowed(every, len(every.model.applied) - 1).model
+        last = len(every.model.applied) - 1
+        return judge.tied(judge.narrowed(every, last), last).model
 
 
 def key(law: EffectLaw) -> tuple[str, ...]:
@@ -109,10 +115,8 @@ def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:
     return chosen
 
 
-def _without_weakest(model: Model) -> Model | None:
-    """The last effect off the joint where it is weakest, which gains or delays then stand for; None of one joint."""
+def _without_weakest(model: Model) -> Model:
+    """The last effect off the joint where it is weakest, which gains or delays then stand for."""
     last = model.applied[-1]
-    if last.active.sum() < 2:
-        return None
     active: Bools = last.active & (np.arange(len(last.active)) != np.argmin(np.abs(last.values[0])))
     return model.replacing(len(model.applied) - 1, attrs.evolve(last, active=active))

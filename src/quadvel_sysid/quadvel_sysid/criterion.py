@@ -36,6 +36,8 @@ class Parts:
     select: Bools
     report: Bools
     starts: NDArray[np.intp]
+    overlap: int = 0
+    """rows after one that share the noise of its torque, as accelerations do that are differences of speeds"""
 
     @property
     def every(self) -> Bools:
@@ -49,7 +51,7 @@ class Parts:
     def first(self, count: int) -> Parts:
         """The parts of the first `count` rows."""
         starts = self.starts[self.starts < count]
-        return Parts(self.fit[:count], self.select[:count], self.report[:count], starts)
+        return Parts(self.fit[:count], self.select[:count], self.report[:count], starts, self.overlap)
 
     def sums(self, values: Array) -> Array:
         """Values (N, ...) summed over each cluster."""
@@ -116,19 +118,26 @@ _LAGS = 20
 """Rows over which its correlation is looked at"""
 
 
-def whiteness(residual: Array, rows: Bools, start: Bools) -> Array:
-    """p-values (J,) of Ljung and Box's test that a residual (N, J) is white on `rows`; `start` (N,): where stretches begin."""
+def whiteness(residual: Array, rows: Bools, start: Bools, overlap: int = 0) -> Array:
+    """p-values (J,) of Ljung and Box's test that a residual (N, J) is white on `rows`.
+
+    start (N,): where stretches begin. overlap: rows within which the noise itself is correlated; these lags are left out, and
+    the variance of the others is Bartlett's.
+    """
     left = np.where(rows, residual, 0.0)
     left = left - np.where(rows, left.sum(axis=0) / np.maximum(rows.sum(axis=0), 1), 0.0)
     power = np.sum(left * left, axis=0) + 1e-300
-    count, total = rows.sum(axis=0), np.zeros(left.shape[1])
+    count, total, variance = rows.sum(axis=0), np.zeros(left.shape[1]), np.ones(left.shape[1])
     stretch = np.cumsum(start)
-    for lag in range(1, _LAGS + 1):
+    for lag in range(1, overlap + _LAGS + 1):
         same = (stretch[lag:] == stretch[:-lag])[:, None]
         pairs = rows[lag:] & rows[:-lag] & same
         r = np.sum(left[lag:] * left[:-lag] * pairs, axis=0) / power
-        total += r * r * count**2 / np.maximum(pairs.sum(axis=0), 1)
-    return np.asarray(stats.chi2.sf(total, _LAGS))
+        if lag > overlap:
+            total += r * r * count**2 / np.maximum(pairs.sum(axis=0), 1)
+        else:
+            variance += 2.0 * r * r
+    return np.asarray(stats.chi2.sf(total / variance, _LAGS))
 
 
 def normality(residual: Array, rows: Bools) -> Array:

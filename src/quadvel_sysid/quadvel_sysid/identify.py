@@ -15,6 +15,7 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
+from . import replay
 from .account import Account, Judge
 from .baselines import baselines
 from .confidence import intervals
@@ -28,10 +29,12 @@ from .library import SignalTerm
 from .logs.dataset import Dataset
 from .logs.findings import Finding
 from .logs.log import Log
+from .lost_commands import read_again
 from .material import VALUES, Material, Progress, gathered
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Chosen, Outcome, identification, parameters
+from .replay import Legs
 from .readings import Reading, read, reference_gains
 from .selection import Search
 
@@ -51,6 +54,8 @@ class Options:
     """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
     cores: int = 1
     """that work side by side; the report is the same"""
+    robot: str | None = None
+    """whose legs the reported rows are replayed on: `aliengo`, `go2`, or an MJCF or URDF file"""
 
 
 def identify(
@@ -66,7 +71,7 @@ def identify(
     options = options or Options()
     data = Dataset.of(train, heldout, options.gains)
     material = gathered(data, options.gains, options.values, progress)
-    return identified(material, options.base, options.cores, progress)
+    return identified(material, options.base, options.cores, progress, options.robot)
 
 
 def identified(
@@ -74,9 +79,11 @@ def identified(
     base: ActuatorParameters | None = None,
     cores: int = 1,
     progress: Progress = lambda share, text: None,
+    robot: str | None = None,
 ) -> Identification:
     """The same of `material`: who does not hold the whole of a long log has more memory for it."""
     body = material.body
+    legs = None if robot is None else Legs.of(robot, material.pieces[0].log.joints)
     progress(0.02, "gains and delays")
     windows = WINDOWS if body is None else (material.pieces[0].log.period,)
     reading, notes = read(material, windows)
@@ -104,11 +111,18 @@ def identified(
         found = identification(outcome, findings)
     else:
         progress(0.95, "replays")
-        tries = [outcome, *(told(one) for one in (search.laws_alone(best), before) if one is not best)]
+        of_laws = search.simplified(search.of_laws or before)
+        tries = [outcome, *(told(one) for one in (of_laws, before) if one is not best)]
         found = _with_motion(tries, body, findings)
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
     report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
+    if legs is not None and body is None:
+        progress(0.95, "replays")
+        pieces, models = [piece.log for piece in material.pieces], (outcome.before, outcome.model)
+        report["replay"] = replay.replayed(
+            pieces, *(parameters(outcome, one) for one in models), legs, parts.report
+        )
     report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
@@ -134,6 +148,8 @@ def _outcome(
     every = parts.chosen_on if material.heldout else parts.every
     chosen = parts.chosen_on
     models = [attrs.evolve(one.model, samples=samples) for one in (before, account)]
+    if len(samples.t) > len(account.model.samples.t):
+        models[1] = read_again(models[1], parts, search.judge.noise)
     late = [latest(fit(one, chosen), chosen) for one in models]
     before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
     effects = tuple(

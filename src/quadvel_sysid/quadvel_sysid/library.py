@@ -39,6 +39,8 @@ from .signals import Array, Bools, Signals
 _KEPT = 4
 """Sets of a term's regressors that are kept"""
 _COMMANDED = "q_des", "error", "tau"
+_PAST_COST = 0.5
+"""In parameters: decides between laws that explain the same"""
 _SIGNAL_COST, _WEIGHT_COST = 5.0, 0.1
 """In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
 
@@ -146,8 +148,9 @@ def _past_only(s: Signals) -> Signals:
 
 
 def complexity(law: EffectLaw) -> float:
-    """What a law says, in parameters a joint."""
-    return float(getattr(law, "complexity", len(law.parameters)))
+    """What a law says, in parameters a joint; one that reaches back in time says more than one of the moment."""
+    past = _PAST_COST if law.shifts or law.remembers else 0.0
+    return float(getattr(law, "complexity", len(law.parameters) + past))
 
 
 class Context:
@@ -204,7 +207,7 @@ _FREQUENCIES, _DAMPING = np.geomspace(3.0, 110.0, 26), (0.02, 0.07, 0.2)  # Hz, 
 _HISTORY = 0.02  # s
 _RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
 _PIECES = 6
-_FINE = 25
+_FINE, _FINEST = 25, 100
 
 
 def terms(context: Context) -> Iterator[SignalTerm]:
@@ -289,10 +292,12 @@ class _Maker:
 
 
 def refined(term: SignalTerm) -> list[SignalTerm]:
-    """The same term with its time constant, frequency or damping, or its place, a little otherwise."""
+    """The same term with a finer curve, its time constant, frequency or damping, or its place, a little otherwise."""
     shape = term.shape
     near: list[Shape] = []
-    if isinstance(shape, Lag):
+    if isinstance(shape, Curve) and shape.pieces < _FINEST:
+        near = [attrs.evolve(shape, pieces=2 * shape.pieces)]
+    elif isinstance(shape, Lag):
         near = [Lag(shape.time * by) for by in (0.7, 0.85, 1.18, 1.4)]
     elif isinstance(shape, Resonance):
         near = [Resonance(shape.frequency * by, shape.damping) for by in (0.93, 0.97, 1.03, 1.07)]

@@ -108,6 +108,16 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
     return [best]
 
 
+def read_again(model: Model, parts: Parts, noise: Array) -> Model:
+    """The model, whose samples reach further than those that its lost commands were read off, with these read off them all."""
+    for k, one in enumerate(model.applied):
+        if isinstance(one.law, CommandHold):
+            odds = backlog(model.without(k), noise, MOST, ~parts.fit)
+            law = CommandHold(odds, odds[parts.fit].mean(axis=0))
+            model = model.replacing(k, attrs.evolve(one, law=law))
+    return model
+
+
 def _suspicious(model: Model, noise: Array) -> bool:
     """Do some of the commands look lost or late, each on its own? If not, the search finds nothing."""
     s = model.signals

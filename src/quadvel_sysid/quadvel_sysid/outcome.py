@@ -147,7 +147,8 @@ def _report(o: Outcome) -> dict[str, Any]:
 def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
     """What no law explains: terms of named signals, or a residual that is not white."""
     parts, samples = o.parts, o.model.samples
-    coloured = whiteness(samples.tau - o.model.predict(), parts.every, samples.start) < WHITE_LEVEL
+    left = samples.tau - o.model.predict()
+    coloured = whiteness(left, parts.every, samples.start, parts.overlap) < WHITE_LEVEL
     names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
     joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
     removable = before - floor

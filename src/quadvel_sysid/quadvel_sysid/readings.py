@@ -91,7 +91,8 @@ def divided(samples: Samples, material: Material) -> Parts:
                 f"{samples.logs[0].log.name}: valid/{joint}: {int(count.min())} rows to be {word}, "
                 f"expected {_LEAST_ROWS} or more"
             )
-    return Parts(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples))
+    overlap = 0 if material.body is None else 1
+    return Parts(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
 
 
 def reference_gains(samples: Samples) -> tuple[float, float]:

@@ -266,7 +266,9 @@ class _Spot:
             values[linear] = weights.T
         groups = np.zeros(len(joint), dtype=np.intp) if law.common else joint
         one = Applied(law, may_act(law, self.screen.joints), values, groups)
-        moved = attrs.evolve(model, gains=model.gains + change[:2]).with_delays(model.delays + change[2:])
+        moved = attrs.evolve(model, gains=np.maximum(model.gains + change[:2], 0.0)).with_delays(
+            model.delays + change[2:]
+        )
         return attrs.evolve(moved.plus(one), samples=self.screen.context.samples)
 
 

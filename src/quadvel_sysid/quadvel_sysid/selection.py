@@ -12,11 +12,13 @@ from collections.abc import Callable, Iterable, Sequence
 import attrs
 import numpy as np
 
-from .account import Account, Judge, parameters
+from quadvel_actuator.effects import EffectLaw
+
+from .account import Account, Judge, groupings, parameters
 from .candidates import LAWS, TERMS, Candidates, key
 from .criterion import LEVEL, PER_PARAMETER, WORTH
 from .library import SignalTerm
-from .model import Groups, Model
+from .model import Applied, Model
 from .signals import Array
 
 MOST = 5
@@ -38,6 +40,8 @@ class Search:
         self._tried = 1
         self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         self._known: dict[tuple[object, ...], Candidates] = {}
+        self.of_laws: Account | None = None
+        """the best account without terms that came up"""
 
     def best(self, start: Model) -> Account:
         """The account of the data with the least criterion.
@@ -46,27 +50,22 @@ class Search:
         laws leave more than noise, terms alone come into question; and where those do so, too, or cost more, further laws,
         and terms on top of the laws.
         """
-        plain = self.judge.profiled(self.judge.fitted(start))
+        self.of_laws = plain = self.judge.profiled(self.judge.fitted(start))
         if plain.white:
             return plain
-        laws = self.run(plain, LAWS, most=1)
+        self.of_laws = laws = self.run(plain, LAWS, most=1)
         if laws.white:
             return self.simplified(laws)
         terms = self.run(plain, TERMS, most=1)
-        laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
+        self.of_laws = laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
         if not laws.white:
             terms = self.run(terms, TERMS)
         accounts = [terms]
         if laws.white or not terms.white or laws.criterion < terms.criterion:
-            laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
+            self.of_laws = laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
             accounts += [laws, self.merged(laws)]
             accounts += [] if laws.white else [self.run(laws, TERMS)]
         return self.simplified(min(accounts, key=lambda one: one.criterion))
-
-    def laws_alone(self, account: Account) -> Account:
-        """The account without its terms."""
-        laws = tuple(one for one in account.model.applied if not isinstance(one.law, SignalTerm))
-        return self.judge.fitted(attrs.evolve(account.model, applied=laws))
 
     def leaning(self, account: Account) -> tuple[str, ...]:
         """The signals that what is left goes with most, whether or not a term of them would pay."""
@@ -88,7 +87,9 @@ class Search:
         if model.delay_groups.any():
             same = attrs.evolve(account.model, delay_groups=one).with_delays(_shared(model.delays))
             account = min(account, self.judge.fitted(same), key=lambda each: each.criterion)
-        return self.tied(account)
+        for k in range(len(account.model.applied)):
+            account = self.judge.tied(account, k)
+        return account
 
     def _nested(self, account: Account, index: int) -> Account:
         """With the law that an effect's is at the end of one of its parameters, unless the rows that select tell them apart."""
@@ -140,6 +141,8 @@ class Search:
 
     def _reason(self, before: Account, after: Account) -> str:
         """Why what was added does not count; nothing where it does."""
+        if len(after.model.applied) > len(before.model.applied) and repeats(after.last, before.model.applied):
+            return "a law that it contains, or that contains it, is on the same joints already"
         found = after.against(before)
         p = found.p * self._tried
         worth = float(np.max(found.joint_gain / self.judge.noise))
@@ -168,7 +171,7 @@ class Search:
         """The account with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
-        for groups in _groupings(joints):
+        for groups in groupings(joints):
             finer = len(np.unique(groups))
             if not model.gains_held and finer > len(np.unique(model.gain_groups[0])):
                 found.append(attrs.evolve(model, gain_groups=np.array([groups, groups])))
@@ -228,27 +231,6 @@ class Search:
             account = min(every, key=lambda one: one.criterion)
         return account
 
-    def tied(self, account: Account) -> Account:
-        """With the values of each effect shared by its joints, or by those of a kind, where that costs nothing."""
-        for k in range(len(account.model.applied)):
-            one = account.model.applied[k]
-            for groups in (
-                np.zeros(len(one.active), dtype=np.intp),
-                *_groupings(account.model.samples.joints),
-            ):
-                if len(np.unique(groups[one.active])) >= len(np.unique(one.groups[one.active])):
-                    continue
-                values = one.values.copy()
-                for g in np.unique(groups[one.active]):
-                    alike = one.active & (groups == g)
-                    values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
-                shared = attrs.evolve(one, groups=groups, values=values)
-                tied = self.judge.fitted(account.model.replacing(k, shared))
-                if tied.criterion < account.criterion:
-                    account = tied
-                    break
-        return account
-
     def rivals(self, account: Account, index: int) -> tuple[str, ...]:
         """The laws that say the same in the place of an effect, to what rows that select can tell."""
         one = account.model.applied[index].law
@@ -265,6 +247,20 @@ class Search:
         return tuple(dict.fromkeys(found))
 
 
+def repeats(one: Applied, others: Iterable[Applied]) -> bool:
+    """Does a law act where a law is at work that it contains as an end of its parameters, or that contains it?"""
+    mine = _contained(one.law)
+    return any(not (one.active & ~other.active).any() and mine & _contained(other.law) for other in others)
+
+
+def _contained(law: EffectLaw) -> set[str]:
+    """The names of a law and of that which it becomes at the end of one of its parameters; none of a term."""
+    if isinstance(law, SignalTerm):
+        return set()
+    less = law.simpler({p.name: np.array([p.scale]) for p in law.parameters})
+    return {law.name} | ({less[0].name} if less else set())
+
+
 def _described(model: Model) -> tuple[object, ...]:
     """What tells two fitted models apart: their laws, forms and joints, and what is shared."""
     effects = [
@@ -277,17 +273,3 @@ def _described(model: Model) -> tuple[object, ...]:
 def _shared(values: Array) -> Array:
     """The mean over the joints, for each of them."""
     return np.repeat(values.mean(axis=-1, keepdims=True), values.shape[-1], axis=-1)
-
-
-def kinds(joints: Iterable[str]) -> Groups:
-    """The same number for joints whose names differ in their first part only: FR_hip_joint, FL_hip_joint."""
-    names = [name.partition("_")[2] or name for name in joints]
-    found: Groups = np.unique(names, return_inverse=True)[1]
-    return found
-
-
-def _groupings(joints: Sequence[str]) -> list[Groups]:
-    """By kind, and each joint for itself; by kind only where several joints are of one."""
-    each = np.arange(len(joints))
-    by_kind = kinds(joints)
-    return [by_kind, each] if by_kind.max() + 1 < len(joints) else [each]
