@@ -14,6 +14,8 @@ from .library import complexity
 from .model import Applied, Groups, Model
 from .signals import Array
 
+_TINY = 1e-12  # N^2 m^2, of a log without noise
+
 
 @attrs.frozen(eq=False)
 class Account:
@@ -29,16 +31,18 @@ class Account:
 
     @cached_property
     def left(self) -> Array:
-        """Mean squared error of the rows that select, in units of the noise variance, (J,)."""
+        """Mean squared error of the rows that select, N^2 m^2, (J,)."""
         rows = self.judge.parts.select
         square = np.sum(np.where(rows, self.residual, 0.0) ** 2, axis=0)
-        left: Array = square / np.maximum(rows.sum(axis=0), 1) / self.judge.noise
+        left: Array = square / np.maximum(rows.sum(axis=0), 1)
         return left
 
     @cached_property
     def criterion(self) -> float:
-        """Error of all joints and what the parameters cost."""
-        return float(self.left.sum()) + PER_PARAMETER * parameters(self.model)
+        """Twice the negative log likelihood of a row's torque, of normal noise of unknown variance, and what parameters cost."""
+        return float(
+            np.log((self.left + _TINY) / (self.judge.noise + _TINY)).sum()
+        ) + PER_PARAMETER * parameters(self.model)
 
     def against(self, before: Account) -> Comparison:
         """On the rows that select."""
@@ -88,8 +92,8 @@ class Judge:
         one = every.model.applied[index]
         idle = Account(every.model.without(index), self)
         found = every.against(idle)
-        cost = PER_PARAMETER * complexity(one.law) * self.noise
-        needed = one.active & (found.p_joints < LEVEL) & (found.joint_gain > cost)
+        cost = PER_PARAMETER * complexity(one.law)
+        needed = one.active & (found.p_joints < LEVEL) & (found.share > cost)
         if not needed.any() or (needed == one.active).all():
             return every
         fewer = self.fitted(every.model.replacing(index, attrs.evolve(one, active=needed)))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from functools import cached_property
 from typing import TypeVar
 
@@ -22,6 +22,8 @@ from .signals import Bools
 
 FITTED, FITTED_TERMS = 6, 4
 """Laws, and terms, that are fitted after a screening"""
+SIMPLIFIED = 3
+"""Of these, the best, of which it is tried what their joints share"""
 LAWS, TERMS = "laws", "terms"
 L = TypeVar("L", bound=EffectLaw)
 
@@ -80,8 +82,14 @@ class Candidates:
         return one
 
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
-        samples = self._context.samples
-        models = side_by_side(lambda k: self._fit(chosen[k]), len(chosen), self._cores, samples)
+        first = self._side_by_side(lambda k: self._fit(chosen[k]), len(chosen))
+        first.sort(key=lambda one: one.criterion)
+        best, others = first[:SIMPLIFIED], first[SIMPLIFIED:]
+        last = len(self._context.model.applied)
+        return self._side_by_side(lambda k: self._judge.tied(best[k], last).model, len(best)) + others
+
+    def _side_by_side(self, work: Callable[[int], Model], count: int) -> list[Account]:
+        models = side_by_side(work, count, self._cores, self._context.samples)
         return [Account(one, self._judge) for one in models]
 
     def _fit(self, one: Screened) -> Model:
@@ -94,8 +102,7 @@ class Candidates:
             model, near = (_without_weakest(fit(start, rows, 4, delays=False)) for start in (model, near))
         starts = [model, near] if law.shifts or law.gainlike else [model]
         every = min((judge.fitted(start) for start in starts), key=lambda one: one.criterion)
-        last = len(every.model.applied) - 1
-        return judge.tied(judge.narrowed(every, last), last).model
+        return judge.narrowed(every, len(every.model.applied) - 1).model
 
 
 def key(law: EffectLaw) -> tuple[str, ...]:

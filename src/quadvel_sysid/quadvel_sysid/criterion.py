@@ -1,4 +1,4 @@
-"""What decides: three parts of the data, the noise of the torque, a clustered test, and an information criterion.
+"""What decides: three parts of the data, a clustered test, an information criterion, and the noise of the torque.
 
 Rows of the first part are fitted, those of the second select, those of the third are only reported. Residuals of
 neighbouring rows are correlated, so that sums over clusters of 0.1 s are the units of every test.
@@ -23,9 +23,9 @@ STILL = 0.02
 LEVEL = 0.01
 """An effect is named if chance would bring its gain with less than this probability, all candidates counted"""
 WORTH = 0.03
-"""Of the noise variance: what an effect has to take off the error of the joint that shows it best"""
+"""Of the error that it leaves: what an effect has to take off on the joint that shows it best"""
 PER_PARAMETER = 0.01
-"""Of the noise variance of a joint: what one more parameter there has to take off the error to be worth its word"""
+"""Of a joint's error: what one more parameter there has to take off to be worth its word"""
 
 
 @attrs.frozen(eq=False)
@@ -62,8 +62,13 @@ class Parts:
         """Residuals (N, J) `before` and `after` a change of the model, on some rows."""
         e0, e1 = np.where(rows, before, 0.0), np.where(rows, after, 0.0)
         d = e0 - e1
+        after = self.sums(e1**2)
         return Comparison(
-            self.sums(e0**2 - e1**2), self.sums(e0 * d), self.sums(e1 * d), self.sums(rows.astype(float))
+            self.sums(e0**2) - after,
+            after,
+            self.sums(e0 * d),
+            self.sums(e1 * d),
+            self.sums(rows.astype(float)),
         )
 
 
@@ -76,6 +81,7 @@ class Comparison:
     """
 
     fall: Array  # e0^2 - e1^2
+    after: Array  # e1^2
     score: Array  # e0 d
     noise: Array  # e1 d
     rows: Array
@@ -86,10 +92,10 @@ class Comparison:
         return float(self.fall.sum() / max(self.rows.sum(), 1))
 
     @property
-    def joint_gain(self) -> Array:
-        """The same over each joint's own rows, (J,)."""
-        gain: Array = self.fall.sum(axis=0) / np.maximum(self.rows.sum(axis=0), 1)
-        return gain
+    def share(self) -> Array:
+        """How much of each joint's squared error the fall is, as a share of what is left after it, (J,)."""
+        share: Array = self.fall.sum(axis=0) / np.maximum(self.after.sum(axis=0), 1e-300)
+        return share
 
     @property
     def p_joints(self) -> Array:

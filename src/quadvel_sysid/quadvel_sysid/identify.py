@@ -15,7 +15,6 @@ import numpy as np
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from . import replay
 from .account import Account, Judge
 from .baselines import baselines
 from .confidence import intervals
@@ -27,19 +26,21 @@ from .fit import fit
 from .identification import Identification
 from .library import SignalTerm
 from .logs.dataset import Dataset
-from .logs.findings import Finding
 from .logs.log import Log
 from .lost_commands import read_again
 from .material import VALUES, Material, Progress, gathered
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Chosen, Outcome, identification, parameters
-from .replay import Legs
 from .readings import Reading, read, reference_gains
+from .replay import STRETCH as LEG_STRETCH
+from .replay import TEXT as LEG_TEXT
+from .replay import Legs
 from .selection import Search
+from .signals import Bools
 
-_CLEARLY = 0.97
-"""of the error of a replay: what an account of motion has to leave at most"""
+_MOVES = 0.9
+"""Of the error of a replay: what a model with more in it has to leave at most"""
 
 
 @attrs.frozen
@@ -105,24 +106,18 @@ def identified(
     def told(account: Account) -> Outcome:
         return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
 
-    findings = [*material.findings, *notes]
-    outcome = told(best)
-    if body is None:
-        found = identification(outcome, findings)
+    if body is None and legs is None:
+        outcome, sections = told(best), {}
     else:
-        progress(0.95, "replays")
-        of_laws = search.simplified(search.of_laws or before)
-        tries = [outcome, *(told(one) for one in (of_laws, before) if one is not best)]
-        found = _with_motion(tries, body, findings)
+        progress(0.93, "replays")
+        accounts = dict.fromkeys((before, search.simplified(search.of_laws or before), best))
+        outcome, sections = _moving([told(one) for one in accounts], body, legs)
+    found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
-    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
-    if legs is not None and body is None:
-        progress(0.95, "replays")
-        pieces, models = [piece.log for piece in material.pieces], (outcome.before, outcome.model)
-        report["replay"] = replay.replayed(
-            pieces, *(parameters(outcome, one) for one in models), legs, parts.report
-        )
+    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report), **sections}
+    if body is not None:
+        report |= _told_of_motion(report)
     report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
@@ -177,44 +172,50 @@ def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
     return worth.gain, worth.p
 
 
-def _with_motion(
-    tries: Sequence[Outcome], body: Body, findings: Sequence[tuple[str, Finding]]
-) -> Identification:
-    """The account with which the commands replay the motion best, with before and after in rad and rad/s, too.
+def _moving(tries: Sequence[Outcome], body: Body | None, legs: Legs | None) -> tuple[Outcome, dict[str, Any]]:
+    """The outcome with which the commands replay the motion best, and the sections of the report about that.
 
-    The torque that a motion implies holds the encoders' errors, which terms can mistake for an effect; a replay does not.
+    A later try has to replay clearly better than those before it on the rows that fit and select. Terms can mistake the errors
+    of encoders for an effect, or foretell a torque only where the joint does what it did; a replay does not.
     """
     logs = [piece.log for piece in tries[0].pieces]
 
-    def replay(o: Outcome, model: Model) -> Replay:
-        return replayed(logs, parameters(o, model), body, o.parts.report)
+    def replay(o: Outcome, model: Model, rows: Bools) -> Replay:
+        if legs is not None:
+            return legs.replayed(logs, parameters(o, model), rows)
+        assert body is not None
+        return replayed(logs, parameters(o, model), body, rows)
 
-    plain = tries[-1]
-    before = after = replay(plain, plain.before)
-    best = plain
-    for one in tries[:-1]:
-        found = replay(one, one.model)
-        if found["dq_rms_rad_s"] < _CLEARLY * after["dq_rms_rad_s"]:
-            best, after = one, found
-    identified_one = identification(best, findings)
-    return attrs.evolve(identified_one, report=_told_of_motion(identified_one.report, before, after, body))
-
-
-def _told_of_motion(report: Mapping[str, Any], before: Replay, after: Replay, body: Body) -> dict[str, Any]:
+    best, least = tries[0], np.inf
+    for one in tries:
+        error = replay(one, one.model, one.parts.chosen_on)["dq_rms_rad_s"]
+        if error < _MOVES * least:
+            best, least = one, error
+    sizes = {
+        name: replay(best, model, best.parts.report)
+        for name, model in (("before", best.before), ("after", best.model))
+    }
+    if legs is not None:
+        return best, {"replay": {"stretch_s": LEG_STRETCH, **sizes, "text": LEG_TEXT}}
+    assert body is not None
     motion = {
         "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
         "replayed_s": STRETCH,
         "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
         "the inertia and an encoder bias part of the torque offset.",
     }
+    return best, {"motion": motion | sizes}
+
+
+def _told_of_motion(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What changes in a report where the torque is what the motion implies."""
+    before, after = report["motion"]["before"], report["motion"]["after"]
     decision = (
         f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
         f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
     )
     return {
-        **report,
         "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
         "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
-        "motion": motion,
         "decision": decision,
     }

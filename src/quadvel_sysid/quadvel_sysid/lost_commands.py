@@ -31,6 +31,8 @@ Where much more is left than that, what was read off the torque as losses was so
 _PIECE, _AROUND = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
 
+_NORMAL = 1.4826
+"""Standard deviation of normal numbers over the median of their sizes"""
 _ROUNDS, _SETTLED = 8, 1e-3
 _RARE = 1e-6
 _SURE = 50.0
@@ -84,6 +86,7 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
     what they do so on average, which is in the delay of a model without them: earlier ones are looked at, in steps of a
     part of the time between two commands, and rows that select decide.
     """
+    noise = _usual_error(model, parts, noise)
     if len(noise) < 2 or not _suspicious(model, noise):
         return []
     period = float(np.median(np.concatenate([np.diff(log.t_cmd) for log in model.samples.logs])))
@@ -116,6 +119,13 @@ def read_again(model: Model, parts: Parts, noise: Array) -> Model:
             law = CommandHold(odds, odds[parts.fit].mean(axis=0))
             model = model.replacing(k, attrs.evolve(one, law=law))
     return model
+
+
+def _usual_error(model: Model, parts: Parts, noise: Array) -> Array:
+    """Variance (J,) of what the model leaves of most rows, N^2 m^2: what a row says of losses is held against that."""
+    size = [np.median(np.abs(one[keep])) for one, keep in zip(model.residual().T, parts.fit.T, strict=True)]
+    usual: Array = np.maximum((_NORMAL * np.array(size)) ** 2, noise)
+    return usual
 
 
 def _suspicious(model: Model, noise: Array) -> bool:

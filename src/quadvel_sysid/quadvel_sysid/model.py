@@ -271,6 +271,8 @@ class Unknowns:
         return found
 
 
+_MOST_GAIN = 4.0
+"""Times the commanded gain: what a drive gives of it at most"""
 SLOPE = 0.01
 """Step of numerical slopes, of a parameter's usual size"""
 DELAY_STEP = 0.0003
@@ -280,8 +282,9 @@ DELAY_STEP = 0.0003
 def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[float, float], float]]:
     """Of each slot: who shares it, where it is free, bounds, and the step of its slope."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
+    known = model.samples.commanded and not model.samples.logs[0].undamped
     for groups in model.gain_groups:
-        yield groups, everywhere & (not model.gains_held), (0.0, 1e6), SLOPE
+        yield groups, everywhere & (not model.gains_held), (0.0, _MOST_GAIN if known else 1e6), SLOPE
     for one in model.applied:
         for parameter in one.law.parameters:
             yield one.groups, one.active, (parameter.low, parameter.high), SLOPE * parameter.scale

@@ -32,6 +32,10 @@ _BEFORE = 0.04
 """s of the measured motion that the model is led along first, so that its delays and memories are filled"""
 _STEP = 0.001
 """s of the replay"""
+TEXT = (
+    "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the measured torque; "
+    "what else pushes them is as measured."
+)
 _SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
@@ -59,7 +63,9 @@ class Legs:
         known = {model.joint(k).name for k in range(model.njnt)}
         for name in joints:
             if name not in known:
-                raise ValueError(f"{path}: joint '{name}' of the log is missing, found {', '.join(sorted(known))}")
+                raise ValueError(
+                    f"{path}: joint '{name}' of the log is missing, found {', '.join(sorted(known))}"
+                )
         return cls(model, tuple(joints))
 
     def inertia(self, q: Array) -> Array:
@@ -76,6 +82,23 @@ class Legs:
             mujoco.mj_fullM(model, data, full)
             found[n] = full[np.ix_(dofs, dofs)]
         return found
+
+    def replayed(self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools) -> dict[str, Any]:
+        """Root mean square deviations over `rows` (N, J) of all logs; how many stretches there were.
+
+        Raises LogError where no stretch lies within these rows.
+        """
+        edges = np.cumsum([0, *(len(log.t) for log in logs)])
+        found = []
+        for log, a, b in zip(logs, edges[:-1], edges[1:], strict=True):
+            begins = stretches(log, rows[a:b])
+            if len(begins):
+                found.append(deviations(log, parameters, self, begins))
+        if not found:
+            raise LogError(
+                f"{logs[0].name}: no {1e3 * STRETCH:.0f} ms in a row are to be replayed, expected longer blocks"
+            )
+        return {"stretches": sum(one[0].shape[1] for one in found), **_sizes(found)}
 
 
 def stretches(log: Log, rows: Bools) -> Array:
@@ -126,35 +149,6 @@ def deviations(log: Log, parameters: ActuatorParameters, legs: Legs, begins: Arr
 def _between(t: Array, values: Array, at: Array) -> Array:
     """Lines through the rows `values` (N, J) at times `t` (N,), read at `at` (S,): (S, J)."""
     return np.stack([np.interp(at, t, one) for one in np.asarray(values, float).T], axis=1)
-
-
-def replayed(
-    logs: Sequence[Log], before: ActuatorParameters, after: ActuatorParameters, legs: Legs, rows: Bools
-) -> dict[str, Any]:
-    """The section `replay` of a report: deviations over `rows` (N, J) of all logs, root mean square, before and after.
-
-    Raises LogError where no stretch lies within these rows.
-    """
-    edges = np.cumsum([0, *(len(log.t) for log in logs)])
-    found: dict[str, list[tuple[Array, Array]]] = {"before": [], "after": []}
-    count = 0
-    for log, a, b in zip(logs, edges[:-1], edges[1:], strict=True):
-        begins = stretches(log, rows[a:b])
-        if len(begins):
-            count += len(begins)
-            for name, parameters in (("before", before), ("after", after)):
-                found[name].append(deviations(log, parameters, legs, begins))
-    if not count:
-        raise LogError(
-            f"{logs[0].name}: no {1e3 * STRETCH:.0f} ms of it in a row are reported, expected more to replay"
-        )
-    return {
-        "stretch_s": STRETCH,
-        "stretches": count,
-        **{name: _sizes(each) for name, each in found.items()},
-        "text": "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the "
-        "measured torque; what else pushes them is as measured.",
-    }
 
 
 def _sizes(found: Sequence[tuple[Array, Array]]) -> dict[str, Any]:

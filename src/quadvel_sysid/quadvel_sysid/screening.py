@@ -31,6 +31,8 @@ _ROWS = 1500
 """Of each joint that a score test looks at"""
 _BATCH = 8
 """Starting values evaluated at once"""
+_LEAST = 1e-3
+"""Of the error: less than that a score test does not promise to leave"""
 _AMPLITUDE = (0.7, 1.4)
 """Times a start that is not linear: how far it is followed"""
 
@@ -62,7 +64,6 @@ class Screen:
         self.rows = fitted[scattered(len(fitted), max(1, len(fitted) // _ROWS))]
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
-        self.share = context.parts.fit.sum(axis=0) / np.maximum((self.weight > 0).sum(axis=0), 1)
         self._remembers = any(one.law.remembers for one in context.model.applied)
         self._few = context.samples.taken(self.rows)
         self._spots: dict[bool, list[_Spot]] = {}
@@ -198,8 +199,8 @@ class _Spot:
         error, choice, (change, weights) = self._solve(columns, law, penalty)
         bare = self.screen.bare
         fall = np.maximum(bare - error, 0.0) * may_act(law, self.screen.joints)
-        cost = PER_PARAMETER * complexity(law) * (self.screen.weight > 0).sum(axis=0)
-        promise = float(np.sum(np.maximum(fall - cost, 0.0) * self.screen.share))
+        gain = -np.log(np.maximum(1.0 - fall / np.maximum(bare, 1e-300), _LEAST))
+        promise = float(np.sum(np.maximum(gain - PER_PARAMETER * complexity(law), 0.0)))
         return Screened(self._started(law, table, choice, change, weights), promise)
 
     def _solve(

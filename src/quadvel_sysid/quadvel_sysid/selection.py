@@ -26,7 +26,7 @@ MOST = 5
 NEAR = 0.5
 """Of the best candidate's worth: what is worth so much is its rival, and tried in its place once more is known"""
 TIE = 0.02
-"""Of the noise variance: laws whose errors differ by less cannot be told apart"""
+"""Of a joint's error: laws whose errors differ by less cannot be told apart"""
 
 Tick = Callable[[str], None]
 
@@ -110,7 +110,7 @@ class Search:
             if more is None:
                 break
             best = self.judge.profiled(self._floated(more, kinds))
-            if len(best.left) + PER_PARAMETER * parameters(best.model) > bound:
+            if PER_PARAMETER * parameters(best.model) > bound:
                 break
         return best
 
@@ -145,13 +145,13 @@ class Search:
             return "a law that it contains, or that contains it, is on the same joints already"
         found = after.against(before)
         p = found.p * self._tried
-        worth = float(np.max(found.joint_gain / self.judge.noise))
+        worth = float(np.max(found.share))
         if p >= LEVEL:
             return (
                 f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self._tried} candidates)"
             )
         if worth <= WORTH:
-            return f"worth {100 * worth:.1f} % of the noise, below {100 * WORTH:.0f} %"
+            return f"takes {100 * worth:.1f} % off the error of a joint, below {100 * WORTH:.0f} %"
         return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
 
     def _pool(self, before: Account) -> Candidates:
@@ -201,7 +201,7 @@ class Search:
 
     def _needed(self, without: Account, account: Account) -> bool:
         found = account.against(without)
-        worth = float(np.max(found.joint_gain / self.judge.noise))
+        worth = float(np.max(found.share))
         return account.criterion < without.criterion and worth > WORTH and found.p < LEVEL
 
     def _swapped(self, account: Account, kinds: str) -> Account:
@@ -242,7 +242,7 @@ class Search:
         found = []
         for other in pool.laws:
             lost = account.against(other)
-            if other.last.law.name != one.name and (lost.joint_gain < TIE * self.judge.noise).all():
+            if other.last.law.name != one.name and (lost.share < TIE).all():
                 found.append(other.last.law.name)
         return tuple(dict.fromkeys(found))
 
