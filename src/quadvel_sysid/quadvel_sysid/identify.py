@@ -107,7 +107,7 @@ def identified(
         return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
 
     if body is None and legs is None:
-        outcome, sections = told(best), {}
+        outcome, sections = told(best), dict[str, Any]()
     else:
         progress(0.93, "replays")
         accounts = dict.fromkeys((before, search.simplified(search.of_laws or before), best))

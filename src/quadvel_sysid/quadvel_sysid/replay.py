@@ -12,17 +12,20 @@ measured torque moves the legs as measured, e = 0; any other leaves its track as
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import attrs
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 
+from .log_signals import double
 from .logs.log import Log, LogError
 from .signals import Array, Bools
 
@@ -36,6 +39,8 @@ TEXT = (
     "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the measured torque; "
     "what else pushes them is as measured."
 )
+_GAP = 3.0
+"""Times the usual spacing of the rows: no stretch goes over a gap so long"""
 _SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
@@ -88,10 +93,10 @@ class Legs:
 
         Raises LogError where no stretch lies within these rows.
         """
-        edges = np.cumsum([0, *(len(log.t) for log in logs)])
-        found = []
-        for log, a, b in zip(logs, edges[:-1], edges[1:], strict=True):
-            begins = stretches(log, rows[a:b])
+        found, first = [], 0
+        for log in logs:
+            begins = stretches(log, rows[first : first + len(log.t)])
+            first += len(log.t)
             if len(begins):
                 found.append(deviations(log, parameters, self, begins))
         if not found:
@@ -103,41 +108,44 @@ class Legs:
 
 def stretches(log: Log, rows: Bools) -> Array:
     """The instants (S,) s at which stretches begin that hold none but `rows` (N, J), one after the other."""
-    whole = rows.all(axis=1)
-    gap = np.diff(log.t, prepend=log.t[0]) > 3.0 * log.period
-    begins, last = [], -np.inf
-    since = log.t[0]
-    for t, fits, broken in zip(log.t, whole, gap, strict=True):
-        if not fits or broken:
-            since = t
-        elif t - since >= STRETCH and t - STRETCH >= max(last, log.t[0] + _BEFORE):
-            begins.append(t - STRETCH)
-            last = t
+    whole: Bools = np.asarray(rows.all(axis=1))
+    fresh = np.diff(log.t, prepend=log.t[0]) > _GAP * log.period
+    broken = np.flatnonzero(~whole | fresh)
+    edges = np.concatenate([[0], broken, [len(whole)]])
+    begins: list[float] = []
+    for first, end in pairwise(edges):
+        inside = np.flatnonzero(whole[first:end]) + first
+        if len(inside):
+            start = max(float(log.t[inside[0]]), float(log.t[0]) + _BEFORE)
+            begins += np.arange(start, log.t[inside[-1]] - STRETCH, STRETCH).tolist()
     return np.array(begins)
 
 
 def deviations(log: Log, parameters: ActuatorParameters, legs: Legs, begins: Array) -> tuple[Array, Array]:
     """What the joints of a replay are off by after each _STEP of the stretches that begin at `begins` (S,) s.
 
-    (T, S, J) of the angles, rad, and of the speeds, rad/s.
+    (T, S, J) of the angles, rad, and of the speeds, rad/s. Raises LogError where the log holds no torque or no gains.
     """
     if log.tau is None or log.kp is None or log.kd is None:
         raise LogError(f"{log.name}: tau, kp, kd: expected all three to replay the commands")
     shape = (len(begins), len(log.joints))
     model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), shape, _STEP)
     none = np.zeros(log.q_des.shape)
-    dq_des, tau_ff = (none if one is None else one for one in (log.dq_des, log.tau_ff))
-    inverse = np.linalg.inv(legs.inertia(_between(log.t, log.q, begins + 0.5 * STRETCH)))
+    commands = [
+        none if one is None else double(one) for one in (log.q_des, log.kp, log.kd, log.dq_des, log.tau_ff)
+    ]
+    inverse = np.linalg.inv(legs.inertia(_between(log, log.q, begins + 0.5 * STRETCH)))
     angle, speed = np.zeros(shape), np.zeros(shape)
     angles, speeds = [], []
     for k in range(-round(_BEFORE / _STEP), round(STRETCH / _STEP)):
         t = begins + k * _STEP
-        q, dq = (_between(log.t, one, t) for one in (log.q, log.dq))
-        tau = _between(log.t, log.tau, t + 0.5 * _STEP)
-        sent = log.command_rows(t)
-        torque = model.step(
-            q + angle, dq + speed, log.q_des[sent], log.kp[sent], log.kd[sent], dq_des[sent], tau_ff[sent]
+        q, dq, tau = (
+            _between(log, log.q, t),
+            _between(log, log.dq, t),
+            _between(log, log.tau, t + 0.5 * _STEP),
         )
+        sent = log.command_rows(t)
+        torque = model.step(q + angle, dq + speed, *(one[sent] for one in commands))
         if k >= 0:
             speed = speed + _STEP * (inverse @ (torque - tau)[..., None])[..., 0]
             angle = angle + _STEP * speed
@@ -146,9 +154,9 @@ def deviations(log: Log, parameters: ActuatorParameters, legs: Legs, begins: Arr
     return np.array(angles), np.array(speeds)
 
 
-def _between(t: Array, values: Array, at: Array) -> Array:
-    """Lines through the rows `values` (N, J) at times `t` (N,), read at `at` (S,): (S, J)."""
-    return np.stack([np.interp(at, t, one) for one in np.asarray(values, float).T], axis=1)
+def _between(log: Log, values: NDArray[np.floating[Any]], at: Array) -> Array:
+    """Lines through the rows `values` (N, J) of a log, read at `at` (S,) s: (S, J)."""
+    return np.stack([np.interp(at, log.t, one) for one in values.T], axis=1)
 
 
 def _sizes(found: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
