@@ -48,10 +48,11 @@ class Parts:
         """The rows that fit and select."""
         return self.fit | self.select
 
-    def first(self, count: int) -> Parts:
-        """The parts of the first `count` rows."""
-        starts = self.starts[self.starts < count]
-        return Parts(self.fit[:count], self.select[:count], self.report[:count], starts, self.overlap)
+    def taken(self, rows: NDArray[np.intp]) -> Parts:
+        """The parts of these rows alone."""
+        starts = np.unique(np.searchsorted(rows, self.starts))
+        fit, select, report = (one[rows] for one in (self.fit, self.select, self.report))
+        return Parts(fit, select, report, starts[starts < len(rows)], self.overlap)
 
     def sums(self, values: Array) -> Array:
         """Values (N, ...) summed over each cluster."""

@@ -12,6 +12,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
 
@@ -37,8 +38,10 @@ from .replay import STRETCH as LEG_STRETCH
 from .replay import TEXT as LEG_TEXT
 from .replay import Legs
 from .selection import Search
-from .signals import Bools
+from .signals import Bools, Samples
 
+_SEARCHED, _COARSEST = 30_000, 0.002
+"""Values of torque that are searched, as long as their rows are not farther apart (s); what is found is fitted to all"""
 _MOVES = 0.9
 """Of the error of a replay: what a model with more in it has to leave at most"""
 
@@ -95,9 +98,8 @@ def identified(
 
     plain = _plain(reading)
     noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
-    # A log that is held out stays outside of the search.
-    samples = reading.samples.reaching(reading.parts.chosen_on)
-    judge = Judge(reading.parts.first(len(samples.t)), noise)
+    samples, rows = _searched(reading)
+    judge = Judge(reading.parts.taken(rows), noise)
     plain = attrs.evolve(plain, samples=samples)
     search, before = Search(judge, tick, cores), judge.fitted(plain)
     best = search.best(plain)
@@ -121,6 +123,15 @@ def identified(
     report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
+
+
+def _searched(reading: Reading) -> tuple[Samples, NDArray[np.intp]]:
+    """The samples that are searched, and which rows these are: none of a log that is held out, and no more than it takes."""
+    samples = reading.samples.reaching(reading.parts.chosen_on)
+    step = min(round(samples.tau.size / _SEARCHED), round(_COARSEST / samples.period))
+    if step > 1:
+        return samples.thinned(step)
+    return samples, np.arange(len(samples.t))
 
 
 def _plain(reading: Reading) -> Model:

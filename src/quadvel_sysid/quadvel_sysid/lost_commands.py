@@ -99,7 +99,7 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
         if 1.0 - usual[0] < _LEAST_SHARE:
             break
         every = np.ones(len(noise), dtype=bool)
-        law = CommandHold(odds, usual)
+        law = CommandHold(_of_every_row(odds, model.samples.row), usual)
         losing = fit(
             at.plus(Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))), parts.fit, 3
         )
@@ -108,7 +108,13 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
             best, least, foretold = (odds, usual), error, squared_error(losing.foretold(), parts.fit)
     if best is None or foretold > _FORETOLD * squared_error(model, parts.fit):
         return []
-    return [best]
+    return [(_of_every_row(best[0], model.samples.row), best[1])]
+
+
+def _of_every_row(odds: Array, rows: NDArray[np.intp]) -> Array:
+    """The odds (N, J, M) of some `rows` (N,) of the logs as those of every row up to the last."""
+    at = np.searchsorted(rows, np.arange(rows[-1] + 1))
+    return odds[at]
 
 
 def read_again(model: Model, parts: Parts, noise: Array) -> Model:

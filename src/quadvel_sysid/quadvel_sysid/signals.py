@@ -192,6 +192,16 @@ class Samples:
             self._parts[count] = part
         return self._parts[count]
 
+    def thinned(self, step: int) -> tuple[Samples, NDArray[np.intp]]:
+        """One row of `step`, and which these are; what happens to the signals between them is known as before."""
+        rows = np.arange(step - 1, len(self.t), step)
+        part = self.taken(rows)
+        stretch = np.cumsum(self.start)[rows]
+        part.start = np.diff(stretch, prepend=-1) > 0
+        part.period = step * self.period
+        part.dt = np.where(part.start, part.period, np.diff(part.t, prepend=part.t[0] - part.period))
+        return part, rows
+
     @property
     def finer(self) -> Samples:
         """These rows, each with BETWEEN - 1 instants before it, evenly over the time since the row before."""
