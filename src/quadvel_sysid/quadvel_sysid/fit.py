@@ -1,7 +1,7 @@
 """One bounded least-squares fit of a model's gains, delays and effects (Levenberg and Marquardt).
 
 Every joint keeps its own small Jacobian, so that the normal equations of all rows are small; each step is a bounded
-linear least-squares problem (`scipy.optimize.lsq_linear`).
+quadratic problem.
 """
 
 from __future__ import annotations
@@ -10,8 +10,7 @@ from itertools import product
 
 import attrs
 import numpy as np
-from scipy.linalg import LinAlgError, cholesky, solve_triangular
-from scipy.optimize import lsq_linear
+from scipy.linalg import solve
 
 from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
 from .signals import Array, Bools
@@ -20,6 +19,8 @@ _SETTLED = 2e-5
 """Relative fall of the error below which a fit has converged"""
 _DAMPING = (1e-6, 1e-3, 0.1, 10.0)
 """Shares of the curvature, tried until the error falls"""
+_PIVOTS = 5, 60
+"""Of all bounds at once, and at most; one by one in between, as all at once may go round in circles (Murty)"""
 RIDGE = 1e-4
 """Weight of a term's own penalty on its weights, of its columns' mean second moment"""
 
@@ -166,17 +167,25 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
 
 
 def _bounded(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
-    """The minimum of x'Ax/2 - g'x within bounds."""
-    scaled = matrix / np.outer(scale, scale)
-    try:
-        factor = cholesky(scaled + 1e-12 * np.eye(len(scaled)))
-    except LinAlgError:
-        factor = cholesky(scaled + 1e-6 * np.eye(len(scaled)))
-    right = solve_triangular(factor, gradient / scale, trans="T")
-    change = solve_triangular(factor, right) / scale
-    low, high = np.minimum(low, 0.0), np.maximum(high, 0.0)
-    if ((change >= low) & (change <= high)).all():
-        return np.asarray(change)
-    room = np.maximum(high * scale, low * scale + 1e-12)
-    found = lsq_linear(factor, right, (low * scale - 1e-12, room + 1e-12), method="bvls")
-    return np.asarray(np.clip(found.x / scale, low, high))
+    """The minimum of x'Ax/2 - g'x within bounds that 0 lies in.
+
+    What a step takes beyond a bound is held there for as long as the slope does not lead back inside (block pivoting).
+    """
+    matrix, gradient = matrix / np.outer(scale, scale), gradient / scale
+    matrix = matrix + 1e-12 * np.eye(len(matrix))
+    low, high = np.minimum(low, 0.0) * scale, np.maximum(high, 0.0) * scale
+    x, held = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+    for pivot in range(_PIVOTS[1]):
+        free = ~held
+        right = gradient[free] - matrix[np.ix_(free, held)] @ x[held]
+        x[free] = solve(matrix[np.ix_(free, free)], right, assume_a="sym")
+        beyond = free & ((x < low) | (x > high))
+        x = x.clip(low, high)
+        slope = matrix @ x - gradient
+        wrong = beyond | (held & (low < high) & np.where(x <= low, slope < 0.0, slope > 0.0))
+        if not wrong.any():
+            break
+        if pivot >= _PIVOTS[0]:
+            wrong[: np.flatnonzero(wrong)[-1]] = False
+        held ^= wrong
+    return np.asarray(x / scale)
