@@ -131,8 +131,7 @@ def whiteness(residual: Array, rows: Bools, start: Bools, overlap: int = 0) -> A
     start (N,): where stretches begin. overlap: rows within which the noise itself is correlated; these lags are left out, and
     the variance of the others is Bartlett's.
     """
-    left = np.where(rows, residual, 0.0)
-    left = left - np.where(rows, left.sum(axis=0) / np.maximum(rows.sum(axis=0), 1), 0.0)
+    left = np.where(rows, residual, 0.0)  # about zero: an offset is structure, too
     power = np.sum(left * left, axis=0) + 1e-300
     count, total, variance = rows.sum(axis=0), np.zeros(left.shape[1]), np.ones(left.shape[1])
     stretch = np.cumsum(start)
