@@ -90,6 +90,8 @@ class Judge:
     def narrowed(self, every: Account, index: int) -> Account:
         """The account with an effect on the joints alone that need it, where that is better."""
         one = every.model.applied[index]
+        if one.law.at_once:
+            return every
         idle = Account(every.model.without(index), self)
         found = every.against(idle)
         cost = PER_PARAMETER * complexity(one.law)

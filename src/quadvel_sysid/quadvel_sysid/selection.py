@@ -65,7 +65,9 @@ class Search:
             self.of_laws = laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
             accounts += [laws, self.merged(laws)]
             accounts += [] if laws.white else [self.run(laws, TERMS)]
-        return self.simplified(min(accounts, key=lambda one: one.criterion))
+        least = min(one.criterion for one in accounts)
+        alike = [one for one in accounts if one.criterion < least + TIE * len(self.judge.noise)]
+        return self.simplified(min(alike, key=_terms))
 
     def leaning(self, account: Account) -> tuple[str, ...]:
         """The signals that what is left goes with most, whether or not a term of them would pay."""
@@ -245,6 +247,11 @@ class Search:
             if other.last.law.name != one.name and (lost.share < TIE).all():
                 found.append(other.last.law.name)
         return tuple(dict.fromkeys(found))
+
+
+def _terms(account: Account) -> tuple[int, float]:
+    """How many terms of named signals there are in an account, whose laws say more to who reads them; and its criterion."""
+    return sum(isinstance(one.law, SignalTerm) for one in account.model.applied), account.criterion
 
 
 def repeats(one: Applied, others: Iterable[Applied]) -> bool:

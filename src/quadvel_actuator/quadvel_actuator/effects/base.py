@@ -126,6 +126,8 @@ class EffectLaw(ABC):
     """has to follow what happens between the rows of a log, too"""
     gainlike: ClassVar[bool] = False
     """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
+    at_once: ClassVar[bool] = False
+    """happens to all joints of a robot at once"""
     common: ClassVar[bool] = False
     """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
