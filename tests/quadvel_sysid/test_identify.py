@@ -85,7 +85,7 @@ def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
     assert any("on which the drive did not act" in finding["text"] for finding in report["findings"])
 
 
-@pytest.mark.xfail(reason="decision 48: a second effect is added beside friction on blurred speeds")
+@pytest.mark.xfail(reason="decision 49: a second effect is added beside friction on blurred speeds")
 def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
     truth = _truth(Effect("coulomb_friction", JOINTS, {"c": 0.8, "v_0": 0.05}))
     log = record(truth, 2, 5.0, 1000, seed=3)
@@ -152,7 +152,7 @@ def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
     assert one["joints"] == list(six[:5] if one["name"] == "viscous_friction" else six[5:])
 
 
-@pytest.mark.xfail(reason="decision 48: one curve over the angle says as much in fewer parameters")
+@pytest.mark.xfail(reason="decision 49: one curve over the angle says as much in fewer parameters")
 def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both():
     three = NAMES[:3]
     spring = Effect("parallel_spring", three, {"k": 5.0, "q0": 0.1})

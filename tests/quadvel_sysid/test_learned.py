@@ -11,7 +11,7 @@ from quadvel_sysid.identify import identify
 VARIANCE = 0.066  # of the torque noise of these logs
 
 
-MISSED = pytest.mark.xfail(reason="decision 48: creep is told as a curve over q_des")
+MISSED = pytest.mark.xfail(reason="decision 49: creep is told as a curve over q_des")
 
 
 @pytest.mark.parametrize(
