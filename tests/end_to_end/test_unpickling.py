@@ -13,7 +13,7 @@ PICKLES = {"pickle", "_pickle", "cPickle", "dill", "cloudpickle", "joblib", "she
 READERS = {"load", "loads", "Unpickler", "open"}
 SAFE_LOADERS = {"SafeLoader", "CSafeLoader"}
 # What is unpickled there was pickled by a process that this one forked, and came through a pipe.
-OWN_FORKS = Path("src/quadvel_sysid/quadvel_sysid/engine/ahead.py")
+OWN_FORKS = Path("src/quadvel_sysid/quadvel_sysid/parallel.py")
 
 
 def faults(source: str) -> Iterator[tuple[int, str]]:

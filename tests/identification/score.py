@@ -58,10 +58,10 @@ def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
 
 def engine() -> str:
     """The last commit that touched the tool, with a + where its files differ from it."""
-    tool = "src/quadvel_actuator"
+    tool = ("src/quadvel_actuator", "src/quadvel_sysid")
     said = [
         subprocess.run(
-            ["git", *call, "--", tool], cwd=ROOT, capture_output=True, text=True, check=True
+            ["git", *call, "--", *tool], cwd=ROOT, capture_output=True, text=True, check=True
         ).stdout
         for call in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
     ]

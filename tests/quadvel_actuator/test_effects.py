@@ -8,10 +8,9 @@ from simulated_joints import NAMES, parameters
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.effects.base import of_each
-from quadvel_sysid.engine.delays import SLOPE, jacobian_with_delays
-from quadvel_sysid.engine.model import Applied, Model, Slots, pack, with_slots
-from quadvel_sysid.engine.signals import Samples
 from quadvel_sysid.logs.log import Log
+from quadvel_sysid.model import DELAY_STEP, Applied, Model, Unknowns, jacobian, pack, with_slots
+from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:3]
 TRUTH = {
@@ -75,7 +74,7 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
     series = Model(
-        Samples([log]), 0.001, np.ones((2, 4)), np.array([zero, zero]), np.zeros(4), np.zeros(4), zero,
+        Samples([log]), 0.001, np.ones((2, 4)), np.array([zero, zero]), np.zeros((2, 4)), zero,
         (Applied(law, active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-8)
@@ -112,9 +111,7 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
         tau = noise * np.random.default_rng(0).standard_normal(q.shape)
         log = Log("coupled", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau)
         gains = np.ones((2, 4)), np.array([zero, zero])
-        torques.append(
-            Model(Samples([log]), 0.0, *gains, np.zeros(4), np.zeros(4), zero, (coupled,)).predict()
-        )
+        torques.append(Model(Samples([log]), 0.0, *gains, np.zeros((2, 4)), zero, (coupled,)).predict())
     np.testing.assert_array_equal(*torques)
 
 
@@ -158,20 +155,20 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     model = Model(
-        samples, 0.0, np.ones((2, 4)), np.array([zero, zero]), np.full(4, 0.004), np.full(4, 0.002), zero,
+        samples, 0.0, np.ones((2, 4)), np.array([zero, zero]), np.repeat([[0.004], [0.002]], 4, axis=1), zero,
         (Applied(law, every, values, np.arange(4)),),
     )  # fmt: skip
-    slots = Slots.of(model)
-    torque, slopes, _ = jacobian_with_delays(model)
+    unknowns = Unknowns.of(model)
+    torque, slopes = jacobian(model, unknowns)
     np.testing.assert_array_equal(torque, model.predict())
-    for k, step in enumerate(slots.step):
+    for k, step in enumerate(unknowns.step[:-2]):
         moved = pack(model)
         moved[k] += step
         slope = (with_slots(model, moved).predict() - torque) / step
         np.testing.assert_allclose(slopes[:, k].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
-    for k, late in enumerate(np.eye(2) * SLOPE):
-        after, before = (model.with_delays(0.004 + by[0], 0.002 + by[1]).predict() for by in (late, -late))
-        slope = (after - before) / (2.0 * SLOPE)
+    for k, late in enumerate(np.eye(2)[:, :, None] * DELAY_STEP):
+        after, before = (model.with_delays(model.delays + by).predict() for by in (late, -late))
+        slope = (after - before) / (2.0 * DELAY_STEP)
         np.testing.assert_allclose(slopes[:, k - 2].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
 
 

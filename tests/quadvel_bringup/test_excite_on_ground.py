@@ -15,8 +15,8 @@ from quadvel_description.kinematics import HIPS, foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_sim.simulator import Simulator, SimulatorConfig
-from quadvel_sysid.engine.identify import identify
 from quadvel_sysid.excitation import PERIOD, Excitation, FootLifting, Sweep
+from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
 LEVEL = 0.15  # rad, that the trunk may tilt by; the player gives up at 0.8

@@ -19,8 +19,8 @@ from quadvel_eval.paper.section import Row, Section, Study
 from quadvel_eval.paper.stance import Stance
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.symmetry import Symmetry
-from quadvel_sysid.engine.eam import fit_eam
-from quadvel_sysid.engine.signals import Samples
+from quadvel_sysid.eam import fit_eam
+from quadvel_sysid.signals import Samples
 
 ONE = Study(seeds=1)
 

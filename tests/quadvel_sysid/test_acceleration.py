@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from quadvel_sysid.engine.acceleration import slope, smooth_part
+from quadvel_sysid.acceleration import slope, smooth_part
 
 
 def _stamps(rng, count=2000):

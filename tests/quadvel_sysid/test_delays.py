@@ -6,11 +6,13 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel
-from quadvel_sysid.engine.delays import fit_with_delays, in_steps
-from quadvel_sysid.engine.identify import identify
-from quadvel_sysid.engine.model import Model
-from quadvel_sysid.engine.signals import Samples
-from quadvel_sysid.engine.stepped import stepped_delays
+from quadvel_sysid.delays import in_steps, latest, running_delays
+from quadvel_sysid.eam import fit_eam
+from quadvel_sysid.fit import fit, profiled, squared_error
+from quadvel_sysid.identify import identify
+from quadvel_sysid.logs.log import Log
+from quadvel_sysid.model import Model
+from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:2]
 ONE = np.zeros(2, dtype=np.intp)
@@ -22,16 +24,16 @@ def _log(seconds, seed=0, **values):
 
 def _fitted(log, input_delay, output_delay):
     samples = Samples([log])
-    delays = np.full(2, input_delay), np.full(2, output_delay)
-    model = Model(samples, 0.001, np.ones((2, 2)), np.array([ONE, ONE]), *delays, ONE)
-    return fit_with_delays(model, samples.judged, 20), samples.judged
+    delays = np.repeat([[input_delay], [output_delay]], 2, axis=1)
+    model = Model(samples, 0.001, np.ones((2, 2)), np.array([ONE, ONE]), delays, ONE)
+    return fit(model, samples.judged, 20), samples.judged
 
 
 def test_a_log_that_tells_little_is_read_as_a_drive_that_works_in_whole_steps():
     fitted, rows = _fitted(_log(2.0), 0.007, 0.001)
-    assert abs(fitted.output_delay[0] - 0.001) > 1e-5
+    assert abs(fitted.delays[1, 0] - 0.001) > 1e-5
     told = in_steps(fitted, rows)
-    np.testing.assert_allclose([told.input_delay[0], told.output_delay[0]], [0.007, 0.001], atol=1e-9)
+    np.testing.assert_allclose(told.delays[:, 0], [0.007, 0.001], atol=1e-9)
 
 
 def test_delays_that_a_log_tells_clearly_stay_between_the_steps():
@@ -53,14 +55,14 @@ def test_a_running_model_does_not_blur_what_the_drive_does_not(window):
     """A fit says the same with an output delay between two steps, which averages the noise of encoders, too."""
     drive, log = _quiet(0.007, 0.001)
     fitted = np.array([0.00666, 0.00133])
-    told = stepped_delays(_model(drive, log, window, fitted), None, log.valid)
+    told = running_delays(_model(drive, log, window, fitted), log.valid)
     assert told == pytest.approx((0.007, 0.001), abs=3e-5)
     assert _run(drive, log, told) < 0.01 * _run(drive, log, fitted)
 
 
 def test_a_running_model_waits_between_the_steps_where_the_drive_does():
     drive, log = _quiet(0.0066, 0.0024)
-    told = stepped_delays(_model(drive, log, 0.001, np.array([0.0066, 0.0024])), None, log.valid)
+    told = running_delays(_model(drive, log, 0.001, np.array([0.0066, 0.0024])), log.valid)
     assert told == pytest.approx((0.0066, 0.0024), abs=3e-5)
 
 
@@ -74,8 +76,8 @@ def _quiet(*delays):
 def _model(drive, log, window, delays):
     """With the gains of the drive."""
     gains = np.array([1.0 + drive.delta_kp / drive.kp_ref, 1.0 + drive.delta_kd / drive.kd_ref])
-    each = (np.full(2, one) for one in delays)
-    return Model(Samples([log]), window, gains[:, None] * np.ones(2), np.array([ONE, ONE]), *each, ONE)
+    each = np.repeat(np.asarray(delays)[:, None], 2, axis=1)
+    return Model(Samples([log]), window, gains[:, None] * np.ones(2), np.array([ONE, ONE]), each, ONE)
 
 
 def _run(drive, log, delays):
@@ -85,3 +87,53 @@ def _run(drive, log, delays):
     rows = zip(log.q, log.dq, log.q_des, strict=True)
     torque = np.array([model.step(q, dq, q_des, 30.0, 0.5) for q, dq, q_des in rows])
     return np.mean((log.tau - torque)[100:] ** 2)
+
+
+def test_a_fit_on_a_grid_of_stamps_foretells_commands_that_come_between_its_rows():
+    """7 and 1 ms: on rows and commands of one grid, any input delay from 6 ms on says the same."""
+    fitted, judged = (_driven(0.001, 0.001, 1), _driven(0.001, 0.00525, 2))
+    report = identify([fitted], [judged]).report
+    assert report["before"]["input_delay_ms"] == pytest.approx(7.0, abs=0.2)
+    assert report["before"]["heldout_mse"] < 1.1 * 0.04
+
+
+def _driven(row, command, seed):
+    """A log with a row every `row` s and a command about every `command` s of a drive with delays of 7 and 1 ms."""
+    t, rng = np.arange(round(3.0 / row)) * row, np.random.default_rng(seed)
+    sent = np.round(np.arange(0.0, 3.0, command) / 0.00025) * 0.00025
+    phase = np.array([0.0, 1.0])
+
+    def q(at):
+        return 0.3 * np.sin(2 * np.pi * 3.0 * at[:, None] + phase)
+
+    def dq(at):
+        return 0.3 * 2 * np.pi * 3.0 * np.cos(2 * np.pi * 3.0 * at[:, None] + phase)
+
+    wide = rng.uniform(-0.1, 0.1, (len(sent), 2)) if command > row else 0.0
+    q_des = q(sent) + 0.2 * np.sin(2 * np.pi * 5.0 * sent[:, None]) + wide
+    newest = np.maximum(np.searchsorted(sent, t - 0.008 + 1e-9, side="right") - 1, 0)
+    tau = 29.0 * (q_des[newest] - q(t - 0.001)) - 0.48 * dq(t - 0.001)
+    tau += 0.2 * rng.standard_normal(tau.shape)
+    gains = {"kp": np.full(q_des.shape, 30.0), "kd": np.full(q_des.shape, 0.5)}
+    return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
+
+
+def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
+    log = _driven(0.001, 0.001, 1)
+    samples = Samples([log])
+    eam = fit_eam(samples, samples.judged)
+    delays = np.stack([eam.input_delay, eam.output_delay])
+    model = Model(samples, eam.window, eam.gains, np.array([ONE, ONE]), delays, ONE)
+    assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
+    assert latest(model, samples.judged).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
+
+
+def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found():
+    """A command every 5.25 ms, in steps: from 2 ms off a fit ends in a valley of its own."""
+    log = _driven(0.001, 0.00525, 2)
+    samples = Samples([log])
+    off = np.repeat([[0.0095], [0.0005]], 2, axis=1)
+    stuck = fit(Model(samples, 0.0, np.ones((2, 2)), np.array([ONE, ONE]), off, ONE), samples.judged)
+    found = profiled(stuck, samples.judged)
+    assert squared_error(found, samples.judged) < 1.05 * 0.04 * samples.judged.sum()
+    np.testing.assert_allclose(found.delays.sum(axis=0), 0.008, atol=5e-4)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_sysid.engine.identify import Options, identify
+from quadvel_sysid.identify import Options, identify
 from quadvel_sysid.logs.read_log import read_log
 
 LEG = ("FR_hip", "FR_thigh", "FR_calf")

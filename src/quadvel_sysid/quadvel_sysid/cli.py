@@ -26,8 +26,8 @@ from .logs.read_log import read_log
 from .memory import give_large_arrays_back, keep_freed_arrays
 
 if TYPE_CHECKING:
-    from .engine.material import Material
-    from .engine.material import Progress as Tell
+    from .material import Material
+    from .material import Progress as Tell
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
@@ -97,6 +97,14 @@ def identify(
             show_default="as below, or as PACE and JointState do",
         ),
     ] = None,
+    robot: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ROBOT",
+            help="Replay the commands on this robot's legs before and after: aliengo, go2, or an MJCF or URDF file.",
+            show_default="no replay",
+        ),
+    ] = None,
     cores: Annotated[
         int | None,
         typer.Option(
@@ -114,8 +122,8 @@ def identify(
     For example, a recording of the stack while it walks, of which blocks are kept aside to judge on:
       quadvel record low_state low_cmd --out walk.mcap --seconds 30
       quadvel identify walk.mcap --out out/identify
-    Two logs of another robot; fit one, judge on the other:
-      quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify
+    Two logs of another robot; fit one, judge on the other, and replay the commands on its legs:
+      quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --robot go2 --out out/identify
     Some joints of it:
       quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify
 
@@ -130,7 +138,7 @@ def identify(
     """
     messages = Console(stderr=True)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, columns, cores, messages)
+        _run(logs, holdout or [], out, base, gains, joints, columns, robot, cores, messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
@@ -144,6 +152,7 @@ def _run(
     gains: tuple[float, float] | None,
     joints: Sequence[str] | None,
     columns: Path | None,
+    robot: str | None,
     cores: int | None,
     messages: Console,
 ) -> None:
@@ -161,17 +170,19 @@ def _run(
         material, long = _material(logs, holdout, joints, names, gains, messages, tell)
         if not long:
             keep_freed_arrays()
-        from .engine.identify import identified
+        from .identify import identified
 
         cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
         with threadpool_limits(1):  # of each copy of this process: they share the cores
-            found = identified(material, parameters, cores, tell)
+            found = identified(material, parameters, cores, tell, robot)
     from .report.report import write
 
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
     console.print(errors(found.report), soft_wrap=True, highlight=False)
+    if "replay" in found.report:
+        console.print(replays(found.report["replay"]), soft_wrap=True, highlight=False)
     for text in found.report["warnings"]:
         messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
@@ -191,9 +202,7 @@ def _material(
         fitted, heldout = ([read_log(path, joints, names) for path in paths] for paths in (logs, holdout))
         data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
         long = sum(log.q.size for log in data.logs) >= _LONG
-        from .engine.material import (
-            gathered,  # what is wrong with the files shows before the engine is loaded
-        )
+        from .material import gathered  # what is wrong with the files shows before the engine is loaded
 
         return gathered(data, gains, progress=tell), long
 
@@ -209,6 +218,15 @@ def errors(report: Mapping[str, Any]) -> str:
     )
     each = ", ".join(f"{name} {entry['heldout_mse']:.3g}" for name, entry in entries)
     return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
+
+
+def replays(replay: Mapping[str, Any]) -> str:
+    """How far the legs leave their measured track, in a line."""
+    before, after = replay["before"], replay["after"]
+    return (
+        f"replayed over {1e3 * replay['stretch_s']:.0f} ms, root mean square: angles off by {before['q_rms_rad']:.3g} rad "
+        f"before, {after['q_rms_rad']:.3g} after; speeds by {before['dq_rms_rad_s']:.3g} and {after['dq_rms_rad_s']:.3g} rad/s"
+    )
 
 
 def say(inspection: Inspection, messages: Console) -> None:

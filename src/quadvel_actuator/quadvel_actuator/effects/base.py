@@ -42,7 +42,7 @@ DRIVE, JOINT = "drive", "joint"
 
 
 class View(Protocol):
-    """What a law may look at: `quadvel_sysid.engine.signals.Signals`, or one step of a running model."""
+    """What a law may look at: `quadvel_sysid.signals.Signals`, or one step of a running model."""
 
     @property
     def t(self) -> Any: ...
@@ -126,6 +126,8 @@ class EffectLaw(ABC):
     """has to follow what happens between the rows of a log, too"""
     gainlike: ClassVar[bool] = False
     """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
+    at_once: ClassVar[bool] = False
+    """happens to all joints of a robot at once"""
     common: ClassVar[bool] = False
     """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
@@ -135,17 +137,8 @@ class EffectLaw(ABC):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[EffectLaw]:
-        """The forms of the law to try on the data `about` (`quadvel_sysid.engine.candidates.About`); none where they cannot act."""
+        """The forms of the law to try on the data `about` (`quadvel_sysid.library.Context`); none where they cannot act."""
         return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
-
-    @property
-    def forms(self) -> tuple[EffectLaw, ...]:
-        """The same law with its signals taken otherwise; which one suits may change with the other effects."""
-        return ()
-
-    def forms_beside(self, rest: Any) -> tuple[EffectLaw, ...]:
-        """Its forms, of which one may suit better beside the `rest` of a model (`quadvel_sysid.engine.candidates.Rest`)."""
-        return self.forms
 
     @property
     def alternatives(self) -> tuple[EffectLaw, ...]:

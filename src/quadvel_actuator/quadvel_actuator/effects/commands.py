@@ -27,6 +27,7 @@ class CommandHold(ErrorLaw):
     parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
     signal = "q_des@history"
     shifts = True
+    at_once = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
     odds: Array | None = attrs.field(default=None, repr=False)
     usual: Array | None = attrs.field(default=None, repr=False)

@@ -136,10 +136,6 @@ class Armature(AddedLaw):
         return tuple(cls(of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
 
     @property
-    def forms(self) -> tuple[Armature, ...]:
-        return tuple(attrs.evolve(self, of=of) for of in _SLOPES if of != self.of)
-
-    @property
     def alternatives(self) -> tuple[Armature, ...]:
         every = (attrs.evolve(self, of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
         return tuple(one for one in every if (one.of, one.at) != (self.of, self.at))

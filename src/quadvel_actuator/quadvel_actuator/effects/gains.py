@@ -30,20 +30,27 @@ from .dynamics import lag, lagged
 from .limits import TorqueSaturation
 
 
+@attrs.frozen(eq=False)
 class GainAsymmetry(TorqueLaw):
-    """tau* (1 + a sign(tau*))"""
+    """tau* (1 + a sign(tau*)); where the weaker way is the one as `commanded`, all of it over 1 - |a|"""
 
     name = "gain_asymmetry"
     stage = Stage.GAIN
     parameters = (Parameter("a", "1", -0.9, 0.9, 0.05),)
     signal = "tau"
     motion = "loads of both signs on every joint"
+    commanded: str = attrs.field(default="mean", validator=one_of("mean", "weaker"))
+
+    @classmethod
+    def variants(cls, about: Any) -> Sequence[GainAsymmetry]:
+        return cls("mean"), cls("weaker")
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{"a": a} for a in (-0.2, -0.05, 0.05, 0.2)]
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return x + p["a"] * np.abs(x)
+        both = x + p["a"] * np.abs(x)
+        return both if self.commanded == "mean" else both / (1.0 - np.abs(p["a"]))
 
 
 _QUICKEST = 2.0  # s, in which a drive warms up; what settles at once is a gain
@@ -264,10 +271,6 @@ class CrossCoupling(AddedLaw):
         """For each joint the other's signal that the residual goes with most, beside what the joint's own explain."""
         found = about.strongest_neighbours()
         return tuple(cls._of(found, about.samples.joints, at) for at in (DRIVE, JOINT)) if found else ()
-
-    def forms_beside(self, rest: Any) -> tuple[EffectLaw, ...]:
-        found = rest.strongest_neighbours()
-        return () if found == self.source else (self._of(found, rest.samples.joints, self.at),)
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

@@ -15,8 +15,8 @@ from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
-from quadvel_sysid.engine.identify import identify
 from quadvel_sysid.excitation import FootLifting, within_torque
+from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
 from ..robot_loop import PERIOD, STEPS, RobotLoop, make_estimator

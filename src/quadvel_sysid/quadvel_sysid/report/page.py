@@ -57,6 +57,7 @@ def page(identification: Identification) -> str:
     sections = [
         ("Before and after, joint by joint", _joints(identification)),
         ("Measured and predicted torque", _torques(identification)),
+        ("Commands replayed on the robot's legs", _replay(report)),
         ("What the residual depends on", _shapes(identification)),
         ("Candidates", _candidates(report)),
         ("Parameters", _parameters(report)),
@@ -185,6 +186,26 @@ def _shapes(identification: Identification) -> str:
         for first in range(0, len(mine), 3):
             text += figures.shape_figure(mine[first : first + 3])
     return text
+
+
+def _replay(report: Mapping[str, Any]) -> str:
+    """How far the legs leave their measured track, joint by joint."""
+    if "replay" not in report:
+        return ""
+    replay, rows = report["replay"], []
+    for j, joint in enumerate(report["joints"]):
+        sizes = [
+            replay[when][f"{what}_per_joint"][j]
+            for what in ("q_rms_rad", "dq_rms_rad_s")
+            for when in ("before", "after")
+        ]
+        rows.append([f"<code>{escape(joint)}</code>", *(number(one) for one in sizes)])
+    head = ("joint", "#angle before, rad", "#after", "#speed before, rad/s", "#after")
+    note = (
+        f"Root mean square after up to {1e3 * replay['stretch_s']:.0f} ms, {replay['after']['stretches']} stretches, "
+        f"held out. {replay['text']}"
+    )
+    return f'<p class="note">{escape(note)}</p>{table(head, rows)}'
 
 
 def _candidates(report: Mapping[str, Any]) -> str:

@@ -1,0 +1,133 @@
+"""A fitted model and what it is worth on the rows that select: what the search compares."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+
+import attrs
+import numpy as np
+
+from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, Comparison, Parts, normality, whiteness
+from .fit import fit, profiled
+from .library import complexity
+from .model import Applied, Groups, Model
+from .signals import Array
+
+_TINY = 1e-12  # N^2 m^2, of a log without noise
+
+
+@attrs.frozen(eq=False)
+class Account:
+    """A fitted model, and what it is worth on the rows that select."""
+
+    model: Model
+    judge: Judge
+
+    @cached_property
+    def residual(self) -> Array:
+        """Measured less predicted torque, (N, J)."""
+        return self.model.residual()
+
+    @cached_property
+    def left(self) -> Array:
+        """Mean squared error of the rows that select, N^2 m^2, (J,)."""
+        rows = self.judge.parts.select
+        square = np.sum(np.where(rows, self.residual, 0.0) ** 2, axis=0)
+        left: Array = square / np.maximum(rows.sum(axis=0), 1)
+        return left
+
+    @cached_property
+    def criterion(self) -> float:
+        """Twice the negative log likelihood of a row's torque, of normal noise of unknown variance, and what parameters cost."""
+        return float(
+            np.log((self.left + _TINY) / (self.judge.noise + _TINY)).sum()
+        ) + PER_PARAMETER * parameters(self.model)
+
+    def against(self, before: Account) -> Comparison:
+        """On the rows that select."""
+        return self.judge.parts.compare(before.residual, self.residual, self.judge.parts.select)
+
+    @cached_property
+    def white(self) -> bool:
+        """Is nothing left but noise, on the rows that fit and select?"""
+        parts, samples = self.judge.parts, self.model.samples
+        p = whiteness(self.residual, parts.chosen_on, samples.start, parts.overlap)
+        p = np.minimum(p, normality(self.residual, parts.chosen_on))
+        return bool((p * 2 * len(p) > WHITE_LEVEL).all())
+
+    @property
+    def last(self) -> Applied:
+        return self.model.applied[-1]
+
+
+def parameters(model: Model) -> float:
+    """How many parameters a model has, each joint's own counted, those of the plain model not."""
+    total = 2.0 * (len(np.unique(model.gain_groups[0])) + len(np.unique(model.delay_groups)) - 2)
+    for one in model.applied:
+        total += complexity(one.law) * len(np.unique(one.groups[one.active]))
+    return total
+
+
+@attrs.frozen(eq=False)
+class Judge:
+    """The data that models are fitted to and held against."""
+
+    parts: Parts
+    noise: Array
+    """variance of the torque's noise (J,), N^2 m^2"""
+
+    def fitted(self, model: Model, iterations: int = 12) -> Account:
+        """The model fitted to the rows for that."""
+        return Account(fit(model, self.parts.fit, iterations), self)
+
+    def profiled(self, account: Account) -> Account:
+        """With its delays sought on a grid once more: what was added may have hidden the right ones."""
+        return min(
+            account, Account(profiled(account.model, self.parts.fit), self), key=lambda one: one.criterion
+        )
+
+    def narrowed(self, every: Account, index: int) -> Account:
+        """The account with an effect on the joints alone that need it, where that is better."""
+        one = every.model.applied[index]
+        if one.law.at_once:
+            return every
+        idle = Account(every.model.without(index), self)
+        found = every.against(idle)
+        cost = PER_PARAMETER * complexity(one.law)
+        needed = one.active & (found.p_joints < LEVEL) & (found.share > cost)
+        if not needed.any() or (needed == one.active).all():
+            return every
+        fewer = self.fitted(every.model.replacing(index, attrs.evolve(one, active=needed)))
+        return min(every, fewer, key=lambda one: one.criterion)
+
+    def tied(self, account: Account, index: int) -> Account:
+        """With the values of an effect shared by its joints, or by those of a kind, where that costs nothing."""
+        one = account.model.applied[index]
+        every = np.zeros(len(one.active), dtype=np.intp)
+        for groups in (every, *groupings(account.model.samples.joints)):
+            if len(np.unique(groups[one.active])) >= len(np.unique(one.groups[one.active])):
+                continue
+            values = one.values.copy()
+            for g in np.unique(groups[one.active]):
+                alike = one.active & (groups == g)
+                values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
+            shared = attrs.evolve(one, groups=groups, values=values)
+            tied = self.fitted(account.model.replacing(index, shared))
+            if tied.criterion < account.criterion:
+                return tied
+        return account
+
+
+def kinds(joints: Iterable[str]) -> Groups:
+    """The same number for joints whose names differ in their first part only: FR_hip_joint, FL_hip_joint."""
+    names = [name.partition("_")[2] or name for name in joints]
+    found: Groups = np.unique(names, return_inverse=True)[1]
+    return found
+
+
+def groupings(joints: Sequence[str]) -> list[Groups]:
+    """By kind, and each joint for itself; by kind only where several joints are of one."""
+    each = np.arange(len(joints))
+    by_kind = kinds(joints)
+    return [by_kind, each] if by_kind.max() + 1 < len(joints) else [each]

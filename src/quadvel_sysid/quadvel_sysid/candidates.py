@@ -1,0 +1,129 @@
+"""The candidates on top of an account: screened, and the most promising fitted with everything else."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from functools import cached_property
+from typing import TypeVar
+
+import attrs
+import numpy as np
+
+from quadvel_actuator.effects import EffectLaw
+
+from . import library
+from .account import Account
+from .fit import fit
+from .library import Context, SignalTerm
+from .model import Model
+from .parallel import side_by_side
+from .screening import Screen, Screened, best_first
+from .signals import Bools
+
+FITTED, FITTED_TERMS = 6, 4
+"""Laws, and terms, that are fitted after a screening"""
+SIMPLIFIED = 3
+"""Of these, the best, of which it is tried what their joints share"""
+LAWS, TERMS = "laws", "terms"
+L = TypeVar("L", bound=EffectLaw)
+
+
+class Candidates:
+    """The candidates on top of an account, fitted, the most promising first."""
+
+    def __init__(
+        self, before: Account, cores: int = 1, among: Collection[tuple[str, ...]] | None = None
+    ) -> None:
+        """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
+        self._before, self._judge, self._cores, self._among = before, before.judge, cores, among
+        self._context = Context(before.model, before.judge.parts, before.judge.noise)
+        self._screen = Screen(self._context)
+
+    def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
+        return (one for one in candidates if self._among is None or key(one) in self._among)
+
+    def tried(self, kinds: str) -> int:
+        """How many laws, or sets of signals, were looked at."""
+        return self._laws[1] if kinds == LAWS else self._terms[1]
+
+    @property
+    def laws(self) -> list[Account]:
+        return self._laws[0]
+
+    @property
+    def terms(self) -> list[Account]:
+        return self._terms[0]
+
+    @cached_property
+    def _laws(self) -> tuple[list[Account], int]:
+        several = len(self._context.samples.joints) > 1
+        asked = (one for one in self._asked(library.laws(self._context)) if several or not one.gainlike)
+        found = list(self._screen.laws(asked))
+        count = len({one.law.name for one in found}) or 1
+        return self._fitted(_distinct(best_first(found), FITTED)), count
+
+    @cached_property
+    def _terms(self) -> tuple[list[Account], int]:
+        found = list(self._screen.terms(self._asked(library.terms(self._context))))
+        best = _distinct(best_first(found), FITTED_TERMS)
+        finer = [self._refined(one) for one in best]
+        best += [one for one in finer if one not in best]
+        return self._fitted(best), len({key(one.law) for one in found})
+
+    def _refined(self, one: Screened) -> Screened:
+        """A term with its place and time constants where it promises most."""
+        for _ in range(3):
+            assert isinstance(one.law, SignalTerm)
+            near = self._screen.terms(library.refined(one.law))
+            better = max(near, key=lambda other: other.promise, default=one)
+            if better.promise <= one.promise:
+                break
+            one = better
+        return one
+
+    def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
+        first = self._side_by_side(lambda k: self._fit(chosen[k]), len(chosen))
+        first.sort(key=lambda one: one.criterion)
+        best, others = first[:SIMPLIFIED], first[SIMPLIFIED:]
+        last = len(self._context.model.applied)
+        return self._side_by_side(lambda k: self._judge.tied(best[k], last).model, len(best)) + others
+
+    def _side_by_side(self, work: Callable[[int], Model], count: int) -> list[Account]:
+        models = side_by_side(work, count, self._cores, self._context.samples)
+        return [Account(one, self._judge) for one in models]
+
+    def _fit(self, one: Screened) -> Model:
+        """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
+        judge, model, law = self._judge, one.model, one.law
+        near = model.with_delays(self._before.model.delays)
+        if law.gainlike:
+            # What all joints share is a gain's or a delay's.
+            rows = judge.parts.fit
+            model, near = (_without_weakest(fit(start, rows, 4, delays=False)) for start in (model, near))
+        starts = [model, near] if law.shifts or law.gainlike else [model]
+        every = min((judge.fitted(start) for start in starts), key=lambda one: one.criterion)
+        return judge.narrowed(every, len(every.model.applied) - 1).model
+
+
+def key(law: EffectLaw) -> tuple[str, ...]:
+    """The name of a law, the signals of a term."""
+    return law.inputs if isinstance(law, SignalTerm) else (law.name,)
+
+
+def _distinct(found: Sequence[Screened], most: int) -> list[Screened]:
+    """The first so many with different names, or signals, and of each name at most two forms."""
+    chosen: list[Screened] = []
+    for one in found:
+        mine = key(one.law)
+        if sum(key(other.law) == mine for other in chosen) < (1 if isinstance(one.law, SignalTerm) else 2):
+            chosen.append(one)
+        if len(chosen) == most:
+            break
+    return chosen
+
+
+def _without_weakest(model: Model) -> Model:
+    """The last effect off the joint where it is weakest, which gains or delays then stand for."""
+    last = model.applied[-1]
+    active: Bools = last.active & (np.arange(len(last.active)) != np.argmin(np.abs(last.values[0])))
+    return model.replacing(len(model.applied) - 1, attrs.evolve(last, active=active))

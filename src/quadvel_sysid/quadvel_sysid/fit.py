@@ -1,0 +1,191 @@
+"""One bounded least-squares fit of a model's gains, delays and effects (Levenberg and Marquardt).
+
+Every joint keeps its own small Jacobian, so that the normal equations of all rows are small; each step is a bounded
+quadratic problem.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import attrs
+import numpy as np
+from scipy.linalg import solve
+
+from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
+from .signals import Array, Bools
+
+_SETTLED = 2e-5
+"""Relative fall of the error below which a fit has converged"""
+_DAMPING = (1e-6, 1e-3, 0.1, 10.0)
+"""Shares of the curvature, tried until the error falls"""
+_PIVOTS = 5, 60
+"""Of all bounds at once, and at most; one by one in between, as all at once may go round in circles (Murty)"""
+RIDGE = 1e-4
+"""Weight of a term's own penalty on its weights, of its columns' mean second moment"""
+
+
+def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) -> Model:
+    """The model with its parameters fitted to `rows` (N, J)."""
+    unknowns = Unknowns.of(model, delays)
+    error = squared_error(model, rows)
+    for _ in range(iterations):
+        better = _step(model, unknowns, rows, error)
+        if better is None:
+            break
+        before, (model, error) = error, better
+        if error > before * (1.0 - _SETTLED):
+            break
+    return tidied(model)
+
+
+_SUMS = np.arange(-0.003, 0.0031, 0.0005)
+_OUTPUTS = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
+"""s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
+_DEEPEST = 3
+"""Points of the grid that a fit starts from"""
+
+
+_PROFILES, _DEEPER = 4, 0.01
+"""Grids at most, one about what the other found, while each takes so much of the error off"""
+
+
+_FACTORS = np.array([1.0, 0.8, 0.9, 0.95, 0.98, 0.99, 1.01, 1.02, 1.05, 1.1, 1.25])
+"""Times a parameter: the values around it that are tried"""
+
+
+def profiled(model: Model, rows: Bools) -> Model:
+    """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
+    error = squared_error(model, rows)
+    for _ in range(_PROFILES):
+        found = _around(model, rows)
+        before, error = error, squared_error(found, rows)
+        model = found if error < before else model
+        if error > (1.0 - _DEEPER) * before:
+            break
+    return model
+
+
+def _around(model: Model, rows: Bools) -> Model:
+    """The best fit from the points of the grid about the model's delays."""
+    unknowns = Unknowns.of(model, delays=False)
+    found = []
+    for more, later in product(_SUMS, _OUTPUTS):
+        delays = model.delays + np.array([[more - later], [later]])
+        if (delays >= -1e-9).all() and (delays <= LONGEST[:, None] + 1e-9).all():
+            at = model.with_delays(delays)
+            error = squared_error(at, rows)
+            found.append(_step(at, unknowns, rows, error) or (at, error))
+    deepest = sorted(found, key=lambda one: one[1])[:_DEEPEST]
+    tried = [fit(_searched(one, rows), rows) for one in (model, *(at for at, _ in deepest))]
+    return min(tried, key=lambda one: squared_error(one, rows))
+
+
+def _searched(model: Model, rows: Bools) -> Model:
+    """The model with every parameter that is not linear at the best of some values around it, one after the other.
+
+    Where a torque jumps with a parameter, as at the edge of a deadband, slopes say little of what a step does.
+    """
+    for k, one in enumerate(model.applied):
+        linear = getattr(one.law, "linear", ())
+        for p, parameter in enumerate(one.law.parameters):
+            if parameter.name not in linear:
+                values = np.repeat(one.values[None], len(_FACTORS), axis=0)
+                values[:, p] = np.clip(values[:, p] * _FACTORS[:, None], parameter.low, parameter.high)
+                one = attrs.evolve(one, values=_best_of(model, k, values, rows))
+                model = model.replacing(k, one)
+    return model
+
+
+def _best_of(model: Model, index: int, values: Array, rows: Bools) -> Array:
+    """Of a batch of values (B, P, J) of an effect the one with the least error, for each group of joints: (P, J)."""
+    every = [np.repeat(one.values[None], len(values), axis=0) for one in model.applied]
+    every[index] = values
+    torque = model.evaluate(np.repeat(model.gains[None], len(values), axis=0), every)
+    error = np.einsum("bnj->bj", np.where(rows, model.samples.tau - torque, 0.0) ** 2)
+    groups = model.applied[index].groups
+    for g in np.unique(groups):
+        error[:, groups == g] = error[:, groups == g].sum(axis=1, keepdims=True)
+    best: Array = values[np.argmin(error, axis=0), :, np.arange(len(groups))].T
+    return best
+
+
+def tidied(model: Model) -> Model:
+    """With every law's parameters in their unique order."""
+    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+
+
+def squared_error(model: Model, rows: Bools) -> float:
+    """Sum of squared errors over `rows` (N, J), N^2 m^2."""
+    left = np.where(rows, model.residual(), 0.0)
+    return float(np.sum(left * left))
+
+
+def normal_equations(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Array, Array, Array, Array]:
+    """J'J, J'r, the slopes (J, A, N) on `rows`, and the residual (N, J) there."""
+    predicted, slopes = jacobian(model, unknowns)
+    left = np.where(rows, model.samples.tau - predicted, 0.0)
+    slopes *= rows.T[:, None]
+    hessian = unknowns.gathered(slopes @ slopes.transpose(0, 2, 1))
+    gradient = unknowns.gathered(np.einsum("jan,nj->ja", slopes, left))
+    return hessian, gradient, slopes, left
+
+
+def _step(model: Model, unknowns: Unknowns, rows: Bools, error: float) -> tuple[Model, float] | None:
+    """The model after a step that lessens the error, and the error; None where none does."""
+    hessian, gradient, _, _ = normal_equations(model, unknowns, rows)
+    theta = pack(model)
+    x = unknowns.vector(theta)
+    penalty = _penalty(model, unknowns, hessian)
+    hessian, gradient = hessian + penalty, gradient - penalty @ x
+    size = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
+    for damping in _DAMPING:
+        change = _bounded(
+            hessian + np.diag(damping * size), gradient, unknowns.low - x, unknowns.high - x, np.sqrt(size)
+        )
+        after = np.where(unknowns.index >= 0, (x + change)[unknowns.index], theta)
+        tried = with_slots(model, after)
+        found = squared_error(tried, rows)
+        if found < error:
+            return tried, found
+    return None
+
+
+def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
+    """The quadratic penalty on the weights of terms, in the unknowns."""
+    total = np.zeros_like(hessian)
+    first = 2
+    for one in model.applied:
+        count = len(one.values)
+        shape = getattr(one.law, "penalty", None)
+        if shape is not None:
+            for j in np.flatnonzero(one.active):
+                at = unknowns.index[first : first + count, j]
+                total[np.ix_(at, at)] += shape * float(np.mean(hessian[at, at])) * RIDGE
+        first += count
+    return total
+
+
+def _bounded(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
+    """The minimum of x'Ax/2 - g'x within bounds that 0 lies in.
+
+    What a step takes beyond a bound is held there for as long as the slope does not lead back inside (block pivoting).
+    """
+    matrix, gradient = matrix / np.outer(scale, scale), gradient / scale
+    matrix = matrix + 1e-12 * np.eye(len(matrix))
+    low, high = np.minimum(low, 0.0) * scale, np.maximum(high, 0.0) * scale
+    x, held = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+    for pivot in range(_PIVOTS[1]):
+        free = ~held
+        right = gradient[free] - matrix[np.ix_(free, held)] @ x[held]
+        x[free] = solve(matrix[np.ix_(free, free)], right, assume_a="sym")
+        beyond = free & ((x < low) | (x > high))
+        x = x.clip(low, high)
+        slope = matrix @ x - gradient
+        wrong = beyond | (held & (low < high) & np.where(x <= low, slope < 0.0, slope > 0.0))
+        if not wrong.any():
+            break
+        if pivot >= _PIVOTS[0]:
+            wrong[: np.flatnonzero(wrong)[-1]] = False
+        held ^= wrong
+    return np.asarray(x / scale)

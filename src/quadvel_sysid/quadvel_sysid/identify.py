@@ -1,0 +1,232 @@
+"""From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
+
+`readings` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
+`selection` searches for effects; the chosen model is fitted to all rows, `confidence` says how sure its values are, and
+`outcome` makes the report.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+from numpy.typing import NDArray
+
+from quadvel_actuator.parameters import ActuatorParameters
+
+from .account import Account, Judge
+from .baselines import baselines
+from .confidence import intervals
+from .contradictions import contradictions
+from .criterion import Parts, noise_variance
+from .delays import in_steps, latest
+from .eam import WINDOWS, pd_torque
+from .fit import fit
+from .identification import Identification
+from .library import SignalTerm
+from .logs.dataset import Dataset
+from .logs.log import Log
+from .lost_commands import read_again
+from .material import VALUES, Material, Progress, gathered
+from .model import Model
+from .motion import STRETCH, Body, Replay, replayed
+from .outcome import Chosen, Outcome, identification, parameters
+from .readings import Reading, read, reference_gains
+from .replay import STRETCH as LEG_STRETCH
+from .replay import TEXT as LEG_TEXT
+from .replay import Legs
+from .selection import Search
+from .signals import Bools, Samples
+
+_SEARCHED, _COARSEST = 30_000, 0.002
+"""Values of torque that are searched, as long as their rows are not farther apart (s); what is found is fitted to all"""
+_MOVES = 0.9
+"""Of the error of a replay: what a model with more in it has to leave at most"""
+
+
+@attrs.frozen
+class Options:
+    """What a user may ask for."""
+
+    gains: tuple[float, float] | None = None
+    """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
+    base: ActuatorParameters | None = None
+    """its torque limits go into the corrected model"""
+    values: int = VALUES
+    """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
+    cores: int = 1
+    """that work side by side; the report is the same"""
+    robot: str | None = None
+    """whose legs the reported rows are replayed on: `aliengo`, `go2`, or an MJCF or URDF file"""
+
+
+def identify(
+    train: Sequence[Log],
+    heldout: Sequence[Log] = (),
+    options: Options | None = None,
+    progress: Progress = lambda share, text: None,
+) -> Identification:
+    """Fit `train`, report on `heldout`, or on blocks of `train` kept aside where there is none.
+
+    `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
+    """
+    options = options or Options()
+    data = Dataset.of(train, heldout, options.gains)
+    material = gathered(data, options.gains, options.values, progress)
+    return identified(material, options.base, options.cores, progress, options.robot)
+
+
+def identified(
+    material: Material,
+    base: ActuatorParameters | None = None,
+    cores: int = 1,
+    progress: Progress = lambda share, text: None,
+    robot: str | None = None,
+) -> Identification:
+    """The same of `material`: who does not hold the whole of a long log has more memory for it."""
+    body = material.body
+    legs = None if robot is None else Legs.of(robot, material.pieces[0].log.joints)
+    progress(0.02, "gains and delays")
+    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    reading, notes = read(material, windows)
+    steps = iter(range(10**6))
+
+    def tick(text: str) -> None:
+        progress(min(0.1 + 0.04 * next(steps), 0.85), text)
+
+    plain = _plain(reading)
+    noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
+    samples, rows = _searched(reading)
+    judge = Judge(reading.parts.taken(rows), noise)
+    plain = attrs.evolve(plain, samples=samples)
+    search, before = Search(judge, tick, cores), judge.fitted(plain)
+    best = search.best(plain)
+    progress(0.88, "intervals")
+
+    def told(account: Account) -> Outcome:
+        return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
+
+    if body is None and legs is None:
+        outcome, sections = told(best), dict[str, Any]()
+    else:
+        progress(0.93, "replays")
+        accounts = dict.fromkeys((before, search.simplified(search.of_laws or before), best))
+        outcome, sections = _moving([told(one) for one in accounts], body, legs)
+    found = identification(outcome, [*material.findings, *notes])
+    parts, samples = reading.parts, reading.samples
+    logs = [one.log for one in samples.logs]
+    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report), **sections}
+    if body is not None:
+        report |= _told_of_motion(report)
+    report["warnings"] = [*report["warnings"], *contradictions(report)]
+    progress(1.0, "done")
+    return attrs.evolve(found, report=report)
+
+
+def _searched(reading: Reading) -> tuple[Samples, NDArray[np.intp]]:
+    """The samples that are searched, and which rows these are: none of a log that is held out, and no more than it takes."""
+    samples = reading.samples.reaching(reading.parts.chosen_on)
+    step = min(round(samples.tau.size / _SEARCHED), round(_COARSEST / samples.period))
+    if step > 1:
+        return samples.thinned(step)
+    return samples, np.arange(len(samples.t))
+
+
+def _plain(reading: Reading) -> Model:
+    """The EAM as a model that effects can be added to."""
+    eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
+    delays = np.stack([eam.input_delay, eam.output_delay])
+    return Model(reading.samples, eam.window, eam.gains, np.array([one, one]), delays, one)
+
+
+def _outcome(
+    account: Account,
+    before: Account,
+    search: Search,
+    reading: Reading,
+    material: Material,
+    base: ActuatorParameters,
+) -> Outcome:
+    """The chosen model with values of all rows, and errors of the rows that chose nothing."""
+    parts, samples = reading.parts, reading.samples
+    every = parts.chosen_on if material.heldout else parts.every
+    chosen = parts.chosen_on
+    models = [attrs.evolve(one.model, samples=samples) for one in (before, account)]
+    if len(samples.t) > len(account.model.samples.t):
+        models[1] = read_again(models[1], parts, search.judge.noise)
+    late = [latest(fit(one, chosen), chosen) for one in models]
+    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
+    effects = tuple(
+        Chosen(*_worth(late[1], k, parts), search.rivals(account, k))
+        for k in range(len(account.model.applied))
+    )
+    has_terms = any(isinstance(one.law, SignalTerm) for one in account.model.applied)
+    leaning = () if account.white or has_terms else search.leaning(account)
+    names = {one.law.name for one in account.model.applied}
+    rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
+    asked = np.ones_like(whole.gains)
+    asked[1] = 0.0 if samples.logs[0].undamped else 1.0
+    ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
+    return Outcome(
+        late[0], before_whole, late[1], whole, effects, rejected, leaning,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
+        material.pieces, *reference_gains(samples), base,
+    )  # fmt: skip
+
+
+def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
+    """What an effect takes off the error of the rows that chose nothing, and its p-value there."""
+    without = fit(model.without(index), parts.chosen_on)
+    worth = parts.compare(without.residual(), model.residual(), parts.report)
+    return worth.gain, worth.p
+
+
+def _moving(tries: Sequence[Outcome], body: Body | None, legs: Legs | None) -> tuple[Outcome, dict[str, Any]]:
+    """The outcome with which the commands replay the motion best, and the sections of the report about that.
+
+    A later try has to replay clearly better than those before it on the rows that fit and select. Terms can mistake the errors
+    of encoders for an effect, or foretell a torque only where the joint does what it did; a replay does not.
+    """
+    logs = [piece.log for piece in tries[0].pieces]
+
+    def replay(o: Outcome, model: Model, rows: Bools) -> Replay:
+        if legs is not None:
+            return legs.replayed(logs, parameters(o, model), rows)
+        assert body is not None
+        return replayed(logs, parameters(o, model), body, rows)
+
+    best, least = tries[0], np.inf
+    for one in tries:
+        error = replay(one, one.model, one.parts.chosen_on)["dq_rms_rad_s"]
+        if error < _MOVES * least:
+            best, least = one, error
+    sizes = {
+        name: replay(best, model, best.parts.report)
+        for name, model in (("before", best.before), ("after", best.model))
+    }
+    if legs is not None:
+        return best, {"replay": {"stretch_s": LEG_STRETCH, **sizes, "text": LEG_TEXT}}
+    assert body is not None
+    motion = {
+        "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
+        "replayed_s": STRETCH,
+        "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
+        "the inertia and an encoder bias part of the torque offset.",
+    }
+    return best, {"motion": motion | sizes}
+
+
+def _told_of_motion(report: Mapping[str, Any]) -> dict[str, Any]:
+    """What changes in a report where the torque is what the motion implies."""
+    before, after = report["motion"]["before"], report["motion"]["after"]
+    decision = (
+        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
+        f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
+    )
+    return {
+        "before": report["before"] | {f"heldout_{name}": value for name, value in before.items()},
+        "after": report["after"] | {f"heldout_{name}": value for name, value in after.items()},
+        "decision": decision,
+    }

@@ -1,0 +1,413 @@
+"""Everything that was found, as the report, the corrected parameters, and the series for the pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import attrs
+import numpy as np
+
+from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
+from quadvel_description.robot import JOINT_NAMES
+
+from .confidence import Intervals
+from .criterion import LEVEL, WHITE_LEVEL, Parts, whiteness
+from .decision import decision
+from .delays import running_delays
+from .identification import Identification, Shape, Trace
+from .library import SignalTerm
+from .logs.excerpts import Piece
+from .logs.findings import Finding as LogFinding
+from .model import Applied, Model, linear_columns
+from .signals import Array, Bools
+
+SCHEMA = 1
+UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
+_REMOVABLE = 0.05
+"""Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
+
+_ALIKE = 0.05  # ms
+_OVER = 1.1  # times the limit, that noise and a short peak may reach
+
+_SHOWN = 4000  # points of a series in a picture
+_SIGNAL_UNITS = {
+    "q": "rad",
+    "q_des": "rad",
+    "dq": "rad/s",
+    "ddq": "rad/s^2",
+    "tau": "N m",
+    "t": "s",
+}
+
+
+@attrs.frozen(eq=False)
+class Chosen:
+    """An effect that was chosen, of the corrected model the one of the same index, on the rows that are reported."""
+
+    gain: float
+    """error without it, everything else fitted anew, less that with it, N^2 m^2"""
+    p: float
+    rivals: tuple[str, ...]
+    """laws that say the same"""
+
+
+@attrs.frozen(eq=False)
+class Outcome:
+    """What the steps of an identification found. Models `whole` are fitted to every row, the others to those that chose."""
+
+    before: Model
+    before_whole: Model
+    model: Model
+    whole: Model
+    effects: tuple[Chosen, ...]
+    rejected: tuple[tuple[str, float, str], ...]
+    """law, gain on the rows that select, reason"""
+    leaning: tuple[str, ...]
+    """the signals that what is left goes with most, where it is not white and no term says more of it"""
+    widths: Intervals
+    ideal: Array  # (N, J), torque of the PD law as commanded
+    noise: Array  # (J,)
+    parts: Parts
+    pieces: Sequence[Piece]
+    kp_ref: float
+    kd_ref: float
+    base: ActuatorParameters
+
+    @property
+    def commanded_kd(self) -> float:
+        """In units of `kd_ref`: 0 where none was commanded, so that the deviation is all of the drive's damping."""
+        return 0.0 if self.before.samples.logs[0].undamped else 1.0
+
+    @property
+    def after(self) -> Array:
+        """Torque that the corrected model foretells, (N, J)."""
+        return self.model.foretold().predict()
+
+    @property
+    def terms(self) -> list[tuple[int, Applied]]:
+        """The terms of named signals, and which of the effects they are."""
+        return [(k, one) for k, one in enumerate(self.model.applied) if isinstance(one.law, SignalTerm)]
+
+
+def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
+    """The report, the parameters and the series; `findings` are (log, finding)."""
+    report = _report(outcome)
+    report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
+    return Identification(report, parameters(outcome), _traces(outcome), _shapes(outcome))
+
+
+def _report(o: Outcome) -> dict[str, Any]:
+    samples, parts = o.model.samples, o.parts
+    errors = {
+        name: samples.tau - torque
+        for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.after))
+    }
+    mses: dict[str, dict[str, Any]] = {
+        name: {"train_mse": _mse(error, parts.chosen_on), "heldout_mse": _mse(error, parts.report)}
+        for name, error in errors.items()
+    }
+    for name in ("before", "after"):
+        mses[name]["per_joint"] = [
+            _mse(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
+        ]
+    floor = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
+    report = {
+        "schema": SCHEMA,
+        "joints": list(samples.joints),
+        "units": UNITS,
+        "noise_floor": floor,
+        "pd": mses["pd"],
+        "before": mses["before"]
+        | {
+            "delta_kp": float((o.before_whole.gains[0, 0] - 1.0) * o.kp_ref),
+            "delta_kd": float((o.before_whole.gains[1, 0] - o.commanded_kd) * o.kd_ref),
+            "input_delay_ms": 1e3 * float(o.before_whole.delays[0, 0]),
+            "output_delay_ms": 1e3 * float(o.before_whole.delays[1, 0]),
+        },
+        "after": mses["after"] | _gains(o),
+        "effects": sorted(_effects(o), key=lambda one: -one["heldout_gain"]),
+        "rejected": [{"name": name, "heldout_gain": gain, "reason": why} for name, gain, why in o.rejected],
+        "unexplained": _unexplained(o, mses["before"]["heldout_mse"], mses["after"]["heldout_mse"], floor),
+        "warnings": [
+            f"{name} sits on its bound: its value and interval are not to be trusted"
+            for name in o.widths.on_bound
+        ]
+        + _unconfirmed(o)
+        + _unlike_delays(o.whole)
+        + _negative_gains(o.whole)
+        + _beyond_limits(o),
+        "fitted_seconds": float(parts.chosen_on.any(axis=1).sum() * samples.period),
+    }
+    report["decision"] = decision(report)
+    return report
+
+
+def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
+    """What no law explains: terms of named signals, or a residual that is not white."""
+    parts, samples = o.parts, o.model.samples
+    left = samples.tau - o.model.predict()
+    coloured = whiteness(left, parts.every, samples.start, parts.overlap) < WHITE_LEVEL
+    names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
+    joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
+    removable = before - floor
+    structured = bool(names) or bool(o.leaning)
+    return {
+        "verdict": "structured" if structured else "white",
+        "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
+        if removable > _REMOVABLE * floor
+        else 0.0,
+        "depends_on": list(dict.fromkeys(names or o.leaning)),
+        "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
+    }
+
+
+def _unconfirmed(o: Outcome) -> list[str]:
+    """Effects that the rows which chose nothing do not show."""
+    return [
+        f"{one.law.name} is not confirmed by the rows that are reported (p = {found.p:.2g} there)"
+        for one, found in zip(o.model.applied, o.effects, strict=True)
+        if found.p > LEVEL
+    ]
+
+
+def _unlike_delays(model: Model) -> list[str]:
+    """A model that runs has one pair of delays."""
+    spread = 1e3 * float(np.ptp(model.delays, axis=1).max())
+    if spread < _ALIKE:
+        return []
+    return [
+        f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml holds their median, so a model that runs "
+        "with it does worse than the error after says"
+    ]
+
+
+def _negative_gains(model: Model) -> list[str]:
+    """A drive that pushes away from its target does not exist: the log or the model is wrong."""
+    found = []
+    for name, row in zip(("kp", "kd"), model.gains, strict=True):
+        joints = np.array(model.samples.joints)[row < 0.0]
+        if len(joints):
+            text = f"{name} + delta_{name} is negative on {', '.join(joints)}"
+            found.append(
+                f"{text}: look at the signs and stamps of the log before believing anything else here"
+            )
+    return found
+
+
+def _beyond_limits(o: Outcome) -> list[str]:
+    """Torques that were measured and that the corrected model can not give."""
+    joints, most = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
+    limits = np.broadcast_to(_limits(o.base, joints), most.shape)
+    return [
+        f"{joint}: up to {torque:.1f} N m were measured, and torque_limit in actuator.yaml, which is the base's, is "
+        f"{limit:.1f} N m"
+        for joint, torque, limit in zip(joints, most, limits, strict=True)
+        if torque > _OVER * limit
+    ]
+
+
+def _mse(error: Array, rows: Any) -> float:
+    count = int(rows.sum())
+    return float(np.sum(np.where(rows, error, 0.0) ** 2) / count) if count else 0.0
+
+
+def _gains(o: Outcome) -> dict[str, Any]:
+    """Gain deviations and delays of the corrected model, a number, or one for each joint, with intervals."""
+    model, widths = o.whole, o.widths
+    found: dict[str, Any] = {}
+    rows = {
+        "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
+        "delta_kd": ((model.gains[1] - o.commanded_kd) * o.kd_ref, widths.gains[1] * o.kd_ref),
+        "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
+        "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
+    }
+    for name, (values, half) in rows.items():
+        least = -np.inf if name.startswith("delta") else 0.0
+        value, ci = _with_interval(values, half, least)
+        found[name], found[f"{name}_ci95"] = value, ci
+    return found
+
+
+def _with_interval(
+    values: Array, half: Array, least: float = -np.inf, most: float = np.inf
+) -> tuple[Any, Any]:
+    """Value and interval, within what is possible: numbers if all joints share them, else lists."""
+    low, high = np.maximum(values - half, least), np.minimum(values + half, most)
+    if np.all(values == values[0]):
+        return float(values[0]), [float(low[0]), float(high[0])]
+    return values.tolist(), np.stack([low, high], axis=1).tolist()
+
+
+def _effects(o: Outcome) -> list[dict[str, Any]]:
+    joints = o.model.samples.joints
+    found = [
+        _effect(of_it, one, half, joints)
+        for of_it, one, half in zip(o.effects, o.whole.applied, o.widths.effects, strict=True)
+        if not isinstance(one.law, SignalTerm)
+    ]
+    if o.terms:
+        found.append(_terms(o, joints))
+    return found
+
+
+def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
+    """All terms as one effect."""
+    ranked = sorted(o.terms, key=lambda pair: -o.effects[pair[0]].gain)
+    acts = np.any([one.active for _, one in ranked], axis=0)
+    return {
+        "name": TERMS,
+        "joints": [name for name, on in zip(joints, acts, strict=True) if on],
+        "params": {},
+        "indistinguishable": [],
+        "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
+        "p_value": min(o.effects[k].p for k, _ in ranked),
+        "inputs": list(dict.fromkeys(name for _, one in ranked for name in one.law.inputs)),  # type: ignore[attr-defined]
+        "terms": [
+            {
+                "kind": one.law.shape.kind,  # type: ignore[attr-defined]
+                "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
+                "at": one.law.at,
+                "joints": [name for name, on in zip(joints, one.active, strict=True) if on],
+                "heldout_gain": o.effects[k].gain,
+            }
+            for k, one in ranked
+        ],
+    }
+
+
+def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
+    params = {}
+    for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
+        value, ci = _with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
+        params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
+    settings = _settings(one)
+    entry: dict[str, Any] = {
+        "name": one.law.name,
+        "joints": [name for name, acts in zip(joints, one.active, strict=True) if acts],
+        "params": params,
+        "indistinguishable": list(of_it.rivals),
+        "heldout_gain": of_it.gain,
+        "p_value": of_it.p,
+        **one.law.observed(),
+    }
+    if settings:
+        entry["form"] = settings
+    if of_it.rivals:
+        entry["separated_by"] = one.law.motion
+    return entry
+
+
+def _settings(one: Applied) -> dict[str, Any]:
+    """The form of a law; what it has for each joint, for those that it acts on."""
+    return {
+        name: [v for v, acts in zip(value, one.active, strict=True) if acts]
+        if isinstance(value, list)
+        else value
+        for name, value in one.law.settings.items()
+    }
+
+
+def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
+    """The corrected model as the stack loads it, or another one of the outcome's."""
+    model = o.whole if model is None else model
+    joints = model.samples.joints
+    mse = _mse(model.foretold().residual(), o.parts.chosen_on)
+    pair = DelayPair(*running_delays(model, o.parts.chosen_on), mse)
+    effects = []
+    for one, half in zip(model.applied, o.widths.effects, strict=False):
+        if isinstance(one.law, SignalTerm):
+            continue
+        values: dict[str, Any] = {}
+        ranges = {}
+        for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
+            value, ci = _with_interval(row[one.active], width[one.active], parameter.low, parameter.high)
+            values[parameter.name], ranges[parameter.name] = value, ci
+        values |= _settings(one)
+        units = {parameter.name: parameter.unit for parameter in one.law.parameters}
+        acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
+        effects.append(Effect(one.law.name, acts, values, units, ranges))
+    terms = [one for one in model.applied if isinstance(one.law, SignalTerm)]
+    if terms:
+        on = np.any([one.active for one in terms], axis=0)
+        acts = tuple(name for name, acting in zip(joints, on, strict=True) if acting)
+        saved = [one.law.term(one, _largest(model, one, o.parts.fit)).saved(joints) for one in terms]  # type: ignore[attr-defined]
+        effects.append(Effect(TERMS, acts, {"terms": saved}))
+    deviations: dict[str, Any] = {
+        "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
+        "delta_kd": (model.gains[1] - o.commanded_kd) * o.kd_ref,
+    }
+    if o.commanded_kd == 0.0:  # a deviation is relative to what is commanded: of nothing it would be nothing
+        own = {"b": np.maximum(deviations.pop("delta_kd"), 0.0).tolist()}
+        effects.append(Effect("viscous_friction", joints, own, {"b": "N m s/rad"}))
+        deviations["delta_kd"] = np.zeros(len(joints))
+    deviations = {
+        name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()
+    }
+    return attrs.evolve(
+        o.base,
+        name="identified",
+        joints=joints,
+        torque_limit=_limits(o.base, joints),
+        kp_ref=o.kp_ref,
+        kd_ref=o.kd_ref,
+        pairs=(pair,),
+        torque_noise=mse,
+        effects=tuple(effects),
+        **deviations,
+    )
+
+
+def _largest(model: Model, one: Applied, rows: Bools) -> Array:
+    """The largest torque (J,) that a term had on `rows` (N, J): a running model's stays within it."""
+    torque = np.einsum("kj,knj->nj", one.values, linear_columns(model, one))
+    return np.max(np.abs(torque) * rows, axis=0)
+
+
+def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
+    """The base's torque limits for these joints: each its own where the base knows it, else the largest."""
+    limit = base.torque_limit
+    if not isinstance(limit, tuple):
+        return limit
+    names = list(base.joints or JOINT_NAMES)
+    every = limit if len(limit) == len(names) else limit * (len(names) // len(limit))
+    return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
+
+
+def _traces(o: Outcome) -> dict[str, Trace]:
+    samples, reported = o.model.samples, o.parts.report
+    series = (samples.tau, o.ideal, o.before.predict(), o.after)
+    rows = np.flatnonzero(reported.any(axis=1))[:_SHOWN]
+    return {
+        joint: Trace(samples.t[rows], *(np.where(reported[rows, j], x[rows, j], np.nan) for x in series))
+        for j, joint in enumerate(samples.joints)
+    }
+
+
+def _shapes(o: Outcome) -> tuple[Shape, ...]:
+    """The residual over the signal that explains it, of up to three joints an effect."""
+    samples = o.model.samples
+    before, after = samples.tau - o.before.predict(), samples.tau - o.after
+    rows = np.flatnonzero(o.parts.report.any(axis=1))
+    rows = rows[:: max(1, len(rows) // _SHOWN)]
+    found = []
+    for one in o.model.applied:
+        for j in np.flatnonzero(one.active)[:3]:
+            x, unit = _signal(o, one.law.signal, int(j))
+            x, e0, e1 = x[rows], before[rows, j], after[rows, j]
+            found.append(Shape(one.law.name, samples.joints[j], one.law.signal, unit, x, e0, e1))
+    return tuple(found)
+
+
+def _signal(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
+    """A signal of the report by its name, and its unit."""
+    s, samples = o.model.signals, o.model.samples
+    owner, _, plain = name.rpartition("/")
+    j = samples.joints.index(owner) if owner else joint
+    kind = plain.partition("@")[0]
+    series: dict[str, Array] = {
+        "q": s.q, "dq": s.dq, "ddq": s.ddq, "q_des": s.q_des, "tau": samples.tau,
+        "t": np.broadcast_to(s.t, s.q.shape),
+    }  # fmt: skip
+    return series[kind][:, j], _SIGNAL_UNITS[kind]

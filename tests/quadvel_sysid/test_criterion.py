@@ -1,0 +1,54 @@
+"""What counts as independent evidence, as noise, and as structure."""
+
+import attrs
+import numpy as np
+from simulated_joints import parameters, record
+
+from quadvel_sysid.criterion import WHITE_LEVEL, clusters, noise_variance, normality, whiteness
+from quadvel_sysid.logs.log import Log
+from quadvel_sysid.signals import Samples
+
+BEGIN, END = 2.0, 4.0  # s, of a stand
+
+
+def starts_of(log: Log) -> np.ndarray:
+    return clusters(Samples([log]))
+
+
+def standing(log: Log, sway: float, rate: float) -> Log:
+    """The log with a stand, in which encoders say what the joints do not and one joint sways (rad, Hz)."""
+    rng = np.random.default_rng(1)
+    still = ((log.t >= BEGIN) & (log.t < END))[:, None]
+    stand = log.q[int(BEGIN * 1000)] + 0.5e-3 * rng.normal(size=log.q.shape)
+    stand[:, 0] += sway * np.sin(2.0 * np.pi * rate * log.t)
+    return attrs.evolve(log, q=np.where(still, stand, log.q))
+
+
+def test_a_stand_says_once_what_it_says_and_motion_each_tenth_of_a_second() -> None:
+    log = record(parameters(), joints=2, seconds=5.0)
+    moving, stood = starts_of(log), starts_of(standing(log, 0.0, 1.0))
+    assert len(moving) == 50
+    at = log.t[stood]
+    assert len(at) == 31
+    assert not ((at > BEGIN + 0.05) & (at < END - 0.05)).any()
+
+
+def test_a_fast_sway_about_one_posture_is_motion() -> None:
+    log = record(parameters(), joints=2, seconds=5.0)
+    assert len(starts_of(standing(log, 0.03, 20.0))) == 50
+
+
+def test_noise_is_white_and_normal_and_what_is_not_is_told_of_its_joint() -> None:
+    rng = np.random.default_rng(3)
+    noise = rng.normal(size=(3000, 3))
+    noise[:, 1] += 0.3 * np.sin(np.arange(3000) / 20.0)
+    noise[::150, 2] += 4.0
+    rows, start = np.ones(noise.shape, dtype=bool), np.arange(3000) == 0
+    assert (whiteness(noise, rows, start) < WHITE_LEVEL).tolist() == [False, True, False]
+    assert (normality(noise, rows) < WHITE_LEVEL).tolist() == [False, False, True]
+
+
+def test_the_noise_of_a_torque_shows_without_a_model() -> None:
+    samples = Samples([record(parameters(), joints=2, seconds=5.0)])
+    found = noise_variance(samples, samples.judged, samples.tau)
+    np.testing.assert_allclose(found, 0.066, rtol=0.15)

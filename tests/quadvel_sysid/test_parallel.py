@@ -1,0 +1,42 @@
+"""Work on several cores: the answers of one."""
+
+import json
+import os
+import signal
+from concurrent.futures.process import BrokenProcessPool
+
+import attrs
+import pytest
+from simulated_joints import NAMES, parameters, record
+
+from quadvel_actuator import Effect
+from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.parallel import side_by_side
+from quadvel_sysid.signals import Samples
+
+
+@pytest.fixture(scope="module")
+def samples():
+    return Samples([record(parameters(joints=1), joints=1, seconds=1.0)])
+
+
+def test_answers_are_those_of_one_core_and_name_the_samples_that_are_here(samples):
+    for cores in (1, 2):
+        found = side_by_side(lambda k: (k * k, samples), 4, cores, samples)
+        assert [square for square, _ in found] == [0, 1, 4, 9]
+        assert all(one is samples for _, one in found)
+
+
+def test_an_error_of_the_work_and_the_end_of_a_worker_come_out(samples):
+    with pytest.raises(ZeroDivisionError):
+        side_by_side(lambda k: 1 // k, 2, 2, samples)
+    with pytest.raises(BrokenProcessPool):
+        side_by_side(lambda k: os.kill(os.getpid(), signal.SIGKILL), 2, 2, samples)
+
+
+def test_the_report_of_two_cores_is_that_of_one():
+    joints = NAMES[:2]
+    truth = attrs.evolve(parameters((Effect("quadratic_drag", joints[:1], {"c": 0.05}),)), joints=joints)
+    log = record(truth, 2, 3.0, 500, seed=4)
+    one, two = (json.dumps(identify([log], options=Options(cores=n)).report, default=float) for n in (1, 2))
+    assert one == two

@@ -1,0 +1,57 @@
+"""The signals of rows: of some of them, of each joint at delays of its own."""
+
+import attrs
+import numpy as np
+import pytest
+from simulated_joints import NAMES, parameters, record
+
+from quadvel_actuator.effects import registry
+from quadvel_sysid.signals import Samples, scattered
+
+JOINTS = NAMES[:2]
+
+
+def _log(seconds=3.0, seed=2):
+    truth = parameters((), input_delay=0.009, output_delay=0.003)
+    return record(attrs.evolve(truth, joints=JOINTS), 2, seconds, 500, seed=seed)
+
+
+def test_signals_of_few_rows_are_those_of_all():
+    samples = Samples([_log(), _log(seed=3)])
+    rows = np.arange(0, len(samples.t), 7)
+    few = samples.taken(rows)
+    assert len(few.t) == len(rows) < len(samples.t) / 6
+    for name in ("t", "q", "q_des", "ddq", "packet"):
+        whole = getattr(samples.at(0.004, 0.001, 0.001), name)
+        np.testing.assert_array_equal(getattr(few.at(0.004, 0.001, 0.001), name), whole[rows])
+
+
+@pytest.mark.parametrize("every", [2, 5, 10])
+def test_few_rows_lie_at_all_places_between_two_commands(every):
+    """Commands at 200 Hz, rows at 500 or 1000 Hz: even steps would show few of the places, and hide a wrong delay."""
+    rows = scattered(4000, every)
+    assert len(rows) == pytest.approx(4000 / every, abs=1)
+    assert np.diff(rows).min() > 0
+    counts = np.bincount(rows % 10)
+    assert counts.min() > 0.8 * len(rows) / 10
+    assert counts.max() < 1.2 * len(rows) / 10
+
+
+def test_each_joint_reads_the_signals_at_its_own_delays():
+    samples = Samples([_log()])
+    mixed = samples.at(np.array([0.004, 0.009]), np.array([0.001, 0.003]), 0.001)
+    for joint, pair in enumerate(((0.004, 0.001), (0.009, 0.003))):
+        for name in ("q", "dq", "q_des", "kp"):
+            own = getattr(samples.at(*pair, 0.001), name)[:, joint]
+            np.testing.assert_array_equal(getattr(mixed, name)[:, joint], own)
+
+
+def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
+    """Each error between two guesses is a jump of the torque that a slope along the width does not see."""
+    samples = Samples([_log(seconds=1.0)])
+    s = samples.at(0.009, 0.003, 0.0)
+    starts = registry()["deadband"](edge="hard").starts(s, samples.tau, samples.tau)
+    widths = np.array([one["width"] for one in starts])
+    share = (np.abs(s.q_des - s.q) < widths[:, None]).mean(axis=1)
+    assert np.diff(share, axis=0).max() < 0.05
+    assert (share[-1] > 0.95).all()
