@@ -65,7 +65,7 @@ EXCITE = [
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
 LOGS = [  # of one leg each
-    Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --out out/identify"),
+    Step("quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --robot go2 --out out/identify"),
     Step("quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify"),
     Step("quadvel identify hung.npz --gains 30 0.5 --out out/identify"),
     Step("quadvel identify out/loop/walk.npz --out out/loop/identified"),
