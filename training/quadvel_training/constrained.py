@@ -45,7 +45,8 @@ class ConstrainedConfig:
     pull: float = 1.0  # weight of the teacher's pull at first,
     pull_samples: float = 3e7  # and samples over which it fades
     constraint_samples: float = 2e7  # over which the weights of the constraints grow to their full
-    stride: float = 2.0  # fine, s/m and s/rad, of the error over a stride
+    stride: float = 1.0  # fine, s/m and s/rad, of the error over a stride,
+    lasting: float = 3.0  # and of the error that lasts: under exploration steady errors hardly show over a stride
     keep: float = 5e6  # samples between policies that are kept and evaluated
     actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025
@@ -183,8 +184,10 @@ class ConstrainedRun:
                 env.tick(self.map.targets(action))
             with self.shares.of("sensing"):
                 self.teacher.advance(command, action.clip(-ACTION_BOUND, ACTION_BOUND))
-                astray = np.hypot(past.stride[:, 0], past.stride[:, 1]) + np.abs(past.stride[:, 2])
-                reward = self.rewards(action) - c.stride * astray
+                astray, lasting = (
+                    np.hypot(e[:, 0], e[:, 1]) + np.abs(e[:, 2]) for e in (past.stride, past.lasting)
+                )
+                reward = self.rewards(action) - c.stride * astray - c.lasting * lasting
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
             row = (obs, critic_obs, action, mean, label, reward, fell, late, alive.copy())
