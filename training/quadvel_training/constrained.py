@@ -46,7 +46,9 @@ class ConstrainedConfig:
     pull_samples: float = 3e7  # and samples over which it fades
     constraint_samples: float = 2e7  # over which the weights of the constraints grow to their full
     stride: float = 1.0  # fine, s/m and s/rad, of the error over a stride,
-    lasting: float = 3.0  # and of the error that lasts: under exploration steady errors hardly show over a stride
+    lasting: float = (
+        3.0  # and of the error that lasts: under exploration steady errors hardly show over a stride
+    )
     keep: float = 5e6  # samples between policies that are kept and evaluated
     actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025

@@ -93,7 +93,7 @@ class Curve(Shape):
     @property
     def penalty(self) -> Array:
         bend = np.diff(np.eye(self.count), 2, axis=0)
-        penalty: Array = 1e-3 * bend.T @ bend + 1e-3 * np.eye(self.count)
+        penalty: Array = 100.0 * bend.T @ bend + 1e-3 * np.eye(self.count)
         return penalty
 
     def _placed(self, u: Array) -> tuple[NDArray[np.intp], list[Array]]:
