@@ -43,7 +43,12 @@ def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
 
 @pytest.mark.parametrize(
     ("name", "kind"),
-    [("privileged", PrivilegedConfig), ("privileged_rough", PrivilegedConfig), ("dagger", DaggerConfig)],
+    [
+        ("privileged", PrivilegedConfig),
+        ("privileged_rough", PrivilegedConfig),
+        ("privileged_last", PrivilegedConfig),
+        ("dagger", DaggerConfig),
+    ],
 )
 def test_the_recipes_without_a_clock_share_robots_and_commands(name, kind):
     config = recipe.read(kind, stage3.RECIPES / f"{name}.yaml")
