@@ -22,7 +22,7 @@ from .signals import Samples
 _BLOCKS = 20  # of a log, at least
 _SHORTEST, _LONGEST = 0.2, 2.0
 """s, of the blocks of which some are fitted, some select and some are reported"""
-_LEAST_ROWS = 30
+_LEAST_ROWS = 20
 _CLEARLY = 0.97
 """of the error: what an even clock has to leave at most"""
 _NOISY = 0.01
