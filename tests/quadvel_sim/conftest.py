@@ -19,6 +19,7 @@ from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
 from geometry_msgs.msg import PoseArray  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.node import Node  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu, JointState, LaserScan  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
@@ -28,9 +29,9 @@ from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import Push, ResetSim, StepSim  # noqa: E402
 from quadvel_nodes.messages import write_low_cmd  # noqa: E402
-from quadvel_nodes.robot_view import LATCHED  # noqa: E402
 
 PROGRAM = "import quadvel_dds; quadvel_dds.install(); from quadvel_sim.sim_node import main; main()"
+STATIC = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)  # of several publishers
 TOPICS = {
     "low_state": LowState,
     "imu": Imu,
@@ -74,7 +75,7 @@ class Peer:
         self.answer: Callable[[Any], JointCommand | None] = lambda state: None
         self._commands = self.node.create_publisher(LowCmd, "low_cmd", 10)
         for topic, kind in TOPICS.items():
-            qos = LATCHED if topic == "/tf_static" else 100
+            qos = STATIC if topic == "/tf_static" else 100
             self.node.create_subscription(kind, topic, lambda message, t=topic: self._hear(t, message), qos)
         self._clients = {
             name: self.node.create_client(kind, f"sim_node/{name}") for name, kind in SERVICES.items()

@@ -94,6 +94,7 @@ def _hung(friction, seconds=5.0, seed=0):
     )
 
 
+@pytest.mark.long
 def test_friction_of_a_hung_leg_is_found_on_the_joint_that_has_it():
     friction = np.zeros(12)
     friction[1] = 0.6
