@@ -126,9 +126,9 @@ LEFT_OUT = {
     "--only symmetry --only gap --only robustness --only stance --only sustained": "the same",
     "quadvel paper --out out/loop/gap --only gap --policy before=src/quadvel_policy/quadvel_policy/policies/aliengo.onnx "
     "--policy after=out/loop/tuned/tuned.onnx": "the same",
-    "quadvel identify go2_walk_1.npz --holdout go2_walk_2.npz --gains 35 0.5 --out out/go2_1": "measured logs that "
+    "quadvel identify go2_walk_1.npz --holdout go2_walk_2.npz --gains 35 0.5 --robot go2 --out out/go2_1": "measured logs that "
     "are no part of this repository; tests/quadvel_sysid/test_measured.py takes them where they are",
-    "quadvel identify go2_walk_2.npz --holdout go2_walk_1.npz --gains 35 0.5 --out out/go2_2": "the same",
+    "quadvel identify go2_walk_2.npz --holdout go2_walk_1.npz --gains 35 0.5 --robot go2 --out out/go2_2": "the same",
     "cd ros_ws && colcon build && source install/setup.bash": "needs ROS 2; tests/ros does it",
     "colcon build": "needs ROS 2; tests/ros does it",
     "python3 -m venv --system-site-packages .venv": "makes an environment out of the network",
