@@ -20,6 +20,9 @@ MARKS = {
     "stiffness_with_error": pytest.mark.long,
     "gain_over_angle": pytest.mark.long,
     "friction_with_a_neighbours_load": pytest.mark.long,
+    "friction_that_wears_in": pytest.mark.long,
+    "resonance": pytest.mark.long,
+    "rubbing": pytest.mark.long,
 }
 
 
