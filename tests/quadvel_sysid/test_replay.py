@@ -86,7 +86,12 @@ def test_the_report_says_how_far_the_legs_leave_their_track_before_and_after():
     ("robot", "joints", "said"),
     [
         ("dog", CALF, "--robot: found dog, expected aliengo, go2 or an MJCF or URDF file"),
-        ("go2", ("knee_joint",), "go2.xml: joint 'knee_joint' of the log is missing, found FL_calf_joint"),
+        (
+            "go2",
+            ("knee_joint",),
+            "--robot go2: joint 'knee_joint' of the log is missing, found FL_calf_joint",
+        ),
+        ("aliengo", ("knee_joint",), "--robot aliengo: joint 'knee_joint' of the log is missing"),
     ],
 )
 def test_a_robot_that_does_not_fit_is_refused_by_name(robot, joints, said):
@@ -99,6 +104,12 @@ def test_a_file_that_is_no_description_is_named(tmp_path):
     path.write_text("<nothing/>")
     with pytest.raises(ValueError, match=r"robot.xml: no MJCF or URDF that MuJoCo reads"):
         Legs.of(str(path), CALF)
+
+
+def test_a_log_without_torque_is_not_identified_with_a_replay():
+    log = record(attrs.evolve(parameters(), joints=NAMES[:2]), 2, 2.0, 1000, load=0.0)
+    with pytest.raises(LogError, match="tau: not in the log, expected the torque to replay"):
+        identify([attrs.evolve(log, tau=None)], options=Options(robot="aliengo"))
 
 
 def test_a_log_without_torque_is_not_replayed():

@@ -27,7 +27,7 @@ from .fit import fit
 from .identification import Identification
 from .library import SignalTerm
 from .logs.dataset import Dataset
-from .logs.log import Log
+from .logs.log import Log, LogError
 from .lost_commands import read_again
 from .material import VALUES, Material, Progress, gathered
 from .model import Model
@@ -87,9 +87,14 @@ def identified(
 ) -> Identification:
     """The same of `material`: who does not hold the whole of a long log has more memory for it."""
     body = material.body
-    legs = None if robot is None else Legs.of(robot, material.pieces[0].log.joints)
+    log = material.pieces[0].log
+    if robot is not None and body is not None:
+        raise LogError(
+            f"{log.name}: tau: not in the log, expected the torque to replay the commands (--robot)"
+        )
+    legs = None if robot is None else Legs.of(robot, log.joints)
     progress(0.02, "gains and delays")
-    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    windows = WINDOWS if body is None else (log.period,)
     reading, notes = read(material, windows)
     steps = iter(range(10**6))
 
@@ -102,7 +107,7 @@ def identified(
     judge = Judge(reading.parts.taken(rows), noise)
     plain = attrs.evolve(plain, samples=samples)
     search, before = Search(judge, tick, cores), judge.fitted(plain)
-    best = search.best(plain)
+    best, of_laws = search.best(plain)
     progress(0.88, "intervals")
 
     def told(account: Account) -> Outcome:
@@ -112,7 +117,7 @@ def identified(
         outcome, sections = told(best), dict[str, Any]()
     else:
         progress(0.93, "replays")
-        accounts = dict.fromkeys((before, search.simplified(search.of_laws or before), best))
+        accounts = dict.fromkeys((before, of_laws if of_laws is best else search.simplified(of_laws), best))
         outcome, sections = _moving([told(one) for one in accounts], body, legs)
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples

@@ -76,7 +76,6 @@ class Model:
     """(2, J) s, input and output"""
     delay_groups: Groups  # (J,)
     applied: tuple[Applied, ...] = ()
-    gains_held: bool = False
 
     @property
     def signals(self) -> Signals:
@@ -284,7 +283,7 @@ def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[fl
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
     known = model.samples.commanded and not model.samples.logs[0].undamped
     for groups in model.gain_groups:
-        yield groups, everywhere & (not model.gains_held), (0.0, _MOST_GAIN if known else 1e6), SLOPE
+        yield groups, everywhere, (0.0, _MOST_GAIN if known else 1e6), SLOPE
     for one in model.applied:
         for parameter in one.law.parameters:
             yield one.groups, one.active, (parameter.low, parameter.high), SLOPE * parameter.scale

@@ -54,22 +54,12 @@ class Legs:
     @classmethod
     def of(cls, robot: str, joints: Sequence[str]) -> Legs:
         """robot: `aliengo`, `go2`, or a file, MJCF or URDF, that holds `joints`. Raises ValueError, OSError."""
-        if robot == "aliengo":
-            return cls(mjcf.load_model(), tuple(joints))
-        shipped = _SHIPPED / f"{robot}.xml"
-        path = shipped if shipped.is_file() else Path(robot)
-        if not path.is_file():
-            names = ", ".join(["aliengo", *(one.stem for one in sorted(_SHIPPED.glob("*.xml")))])
-            raise FileNotFoundError(f"--robot: found {robot}, expected {names} or an MJCF or URDF file")
-        try:
-            model = mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
-            raise ValueError(f"{path}: no MJCF or URDF that MuJoCo reads: {error}") from None
+        model = mjcf.load_model() if robot == "aliengo" else _loaded(robot)
         known = {model.joint(k).name for k in range(model.njnt)}
         for name in joints:
             if name not in known:
                 raise ValueError(
-                    f"{path}: joint '{name}' of the log is missing, found {', '.join(sorted(known))}"
+                    f"--robot {robot}: joint '{name}' of the log is missing, found {', '.join(sorted(known))}"
                 )
         return cls(model, tuple(joints))
 
@@ -104,6 +94,19 @@ class Legs:
                 f"{logs[0].name}: no {1e3 * STRETCH:.0f} ms in a row are to be replayed, expected longer blocks"
             )
         return {"stretches": sum(one[0].shape[1] for one in found), **_sizes(found)}
+
+
+def _loaded(robot: str) -> mujoco.MjModel:
+    """The model of a shipped description, or of a file."""
+    shipped = _SHIPPED / f"{robot}.xml"
+    path = shipped if shipped.is_file() else Path(robot)
+    if not path.is_file():
+        names = ", ".join(["aliengo", *(one.stem for one in sorted(_SHIPPED.glob("*.xml")))])
+        raise FileNotFoundError(f"--robot: found {robot}, expected {names} or an MJCF or URDF file")
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(f"{path}: no MJCF or URDF that MuJoCo reads: {error}") from None
 
 
 def stretches(log: Log, rows: Bools) -> Array:

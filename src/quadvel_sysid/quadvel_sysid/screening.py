@@ -17,6 +17,7 @@ import numpy as np
 from quadvel_actuator.effects import EffectLaw, Stage
 
 from .criterion import PER_PARAMETER
+from .fit import RIDGE
 from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
 from .signals import Array, Samples, scattered
@@ -210,7 +211,7 @@ class _Spot:
         joints, size = columns.shape[1:3]
         cc = columns @ columns.swapaxes(-1, -2)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
-        ridge = 1e-8 * np.eye(size) if penalty is None else 1e-4 * penalty
+        ridge = 1e-8 * np.eye(size) if penalty is None else RIDGE * penalty
         cc = cc + ridge * scale + 1e-12 * np.eye(size)
         cr = np.einsum("sjln,jn->sjl", columns, self.left)
         cs = np.einsum("sjln,jkn->sjlk", columns, self.shared)

@@ -40,34 +40,33 @@ class Search:
         self._tried = 1
         self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         self._known: dict[tuple[object, ...], Candidates] = {}
-        self.of_laws: Account | None = None
-        """the best account without terms that came up"""
 
-    def best(self, start: Model) -> Account:
-        """The account of the data with the least criterion.
+    def best(self, start: Model) -> tuple[Account, Account]:
+        """The account of the data with the least criterion, and the best one without terms.
 
         Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these
         laws leave more than noise, terms alone come into question; and where those do so, too, or cost more, further laws,
         and terms on top of the laws.
         """
-        self.of_laws = plain = self.judge.profiled(self.judge.fitted(start))
+        plain = self.judge.profiled(self.judge.fitted(start))
         if plain.white:
-            return plain
-        self.of_laws = laws = self.run(plain, LAWS, most=1)
+            return plain, plain
+        laws = self.run(plain, LAWS, most=1)
         if laws.white:
-            return self.simplified(laws)
+            laws = self.simplified(laws)
+            return laws, laws
         terms = self.run(plain, TERMS, most=1)
-        self.of_laws = laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
+        laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
         if not laws.white:
             terms = self.run(terms, TERMS)
         accounts = [terms]
         if laws.white or not terms.white or laws.criterion < terms.criterion:
-            self.of_laws = laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
+            laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
             accounts += [laws, self.merged(laws)]
             accounts += [] if laws.white else [self.run(laws, TERMS)]
         least = min(one.criterion for one in accounts)
         alike = [one for one in accounts if one.criterion < least + TIE * len(self.judge.noise)]
-        return self.simplified(min(alike, key=_terms))
+        return self.simplified(min(alike, key=_terms)), laws
 
     def leaning(self, account: Account) -> tuple[str, ...]:
         """The signals that what is left goes with most, whether or not a term of them would pay."""
@@ -175,7 +174,7 @@ class Search:
         found = []
         for groups in groupings(joints):
             finer = len(np.unique(groups))
-            if not model.gains_held and finer > len(np.unique(model.gain_groups[0])):
+            if finer > len(np.unique(model.gain_groups[0])):
                 found.append(attrs.evolve(model, gain_groups=np.array([groups, groups])))
             if finer > len(np.unique(model.delay_groups)):
                 found.append(attrs.evolve(model, delay_groups=groups))
@@ -274,7 +273,7 @@ def _described(model: Model) -> tuple[object, ...]:
         (one.law.name, str(one.law.settings), one.active.tobytes(), one.groups.tobytes())
         for one in model.applied
     ]
-    return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes(), model.gains_held)
+    return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes())
 
 
 def _shared(values: Array) -> Array:
