@@ -1,9 +1,9 @@
 """Stage 3 without a clock: constrained reinforcement learning of the paper's plain network at 200 Hz (Section 3.3).
 
-Starts from the student of `dagger`, whose teacher pulls it back at first: what an action costs shows at once, what it gains only
-after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and one for the
-error over a stride: steady errors are the policy's own to remove. Exploration is correlated in time, as soft gains filter white
-noise away at 200 Hz.
+Starts from the student of `dagger`, whose teacher pulls it back at first: what an action costs shows at once, what it gains
+only after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and fines
+for the error over a stride and for the one that lasts: steady errors are the policy's own to remove. Exploration is
+correlated in time, as soft gains filter white noise away at 200 Hz.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from .ppo import GENTLE, Ppo, PpoConfig, Rollout
 from .privileged import ACTION_BOUND, Judgement, velocity_error
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
+from .walking_rewards import sizes
 
 CRITIC_EXTRA = privileged.CRITIC_EXTRA + 12 + 12  # and torques, exploration under way
 
@@ -186,10 +187,9 @@ class ConstrainedRun:
                 env.tick(self.map.targets(action))
             with self.shares.of("sensing"):
                 self.teacher.advance(command, action.clip(-ACTION_BOUND, ACTION_BOUND))
-                astray, lasting = (
-                    np.hypot(e[:, 0], e[:, 1]) + np.abs(e[:, 2]) for e in (past.stride, past.lasting)
-                )
-                reward = self.rewards(action) - c.stride * astray - c.lasting * lasting
+                reward = self.rewards(action)
+                for weight, error in ((c.stride, past.stride), (c.lasting, past.lasting)):
+                    reward -= weight * sum(sizes(error))
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
             row = (obs, critic_obs, action, mean, label, reward, fell, late, alive.copy())
@@ -210,11 +210,11 @@ class ConstrainedRun:
 
     def _figures(self, rows: dict[str, torch.Tensor], alive: np.ndarray) -> dict[str, float]:
         """Errors over a stride of robots that are up (m/s, rad/s), falls a robot-minute."""
-        stride = self.teacher.past.stride[alive]
+        xy, wz = sizes(self.teacher.past.stride[alive])
         return {
             "reward": float(rows["reward"].mean()),
-            "error_xy": float(np.hypot(stride[:, 0], stride[:, 1]).mean()),
-            "error_wz": float(np.abs(stride[:, 2]).mean()),
+            "error_xy": float(xy.mean()),
+            "error_wz": float(wz.mean()),
             "falls_per_minute": float(60 * rows["ended"].sum() / (self.config.length * self.config.n * TICK)),
         }
 

@@ -30,6 +30,7 @@ from .onnx_file import commit, export
 from .ppo import FAR
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
 from .randomisation import Randomisation, actuator
+from .walking_rewards import sizes
 
 AGO = 4  # ticks between the teacher's actions as it learned them
 SPREAD = 3
@@ -220,8 +221,7 @@ class DaggerRun:
         for name, driver in (("student", self.driven), ("teacher", ~self.driven)):
             up, minutes = driver & alive, driver.sum() * self.config.length * TICK / 60
             if up.any():
-                seen[f"{name}_xy"] = float(np.hypot(error[up, 0], error[up, 1]).mean())
-                seen[f"{name}_wz"] = float(np.abs(error[up, 2]).mean())
+                seen[f"{name}_xy"], seen[f"{name}_wz"] = (float(size.mean()) for size in sizes(error[up]))
                 seen[f"{name}_falls"] = float((fell & driver).sum() / minutes)
         return seen
 

@@ -25,7 +25,7 @@ from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout
 from .randomisation import Randomisation, actuator
-from .walking_rewards import SAMPLE, WalkingRewards, WalkingWeights
+from .walking_rewards import SAMPLE, WalkingRewards, WalkingWeights, sizes
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 ACTION_BOUND = 4.0  # of the network's unit
@@ -174,7 +174,7 @@ class Judgement:
         judged = np.maximum(self._age[ids] - TRANSIENT, 0.0)
         mean = self._sum[ids] / np.maximum(judged, 1e-6)[:, None]
         self._sum[ids], self._age[ids] = 0.0, 0.0
-        return np.stack([np.hypot(mean[:, 0], mean[:, 1]), np.abs(mean[:, 2])], axis=1), judged
+        return np.stack(sizes(mean), axis=1), judged
 
     def tell(self, grid: CommandGrid, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
         """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
@@ -293,8 +293,7 @@ class PrivilegedRun:
                 keep[name].append(value)
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
-            stride = self.past.stride
-            errors = np.hypot(stride[:, 0], stride[:, 1]).mean(), np.abs(stride[:, 2]).mean()
+            errors = [size.mean() for size in sizes(self.past.stride)]
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
             self.judgement.tell(self.grid, command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))

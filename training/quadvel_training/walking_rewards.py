@@ -21,6 +21,11 @@ LIFT = 0.06  # m, clearance wanted in swing
 LONG_DOWN = 0.4  # s: a foot that is down for longer while walking is being dragged along
 
 
+def sizes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Of velocity errors (n, 3) those in xy (n,), m/s, and in yaw (n,), rad/s."""
+    return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
+
+
 class Past(Protocol):
     """What `privileged.Past` keeps."""
 
@@ -99,9 +104,8 @@ class WalkingRewards:
         xy = np.sum((command[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
         wz = (command[:, 2] - env.angular_velocity[:, 2]) ** 2
         speed, turn = np.hypot(command[:, 0], command[:, 1]), np.abs(command[:, 2])
-        (stride_xy, stride_wz), (lasting_xy, lasting_wz) = (
-            (np.hypot(e[:, 0], e[:, 1]), np.abs(e[:, 2])) for e in (past.stride, past.lasting)
-        )
+        stride_xy, stride_wz = sizes(past.stride)
+        lasting_xy, lasting_wz = sizes(past.lasting)
         return {
             "linear": w.linear * np.exp(-xy / (0.25 * (1 + 0.5 * speed)))
             + w.linear_narrow * np.exp(-xy / 0.04),
