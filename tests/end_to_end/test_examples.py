@@ -115,17 +115,13 @@ LEFT_OUT = {
     "quadvel twin my_plant.yaml": "the same with a plant of the user's",
     "quadvel eval --grid quick --out out/eval": "minutes; tests/quadvel_eval/test_grid.py runs some of its walks",
     "quadvel eval --grid quick --policy NETWORK.onnx --out out/eval": "the same",
-    "quadvel eval --grid quick --policy out/training/constrained/policy.onnx --out out/eval": "the same",
     "quadvel bench --out out/bench.json": "minutes, and only of use on an idle machine",
     "quadvel paper --out docs/results/paper": "an hour; tests/quadvel_eval/test_paper_study.py runs parts of it",
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
-    "quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd.onnx "
-    "--policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx": "the same",
-    "quadvel paper --out docs/results/ablation --policy rl_pd=out/ablation/rl_pd.onnx "
-    "--policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx --only tracking --only jitter "
-    "--only symmetry --only gap --only robustness --only stance --only sustained": "the same",
-    "quadvel paper --out out/loop/gap --only gap --policy before=src/quadvel_policy/quadvel_policy/policies/aliengo.onnx "
-    "--policy after=out/loop/tuned/tuned.onnx": "the same",
+    "quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx "
+    "--policy rl_eam=out/ablation/rl_eam/policy.onnx --policy crl_eam=out/ablation/crl_eam/policy.onnx": "the same",
+    "quadvel paper --out out/loop/gap --only gap --policy before=src/quadvel_policy/quadvel_policy/policies/crl_eam.onnx "
+    "--policy after=out/loop/tuned/policy.onnx": "the same",
     "quadvel identify go2_walk_1.npz --holdout go2_walk_2.npz --gains 35 0.5 --robot go2 --out out/go2_1": "measured logs that "
     "are no part of this repository; tests/quadvel_sysid/test_measured.py takes them where they are",
     "quadvel identify go2_walk_2.npz --holdout go2_walk_1.npz --gains 35 0.5 --robot go2 --out out/go2_2": "the same",

@@ -1,4 +1,4 @@
-"""Stage 3 without a clock: the pull of the teacher and the constraints over the samples, resuming, the policy file."""
+"""Stage 3: the pull of the teacher and the constraints over the samples, resuming, the policy file."""
 
 from __future__ import annotations
 
@@ -36,12 +36,14 @@ def weights(run):
 def test_the_pull_fades_and_the_constraints_grow(files):
     run = ConstrainedRun(SMALL, *files)
     first = run.step(0.0)
+    assert first["away"] >= 0.0
     run.samples = 5_000
     later = run.step(0.5)
     run.samples = 20_000
     last = run.step(0.9)
     assert first["pull"] > later["pull"] > last["pull"] == 0.0
-    assert 0.0 < first["constraints"] < later["constraints"] < last["constraints"] == 1.0
+    assert run.teacher is None  # nobody asks it any more
+    assert 0.0 <= first["constraints"] < later["constraints"] < last["constraints"] == 1.0
     assert all(np.isfinite(value) for seen in (first, later, last) for value in seen.values())
 
 
@@ -64,6 +66,29 @@ def test_it_starts_as_its_student_and_goes_on_from_a_checkpoint(files, tmp_path)
     again.restore(loop.load(tmp_path / "constrained.pt"))
     assert torch.equal(weights(again), weights(run))
     assert (again.samples, again.updates) == (run.samples, run.updates)
+
+
+def test_exploration_shrinks(files):
+    run = ConstrainedRun(attrs.evolve(SMALL, std=0.08, final_std=0.02, std_samples=1e4), *files)
+    spread = []
+    for samples in (0, 5_000, 20_000):
+        run.samples = samples
+        run.step(0.0)
+        spread.append(float(run.actor.log_std.exp().mean()))
+    assert spread == pytest.approx([0.08, 0.05, 0.02])
+
+
+def test_a_start_of_its_own_brings_its_critic_and_needs_no_teacher(files, tmp_path):
+    run = ConstrainedRun(SMALL, *files)
+    run.step(0.0)
+    loop.save(run.state(), tmp_path / "constrained.pt")
+    tuned = ConstrainedRun(SMALL, tmp_path / "constrained.pt")
+    assert torch.equal(weights(tuned), weights(run))
+    for one, two in zip(run.critic.parameters(), tuned.critic.parameters(), strict=True):
+        assert torch.equal(one, two)
+    assert "away" not in tuned.step(0.0)
+    with pytest.raises(loop.CheckpointError, match=r"privileged[.]pt: expected .* `dagger`"):
+        ConstrainedRun(SMALL, files[1])
 
 
 def test_the_policy_file_answers_as_the_network_does(files, tmp_path):

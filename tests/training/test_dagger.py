@@ -8,6 +8,7 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
+from quadvel_policy.observation import CommandLimits  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
 from quadvel_training import dagger, loop  # noqa: E402
 from quadvel_training.dagger import DaggerConfig, DaggerRun  # noqa: E402
@@ -33,7 +34,7 @@ def run(teacher_file):
 
 
 def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
-    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+    dagger.export_policy(run.student, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
     model = onnx.load(tmp_path / "policy.onnx")
     assert len(model.graph.node) <= 40
     sizes = {x.name: [d.dim_value for d in x.type.tensor_type.shape.dim] for x in model.graph.input}
@@ -44,7 +45,7 @@ def test_the_file_is_the_papers_network_and_nothing_else(run, tmp_path):
 
 
 def test_the_file_does_what_the_network_does(run, tmp_path):
-    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+    dagger.export_policy(run.student, run.env, run.grid.config.answered, tmp_path / "policy.onnx", {})
     policy = PolicyFile(tmp_path / "policy.onnx")
     obs = np.random.default_rng(0).normal(size=(50, 48)).astype(np.float32)
     with torch.no_grad():
@@ -53,19 +54,23 @@ def test_the_file_does_what_the_network_does(run, tmp_path):
     assert np.abs(found - expected[:, 0].numpy()).max() < 1e-4
 
 
-def test_the_file_answers_the_commands_that_its_teacher_followed(run, tmp_path):
-    dagger.export_policy(run.student, run.env, run.grid, tmp_path / "policy.onnx", {})
+def test_the_file_says_which_commands_it_answers_and_how_to_run_it(run, tmp_path):
+    limits = CommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
+    dagger.export_policy(run.student, run.env, limits, tmp_path / "policy.onnx", {})
     metadata = PolicyFile(tmp_path / "policy.onnx").metadata
-    assert metadata.command_limits["vx"] == (0.0, 2.0)
-    assert metadata.command_limits["wz"] == pytest.approx((-0.7, 0.7))
-    assert metadata.curve_limit == 4.0
+    assert metadata.limits == limits
+    assert np.allclose(metadata.action_offset, run.env.stand_q)
+    assert metadata.kp == (30.0,) * 12
+    assert metadata.kd == (0.5,) * 12
+    assert metadata.rate_hz == 200.0
+    assert metadata.actuator["delta_kp"] == pytest.approx(-0.706)
 
 
 def test_the_teacher_knows_what_was_done_20_ms_ago(run):
     teacher, seen = run.teacher, []
     for i in range(6):
         seen.append(teacher._executed[0][0, 0])
-        teacher.advance(run.env.command, np.full((8, 12), i, np.float32))
+        teacher.advance(np.full((8, 12), i, np.float32))
     assert seen == [0, 0, 0, 0, 0, 1]
     assert PrivilegedConfig().period == dagger.AGO * dagger.TICK
 

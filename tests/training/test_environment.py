@@ -1,4 +1,4 @@
-"""The training environment, its rewards and the teacher's parts."""
+"""The training environment, its rewards, and how runs go on."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
-from quadvel_training import gait, loop, teacher  # noqa: E402
-from quadvel_training.crl import PARTS, CrlConfig, CrlRun  # noqa: E402
-from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput  # noqa: E402
+from quadvel_training import loop  # noqa: E402
+from quadvel_training.constrained import PARTS, ConstrainedConfig, ConstrainedRun  # noqa: E402
+from quadvel_training.env import RAMP_AXES, RAMP_DOWN, TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
 
@@ -20,16 +21,10 @@ STANDING = CommandRange(stance=1.0, hold=(100.0, 100.0))
 QUIET = EnvConfig(n=4, threads=1, seed=3, randomisation=Randomisation.none(), commands=STANDING)
 
 
-def test_the_gait_stands_still_on_command():
-    env = VelocityEnv(QUIET)
-    walker = teacher.GaitState(env)
-    for _ in range(300):
-        env.tick(walker.targets())
-        walker.advance()
-    assert not env.fallen.any()
-    assert np.abs(env.velocity).max() < 0.05
-    assert np.abs(env.height - gait.HEIGHT).max() < 0.03
-    assert env.contact.all()
+def stand(env):
+    """A tick in which stiff joints hold the standing posture."""
+    gains = np.ones((env.config.n, 12))
+    env.tick(np.tile(robot.NOMINAL_Q, (env.config.n, 1)), kp=150.0 * gains, kd=5.0 * gains)
 
 
 def test_targets_beyond_the_range_push_as_the_whole_target_would():
@@ -66,12 +61,36 @@ def test_commands_of_the_ellipsoid_lie_in_it():
     assert (drawn[drawn[:, 3] == 1, :3] == 0).all()
 
 
+def test_led_commands_go_the_way_that_the_command_mux_leads_them():
+    env, grow, time = VelocityEnv(QUIET), 2.0 * RAMP_AXES, 0.0
+    config = MuxConfig(
+        acceleration=tuple(grow), stop_acceleration=tuple(RAMP_DOWN * grow), dead_zone=(1e-9,) * 3
+    )
+    mux = CommandMux([MuxInput("planner", priority=0, timeout=9.0)], config)
+    mux.update(time)
+    env._ramp[:] = 2.0
+    for goal in ([1.5, -0.4, 2.0, 0.0], [0.2, 0.133, 0.0, 0.0], [-0.3, 0.133, 0.4, 0.0], [0.0, 0.0, 0.0, 1.0]):
+        env._goal[:] = goal
+        for _ in range(round(1.0 / TICK)):
+            stand(env)
+            time += TICK
+            mux.receive("planner", time, goal[:3])
+            wanted = mux.update(time)
+            np.testing.assert_allclose(env.command[2], [*wanted.velocity, wanted.stance], atol=1e-9)
+        assert env.command[2].tolist() == goal
+
+
+def test_a_share_of_the_commands_is_led_and_the_others_come_at_once():
+    env = VelocityEnv(attrs.evolve(QUIET, n=400, ramped=0.3, commands=CommandRange(stance=0.0)))
+    assert np.mean((env.command == env._goal).all(axis=1)) == pytest.approx(0.7, abs=0.1)
+    assert (env.command[:, 3] == 0.0).all()
+
+
 def test_acceleration_at_rest_is_gravity_upwards():
     env = VelocityEnv(QUIET)
-    seen, walker = [], teacher.GaitState(env)
+    seen = []
     for _ in range(400):
-        env.tick(walker.targets())
-        walker.advance()
+        stand(env)
         seen.append(env.acceleration)
     assert np.mean(seen[200:], axis=(0, 1)) == pytest.approx([0.0, 0.0, robot.GRAVITY], abs=0.15)
 
@@ -155,14 +174,14 @@ def test_a_run_resumes_where_its_checkpoint_stands(tmp_path):
 
 
 def test_a_resumed_run_of_stage_3_draws_on_where_it_was_saved(tmp_path):
-    config = CrlConfig(n=3, length=3, threads=1, critic_first=0)
-    first = CrlRun(config)
+    config = ConstrainedConfig(n=3, length=3, threads=1, critic_first=0)
+    first = ConstrainedRun(config)
     seen = first.step(0.0)
     assert sum(seen[part] for part in PARTS) == pytest.approx(1.0)
-    loop.save(first.state(), tmp_path / "crl.pt")
+    loop.save(first.state(), tmp_path / "constrained.pt")
     expected = first.env.rng.random(), torch.rand(1)
-    second = CrlRun(config)
-    second.restore(loop.load(tmp_path / "crl.pt"))
+    second = ConstrainedRun(config)
+    second.restore(loop.load(tmp_path / "constrained.pt"))
     assert (second.env.rng.random(), torch.rand(1)) == expected
     assert second.samples == 9
 

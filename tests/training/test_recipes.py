@@ -9,16 +9,20 @@ import pytest
 pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
 from quadvel_actuator import ActuatorModel
-from quadvel_training import loop, recipe, stage3
-from quadvel_training.crl import CrlConfig
+from quadvel_estimator.learned import LearnedEstimator
+from quadvel_policy.policy_file import PolicyFile
+from quadvel_training import loop, recipe, stages
+from quadvel_training.constrained import ConstrainedConfig
 from quadvel_training.dagger import DaggerConfig
+from quadvel_training.estimator import EstimatorConfig
+from quadvel_training.loop import Budget
 from quadvel_training.privileged import PrivilegedConfig
 from quadvel_training.randomisation import actuator, sample_actuators
 
 
 @pytest.fixture
 def ablation():
-    return {name: recipe.read(CrlConfig, stage3.RECIPES / f"{name}.yaml") for name in stage3.ABLATION}
+    return {name: recipe.read(ConstrainedConfig, stages.RECIPES / f"{name}.yaml") for name in stages.ABLATION}
 
 
 def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
@@ -48,12 +52,13 @@ def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
         ("privileged_rough", PrivilegedConfig),
         ("privileged_last", PrivilegedConfig),
         ("dagger", DaggerConfig),
+        ("crl_eam", ConstrainedConfig),
     ],
 )
-def test_the_recipes_without_a_clock_share_robots_and_commands(name, kind):
-    config = recipe.read(kind, stage3.RECIPES / f"{name}.yaml")
+def test_the_stages_share_robots_and_commands(name, kind):
+    config = recipe.read(kind, stages.RECIPES / f"{name}.yaml")
     assert config.randomisation.payload == (-2.0, 5.0)
-    assert config.grid == recipe.read(PrivilegedConfig, stage3.RECIPES / "privileged.yaml").grid
+    assert config.grid == recipe.read(PrivilegedConfig, stages.RECIPES / "privileged.yaml").grid
 
 
 def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):
@@ -85,24 +90,43 @@ def test_a_recipe_with_a_mistake_is_refused_by_file_and_field(tmp_path, text, co
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(recipe.RecipeError, match=rf"mine[.]yaml: .*{complaint}"):
-        recipe.read(CrlConfig, path)
+        recipe.read(ConstrainedConfig, path)
+
+
+def small(monkeypatch):
+    """Every stage takes a few robots and samples, whatever its recipe says."""
+    read, few = recipe.read, {"n": 4, "length": 4, "budget": Budget(40, 5.0)}
+
+    def read_small(kind, source):
+        config = read(kind, source)
+        fields = few | ({"keep": 1e9} if hasattr(config, "keep") else {})
+        fields |= {"mini_batches": 2} if kind is EstimatorConfig else {}
+        return attrs.evolve(config, **fields)
+
+    monkeypatch.setattr(recipe, "read", read_small)
+
+
+def test_all_stages_follow_each_other_and_what_is_done_is_not_done_again(tmp_path, monkeypatch):
+    small(monkeypatch)
+    assert stages.everything(tmp_path, "cpu")
+    assert PolicyFile(tmp_path / "constrained" / stages.POLICY_FILE).metadata.recipe["samples"] >= 40
+    LearnedEstimator(tmp_path / "estimator" / stages.ESTIMATOR_FILE)
+    kept = {path: loop.load(path)["samples"] for path in tmp_path.glob("*/*.pt")}
+    assert len(kept) == 4
+    assert stages.everything(tmp_path, "cpu")
+    assert {path: loop.load(path)["samples"] for path in kept} == kept
 
 
 def test_the_ablation_gives_every_recipe_the_same_and_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
     runs, stop_after = [], 2
 
-    def learn(config, source, start, folder, device):
-        runs.append((source.stem, start.name, config.budget.samples))
-        loop.save({"samples": config.budget.samples}, folder / stage3.CHECKPOINT)
+    def train(config, source, start, teacher, folder, device):
+        runs.append((source.stem, start.name, teacher.name, config.budget.samples, folder.name))
         return len(runs) != stop_after
 
-    monkeypatch.setattr(stage3, "learn", learn)
-    monkeypatch.setattr(stage3, "export", lambda config, source, checkpoint, out: out.touch())
-    start = tmp_path / "start.pt"
-    assert not stage3.ablation(start, 100.0, tmp_path, "cpu")
-    assert stage3.ablation(start, 100.0, tmp_path, "cpu")
-    order = ["rl_pd", "rl_eam", "rl_eam", "crl_eam"]
-    assert runs == [(name, "start.pt", 100.0) for name in order]
-    assert all((tmp_path / f"{name}.onnx").exists() for name in order)
-    assert stage3.ablation(start, 100.0, tmp_path, "cpu")
-    assert len(runs) == len(order)
+    monkeypatch.setattr(stages, "train_policy", train)
+    start, teacher = tmp_path / "start.pt", tmp_path / "teacher.pt"
+    assert not stages.ablation(start, teacher, 100.0, tmp_path, "cpu")
+    assert stages.ablation(start, teacher, 100.0, tmp_path, "cpu")
+    order = ["rl_pd", "rl_eam", "rl_pd", "rl_eam", "crl_eam"]
+    assert runs == [(name, "start.pt", "teacher.pt", 100.0, name) for name in order]

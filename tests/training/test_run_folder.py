@@ -12,9 +12,10 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_actuator import ActuatorParameters, Effect  # noqa: E402
 from quadvel_description.robot import JOINT_NAMES  # noqa: E402
 from quadvel_policy.policy_file import PolicyFile  # noqa: E402
-from quadvel_training import loop, run_folder, stage3, student  # noqa: E402
-from quadvel_training.crl import CrlConfig  # noqa: E402
+from quadvel_training import loop, run_folder, stages  # noqa: E402
+from quadvel_training.constrained import ConstrainedConfig  # noqa: E402
 from quadvel_training.loop import Budget  # noqa: E402
+from quadvel_training.networks import Recurrent  # noqa: E402
 
 
 @pytest.fixture
@@ -32,12 +33,14 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     setups = []
     monkeypatch.setattr(run_folder, "_evaluate", lambda setup: setups.append(setup) or figures)
     start, folder = tmp_path / "start.pt", tmp_path / "run"
-    loop.save({"student": student.Policy().state_dict(), "samples": 7}, start)
-    config = CrlConfig(n=2, length=3, threads=1, keep=10, actuator=str(drives), budget=Budget(15, 1.0))
-    assert stage3.learn(config, tmp_path / "mine.yaml", start, folder, "cpu")
+    loop.save({"student": Recurrent(48, 12).state_dict(), "samples": 7}, start)
+    config = ConstrainedConfig(
+        n=2, length=3, threads=1, keep=10, actuator=str(drives), budget=Budget(15, 1.0)
+    )
+    assert stages.train_policy(config, tmp_path / "mine.yaml", start, None, folder, "cpu")
 
     about = json.loads((folder / "run.json").read_text())
-    assert (about["stage"], about["recipe"], about["configuration"]["n"]) == ("crl", "mine", 2)
+    assert (about["stage"], about["recipe"], about["configuration"]["n"]) == ("constrained", "mine", 2)
     assert about["commit"]
     kept = sorted(path.name for path in (folder / "kept").iterdir())
     assert kept == [f"000000k.{suffix}" for suffix in ("json", "onnx", "pt")]
@@ -46,7 +49,7 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     assert PolicyFile(folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"] == "coulomb_friction"
     assert loop.load(folder / "kept" / kept[2])["samples"] == 12
 
-    made_of = run_folder.made_of("crl", None, config, folder / stage3.CHECKPOINT)
+    made_of = run_folder.made_of("constrained", None, config, folder / stages.POLICY)
     assert made_of["samples"] == 18
     assert made_of["hours"] >= 0.0
     assert made_of["configuration"]["actuator"] == drives.name  # in a file that goes elsewhere

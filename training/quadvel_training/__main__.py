@@ -17,27 +17,24 @@ from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import (
     constrained,
-    crl,
     dagger,
-    distill,
     env,
     estimator,
     kalman_tuning,
     leg_classifier,
     loop,
-    parallel,
     privileged,
     recipe,
     run_folder,
-    stage3,
-    teacher,
+    stages,
 )
 from .card import card
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Train quadvel's policy and estimator. The order: teacher, distill, crl, export, estimator, card; `ablation` and `tune` "
-    "run stage 3 with recipes of their own. Every run resumes where its directory stands; Ctrl-C saves.",
+    help="Train quadvel's policy and estimator. `all` runs the stages one after the other: privileged, dagger, constrained, "
+    "estimator; `ablation` and `tune` run the last but one with recipes of their own. Every run resumes where its directory "
+    "stands; Ctrl-C saves.",
 )
 
 Out = Annotated[
@@ -51,7 +48,15 @@ Recipe = Annotated[
 ]
 Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
 Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
-START = Path("training/checkpoints/student.pt")
+TEACHER = Path("out/training/privileged/privileged.pt")
+STUDENT = Path("out/training/dagger/dagger.pt")
+POLICY = Path("out/training/constrained/constrained.pt")
+TeacherFile = Annotated[
+    Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.", dir_okay=False)
+]
+PolicyCheckpoint = Annotated[
+    Path, typer.Option("--policy", help="Checkpoint of the policy, of `constrained` or `dagger`.")
+]
 
 
 def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> Any:
@@ -62,135 +67,68 @@ def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> 
     return config
 
 
-@app.command("teacher")
-def train_teacher(
-    out: Out = Path("out/training/teacher"), source: Recipe = None, minutes: Minutes = None
-) -> None:
-    """Stage 1: the teacher with a clock and the true state."""
-    config = _configured(teacher.TeacherConfig, source, minutes)
-    run_folder.describe(out, "teacher", source, config)
-    loop.train(teacher.TeacherRun(config), config.budget, out / "teacher.pt")
+@app.command("all")
+def train_everything(out: Out = Path("out/training"), device: Device = "cpu") -> None:
+    """From random weights to policy and estimator: every stage with its recipe, in folders of DIR; days of two cores.
+
+    Ends with DIR/constrained/policy.onnx and DIR/estimator/estimator.onnx. Goes on where it was stopped.
+    """
+    if not stages.everything(out, device):
+        raise typer.Exit(1)
+    print(f"written: {out}/constrained/{stages.POLICY_FILE}, {out}/estimator/{stages.ESTIMATOR_FILE}")
 
 
 @app.command("privileged")
 def train_privileged(
     out: Out = Path("out/training/privileged"), source: Recipe = None, minutes: Minutes = None
 ) -> None:
-    """Stage 1 without a clock: a memoryless teacher finds its gait from random weights, by rewards alone.
+    """Stage 1: a memoryless teacher finds its gait from random weights, by rewards alone.
 
     Numbered checkpoints go to DIR/kept; any of them, copied to DIR/privileged.pt, is where the same command goes on from.
     """
-    config = _configured(privileged.PrivilegedConfig, source, minutes)
-    run_folder.describe(out, "privileged", source, config)
-    run = privileged.PrivilegedRun(config)
-    loop.train(run, config.budget, out / "privileged.pt", privileged.Numbered(run, out))
+    stages.train_teacher(_configured(privileged.PrivilegedConfig, source, minutes), source, out)
 
 
 @app.command("dagger")
 def train_dagger(
-    teacher_file: Annotated[
-        Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.")
-    ] = Path("out/training/privileged/privileged.pt"),
+    teacher: TeacherFile = TEACHER,
     out: Out = Path("out/training/dagger"),
     source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
-    """Stage 2 without a clock: the paper's plain network learns from that teacher while it drives itself.
+    """Stage 2: the paper's network learns from that teacher while it drives itself.
 
     Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
     """
-    config = _configured(dagger.DaggerConfig, source, minutes)
-    run_folder.describe(out, "dagger", source, config)
-    run = dagger.DaggerRun(config, teacher_file)
-    checkpoint = out / "dagger.pt"
-    loop.train(run, config.budget, checkpoint)
-    about = run_folder.made_of("dagger", source, config, checkpoint)
-    dagger.export_policy(run.student, run.env, run.grid, out / "policy.onnx", about)
-    print(f"written: {out / 'policy.onnx'}")
+    stages.train_student(_configured(dagger.DaggerConfig, source, minutes), source, teacher, out)
+    print(f"written: {out / stages.POLICY_FILE}")
 
 
 @app.command("constrained")
 def train_constrained(
-    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger`.")] = Path(
-        "out/training/dagger/dagger.pt"
-    ),
-    teacher_file: Annotated[
-        Path, typer.Option("--teacher", help="Checkpoint of `privileged`, which pulls at first.")
-    ] = Path("out/training/privileged/privileged.pt"),
+    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger`.")] = STUDENT,
+    teacher: TeacherFile = TEACHER,
     out: Out = Path("out/training/constrained"),
     source: Recipe = None,
     minutes: Minutes = None,
     device: Device = "cpu",
 ) -> None:
-    """Stage 3 without a clock: constrained reinforcement learning of the plain network, from the student of `dagger`.
+    """Stage 3: constrained reinforcement learning of that network, pulled by the teacher at first.
 
+    \b
     Writes DIR/policy.onnx; on the way, policies and what a quick evaluation says of them go to DIR/kept.
+    With torchrun, several processes or machines learn together:
+      torchrun --nproc-per-node 2 -m -- quadvel_training constrained ...
     """
     config = _configured(constrained.ConstrainedConfig, source, minutes)
-    run = constrained.ConstrainedRun(config, start, teacher_file, device)
-    checkpoint = out / "constrained.pt"
-    if parallel.rank() == 0:
-        run_folder.describe(out, "constrained", source, config)
-    loop.train(run, config.budget, checkpoint, run_folder.Evaluated(run, out))
-    if parallel.rank() == 0:
-        run.write_policy(out / "policy.onnx", run_folder.made_of("constrained", source, config, checkpoint))
-        print(f"written: {out / 'policy.onnx'}")
-
-
-@app.command("distill")
-def train_student(
-    teacher_file: Annotated[Path, typer.Option("--teacher")] = Path("out/training/teacher/teacher.pt"),
-    start: Annotated[Path | None, typer.Option(help="Checkpoint of a student to refine.")] = None,
-    out: Out = Path("out/training/student"),
-    source: Recipe = None,
-    minutes: Minutes = None,
-) -> None:
-    """Stage 2: the recurrent student learns from the teacher."""
-    config = _configured(distill.DistillConfig, source, minutes)
-    run_folder.describe(out, "distill", source, config)
-    run = distill.DistillRun(config, teacher_file, stage3.policy_of(start) if start else None)
-    checkpoint = out / "student.pt"
-    loop.train(run, config.budget, checkpoint)
-    stage3.export_student(config, source, checkpoint, out / "policy.onnx")
-
-
-@app.command("crl")
-def train_crl(
-    start: Annotated[
-        Path | None, typer.Option(help="Checkpoint of a student; without it, random weights.")
-    ] = None,
-    out: Out = Path("out/training/crl"),
-    source: Recipe = None,
-    minutes: Minutes = None,
-    device: Device = "cpu",
-) -> None:
-    """Stage 3: constrained reinforcement learning with the rewards of Table 2.
-
-    With torchrun, several processes or machines learn together: torchrun --nproc-per-node 2 -m -- quadvel_training crl ...
-    """
-    stage3.learn(_configured(crl.CrlConfig, source, minutes), source, start, out, device)
-
-
-@app.command("export")
-def export_policy(
-    checkpoint: Annotated[Path, typer.Argument(help="Of `distill` or `crl`.")],
-    out: Annotated[Path, typer.Option(help="The policy file to write.")] = Path("out/training/crl_eam.onnx"),
-    source: Recipe = None,
-) -> None:
-    """A policy file of a checkpoint, behind a command map that takes out its steady-state error.
-
-    The recipe is that of the checkpoint's stage: it says which commands the file answers.
-    """
-    if stage3.is_student(checkpoint):
-        stage3.export_student(recipe.read(distill.DistillConfig, source), source, checkpoint, out)
-    else:
-        stage3.export(recipe.read(crl.CrlConfig, source), source, checkpoint, out)
-    print(f"written: {out}")
+    stages.train_policy(config, source, start, teacher, out, device)
+    print(f"written: {out / stages.POLICY_FILE}")
 
 
 @app.command("ablation")
 def train_ablation(
-    start: Annotated[Path, typer.Option(help="Checkpoint that all three start from.")] = START,
+    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger` that all three start from.")] = STUDENT,
+    teacher: TeacherFile = TEACHER,
     samples: Annotated[float, typer.Option(help="Of each recipe, the budget that is equal for all.")] = 6e7,
     out: Annotated[Path, typer.Option(help="Folder for the runs and their policy files.")] = Path(
         "out/ablation"
@@ -201,12 +139,12 @@ def train_ablation(
 
     \b
     Then:
-      quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd.onnx \\
-        --policy rl_eam=out/ablation/rl_eam.onnx --policy crl_eam=out/ablation/crl_eam.onnx
+      quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx \\
+        --policy rl_eam=out/ablation/rl_eam/policy.onnx --policy crl_eam=out/ablation/crl_eam/policy.onnx
     """
-    if not stage3.ablation(start, samples, out, device):
+    if not stages.ablation(start, teacher, samples, out, device):
         raise typer.Exit(1)
-    print(f"written: {', '.join(f'{out}/{name}.onnx' for name in stage3.ABLATION)}")
+    print(f"written: {', '.join(f'{out}/{name}/{stages.POLICY_FILE}' for name in stages.ABLATION)}")
 
 
 def _actuator_file(path: Path) -> Path:
@@ -223,24 +161,20 @@ def tune_policy(
         Path,
         typer.Option(help="Actuator file of `quadvel identify`.", exists=True, callback=_actuator_file),
     ],
-    policy: Annotated[Path, typer.Option(help="Checkpoint to start from.", exists=True)] = START,
+    policy: PolicyCheckpoint = POLICY,
     minutes: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            help="How long; counts anew where it is resumed. 0: measure its command map, learn nothing.",
-        ),
+        float, typer.Option(min=0.1, help="How long; counts anew where it is resumed.")
     ] = 20.0,
     out: Out = Path("out/tuned"),
     device: Device = "cpu",
 ) -> None:
-    """Tune a policy on a corrected actuator model for a short while: DIR/tuned.onnx, with a command map of its own.
+    """Tune a policy on a corrected actuator model for a short while: DIR/policy.onnx.
 
     \b
     Before and after, on the plants of the gap:
-      quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/tuned.onnx
+      quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/policy.onnx
     """
-    print(f"written: {stage3.tune(actuator, policy, minutes, out, device)}")
+    print(f"written: {stages.tune(actuator, policy, minutes, out, device)}")
 
 
 @app.command("record")
@@ -261,32 +195,21 @@ def record_log(
 
 @app.command("estimator")
 def train_estimator(
-    policy: Annotated[Path, typer.Option(help="Checkpoint of the policy whose walks it learns on.")] = Path(
-        "out/training/student/student.pt"
-    ),
+    policy: PolicyCheckpoint = POLICY,
     out: Out = Path("out/training/estimator"),
     source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
-    """The linear-velocity estimator, on the policy's own walks."""
-    config = _configured(estimator.EstimatorConfig, source, minutes)
-    run_folder.describe(out, "estimator", source, config)
-    run = estimator.EstimatorRun(config, stage3.policy_of(policy))
-    checkpoint = out / "estimator.pt"
-    loop.train(run, config.budget, checkpoint)
-    run.export(out / "estimator.onnx", run_folder.made_of("estimator", source, config, checkpoint))
+    """The linear-velocity estimator, on the policy's own walks: DIR/estimator.onnx."""
+    stages.train_estimator(_configured(estimator.EstimatorConfig, source, minutes), source, policy, out)
+    print(f"written: {out / stages.ESTIMATOR_FILE}")
 
 
 @app.command("kalman")
-def tune_kalman(
-    policy: Annotated[Path, typer.Option(help="Checkpoint of the policy whose walks it is tuned on.")] = Path(
-        "out/training/student/student.pt"
-    ),
-    source: Recipe = None,
-) -> None:
+def tune_kalman(policy: PolicyCheckpoint = POLICY, source: Recipe = None) -> None:
     """Tune the Kalman filter's noise on the same kind of walks; prints what belongs into `KalmanConfig`."""
     config = recipe.read(kalman_tuning.TuningConfig, source)
-    recording = kalman_tuning.record(config, stage3.policy_of(policy))
+    recording = kalman_tuning.record(config, dagger.policy_of(policy))
     before = kalman_tuning.rmse(KalmanConfig(), recording)
     with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[error]}")) as progress:
         task = progress.add_task("kalman", total=config.evaluations, error="")
@@ -344,7 +267,7 @@ def main() -> None:
     torch.set_num_threads(env.cores())
     try:
         app()
-    except (recipe.RecipeError, FileNotFoundError) as error:
+    except (recipe.RecipeError, loop.CheckpointError, FileNotFoundError) as error:
         raise SystemExit(f"quadvel_training: {error}") from None
 
 

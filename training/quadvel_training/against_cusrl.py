@@ -19,9 +19,9 @@ import typer
 from quadvel_description import symmetry
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
-from . import student
-from .crl import PRIVILEGED, CrlConfig, CrlRun
-from .networks import Gaussian, Mlp, torch_mirror
+from . import constrained, dagger, networks
+from .constrained import ConstrainedConfig, ConstrainedRun
+from .networks import Gaussian, Mlp, Recurrent, torch_mirror
 from .ppo import Ppo, Rollout
 
 try:
@@ -30,18 +30,18 @@ except ModuleNotFoundError:
     raise SystemExit("This comparison needs cusrl: pip install cusrl==1.2.2") from None
 
 OBS = DEFAULT_OBSERVATION.size
-STATE = OBS + PRIVILEGED
+STATE = constrained.CRITIC
 CRITIC = (256, 128, 64)
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
 Jobs = tuple[Callable[[], object], Callable[[], object]]
 
 
 class OurLearner:
-    """Inference and update of `crl.CrlRun` on random observations without resets."""
+    """Inference and update of `ConstrainedRun` on random observations without resets."""
 
-    def __init__(self, config: CrlConfig) -> None:
+    def __init__(self, config: ConstrainedConfig) -> None:
         self.config = config
-        self.actor = Gaussian(student.Policy(), 12, config.std)
+        self.actor = Gaussian(Recurrent(OBS, 12), 12, config.std)
         self.actor.log_std.requires_grad_(False)
         self.ppo = Ppo(self.actor, Mlp(STATE, 1, CRITIC), config.ppo, MIRROR_OBS, MIRROR_ACTION)
         self.seen = self.ppo.mirrored(config.n)
@@ -81,15 +81,15 @@ class Noise(cusrl.Environment):
 
 
 class Walk(Noise):
-    """The environment, rewards and sensing of a `CrlRun`."""
+    """The environment, rewards and sensing of a `ConstrainedRun`."""
 
-    def __init__(self, run: CrlRun) -> None:
+    def __init__(self, run: ConstrainedRun) -> None:
         super().__init__(run.config.n)
         self.run, self.action = run, np.zeros((run.config.n, 12), np.float32)
 
     def _observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        obs = student.observe(self.run.env, self.action)
-        return torch.from_numpy(obs), torch.from_numpy(self.run._critic_obs(obs))
+        obs = dagger.observe(self.run.env, self.action)
+        return torch.from_numpy(obs), torch.from_numpy(self.run._critic_obs())
 
     def reset(self, *, indices: Any = None, **_: Any) -> tuple[Any, ...]:
         ids = np.arange(self.num_instances) if indices is None else np.asarray(indices)
@@ -117,15 +117,15 @@ class PartSymmetry(cusrl.hook.MirrorSymmetryLoss):
         return super().objective(metadata, part)
 
 
-def cusrl_agent(config: CrlConfig, env: Noise, recurrent_critic: bool, lean: bool) -> Any:
+def cusrl_agent(config: ConstrainedConfig, env: Noise, recurrent_critic: bool, lean: bool) -> Any:
     """cusrl's PPO of our sizes, and its defaults for what costs no time.
 
     `lean`: symmetry on a quarter of each mini-batch, and no statistics pass after each update.
     """
     p, preset, hook = config.ppo, cusrl.preset, cusrl.hook
     mlp = partial(cusrl.Mlp.Factory, activation_fn="SiLU", ends_with_activation=True)
-    lstm = [cusrl.Lstm.Factory(hidden_size=student.MEMORY), mlp(hidden_dims=student.HIDDEN)]
-    recurrent = cusrl.Sequential.Factory(lstm, [student.MEMORY])
+    lstm = [cusrl.Lstm.Factory(hidden_size=networks.MEMORY), mlp(hidden_dims=networks.HIDDEN)]
+    recurrent = cusrl.Sequential.Factory(lstm, [networks.MEMORY])
     hooks = preset.ppo.ppo_hook_suite(desired_kl_divergence=p.target_kl)
     if lean:
         extra = (hook.OnPolicyStatistics, hook.AdaptiveLRSchedule)
@@ -147,7 +147,7 @@ def cusrl_agent(config: CrlConfig, env: Noise, recurrent_critic: bool, lean: boo
 class TheirLoop:
     """cusrl's rollout and update, as its trainer does them, without logging."""
 
-    def __init__(self, config: CrlConfig, env: Noise, recurrent_critic: bool, lean: bool) -> None:
+    def __init__(self, config: ConstrainedConfig, env: Noise, recurrent_critic: bool, lean: bool) -> None:
         self.env, self.agent = env, cusrl_agent(config, env, recurrent_critic, lean)
         self.seen = env.reset()[:2]
 
@@ -164,15 +164,15 @@ class TheirLoop:
         self.agent.update()
 
 
-def contestants(config: CrlConfig) -> dict[str, Jobs]:
+def contestants(config: ConstrainedConfig) -> dict[str, Jobs]:
     """By name: a call of the learner alone, and one of the whole loop with physics."""
     everywhere = attrs.evolve(config, ppo=attrs.evolve(config.ppo, symmetric_share=1.0))
     jobs: dict[str, Jobs] = {}
     for name, c in {"ours, symmetry on a quarter": config, "ours, symmetry on all": everywhere}.items():
-        jobs[name] = OurLearner(c).update, partial(CrlRun(c).step, 0.0)
+        jobs[name] = OurLearner(c).update, partial(ConstrainedRun(c).step, 0.0)
     critics = {"LSTM critic": (True, False), "MLP critic": (False, False), "MLP critic, lean": (False, True)}
     for name, options in critics.items():
-        environments = Noise(config.n), Walk(CrlRun(config))
+        environments = Noise(config.n), Walk(ConstrainedRun(config))
         alone, whole = (TheirLoop(config, env, *options).update for env in environments)
         jobs[f"cusrl, {name}"] = alone, whole
     return jobs
@@ -181,7 +181,7 @@ def contestants(config: CrlConfig) -> dict[str, Jobs]:
 def main(repeats: Annotated[int, typer.Option(help="Updates of each contestant, in turns.")] = 3) -> None:
     """Compare our learner with cusrl's recurrent PPO on one thread."""
     torch.set_num_threads(1)
-    config = CrlConfig(threads=1, critic_first=0)
+    config = ConstrainedConfig(threads=1, critic_first=0)
     jobs = contestants(config)
     seconds = np.zeros((repeats, len(jobs), 2))
     for turn, row, column in np.ndindex(seconds.shape):

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
-from . import student
-from .crl import PARTS, PRIVILEGED, CrlConfig, CrlRun
+from . import dagger
+from .constrained import CRITIC, PARTS, ConstrainedConfig, ConstrainedRun
 from .env import EnvConfig, VelocityEnv, training_model
-from .networks import Mlp
+from .networks import Mlp, Recurrent
 from .rewards import RewardWeights, Table2
 
 
@@ -77,7 +77,7 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
     action = np.zeros((n, 12), np.float32)
 
     def tick() -> None:
-        student.observe(env, action)
+        dagger.observe(env, action)
         env.tick(np.tile(env.stand_q, (n, 1)))
         rewards(action)
 
@@ -85,14 +85,14 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
     return _rate_and_ratio("steps", n * env.substeps, seconds["whole"], seconds["bare"])
 
 
-def _bare_parts(run: CrlRun) -> dict[str, tuple[Callable[[], object], float]]:
+def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], float]]:
     """What an update can't do without, each with how often it needs it: physics, and passes of networks of its sizes.
 
     The passes are inference, and forward and backward those of actor, mirrored actor and critic.
     """
     config, size = run.config, DEFAULT_OBSERVATION.size
     p, n, length = config.ppo, config.n, config.length
-    actor, critic = student.Policy(), Mlp(size + PRIVILEGED, 1)
+    actor, critic = Recurrent(size, 12), Mlp(CRITIC, 1)
     one, state = torch.randn(1, n, size), actor.initial_state(n)
 
     def infer() -> None:
@@ -111,7 +111,7 @@ def _bare_parts(run: CrlRun) -> dict[str, tuple[Callable[[], object], float]]:
         "inference": (_repeated(infer, few), length / few),
         "actor": (learn(actor, size, batch), batches),
         "mirrored": (learn(actor, size, round(batch * p.symmetric_share)), batches),
-        "critic": (learn(critic, size + PRIVILEGED, batch), batches),
+        "critic": (learn(critic, CRITIC, batch), batches),
     }
 
 
@@ -123,10 +123,10 @@ def _repeated(job: Callable[[], object], times: int) -> Callable[[], None]:
     return repeated
 
 
-def training(config: CrlConfig | None = None, updates: int = 5) -> dict[str, float]:
+def training(config: ConstrainedConfig | None = None, updates: int = 5) -> dict[str, float]:
     """Policy samples a second of the whole loop, of its bare parts, their ratio, and the shares of the loop's parts."""
-    config = config or CrlConfig(critic_first=0)
-    run = CrlRun(config)
+    config = config or ConstrainedConfig(critic_first=0)
+    run = ConstrainedRun(config)
     seen: list[dict[str, float]] = []
     parts = _bare_parts(run)
     seconds = _in_turn(

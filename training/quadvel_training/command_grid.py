@@ -15,6 +15,8 @@ import torch
 
 from quadvel_policy.observation import CommandLimits
 
+from .loop import CheckpointError
+
 WIDTH = (0.5, 0.4, 0.7)  # of a cell: m/s, m/s, rad/s; about rest lies the middle of one
 FIRST = (1.0, 0.4, 1.05)  # m/s, m/s, rad/s: cells whose middle lies so near to rest are open from the start
 RECENT = 0.3  # weight of the last command in a cell's success
@@ -33,11 +35,14 @@ class GridConfig:
     stance: float = 0.1  # share of stance commands
     straight: float = 0.25  # share of commands without turning,
     near: float = 0.2  # of commands near rest, with and without turning, which are few among all cells,
-    spin: float = 0.05  # of commands that turn on the spot; the rest may be any
+    axis: float = 0.15  # of commands along one axis alone, the fastest ones among them; the rest may be any
     hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
     error_xy: float = 0.12  # m/s, mean error up to which a command at rest is followed,
     error_wz: float = 0.12  # rad/s, the same of yaw,
     error_share: float = 0.06  # and so much more with every m/s and rad/s of the command
+
+    answered: CommandLimits = CommandLimits((-3.2, -2.0, -6.0), (4.2, 2.0, 6.0), curve=3.6)
+    """The commands that a policy file answers, m/s, rad/s, m/s^2; the grid goes beyond, so that none is at the edge of it."""
 
     def limits(self) -> CommandLimits:
         """The commands that belong to the grid."""
@@ -78,15 +83,20 @@ class CommandGrid:
         """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
         c = self.config
         kind = rng.random(n)
-        straight, spin = kind < c.straight, kind > 1.0 - c.spin
+        straight = kind < c.straight
         near = ~straight & (kind < c.straight + c.near)
         command = np.zeros((n, 4))
         command[:, :3] = self._draw_from(self.open, rng, n)
         command[straight, :3] = self._draw_from(self._plane(2), rng, straight.sum())
         command[near, :3] = self._draw_from(self._near, rng, near.sum())
         command[straight | (near & (rng.random(n) < 0.5)), 2] = 0.0
-        command[spin, :3] = self._draw_from(self._plane(0) & self._plane(1), rng, spin.sum())
-        command[spin, :2] = 0.0
+        along = np.where(kind > 1.0 - c.axis, rng.integers(3, size=n), -1)
+        for axis in range(3):
+            ids, (one, other) = np.flatnonzero(along == axis), {0, 1, 2} - {axis}
+            command[ids, axis] = self._draw_from(self._plane(one) & self._plane(other), rng, len(ids))[
+                :, axis
+            ]
+            command[ids, one] = command[ids, other] = 0.0
         command[:, :3] = [self._limits.held(one) for one in command[:, :3].tolist()]
         still = rng.random(n) < c.stance
         command[still] = [0.0, 0.0, 0.0, 1.0]
@@ -145,9 +155,9 @@ class CommandGrid:
         return {name: torch.from_numpy(array.copy()) for name, array in held.items()}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint. Raises ValueError where the grid was another."""
+        """Go on from a checkpoint. Raises CheckpointError where the grid was another."""
         if tuple(state["followed"].shape) != self.shape:
             found = tuple(state["followed"].shape)
-            raise ValueError(f"checkpoint: command grid of {found} cells, expected {self.shape}")
+            raise CheckpointError(f"checkpoint: command grid of {found} cells, expected {self.shape}")
         self.followed, self.success = state["followed"].numpy().copy(), state["success"].numpy().copy()
         self._open_around_followed()

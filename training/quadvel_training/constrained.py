@@ -1,4 +1,4 @@
-"""Stage 3 without a clock: constrained reinforcement learning of the paper's plain network at 200 Hz (Section 3.3).
+"""Stage 3: constrained reinforcement learning of the paper's plain network at 200 Hz (Section 3.3).
 
 Starts from the student of `dagger`, whose teacher pulls it back at first: what an action costs shows at once, what it gains
 only after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and fines
@@ -17,6 +17,7 @@ import numpy as np
 import torch
 
 from quadvel_description import symmetry
+from quadvel_policy.observation import DEFAULT_OBSERVATION
 from quadvel_sim.terrain import Terrain
 
 from . import dagger, parallel, privileged
@@ -25,12 +26,15 @@ from .env import TICK, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
 from .ppo import GENTLE, Ppo, PpoConfig, Rollout
-from .privileged import ACTION_BOUND, Judgement, velocity_error
+from .privileged import ACTION_BOUND, Judgement, Past, velocity_error
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
 from .walking_rewards import sizes
 
-CRITIC_EXTRA = privileged.CRITIC_EXTRA + 12 + 12  # and torques, exploration under way
+CRITIC = (
+    privileged.SIZE + privileged.CRITIC_EXTRA + 12 + 12
+)  # what the critic sees: torques, exploration under way, too
+PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
 
 
 @attrs.frozen
@@ -41,7 +45,11 @@ class ConstrainedConfig:
     n: int = 512
     threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
-    std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit
+    std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit, at first,
+    final_std: float = (
+        0.025  # in the end: steady errors without exploration are those with it, but for what it does itself
+    )
+    std_samples: float = 5e7  # and samples in between
     critic_first: int = 40  # updates of the critic alone
     pull: float = 1.0  # weight of the teacher's pull at first,
     pull_samples: float = 3e7  # and samples over which it fades
@@ -53,6 +61,7 @@ class ConstrainedConfig:
     keep: float = 5e6  # samples between policies that are kept and evaluated
     actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025
+    ramped: float = 0.6  # share of the commands that are led to new velocities, as the command mux does it
     seed: int = 3
     grid: GridConfig = GridConfig()  # the student's; its open cells come with it
     terrain: Terrain = Terrain()
@@ -64,14 +73,24 @@ class ConstrainedConfig:
 class ConstrainedRun:
     """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
 
-    def __init__(self, config: ConstrainedConfig, start: Path, teacher: Path, device: str = "cpu") -> None:
-        """start, teacher: checkpoints of `dagger` and of `privileged`."""
+    def __init__(
+        self,
+        config: ConstrainedConfig,
+        start: Path | None = None,
+        teacher: Path | None = None,
+        device: str = "cpu",
+    ) -> None:
+        """start: checkpoint of `dagger`, or of this stage, whose critic comes with it; without it, random weights.
+
+        teacher: checkpoint of `privileged`; without it nothing pulls.
+        """
         self.config = c = config
         self.device = parallel.join(device)
         torch.manual_seed(c.seed)
-        known = load(start)
+        known = load(start) if start else {}
         self.grid = CommandGrid(c.grid)
-        self.grid.restore(known["grid"])
+        if "grid" in known:
+            self.grid.restore(known["grid"])
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
@@ -80,16 +99,19 @@ class ConstrainedRun:
             actuator=actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
+            ramped=c.ramped,
         )
         self.env = VelocityEnv(env_config, self.grid)
-        self.teacher = dagger.Teacher(load(teacher), self.env)
+        self.past = Past(self.env)
+        self.teacher = dagger.Teacher(load(teacher), self.env, self.past) if teacher else None
         self.rewards = Table2(self.env, c.rewards)
         self.judgement = Judgement(c.n)
-        network = Recurrent(symmetry.OBSERVATION.index.size, 12)
-        network.load_state_dict(known["student"])
+        network = dagger.policy_of(start) if start else Recurrent(DEFAULT_OBSERVATION.size, 12)
         self.actor = Gaussian(network, 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
-        self.critic = Mlp(privileged.SIZE + CRITIC_EXTRA, 1).to(self.device)
+        self.critic = Mlp(CRITIC, 1).to(self.device)
+        if "critic" in known:
+            self.critic.load_state_dict(known["critic"])
         self.mirror_obs, mirror_action = (
             torch_mirror(mirror, self.device) for mirror in (symmetry.OBSERVATION, symmetry.JOINTS)
         )
@@ -113,7 +135,7 @@ class ConstrainedRun:
 
     def write_policy(self, path: Path, about: dict[str, Any]) -> None:
         """The policy file as it is now; about: how it came to be."""
-        dagger.export_policy(self.policy(), self.env, self.grid, path, about)
+        dagger.export_policy(self.policy(), self.env, self.grid.config.answered, path, about)
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -141,9 +163,13 @@ class ConstrainedRun:
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
         c = self.config
+        pull = c.pull * max(0.0, 1.0 - self.samples / c.pull_samples)
+        if pull == 0.0:
+            self.teacher = None
+        spread = c.std + (c.final_std - c.std) * min(1.0, self.samples / c.std_samples)
+        self.actor.log_std.fill_(np.log(spread))
         rollout, seen = self.collect()
         self.updates += 1
-        pull = c.pull * max(0.0, 1.0 - self.samples / c.pull_samples)
         constraints = min(1.0, self.samples / c.constraint_samples)
         with self.shares.of("learning"):
             learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
@@ -156,7 +182,7 @@ class ConstrainedRun:
         )
 
     def _critic_obs(self) -> np.ndarray:
-        env, past = self.env, self.teacher.past
+        env, past = self.env, self.past
         known = privileged.observe(env, past, self._action)
         seen = known, privileged.critic_extra(env, past), 0.05 * env.torque, self._noise
         return np.concatenate(seen, axis=1).astype(np.float32)
@@ -168,8 +194,9 @@ class ConstrainedRun:
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment."""
-        c, env, past = self.config, self.env, self.teacher.past
-        names = ("obs", "critic_obs", "action", "mean", "label", "reward", "ended", "cut", "mask")
+        c, env, past = self.config, self.env, self.past
+        names = ["obs", "critic_obs", "action", "mean", "reward", "ended", "cut", "mask"]
+        names += ["label"] if self.teacher else []
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().cpu().numpy()
         alive = np.ones(c.n, bool)
@@ -179,20 +206,22 @@ class ConstrainedRun:
                 obs, critic_obs = dagger.observe(env, self._action), self._critic_obs()
             with self.shares.of("inference"):
                 mean, state = self._act(obs, state)
-                label = self.teacher.action()
+                label = [self.teacher.action()] if self.teacher else []
             with self.shares.of("physics"):
                 drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
                 self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
                 action, command = mean + self._noise, env.command.copy()
                 env.tick(self.map.targets(action))
             with self.shares.of("sensing"):
-                self.teacher.advance(command, action.clip(-ACTION_BOUND, ACTION_BOUND))
+                past.advance(command)
+                if self.teacher:
+                    self.teacher.advance(action.clip(-ACTION_BOUND, ACTION_BOUND))
                 reward = self.rewards(action)
                 for weight, error in ((c.stride, past.stride), (c.lasting, past.lasting)):
                     reward -= weight * sum(sizes(error))
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
-            row = (obs, critic_obs, action, mean, label, reward, fell, late, alive.copy())
+            row = (obs, critic_obs, action, mean, reward, fell, late, alive.copy(), *label)
             for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
             self.judgement.advance(velocity_error(env, command), TICK)
@@ -210,7 +239,7 @@ class ConstrainedRun:
 
     def _figures(self, rows: dict[str, torch.Tensor], alive: np.ndarray) -> dict[str, float]:
         """Errors over a stride of robots that are up (m/s, rad/s), falls a robot-minute."""
-        xy, wz = sizes(self.teacher.past.stride[alive])
+        xy, wz = sizes(self.past.stride[alive])
         return {
             "reward": float(rows["reward"].mean()),
             "error_xy": float(xy.mean()),
@@ -228,7 +257,9 @@ class ConstrainedRun:
             return
         self.env.reset(over)
         self.rewards.reset(over)
-        self.teacher.reset(over)
+        self.past.reset(over)
+        if self.teacher:
+            self.teacher.reset(over)
         self.judgement.close(over)
         self._noise = self._noise.copy()  # the rollout holds the one before
         self._action[over] = self._noise[over] = 0.0

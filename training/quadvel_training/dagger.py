@@ -18,13 +18,19 @@ import torch
 from torch import Tensor
 
 from quadvel_description import robot
-from quadvel_policy.observation import DEFAULT_OBSERVATION, ActionMap, PolicyMetadata, build_observation
+from quadvel_policy.observation import (
+    DEFAULT_OBSERVATION,
+    ActionMap,
+    CommandLimits,
+    PolicyMetadata,
+    build_observation,
+)
 from quadvel_sim.terrain import Terrain
 
 from . import privileged
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
-from .loop import Budget, cosine, load, set_rate
+from .loop import Budget, CheckpointError, cosine, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
 from .onnx_file import commit, export
 from .ppo import FAR
@@ -68,25 +74,25 @@ class Teacher:
     fell in none held or averaged (decision 43).
     """
 
-    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv) -> None:
+    def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, past: Past) -> None:
+        """past: what the robots of `env` have done, which whoever drives them keeps."""
         self.actor = Gaussian(Mlp(privileged.SIZE, 12), 12, 1.0)
         self.actor.load_state_dict(checkpoint["actor"])
-        self.env, self.past = env, Past(env)
+        self.env, self._past = env, past
         n = env.config.n
         self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(AGO)], AGO)
         self._said = np.zeros((SPREAD, n, 12), np.float32)  # the newest first
         self._starts = np.ones(n, bool)
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the past of `ids`."""
-        self.past.reset(ids)
+        """Forget what `ids` did."""
         for action in self._executed:
             action[ids] = 0.0
         self._starts[ids] = True
 
     def action(self) -> np.ndarray:
         """What it would do now, (n, 12); asked once a tick."""
-        obs = privileged.observe(self.env, self.past, self._executed[0])
+        obs = privileged.observe(self.env, self._past, self._executed[0])
         with torch.no_grad():
             now: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy().clip(-ACTION_BOUND, ACTION_BOUND)
         self._said = np.concatenate([now[None], self._said[:-1]])
@@ -95,9 +101,8 @@ class Teacher:
         mean: np.ndarray = self._said.mean(axis=0)
         return mean
 
-    def advance(self, command: np.ndarray, executed: np.ndarray) -> None:
-        """After a tick under `command` (n, 4) in which the actions `executed` (n, 12) were taken."""
-        self.past.advance(command)
+    def advance(self, executed: np.ndarray) -> None:
+        """After a tick in which the actions `executed` (n, 12) were taken."""
         self._executed.append(executed.copy())
 
 
@@ -120,7 +125,8 @@ class DaggerRun:
             randomisation=c.randomisation,
         )
         self.env = VelocityEnv(env_config, self.grid)
-        self.teacher = Teacher(checkpoint, self.env)
+        self.past = Past(self.env)
+        self.teacher = Teacher(checkpoint, self.env, self.past)
         self.student = Recurrent(DEFAULT_OBSERVATION.size, 12)
         self.map = action_map(self.env)
         self.optimiser = torch.optim.Adam(self.student.parameters(), lr=c.learning_rate)
@@ -160,6 +166,7 @@ class DaggerRun:
         if not len(ids):
             return
         self.env.reset(ids)
+        self.past.reset(ids)
         self.teacher.reset(ids)
         self.driven[ids] = self._turn[ids] < self._share()
         self._previous[ids] = self._noise[ids] = 0.0
@@ -204,7 +211,8 @@ class DaggerRun:
             masks.append(alive.copy())
             command = env.command.copy()
             env.tick(self.map.targets(self._previous))
-            self.teacher.advance(command, self._previous.clip(-ACTION_BOUND, ACTION_BOUND))
+            self.past.advance(command)
+            self.teacher.advance(self._previous.clip(-ACTION_BOUND, ACTION_BOUND))
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
         masks[-1] = alive  # robots that end in the last tick count as ended, too
@@ -216,7 +224,7 @@ class DaggerRun:
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
         """Errors over a stride (m/s, rad/s) and falls a robot-minute, of robots driven by the student and by the teacher."""
-        error = self.teacher.past.stride
+        error = self.past.stride
         seen = {"driven": float(self.driven.mean())}
         for name, driver in (("student", self.driven), ("teacher", ~self.driven)):
             up, minutes = driver & alive, driver.sum() * self.config.length * TICK / 60
@@ -240,6 +248,24 @@ class DaggerRun:
         return total / self.config.mini_batches
 
 
+def policy_of(checkpoint: Path) -> Recurrent:
+    """The policy's network in a checkpoint of this stage or of `constrained`. Raises FileNotFoundError, CheckpointError."""
+    content, network = load(checkpoint), Recurrent(DEFAULT_OBSERVATION.size, 12)
+    prefix = "network."
+    weights = content.get("student") or {
+        name.removeprefix(prefix): value
+        for name, value in content.get("actor", {}).items()
+        if name.startswith(prefix + "lstm") or name.startswith(prefix + "body")
+    }
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError:
+        raise CheckpointError(
+            f"{checkpoint}: expected a checkpoint of `dagger` or of `constrained`"
+        ) from None
+    return network
+
+
 def action_map(env: VelocityEnv) -> ActionMap:
     """Zero stands: the offset is the nominal posture with the gravity torque fed forward through kp."""
     return ActionMap(env.stand_q, ACTION_SCALE, ACTION_BOUND)
@@ -253,10 +279,10 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
 
 
 def export_policy(
-    network: Recurrent, env: VelocityEnv, grid: CommandGrid, path: Path, about: dict[str, Any]
+    network: Recurrent, env: VelocityEnv, limits: CommandLimits, path: Path, about: dict[str, Any]
 ) -> None:
-    """Write the policy file: the network as it is. It answers the commands that the grid has reached; about: how it came to be."""
-    reach = grid.reach()
+    """Write the policy file: the network as it is. limits: the commands that it answers; about: how it came to be."""
+    (back, right, clockwise), (ahead, left, turn) = limits.low, limits.high
     metadata = PolicyMetadata(
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,
@@ -265,11 +291,11 @@ def export_policy(
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(robot.NOMINAL_Q),
         command_limits={
-            "vx": (reach["back"], reach["forward"]),
-            "vy": (-reach["sideways"], reach["sideways"]),
-            "wz": (-reach["turn"], reach["turn"]),
+            "vx": (back, ahead),
+            "vy": (right, left),
+            "wz": (clockwise, turn),
         },
-        curve_limit=grid.config.curve,
+        curve_limit=limits.curve,
         state_shape=tuple(network.initial_state(1)[0].shape),
         actuator=attrs.asdict(env.config.actuator),
         recipe=about,

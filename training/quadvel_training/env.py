@@ -26,6 +26,12 @@ from .randomisation import PlantSampler, Randomisation, sample_actuators
 
 TICK = 0.005  # s, one sample of the policy on the robot
 HEAT = 0.2  # W/(N m)^2, k_r of the paper's energy
+RAMP = (
+    0.7,
+    5.0,
+)  # m/s^2, from and to: how fast commands that are led grow; they fall RAMP_DOWN times as fast,
+RAMP_DOWN = 4.0
+RAMP_AXES = np.array([1.0, 0.7, 1.25])  # and on the axes vx, vy (m/s^2), wz (rad/s^2) in these proportions
 EDGE = 0.6  # m, before the end of rough ground, at which an episode ends as if its time was over
 ABSURD_SPEED = 150.0  # m/s or rad/s of any body or joint: physics that has blown up, or is about to
 STANCE_LENGTH, STANCE_WIDTH = np.ptp(
@@ -99,6 +105,7 @@ class EnvConfig:
     actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
+    ramped: float = 0.0  # share of the commands that are led to the new velocity as the command mux does it
     terrain: Terrain = Terrain()
 
 
@@ -118,7 +125,7 @@ class VelocityEnv:
     frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
     contact (n, 4) bool; height (n,) of the trunk above ground; power (n,) of the joints by the paper's energy term, mean of
     the sample, W; fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
-    command is new.
+    command is new. `command` may be on its way yet to the velocity that was drawn.
     """
 
     def __init__(self, config: EnvConfig, commands: Commands | None = None) -> None:
@@ -141,6 +148,7 @@ class VelocityEnv:
 
         n = c.n
         self.command = np.zeros((n, 4))
+        self._goal, self._ramp = np.zeros((n, 4)), np.full(n, np.inf)
         self.changed = np.zeros(n, bool)
         self.broken = np.zeros(n, bool)
         self.power = np.zeros(n)
@@ -173,15 +181,30 @@ class VelocityEnv:
         self._clock[ids] = self.config.period  # not 0, which MuJoCo's own starting over would not differ from
         self.time[ids] = rng.uniform(0, 0.2, n) * self.config.episode
         self._velocity_drift[ids] = 0.0
+        self.command[ids] = [0.0, 0.0, 0.0, 1.0]
         self._new_commands(ids)
         self._read()
         self.torque[ids] = 0.0
         self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
 
     def _new_commands(self, ids: np.ndarray) -> None:
-        self.command[ids] = self.commands.draw(self.rng, len(ids))
+        n, (slow, quick) = len(ids), RAMP
+        self._goal[ids] = self.commands.draw(self.rng, n)
+        led = self.rng.random(n) < self.config.ramped
+        self._ramp[ids] = np.where(led, slow * (quick / slow) ** self.rng.random(n), np.inf)
+        self._lead_commands(ids)
         self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.commands.hold, len(ids))
         self.changed[ids] = True
+
+    def _lead_commands(self, ids: np.ndarray | slice) -> None:
+        """Take the commands a sample nearer to what was drawn; a robot is told to stand once its command is at rest."""
+        goal, command = self._goal[ids, :3], self.command[ids, :3]
+        way = goal - command
+        slower = np.abs(goal) < np.abs(command)
+        step = self._ramp[ids, None] * RAMP_AXES * np.where(slower, RAMP_DOWN, 1.0) * self.config.period
+        command = command + way / np.maximum(np.abs(way) / step, 1.0).max(axis=1, keepdims=True)
+        self.command[ids, :3] = command
+        self.command[ids, 3] = self._goal[ids, 3] * (command == 0.0).all(axis=1)
 
     def tick(
         self,
@@ -215,6 +238,7 @@ class VelocityEnv:
         self._read()
         proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, robot.GRAVITY]
         self.acceleration = rotate_inverse(self.quaternion, proper)
+        self._lead_commands(slice(None))
         due = np.flatnonzero(self.time >= self._next_command)
         if len(due):
             self._new_commands(due)

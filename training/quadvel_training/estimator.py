@@ -22,6 +22,7 @@ from .env import TICK, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State, select
 from .onnx_file import commit, export
+from .randomisation import Randomisation
 from .walks import Walks, both_grounds
 
 MEMORY = 128
@@ -143,6 +144,7 @@ class EstimatorConfig:
     seed: int = 2
     forget: float = 0.005  # share of the memories lost a sequence, as after a gap in the stream
     commands: CommandRange = CommandRange(vx=(-1.8, 2.6), vy=0.8, wz=1.6)
+    randomisation: Randomisation = Randomisation()
     rough: Terrain = Terrain(kind="rough", roughness=0.06, blend=10.0)
 
 
@@ -171,7 +173,9 @@ class EstimatorRun:
         self.samples = 0
         self.walks = [
             Walk(walks, self.network)
-            for walks in both_grounds(config.n, config.seed, config.commands, config.rough, actor)
+            for walks in both_grounds(
+                config.n, config.seed, config.commands, config.randomisation, config.rough, actor
+            )
         ]
 
     def state(self) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from quadvel_sim.terrain import Terrain
 
 from .env import TICK, CommandRange
 from .networks import Recurrent
+from .randomisation import Randomisation
 from .walks import Walks, both_grounds
 
 SETTLE = 0.5  # s, at the start of a window, in which the filter finds its state; not judged
@@ -30,6 +31,7 @@ class TuningConfig:
     evaluations: int = 200
     seed: int = 4
     commands: CommandRange = CommandRange()
+    randomisation: Randomisation = Randomisation()
     rough: Terrain = Terrain(kind="rough", blend=10.0)
 
 
@@ -47,7 +49,9 @@ def record(config: TuningConfig, actor: Recurrent) -> Recording:
     ticks = round(config.window / TICK)
     grounds = [
         [_window(walks, ticks) for _ in range(config.windows)]
-        for walks in both_grounds(config.n, config.seed, config.commands, config.rough, actor)
+        for walks in both_grounds(
+            config.n, config.seed, config.commands, config.randomisation, config.rough, actor
+        )
     ]
     parts = [window for ground in grounds for window in ground]
     names = [f.name for f in attrs.fields(RobotState) if f.name not in ("time", "tick")]

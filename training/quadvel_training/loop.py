@@ -20,6 +20,10 @@ from . import parallel
 SAVE_EVERY = 60.0  # s
 
 
+class CheckpointError(ValueError):
+    """A checkpoint of something else."""
+
+
 @attrs.frozen
 class Budget:
     """A run ends when the first of the two is spent; minutes count from its start or resumption."""

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from quadvel_description.symmetry import Mirror
 
 State = tuple[Tensor, Tensor]
+MEMORY, HIDDEN = 256, (192, 128)  # of the paper's actor: LSTM, then linear layers
 
 
 def select(state: State, ids: Tensor) -> State:
@@ -56,7 +57,7 @@ class Recurrent(nn.Module):
     """LSTM, then linear layers with SiLU; one state (layers, N, hidden) pair is carried from sequence to sequence."""
 
     def __init__(
-        self, inputs: int, outputs: int, memory: int = 256, hidden: tuple[int, ...] = (192, 128)
+        self, inputs: int, outputs: int, memory: int = MEMORY, hidden: tuple[int, ...] = HIDDEN
     ) -> None:
         super().__init__()
         self.lstm = nn.LSTM(inputs, memory)

@@ -18,7 +18,6 @@ from quadvel_eval.walk import Setup
 
 from . import loop
 from .constrained import ConstrainedRun
-from .crl import CrlRun
 from .onnx_file import commit
 from .randomisation import ACTUATORS, actuator
 
@@ -57,7 +56,7 @@ class Evaluated:
     On the drives as they are known best: those of an actuator file where the run has one, else Table 4.
     """
 
-    run: CrlRun | ConstrainedRun
+    run: ConstrainedRun
     folder: Path
     _asked_at: int | None = attrs.field(default=None, init=False)
 

@@ -20,9 +20,10 @@ from quadvel_policy.supervisor import SupervisorConfig
 from quadvel_sim.config import SensorNoise
 from quadvel_sim.terrain import Terrain
 
-from . import student
+from . import dagger
 from .env import TICK, CommandRange, EnvConfig, VelocityEnv
 from .networks import Recurrent
+from .randomisation import Randomisation
 
 NOISE = np.repeat(attrs.astuple(SensorNoise()), (12, 12, 3, 3, 3))
 NOISE_SCALE = (0.5, 3.0)  # of a walk's noise, times NOISE: no robot's sensors are the simulator's
@@ -31,6 +32,7 @@ BIAS_ANGULAR_VELOCITY = 0.01  # rad/s
 BIAS_TILT = 0.005  # rad
 FALL_TILT = 0.9  # rad
 EPISODE = 30.0  # s
+RAMPED = 0.6  # share of the commands that are led to new velocities, as the command mux does it
 
 
 class Mode(IntEnum):
@@ -139,7 +141,7 @@ class Walks:
         self.env, self._actor = env, actor
         n = env.config.n
         self.over = np.zeros(n, bool)
-        self._map = student.action_map(env)
+        self._map = dagger.action_map(env)
         self._modes = Modes(n, env.rng)
         self._action = np.zeros((n, 12), np.float32)
         self._memory = actor.initial_state(n)
@@ -225,10 +227,12 @@ class Walks:
 
 
 def both_grounds(
-    n: int, seed: int, commands: CommandRange, rough: Terrain, actor: Recurrent
+    n: int, seed: int, commands: CommandRange, randomisation: Randomisation, rough: Terrain, actor: Recurrent
 ) -> tuple[Walks, Walks]:
     """Walks of `n` robots in all, half on flat ground, half on `rough`."""
-    config = EnvConfig(n=n // 2, seed=seed, commands=commands, episode=EPISODE)
+    config = EnvConfig(
+        n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE, ramped=RAMPED
+    )
     flat, uneven = (VelocityEnv(attrs.evolve(config, terrain=terrain)) for terrain in (Terrain(), rough))
     return Walks(flat, actor), Walks(uneven, actor)
 

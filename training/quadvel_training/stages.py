@@ -1,0 +1,117 @@
+"""The stages of training as they are run: each in a folder of its own, where it goes on; all of them one after the other;
+stage 3 with the ablation's recipes, and for a short while on a corrected actuator model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import attrs
+
+from . import loop, parallel, recipe
+from .constrained import ConstrainedConfig, ConstrainedRun
+from .dagger import DaggerConfig, DaggerRun, export_policy, policy_of
+from .estimator import EstimatorConfig, EstimatorRun
+from .loop import Budget
+from .privileged import Numbered, PrivilegedConfig, PrivilegedRun
+from .run_folder import Evaluated, describe, made_of
+
+RECIPES = Path(__file__).parents[1] / "recipes"
+TEACHER_PARTS = ("privileged", "privileged_rough", "privileged_last")  # recipes, one after the other
+ABLATION = ("rl_pd", "rl_eam", "crl_eam")
+TEACHER, STUDENT, POLICY, ESTIMATOR = (
+    "privileged.pt",
+    "dagger.pt",
+    "constrained.pt",
+    "estimator.pt",
+)  # checkpoints
+POLICY_FILE, ESTIMATOR_FILE = "policy.onnx", "estimator.onnx"
+NO_LIMIT = 1e6  # minutes
+
+
+def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -> bool:
+    """Stage 1; whether its budget is spent. source, here and below: the recipe file, for the record."""
+    describe(folder, "privileged", source, config)
+    run = PrivilegedRun(config)
+    return loop.train(run, config.budget, folder / TEACHER, Numbered(run, folder))
+
+
+def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
+    """Stage 2, from a checkpoint of stage 1; the policy file is written where it was stopped, too."""
+    describe(folder, "dagger", source, config)
+    run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
+    spent = loop.train(run, config.budget, checkpoint)
+    about = made_of("dagger", source, config, checkpoint)
+    export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
+    return spent
+
+
+def train_policy(
+    config: ConstrainedConfig,
+    source: Path | None,
+    start: Path,
+    teacher: Path | None,
+    folder: Path,
+    device: str,
+) -> bool:
+    """Stage 3, from a checkpoint of stage 2 or of its own, pulled by that of the `teacher`; policy file as in stage 2."""
+    run, checkpoint = ConstrainedRun(config, start, teacher, device), folder / POLICY
+    if parallel.rank() == 0:
+        describe(folder, "constrained", source, config)
+    spent = loop.train(run, config.budget, checkpoint, Evaluated(run, folder))
+    if parallel.rank() == 0:
+        run.write_policy(folder / POLICY_FILE, made_of("constrained", source, config, checkpoint))
+    return spent
+
+
+def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, folder: Path) -> bool:
+    """The velocity estimator on the walks of a checkpoint of stage 2 or 3; its file is written where it was stopped, too."""
+    describe(folder, "estimator", source, config)
+    run, checkpoint = EstimatorRun(config, policy_of(policy)), folder / ESTIMATOR
+    spent = loop.train(run, config.budget, checkpoint)
+    run.export(folder / ESTIMATOR_FILE, made_of("estimator", source, config, checkpoint))
+    return spent
+
+
+def everything(out: Path, device: str) -> bool:
+    """All stages from random weights on, each with its recipe in a folder of `out`; goes on where it was stopped.
+
+    Returns whether all are done.
+    """
+    teacher, student, policy, estimator = (
+        out / name for name in ("privileged", "dagger", "constrained", "estimator")
+    )
+    for part in TEACHER_PARTS:
+        source = RECIPES / f"{part}.yaml"
+        if not train_teacher(recipe.read(PrivilegedConfig, source), source, teacher):
+            return False
+    source = RECIPES / "dagger.yaml"
+    if not train_student(recipe.read(DaggerConfig, source), source, teacher / TEACHER, student):
+        return False
+    source = RECIPES / "crl_eam.yaml"
+    config = recipe.read(ConstrainedConfig, source)
+    if not train_policy(config, source, student / STUDENT, teacher / TEACHER, policy, device):
+        return False
+    source = RECIPES / "estimator.yaml"
+    return train_estimator(recipe.read(EstimatorConfig, source), source, policy / POLICY, estimator)
+
+
+def ablation(start: Path, teacher: Path, samples: float, out: Path, device: str) -> bool:
+    """Train the three recipes from one start, `samples` each, one after the other; policies are OUT/RECIPE/policy.onnx.
+
+    Goes on where it was stopped; whether all are done.
+    """
+    for name in ABLATION:
+        source = RECIPES / f"{name}.yaml"
+        config = attrs.evolve(recipe.read(ConstrainedConfig, source), budget=Budget(samples, NO_LIMIT))
+        if not train_policy(config, source, start, teacher, out / name, device):
+            return False
+    return True
+
+
+def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
+    """Tune the policy of a checkpoint on the actuators of a file; the policy file, written where it was stopped, too."""
+    source = RECIPES / "tune.yaml"
+    config = recipe.read(ConstrainedConfig, source)
+    budget = attrs.evolve(config.budget, minutes=minutes)
+    train_policy(attrs.evolve(config, actuator=str(drives), budget=budget), source, start, None, out, device)
+    return out / POLICY_FILE
