@@ -69,7 +69,12 @@ def test_led_commands_go_the_way_that_the_command_mux_leads_them():
     mux = CommandMux([MuxInput("planner", priority=0, timeout=9.0)], config)
     mux.update(time)
     env._ramp[:] = 2.0
-    for goal in ([1.5, -0.4, 2.0, 0.0], [0.2, 0.133, 0.0, 0.0], [-0.3, 0.133, 0.4, 0.0], [0.0, 0.0, 0.0, 1.0]):
+    for goal in (
+        [1.5, -0.4, 2.0, 0.0],
+        [0.2, 0.133, 0.0, 0.0],
+        [-0.3, 0.133, 0.4, 0.0],
+        [0.0, 0.0, 0.0, 1.0],
+    ):
         env._goal[:] = goal
         for _ in range(round(1.0 / TICK)):
             stand(env)

@@ -109,12 +109,16 @@ class EnvConfig:
     terrain: Terrain = Terrain()
 
 
-def training_model(timestep: float, terrain: Terrain) -> mujoco.MjModel:
-    """The AlienGo as it is trained on: feet and trunk collide, no sensors."""
+def training_model(timestep: float, terrain: Terrain, torsion: bool = False) -> mujoco.MjModel:
+    """The AlienGo as it is trained on: feet and trunk collide, no sensors. torsion: feet resist being turned on the ground."""
     plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
     spec = mjcf.build_spec(plant)
     terrain.add_to(spec)
-    return spec.compile()
+    model = spec.compile()
+    if torsion:
+        for leg in robot.LEGS:
+            model.geom(f"{leg}_foot").condim[0] = 4
+    return model
 
 
 class VelocityEnv:
@@ -132,7 +136,7 @@ class VelocityEnv:
         """`commands`: where they are drawn instead of the configuration's range."""
         self.config = c = config
         self.commands: Commands = commands or c.commands
-        self.model = training_model(c.timestep, c.terrain)
+        self.model = training_model(c.timestep, c.terrain, c.randomisation.torsional_friction[1] > 0.0)
         self.substeps = round(c.period / c.timestep)
         self._resend = max(
             1, int(TICK / c.timestep)

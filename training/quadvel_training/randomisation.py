@@ -30,6 +30,10 @@ class Randomisation:
         10.0,
         10.0,
     )  # MuJoCo's impratio: how little a foot creeps below the cone's edge
+    torsional_friction: tuple[float, float] = (
+        0.0,
+        0.0,
+    )  # m, of feet: turning one under load costs this times it
     pyramidal: float = 0.0  # share of robots with a pyramidal friction cone instead of an elliptic one
     transmission_delay: tuple[float, float] = (0.0, 0.002)  # s, on top of the actuator's own input delay
     noise_q: float = 0.01  # rad
@@ -107,6 +111,7 @@ class PlantSampler:
         uniform = rng.uniform
         friction = uniform(*r.foot_friction, (n, len(self._feet)))
         f["geom_friction"][ids[:, None], self._feet, 0] = friction
+        f["geom_friction"][ids[:, None], self._feet, 1] = uniform(*r.torsional_friction, (n, 1))
         f["geom_solref"][ids[:, None], self._feet, 0] = uniform(*r.contact_time, (n, 1))
         f["geom_solref"][ids[:, None], self._feet, 1] = uniform(*r.contact_damping, (n, 1))
         self._impratio[ids] = uniform(*r.grip, self._impratio[ids].shape)
