@@ -11,6 +11,7 @@ from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.tracking import Tracking, left_right
 from quadvel_eval.segments import Segment
 from quadvel_policy.observation import CommandLimits
+from quadvel_policy.policy_file import SHIPPED_POLICY
 
 LIMITS = CommandLimits((-1.0, -0.5, -1.0), (2.0, 0.5, 1.0))
 
@@ -64,7 +65,7 @@ def test_the_grid_has_every_command_with_every_seed_on_both_plants() -> None:
     jobs = Tracking(grids=("paper",)).jobs(Study(seeds=3))
     assert len(jobs) == 2 * 363
     assert {job.labels["plant"] for job in jobs} == {"usual", "second"}
-    assert {job.labels["policy"] for job in jobs} == {"aliengo"}
+    assert {job.labels["policy"] for job in jobs} == {SHIPPED_POLICY.stem}
 
 
 def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:

@@ -19,6 +19,7 @@ from quadvel_eval.paper.section import Row, Section, Study
 from quadvel_eval.paper.stance import Stance
 from quadvel_eval.paper.sustained import Sustained
 from quadvel_eval.paper.symmetry import Symmetry
+from quadvel_policy.policy_file import SHIPPED_POLICY
 from quadvel_sysid.eam import fit_eam
 from quadvel_sysid.signals import Samples
 
@@ -38,7 +39,7 @@ def rows(section: Section) -> Sequence[Row]:
 
 def ours(section: Section) -> dict[str, float | None]:
     """What the shipped policy reached, by what."""
-    return {row.what: row.ours["aliengo"] for row in rows(section)}
+    return {row.what: row.ours[SHIPPED_POLICY.stem] for row in rows(section)}
 
 
 def test_a_ramp_ends_at_its_top() -> None:
@@ -81,7 +82,7 @@ def test_both_estimators_are_judged_on_the_same_walks() -> None:
 
 def test_a_push_comes_while_the_robot_walks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(conditions, "DURATION", 2.1)
-    setup, cell = ONE.setup("aliengo"), Cell((0.3, 0.0, 0.0), 0)
+    setup, cell = ONE.setup(SHIPPED_POLICY.stem), Cell((0.3, 0.0, 0.0), 0)
     assert walk_under(setup, cell, (0.0, 900.0, 0.0)).segment is None
     assert walk_under(setup, cell, (0.0, 10.0, 0.0)).segment is not None
 

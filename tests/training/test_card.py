@@ -61,5 +61,5 @@ def test_an_evaluation_of_another_network_is_refused(evaluation, tmp_path):
     model = onnx.load(SHIPPED_POLICY)
     model.doc_string = "another one"
     onnx.save(model, other)
-    with pytest.raises(ValueError, match=r"is an evaluation of .*aliengo[.]onnx, expected one of .*other"):
+    with pytest.raises(ValueError, match=r"is an evaluation of .*crl_eam[.]onnx, expected one of .*other"):
         card(other, [evaluation])
