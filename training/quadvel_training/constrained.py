@@ -52,7 +52,8 @@ class ConstrainedConfig:
     std_samples: float = 5e7  # and samples in between
     critic_first: int = 40  # updates of the critic alone
     pull: float = 1.0  # weight of the teacher's pull at first,
-    pull_samples: float = 3e7  # and samples over which it fades
+    final_pull: float = 0.0  # in the end,
+    pull_samples: float = 3e7  # and samples in between
     constraint_samples: float = 2e7  # over which the weights of the constraints grow to their full
     stride: float = 1.0  # fine, s/m and s/rad, of the error over a stride,
     lasting: float = (
@@ -68,6 +69,11 @@ class ConstrainedConfig:
     randomisation: Randomisation = Randomisation()
     rewards: RewardWeights = RewardWeights()
     ppo: PpoConfig = attrs.evolve(GENTLE, smoothness=3.2)
+
+
+def _between(first: float, last: float, done: float) -> float:
+    """In a straight line from one to the other, which it keeps."""
+    return first + (last - first) * min(1.0, done)
 
 
 class ConstrainedRun:
@@ -163,14 +169,14 @@ class ConstrainedRun:
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
         c = self.config
-        pull = c.pull * max(0.0, 1.0 - self.samples / c.pull_samples)
+        pull = _between(c.pull, c.final_pull, self.samples / c.pull_samples)
         if pull == 0.0:
             self.teacher = None
-        spread = c.std + (c.final_std - c.std) * min(1.0, self.samples / c.std_samples)
+        spread = _between(c.std, c.final_std, self.samples / c.std_samples)
         self.actor.log_std.fill_(np.log(spread))
         rollout, seen = self.collect()
         self.updates += 1
-        constraints = min(1.0, self.samples / c.constraint_samples)
+        constraints = _between(0.0, 1.0, self.samples / c.constraint_samples)
         with self.shares.of("learning"):
             learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
         return (
