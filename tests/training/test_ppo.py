@@ -89,6 +89,13 @@ def test_a_run_ends_before_it_spoils_its_weights():
     assert all(torch.isfinite(weight).all() for weight in ppo.actor.parameters())
 
 
+@pytest.mark.parametrize(("target_kl", "rate"), [(None, 2e-3), (0.01, 1e-3)])
+def test_a_rate_that_is_not_adapted_is_that_of_the_recipe_where_a_run_goes_on(target_kl, rate):
+    again = learner(learning_rate=2e-3, target_kl=target_kl)
+    again.restore(learner(learning_rate=1e-3).state())
+    assert again.learning_rate == again.actor_optimiser.param_groups[0]["lr"] == rate
+
+
 def test_masked_samples_have_no_advantage():
     mask = torch.ones(6, 1)
     mask[3:] = 0.0

@@ -127,10 +127,12 @@ class Ppo:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Go on from `state`; at the configuration's own learning rate where that is not adapted."""
         self.actor_optimiser.load_state_dict(state["actor_optimiser"])
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
-        self.learning_rate = state["learning_rate"]
+        if self.config.target_kl is not None:
+            self.learning_rate = state["learning_rate"]
+        set_rate(self.actor_optimiser, self.learning_rate)
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def advantages(self, r: Rollout) -> tuple[Tensor, Tensor]:
