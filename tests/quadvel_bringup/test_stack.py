@@ -13,6 +13,8 @@ import yaml
 
 import quadvel_dds
 from quadvel_bringup import nodes
+from quadvel_bringup.follow_demo import FOLLOWED
+from quadvel_bringup.recorded_run import RECORDED
 from quadvel_bringup.stack import PARAMETERS, Stack
 
 SRC = Path(__file__).parents[2] / "src"
@@ -168,3 +170,24 @@ def test_what_a_robot_cannot_do_is_refused_by_name() -> None:
 def test_another_robot_is_refused_by_name() -> None:
     with pytest.raises(ValueError, match="low_level"):
         Stack(low_level="spot")
+
+
+def test_the_page_is_one_more_node_and_none_of_the_robot() -> None:
+    robot = Stack(use_sim_time=True)
+    assert set(robot.commands(view=True)) - set(robot.commands()) == {"view"}
+    assert "use_sim_time:=true" not in robot.arguments(view=True)["view"]
+
+
+def test_rviz_shows_topics_that_are_recorded_with_the_types_of_its_displays() -> None:
+    known = RECORDED | FOLLOWED
+    config = yaml.safe_load((PARAMETERS.parent / "robot.rviz").read_text())
+    shown = {}
+    for display in config["Visualization Manager"]["Displays"]:
+        place = display.get("Topic") or display.get("Description Topic")
+        if place:
+            shown[place["Value"]] = display["Class"].rpartition("/")[2]
+    message = {"RobotModel": "String", "Pose": "PoseStamped"}
+    assert {topic: known[topic].rpartition("/")[2] for topic in shown} == {
+        topic: message.get(kind, kind) for topic, kind in shown.items()
+    }
+    assert {"/scan", "/person", "/follow_planner/path"} <= set(shown)

@@ -24,11 +24,9 @@ from quadvel_sim.world import SHIPPED
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
 from .follow_demo import follow
-from .nodes import command
 from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
-from .up import VIEW
 
 MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 """What is made of the recording; what is left of an earlier one goes."""
@@ -87,7 +85,7 @@ def demo_command(
         if tour:
             good = run_tour(TourSetup(world=world, metres=metres, seed=seed), folder, console)
         else:
-            good = follow(folder, world, seconds, console)
+            good = follow(folder, world, seconds, view, console)
         raise typer.Exit(0 if good else 1)
     stack = _stack(low_level, loss, jitter, lockstep, actuator)
     rehearse(stack)
@@ -95,8 +93,7 @@ def demo_command(
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
         script = "quick" if quick else "full"
-        nodes = stack.commands() | ({VIEW: command(VIEW, stack.view_arguments())} if view else {})
-        problem = ScriptedWalk(draft, script, nodes, lockstep, console).run()
+        problem = ScriptedWalk(draft, script, stack.commands(view), lockstep, console).run()
     for name in MADE_OF_IT:
         (folder / name).unlink(missing_ok=True)
     if problem:

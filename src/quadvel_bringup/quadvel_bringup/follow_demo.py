@@ -37,14 +37,20 @@ class FollowedWalk(RecordedRun):
     """Over `seconds` after the robot began to follow."""
 
     def __init__(
-        self, recording: Path, stack: Stack, laser: tuple[float, float], seconds: float, console: Console
+        self,
+        recording: Path,
+        stack: Stack,
+        laser: tuple[float, float],
+        seconds: float,
+        view: bool,
+        console: Console,
     ) -> None:
-        """laser: where it is on the robot, x and y, m."""
+        """laser: where it is on the robot, x and y, m. view: with the operator's page."""
         place = dict(zip(("laser_x", "laser_y"), laser, strict=True))
         file = ["--params-file", str(stack.parameters.resolve())]
         names = ("person_tracker", "follow_planner")
         followers = {name: command(name, [*arguments(name, place), *file]) for name in names}
-        super().__init__(recording, {**stack.commands(), **followers}, FOLLOWED, False, console, seconds)
+        super().__init__(recording, {**stack.commands(view), **followers}, FOLLOWED, False, console, seconds)
         self._seconds, self._began = seconds, float("inf")
 
     def listen(self, node: Any) -> None:
@@ -63,14 +69,14 @@ class FollowedWalk(RecordedRun):
         self._bar.update(self._task, completed=passed, description=words[:24])
 
 
-def follow(folder: Path, world: str, seconds: float, console: Console) -> bool:
-    """Run, judge, write; whether the robot neither fell nor touched anything."""
+def follow(folder: Path, world: str, seconds: float, view: bool, console: Console) -> bool:
+    """Run, judge, write; whether the robot neither fell nor touched anything. view: with the operator's page."""
     stack, loaded = Stack(world=world), World.load(world)
     rehearse(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
     with replacing(recorded) as draft:
-        problem = FollowedWalk(draft, stack, (x, y), seconds, console).run()
+        problem = FollowedWalk(draft, stack, (x, y), seconds, view, console).run()
     if problem:
         console.print(f"[bold red]{problem}")
     outcome, moments = read_walk(recorded, loaded)

@@ -17,6 +17,7 @@ from .alone import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import enclave
 from .processes import ProcessGroup, StopSignals
+from .stack import VIEW
 
 RECORDED = {
     "/command": "quadvel_msgs/msg/VelocityCommand",
@@ -112,7 +113,7 @@ class RecordedRun(ABC):
         ended: dict[str, int] = {}
         while not self.is_over(ended) and not ended and not signals.received:
             record()
-            ended = group.ended()
+            ended = {name: code for name, code in group.ended().items() if name != VIEW}
         if self.is_over(ended):
             self._bar.update(self._task, completed=self._bar.tasks[0].total, description="done")
             return ""

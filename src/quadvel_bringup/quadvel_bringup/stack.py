@@ -15,6 +15,9 @@ PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 
 Parameters = Mapping[str, bool | str | int | float]
 
+VIEW = "view"
+"""The node that serves the operator's page: where it ends, the robot goes on"""
+
 BOARD_PORT = 8007
 """UDP port of the AlienGo's board; the simulated one adds the number of the ROS domain, as nobody shares one"""
 
@@ -114,17 +117,17 @@ class Stack:
             followers = {name: {**values, "use_sim_time": True} for name, values in followers.items()}
         return serving | followers
 
-    def arguments(self) -> dict[str, list[str]]:
-        """The same as arguments of ROS 2."""
-        return {name: self._arguments(name, values) for name, values in self.overrides().items()}
+    def arguments(self, view: bool = False) -> dict[str, list[str]]:
+        """The same as arguments of ROS 2.
 
-    def view_arguments(self) -> list[str]:
-        """Those of the node `view` beside them; it is no part of the robot, and stays in the time of who looks at it."""
-        return self._arguments("view", {})
+        view: with the node `view`, which is no part of the robot and stays in the time of who looks at it.
+        """
+        nodes = self.overrides() | ({VIEW: {}} if view else {})
+        return {name: self._arguments(name, values) for name, values in nodes.items()}
 
-    def commands(self) -> dict[str, list[str]]:
+    def commands(self, view: bool = False) -> dict[str, list[str]]:
         """The same as command lines, which run each node as a process of its own."""
-        return {name: command(name, arguments) for name, arguments in self.arguments().items()}
+        return {name: command(name, arguments) for name, arguments in self.arguments(view).items()}
 
     def _arguments(self, name: str, values: Parameters) -> list[str]:
         first, *rest = arguments(name, values)

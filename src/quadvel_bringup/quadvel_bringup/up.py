@@ -9,10 +9,7 @@ from .node_output import PrefixedOutput
 from .nodes import command
 from .processes import ProcessGroup, StopSignals
 from .rehearsal import rehearse
-from .stack import Stack
-
-VIEW = "view"
-"""The node that shows the robot: where it ends, the robot goes on"""
+from .stack import VIEW, Stack
 
 
 def up(stack: Stack, view: bool = False) -> int:
@@ -25,7 +22,7 @@ def up(stack: Stack, view: bool = False) -> int:
     rehearse(stack)
     if stack.brings_robot:
         look_for_others()
-    nodes = stack.arguments() | ({VIEW: stack.view_arguments()} if view else {})
+    nodes = stack.arguments(view)
     say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
         say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
