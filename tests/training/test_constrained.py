@@ -68,6 +68,18 @@ def test_it_starts_as_its_student_and_goes_on_from_a_checkpoint(files, tmp_path)
     assert (again.samples, again.updates) == (run.samples, run.updates)
 
 
+def test_the_policy_is_the_average_of_what_it_was(files):
+    run = ConstrainedRun(attrs.evolve(SMALL, averaged=3), *files)
+    average = np.zeros(weights(run).numel())
+    for update in range(1, 6):
+        run.step(0.0)
+        share = 1 / min(update, 3)
+        average += share * (weights(run).numpy() - average)
+    found = torch.cat([p.detach().ravel() for p in run.policy().parameters()])
+    assert found.numpy() == pytest.approx(average, abs=1e-6)
+    assert not torch.equal(found, weights(run))
+
+
 def test_exploration_shrinks(files):
     run = ConstrainedRun(attrs.evolve(SMALL, std=0.08, final_std=0.02, std_samples=1e4), *files)
     spread = []
@@ -83,7 +95,10 @@ def test_a_start_of_its_own_brings_its_critic_and_needs_no_teacher(files, tmp_pa
     run.step(0.0)
     loop.save(run.state(), tmp_path / "constrained.pt")
     tuned = ConstrainedRun(SMALL, tmp_path / "constrained.pt")
-    assert torch.equal(weights(tuned), weights(run))
+    assert all(
+        torch.equal(run.average.state_dict()[name], value)
+        for name, value in tuned.policy().state_dict().items()
+    )
     for one, two in zip(run.critic.parameters(), tuned.critic.parameters(), strict=True):
         assert torch.equal(one, two)
     assert "away" not in tuned.step(0.0)

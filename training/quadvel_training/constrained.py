@@ -59,6 +59,7 @@ class ConstrainedConfig:
     lasting: float = (
         3.0  # and of the error that lasts: under exploration steady errors hardly show over a stride
     )
+    averaged: int = 150  # updates over which the weights of the policy are averaged: single steps leave steady errors behind
     keep: float = 5e6  # samples between policies that are kept and evaluated
     actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025
@@ -115,6 +116,7 @@ class ConstrainedRun:
         network = dagger.policy_of(start) if start else Recurrent(DEFAULT_OBSERVATION.size, 12)
         self.actor = Gaussian(network, 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
+        self.average: Recurrent = copy.deepcopy(self.actor.network)
         self.critic = Mlp(CRITIC, 1).to(self.device)
         if "critic" in known:
             self.critic.load_state_dict(known["critic"])
@@ -135,9 +137,15 @@ class ConstrainedRun:
         return h.to(self.device), c.to(self.device)
 
     def policy(self) -> Recurrent:
-        """A copy of the policy as it is now, on the CPU."""
-        network: Recurrent = copy.deepcopy(self.actor.network).cpu()
-        return network
+        """A copy of the averaged policy as it is now, on the CPU."""
+        return copy.deepcopy(self.average).cpu()
+
+    @torch.no_grad()  # type: ignore[untyped-decorator]
+    def _follow_weights(self) -> None:
+        """Take the policy's weights into their average."""
+        share = 1.0 / min(self.updates, self.config.averaged)
+        for mean, now in zip(self.average.parameters(), self.actor.network.parameters(), strict=True):
+            mean.lerp_(now, share)
 
     def write_policy(self, path: Path, about: dict[str, Any]) -> None:
         """The policy file as it is now; about: how it came to be."""
@@ -147,6 +155,7 @@ class ConstrainedRun:
         """What a resumed run needs."""
         return {
             "actor": self.actor.state_dict(),
+            "average": self.average.state_dict(),
             "critic": self.critic.state_dict(),
             "learner": self.ppo.state(),
             "grid": self.grid.state(),
@@ -158,6 +167,7 @@ class ConstrainedRun:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
         self.actor.load_state_dict(state["actor"])
+        self.average.load_state_dict(state["average"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
@@ -179,6 +189,7 @@ class ConstrainedRun:
         constraints = _between(0.0, 1.0, self.samples / c.constraint_samples)
         with self.shares.of("learning"):
             learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
+            self._follow_weights()
         return (
             seen
             | learned

@@ -251,18 +251,10 @@ class DaggerRun:
 def policy_of(checkpoint: Path) -> Recurrent:
     """The policy's network in a checkpoint of this stage or of `constrained`. Raises FileNotFoundError, CheckpointError."""
     content, network = load(checkpoint), Recurrent(DEFAULT_OBSERVATION.size, 12)
-    prefix = "network."
-    weights = content.get("student") or {
-        name.removeprefix(prefix): value
-        for name, value in content.get("actor", {}).items()
-        if name.startswith(prefix + "lstm") or name.startswith(prefix + "body")
-    }
-    try:
-        network.load_state_dict(weights)
-    except RuntimeError:
-        raise CheckpointError(
-            f"{checkpoint}: expected a checkpoint of `dagger` or of `constrained`"
-        ) from None
+    weights = content.get("average") or content.get("student")
+    if weights is None:
+        raise CheckpointError(f"{checkpoint}: expected a checkpoint of `dagger` or of `constrained`")
+    network.load_state_dict(weights)
     return network
 
 
