@@ -139,14 +139,19 @@ def test_rewards_of_table_2_at_a_state_computed_by_hand():
     assert terms["action_smoothness"] == pytest.approx(-1.2)
 
 
-def test_lifting_feet_pays_only_while_walking():
+def test_lifting_feet_pays_only_while_walking_and_posture_counts_only_in_stance():
     env = VelocityEnv(QUIET)
     table = Table2(env, RewardWeights())
     env.contact = np.zeros((4, 4), bool)
     env.clearance = np.full((4, 4), 0.03)
     env.command[:] = [0.0, 0.0, 0.0, 1.0]
+    env.q = robot.NOMINAL_Q + np.linspace(-0.1, 0.2, 12) * np.ones((4, 1))
+    assert table.terms(np.zeros((4, 12)))["posture"][0] == pytest.approx(
+        -np.abs(np.linspace(-0.1, 0.2, 12)).sum()
+    )
     assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == 0.0
     env.command[:] = 0.0
+    assert table.terms(np.zeros((4, 12)))["posture"][0] == 0.0
     assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == pytest.approx(0.12)
 
 

@@ -59,11 +59,13 @@ class ConstrainedConfig:
     lasting: float = (
         3.0  # and of the error that lasts: under exploration steady errors hardly show over a stride
     )
+    standing: float = (
+        20.0  # fine, s/m and s/rad, of the error that lasts while a robot is told to stand: it may not creep
+    )
     averaged: int = 150  # updates over which the weights of the policy are averaged: single steps leave steady errors behind
     keep: float = 5e6  # samples between policies that are kept and evaluated
     actuator: str = "eam"  # or ideal, or an actuator file
     timestep: float = 0.0025
-    ramped: float = 0.6  # share of the commands that are led to new velocities, as the command mux does it
     seed: int = 3
     grid: GridConfig = GridConfig()  # the student's; its open cells come with it
     terrain: Terrain = Terrain()
@@ -106,7 +108,6 @@ class ConstrainedRun:
             actuator=actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
-            ramped=c.ramped,
         )
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
@@ -234,8 +235,8 @@ class ConstrainedRun:
                 if self.teacher:
                     self.teacher.advance(action.clip(-ACTION_BOUND, ACTION_BOUND))
                 reward = self.rewards(action)
-                for weight, error in ((c.stride, past.stride), (c.lasting, past.lasting)):
-                    reward -= weight * sum(sizes(error))
+                lasting = np.where(command[:, 3] > 0.5, c.standing, c.lasting)
+                reward -= c.stride * sum(sizes(past.stride)) + lasting * sum(sizes(past.lasting))
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
             row = (obs, critic_obs, action, mean, reward, fell, late, alive.copy(), *label)

@@ -105,7 +105,7 @@ class EnvConfig:
     actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
-    ramped: float = 0.0  # share of the commands that are led to the new velocity as the command mux does it
+    ramped: float = 0.6  # share of the commands that are led to the new velocity as the command mux does it
     terrain: Terrain = Terrain()
 
 

@@ -32,7 +32,6 @@ BIAS_ANGULAR_VELOCITY = 0.01  # rad/s
 BIAS_TILT = 0.005  # rad
 FALL_TILT = 0.9  # rad
 EPISODE = 30.0  # s
-RAMPED = 0.6  # share of the commands that are led to new velocities, as the command mux does it
 
 
 class Mode(IntEnum):
@@ -230,9 +229,7 @@ def both_grounds(
     n: int, seed: int, commands: CommandRange, randomisation: Randomisation, rough: Terrain, actor: Recurrent
 ) -> tuple[Walks, Walks]:
     """Walks of `n` robots in all, half on flat ground, half on `rough`."""
-    config = EnvConfig(
-        n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE, ramped=RAMPED
-    )
+    config = EnvConfig(n=n // 2, seed=seed, commands=commands, randomisation=randomisation, episode=EPISODE)
     flat, uneven = (VelocityEnv(attrs.evolve(config, terrain=terrain)) for terrain in (Terrain(), rough))
     return Walks(flat, actor), Walks(uneven, actor)
 
