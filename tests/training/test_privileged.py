@@ -8,14 +8,20 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
 
-from quadvel_description import symmetry  # noqa: E402
+from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, privileged  # noqa: E402
 from quadvel_training.command_grid import FIRST, WIDTH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.privileged import Numbered, Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
-from quadvel_training.walking_rewards import HIGHEST, LOWEST, WalkingRewards, WalkingWeights  # noqa: E402
+from quadvel_training.walking_rewards import (  # noqa: E402
+    HIGHEST,
+    LOWEST,
+    WalkingRewards,
+    WalkingWeights,
+    hips_astray,
+)
 
 SMALL = PrivilegedConfig(n=6, threads=1, length=4)
 CALM = EnvConfig(n=4, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
@@ -275,3 +281,12 @@ def test_numbered_checkpoints_are_kept(tmp_path):
     run.samples = 1100
     keeper.keep()
     assert loop.load(tmp_path / "kept" / "000001k.pt")["samples"] == 1100
+
+
+def test_hips_away_from_straight_down_cost_and_less_so_sideways():
+    env = VelocityEnv(EnvConfig(n=2, threads=1, randomisation=Randomisation.none()))
+    env.q = np.tile(robot.NOMINAL_Q, (2, 1))
+    env.q[:, ::3] = [0.1, -0.2, 0.0, 0.3]
+    assert hips_astray(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
+        [0.6, 0.3]
+    )

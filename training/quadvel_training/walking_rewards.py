@@ -26,6 +26,15 @@ def sizes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
 
+def hips_astray(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
+    """By how much the four hips are away from straight down (n,), rad; moving sideways, where they have to swing, it counts less.
+
+    Trotting on feet close to the middle costs the least, and tips over the soonest.
+    """
+    astray = np.abs(env.q[:, ::3]).sum(axis=1)
+    return np.asarray(astray / (1.0 + 2.0 * np.abs(command[:, 1])))
+
+
 class Past(Protocol):
     """What `privileged.Past` keeps."""
 
@@ -60,7 +69,8 @@ class WalkingWeights:
     dragging: float = 0.4  # fine for each foot that stays down
     slip: float = 0.06  # fine, s/m, of each foot on the ground
     stumble: float = 3.0  # fine, s/m^2: clearance missing in swing times the foot's speed
-    posture: float = 0.075  # fine in stance, 1/rad, off the nominal posture
+    hips: float = 0.3  # fine, 1/rad, of hips away from straight down
+    posture: float = 0.2  # fine in stance, 1/rad, off the nominal posture
     step: float = 0.1  # fine in stance for each foot in the air
     fidget: float = 1e-3  # fine in stance: joint speeds squared
     alive: float = 0.3
@@ -133,6 +143,7 @@ class WalkingRewards:
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
             "smoothness": -self._samples * w.rate * np.sum((now - before) ** 2, axis=1)
             - self._samples**2 * w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
+            "hips": -w.hips * hips_astray(env, command),
             "alive": np.full(len(now), w.alive),
         }
 
