@@ -23,6 +23,7 @@ from . import (
     kalman_tuning,
     leg_classifier,
     loop,
+    parallel,
     privileged,
     recipe,
     run_folder,
@@ -48,9 +49,9 @@ Recipe = Annotated[
 ]
 Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
 Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
-TEACHER = Path("out/training/privileged/privileged.pt")
-STUDENT = Path("out/training/dagger/dagger.pt")
-POLICY = Path("out/training/constrained/constrained.pt")
+TEACHER = Path("out/training/privileged") / stages.TEACHER
+STUDENT = Path("out/training/dagger") / stages.STUDENT
+POLICY = Path("out/training/constrained") / stages.POLICY
 TeacherFile = Annotated[
     Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.", dir_okay=False)
 ]
@@ -122,7 +123,8 @@ def train_constrained(
     """
     config = _configured(constrained.ConstrainedConfig, source, minutes)
     stages.train_policy(config, source, start, teacher, out, device)
-    print(f"written: {out / stages.POLICY_FILE}")
+    if parallel.rank() == 0:
+        print(f"written: {out / stages.POLICY_FILE}")
 
 
 @app.command("ablation")

@@ -30,7 +30,7 @@ except ModuleNotFoundError:
     raise SystemExit("This comparison needs cusrl: pip install cusrl==1.2.2") from None
 
 OBS = DEFAULT_OBSERVATION.size
-STATE = constrained.CRITIC
+STATE = constrained.CRITIC_SIZE
 CRITIC = (256, 128, 64)
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
 Jobs = tuple[Callable[[], object], Callable[[], object]]

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quadvel_policy.observation import DEFAULT_OBSERVATION
 
 from . import dagger
-from .constrained import CRITIC, PARTS, ConstrainedConfig, ConstrainedRun
+from .constrained import CRITIC_SIZE, PARTS, ConstrainedConfig, ConstrainedRun
 from .env import EnvConfig, VelocityEnv, training_model
 from .networks import Mlp, Recurrent
 from .rewards import RewardWeights, Table2
@@ -92,7 +92,7 @@ def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], fl
     """
     config, size = run.config, DEFAULT_OBSERVATION.size
     p, n, length = config.ppo, config.n, config.length
-    actor, critic = Recurrent(size, 12), Mlp(CRITIC, 1)
+    actor, critic = Recurrent(size, 12), Mlp(CRITIC_SIZE, 1)
     one, state = torch.randn(1, n, size), actor.initial_state(n)
 
     def infer() -> None:
@@ -111,7 +111,7 @@ def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], fl
         "inference": (_repeated(infer, few), length / few),
         "actor": (learn(actor, size, batch), batches),
         "mirrored": (learn(actor, size, round(batch * p.symmetric_share)), batches),
-        "critic": (learn(critic, CRITIC, batch), batches),
+        "critic": (learn(critic, CRITIC_SIZE, batch), batches),
     }
 
 

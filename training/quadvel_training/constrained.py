@@ -23,7 +23,7 @@ from quadvel_sim.terrain import Terrain
 from . import dagger, parallel, privileged
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
-from .loop import Budget, Shares, load
+from .loop import Budget, Shares, linear, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
 from .ppo import GENTLE, Ppo, PpoConfig, Rollout
 from .privileged import ACTION_BOUND, Judgement, Past, velocity_error
@@ -31,7 +31,7 @@ from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
 from .walking_rewards import sizes
 
-CRITIC = (
+CRITIC_SIZE = (
     privileged.SIZE + privileged.CRITIC_EXTRA + 12 + 12
 )  # what the critic sees: torques, exploration under way, too
 PARTS = ("physics", "sensing", "inference", "learning")  # of an update's time; rewards count as sensing
@@ -74,11 +74,6 @@ class ConstrainedConfig:
     ppo: PpoConfig = attrs.evolve(GENTLE, smoothness=3.2)
 
 
-def _between(first: float, last: float, done: float) -> float:
-    """In a straight line from one to the other, which it keeps."""
-    return first + (last - first) * min(1.0, done)
-
-
 class ConstrainedRun:
     """Environment, policy, critic and learner; networks and learning on `device`, all else on the CPU."""
 
@@ -118,7 +113,7 @@ class ConstrainedRun:
         self.actor = Gaussian(network, 12, c.std).to(self.device)
         self.actor.log_std.requires_grad_(False)
         self.average: Recurrent = copy.deepcopy(self.actor.network)
-        self.critic = Mlp(CRITIC, 1).to(self.device)
+        self.critic = Mlp(CRITIC_SIZE, 1).to(self.device)
         if "critic" in known:
             self.critic.load_state_dict(known["critic"])
         self.mirror_obs, mirror_action = (
@@ -180,14 +175,14 @@ class ConstrainedRun:
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
         c = self.config
-        pull = _between(c.pull, c.final_pull, self.samples / c.pull_samples)
+        pull = linear(c.pull, c.final_pull, self.samples / c.pull_samples)
         if pull == 0.0:
             self.teacher = None
-        spread = _between(c.std, c.final_std, self.samples / c.std_samples)
+        spread = linear(c.std, c.final_std, self.samples / c.std_samples)
         self.actor.log_std.fill_(np.log(spread))
         rollout, seen = self.collect()
         self.updates += 1
-        constraints = _between(0.0, 1.0, self.samples / c.constraint_samples)
+        constraints = linear(0.0, 1.0, self.samples / c.constraint_samples)
         with self.shares.of("learning"):
             learned = self.ppo.update(rollout, self.updates > c.critic_first, pull, constraints)
             self._follow_weights()

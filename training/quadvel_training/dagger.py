@@ -19,6 +19,7 @@ from torch import Tensor
 
 from quadvel_description import robot
 from quadvel_policy.observation import (
+    COMMAND_AXES,
     DEFAULT_OBSERVATION,
     ActionMap,
     CommandLimits,
@@ -30,7 +31,7 @@ from quadvel_sim.terrain import Terrain
 from . import privileged
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
-from .loop import Budget, CheckpointError, cosine, load, set_rate
+from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
 from .onnx_file import commit, export
 from .ppo import FAR
@@ -160,7 +161,7 @@ class DaggerRun:
 
     def _share(self) -> float:
         c = self.config
-        return c.first_driven + (c.driven - c.first_driven) * min(1.0, self.samples / c.takeover)
+        return linear(c.first_driven, c.driven, self.samples / c.takeover)
 
     def _start_over(self, ids: np.ndarray) -> None:
         if not len(ids):
@@ -274,7 +275,6 @@ def export_policy(
     network: Recurrent, env: VelocityEnv, limits: CommandLimits, path: Path, about: dict[str, Any]
 ) -> None:
     """Write the policy file: the network as it is. limits: the commands that it answers; about: how it came to be."""
-    (back, right, clockwise), (ahead, left, turn) = limits.low, limits.high
     metadata = PolicyMetadata(
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,
@@ -282,11 +282,7 @@ def export_policy(
         kp=(env.config.kp,) * 12,
         kd=(env.config.kd,) * 12,
         nominal_q=tuple(robot.NOMINAL_Q),
-        command_limits={
-            "vx": (back, ahead),
-            "vy": (right, left),
-            "wz": (clockwise, turn),
-        },
+        command_limits=dict(zip(COMMAND_AXES, zip(limits.low, limits.high, strict=True), strict=True)),
         curve_limit=limits.curve,
         state_shape=tuple(network.initial_state(1)[0].shape),
         actuator=attrs.asdict(env.config.actuator),

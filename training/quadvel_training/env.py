@@ -20,6 +20,7 @@ from quadvel_description import mjcf, robot
 from quadvel_description.command_range import within_range
 from quadvel_description.kinematics import foot_kinematics, foot_positions, roll_pitch, rotate, rotate_inverse
 from quadvel_policy.observation import CommandLimits
+from quadvel_sim.physics import Physics
 from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
@@ -109,15 +110,13 @@ class EnvConfig:
     terrain: Terrain = Terrain()
 
 
-def training_model(timestep: float, terrain: Terrain, torsion: bool = False) -> mujoco.MjModel:
-    """The AlienGo as it is trained on: feet and trunk collide, no sensors. torsion: feet resist being turned on the ground."""
+def training_model(timestep: float, terrain: Terrain, torsional_friction: float = 0.0) -> mujoco.MjModel:
+    """The AlienGo as it is trained on: feet and trunk collide, no sensors. torsional_friction: of the feet, m."""
     plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
     spec = mjcf.build_spec(plant)
     terrain.add_to(spec)
     model = spec.compile()
-    if torsion:
-        for leg in robot.LEGS:
-            model.geom(f"{leg}_foot").condim[0] = 4
+    Physics(torsional_friction=torsional_friction).apply(model)
     return model
 
 
@@ -136,7 +135,7 @@ class VelocityEnv:
         """`commands`: where they are drawn instead of the configuration's range."""
         self.config = c = config
         self.commands: Commands = commands or c.commands
-        self.model = training_model(c.timestep, c.terrain, c.randomisation.torsional_friction[1] > 0.0)
+        self.model = training_model(c.timestep, c.terrain, c.randomisation.torsional_friction[1])
         self.substeps = round(c.period / c.timestep)
         self._resend = max(
             1, int(TICK / c.timestep)

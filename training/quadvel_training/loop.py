@@ -99,6 +99,11 @@ def load(path: Path) -> dict[str, Any]:
     return content
 
 
+def linear(start: float, end: float, done: float) -> float:
+    """From `start` to `end` in a straight line."""
+    return start + (end - start) * min(done, 1.0)
+
+
 def cosine(start: float, end: float, done: float) -> float:
     """From `start` to `end` along half a cosine."""
     return end + 0.5 * (start - end) * (1 + math.cos(math.pi * min(done, 1.0)))

@@ -249,7 +249,7 @@ class PrivilegedRun:
 
     def _bound_exploration(self) -> None:
         c = self.config
-        most = c.std + (c.final_std - c.std) * min(1.0, self.samples / c.std_samples)
+        most = loop.linear(c.std, c.final_std, self.samples / c.std_samples)
         least = c.forming_std if self.samples < c.formed else 0.5 * c.final_std
         with torch.no_grad():
             self.actor.log_std.clamp_(min=float(np.log(least)), max=float(np.log(max(most, least))))

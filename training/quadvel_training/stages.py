@@ -4,6 +4,7 @@ stage 3 with the ablation's recipes, and for a short while on a corrected actuat
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import attrs
 
@@ -81,18 +82,20 @@ def everything(out: Path, device: str) -> bool:
         out / name for name in ("privileged", "dagger", "constrained", "estimator")
     )
     for part in TEACHER_PARTS:
-        source = RECIPES / f"{part}.yaml"
-        if not train_teacher(recipe.read(PrivilegedConfig, source), source, teacher):
+        if not train_teacher(*_recipe(PrivilegedConfig, part), teacher):
             return False
-    source = RECIPES / "dagger.yaml"
-    if not train_student(recipe.read(DaggerConfig, source), source, teacher / TEACHER, student):
+    if not train_student(*_recipe(DaggerConfig, "dagger"), teacher / TEACHER, student):
         return False
-    source = RECIPES / "crl_eam.yaml"
-    config = recipe.read(ConstrainedConfig, source)
-    if not train_policy(config, source, student / STUDENT, teacher / TEACHER, policy, device):
+    stage3 = _recipe(ConstrainedConfig, "crl_eam")
+    if not train_policy(*stage3, student / STUDENT, teacher / TEACHER, policy, device):
         return False
-    source = RECIPES / "estimator.yaml"
-    return train_estimator(recipe.read(EstimatorConfig, source), source, policy / POLICY, estimator)
+    return train_estimator(*_recipe(EstimatorConfig, "estimator"), policy / POLICY, estimator)
+
+
+def _recipe(kind: type[Any], name: str) -> tuple[Any, Path]:
+    """A recipe that comes with the project, as a configuration of `kind`, and its file."""
+    source = RECIPES / f"{name}.yaml"
+    return recipe.read(kind, source), source
 
 
 def ablation(start: Path, teacher: Path, samples: float, out: Path, device: str) -> bool:
@@ -101,8 +104,8 @@ def ablation(start: Path, teacher: Path, samples: float, out: Path, device: str)
     Goes on where it was stopped; whether all are done.
     """
     for name in ABLATION:
-        source = RECIPES / f"{name}.yaml"
-        config = attrs.evolve(recipe.read(ConstrainedConfig, source), budget=Budget(samples, NO_LIMIT))
+        config, source = _recipe(ConstrainedConfig, name)
+        config = attrs.evolve(config, budget=Budget(samples, NO_LIMIT))
         if not train_policy(config, source, start, teacher, out / name, device):
             return False
     return True
@@ -110,8 +113,7 @@ def ablation(start: Path, teacher: Path, samples: float, out: Path, device: str)
 
 def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
     """Tune the policy of a checkpoint on the actuators of a file; the policy file, written where it was stopped, too."""
-    source = RECIPES / "tune.yaml"
-    config = recipe.read(ConstrainedConfig, source)
+    config, source = _recipe(ConstrainedConfig, "tune")
     budget = attrs.evolve(config.budget, minutes=minutes)
     train_policy(attrs.evolve(config, actuator=str(drives), budget=budget), source, start, None, out, device)
     return out / POLICY_FILE
