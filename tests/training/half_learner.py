@@ -34,6 +34,7 @@ if __name__ == "__main__":
     parallel.join("cpu")
     update(slice(4, 8))
     assert parallel.from_first("second") == "first"
+    assert parallel.gather("second") == ["first", "second"]
     parallel.leave()
     names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
     assert not any("gloo" in name for name in names), names

@@ -43,6 +43,7 @@ def test_two_processes_with_half_of_the_robots_each_take_the_step_of_one_with_al
 
     together = update(slice(0, 4))
     assert parallel.from_first("first") == "first"
+    assert parallel.gather("first") == ["first", "second"]
     assert another.wait(30) == 0
     parallel.leave()
     for name, expected in update(slice(0, 8)).items():

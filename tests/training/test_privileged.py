@@ -10,10 +10,10 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
-from quadvel_training import loop, privileged  # noqa: E402
+from quadvel_training import loop, parallel, privileged  # noqa: E402
 from quadvel_training.command_grid import FIRST, WIDTH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.privileged import Numbered, Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.privileged import Judgement, Numbered, Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
     HIGHEST,
@@ -257,6 +257,23 @@ def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
     third.step(0.0)
     for one, other in zip(second.actor.parameters(), third.actor.parameters(), strict=True):
         assert torch.equal(one, other)
+
+
+def test_the_grid_hears_how_robots_of_all_processes_followed(monkeypatch, grid):
+    command, over, stood = np.array([[1.0, 0, 0, 0], [0.5, 0, 0, 0]]), np.ones(2, bool), np.zeros(2, bool)
+    mine, other = Judgement(2), Judgement(2)
+    for judgement in (mine, other):
+        for _ in range(100):
+            judgement.advance(np.zeros((2, 3)), 0.02)
+    other.end(command, over, ~stood)
+    mine.end(command, over, stood)
+    monkeypatch.setattr(parallel, "gather", lambda own: [other._over, own])
+    both = CommandGrid(GridConfig())
+    mine.tell(both)
+    one = grid.cell_of(command[0, :3])
+    assert both.success[one] > 0.0
+    mine.tell(grid)
+    assert grid.success[one] == 0.0
 
 
 def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():

@@ -85,7 +85,10 @@ def train_privileged(
 ) -> None:
     """Stage 1: a memoryless teacher finds its gait from random weights, by rewards alone.
 
+    \b
     Numbered checkpoints go to DIR/kept; any of them, copied to DIR/privileged.pt, is where the same command goes on from.
+    With torchrun, several processes learn together, here one on each of two cores:
+      torchrun --nproc-per-node 2 -m -- quadvel_training privileged ...
     """
     stages.train_teacher(_configured(privileged.PrivilegedConfig, source, minutes), source, out)
 

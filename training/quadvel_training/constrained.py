@@ -238,8 +238,9 @@ class ConstrainedRun:
             for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
             self.judgement.advance(velocity_error(env, command), TICK)
-            self.judgement.tell(self.grid, command, (fell | late | env.changed) & alive, fell)
+            self.judgement.end(command, (fell | late | env.changed) & alive, fell)
             alive &= ~(fell | late)
+        self.judgement.tell(self.grid)
         self.samples += c.length * c.n * parallel.size()
         rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
         rows |= {"noise": before, "last_critic_obs": self._critic_obs()}

@@ -68,3 +68,11 @@ def from_first(value: Any) -> Any:
     kept = [value]
     dist.broadcast_object_list(kept, src=0, device=torch.device("cpu"))
     return kept[0]
+
+
+def gather(value: Any) -> list[Any]:
+    """What each process has, the first one's first."""
+    kept = [value] * size()
+    if size() > 1:
+        dist.all_gather_object(kept, value)
+    return kept

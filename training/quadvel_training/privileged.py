@@ -7,6 +7,7 @@ seconds, a recurrent student can keep for itself.
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
 from quadvel_sim.terrain import Terrain
 
-from . import loop
+from . import loop, parallel
 from .command_grid import CommandGrid, GridConfig
 from .env import EnvConfig, VelocityEnv, cores
 from .loop import Budget
@@ -163,6 +164,9 @@ class Judgement:
 
     def __init__(self, n: int) -> None:
         self._sum, self._age = np.zeros((n, 3)), np.zeros(n)
+        self._over: list[
+            tuple[np.ndarray, np.ndarray, np.ndarray]
+        ] = []  # what `CommandGrid.note` is told next
 
     def advance(self, error: np.ndarray, period: float) -> None:
         """Note the errors (n, 3) of one sample."""
@@ -176,14 +180,19 @@ class Judgement:
         self._sum[ids], self._age[ids] = 0.0, 0.0
         return np.stack(sizes(mean), axis=1), judged
 
-    def tell(self, grid: CommandGrid, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
-        """Tell the grid how the commands (n, 4) that are `over` (n,) were followed; too short ones say nothing, falls always."""
+    def end(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
+        """Judge the commands (n, 4) that are `over` (n,); too short ones say nothing, falls always."""
         ids = np.flatnonzero(over)
-        if not len(ids):
-            return
         error, judged = self.close(ids)
         tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
-        grid.note(command[ids][tells], error[tells], fell[ids][tells])
+        if tells.any():
+            self._over.append((command[ids][tells], error[tells], fell[ids][tells]))
+
+    def tell(self, grid: CommandGrid) -> None:
+        """Tell the grid what was judged since the last time, by all processes: all their grids are one."""
+        for judged in itertools.chain(*parallel.gather(self._over)):
+            grid.note(*judged)
+        self._over = []
 
 
 class PrivilegedRun:
@@ -191,12 +200,13 @@ class PrivilegedRun:
 
     def __init__(self, config: PrivilegedConfig) -> None:
         self.config = c = config
+        parallel.join("cpu")
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed,
+            seed=c.seed + 1000 * parallel.rank(),
             period=c.period,
             timestep=c.timestep,
             actuator=actuator(c.actuator),
@@ -227,14 +237,15 @@ class PrivilegedRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of its grid."""
+        """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
-        torch.set_rng_state(state["random"]["learner"])
-        self.env.rng.bit_generator.state = state["random"]["environments"]
+        if parallel.size() == 1:
+            torch.set_rng_state(state["random"]["learner"])
+            self.env.rng.bit_generator.state = state["random"]["environments"]
         self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
@@ -295,9 +306,10 @@ class PrivilegedRun:
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
             errors = [size.mean() for size in sizes(self.past.stride)]
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
-            self.judgement.tell(self.grid, command, fell | late | env.changed, fell)
+            self.judgement.end(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
-        self.samples += c.length * c.n
+        self.judgement.tell(self.grid)
+        self.samples += c.length * c.n * parallel.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = self._critic_obs(observe(env, self.past, self._actions[self._ago - 1]))
         rollout = Rollout(

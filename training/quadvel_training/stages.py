@@ -31,8 +31,9 @@ NO_LIMIT = 1e6  # minutes
 
 def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -> bool:
     """Stage 1; whether its budget is spent. source, here and below: the recipe file, for the record."""
-    describe(folder, "privileged", source, config)
     run = PrivilegedRun(config)
+    if parallel.rank() == 0:
+        describe(folder, "privileged", source, config)
     return loop.train(run, config.budget, folder / TEACHER, Numbered(run, folder))
 
 
