@@ -68,6 +68,12 @@ def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> 
     return config
 
 
+def _written(path: Path) -> None:
+    """Say so, in the one process that wrote it."""
+    if parallel.rank() == 0:
+        print(f"written: {path}")
+
+
 @app.command("all")
 def train_everything(out: Out = Path("out/training"), device: Device = "cpu") -> None:
     """From random weights to policy and estimator: every stage with its recipe, in folders of DIR; days of two cores.
@@ -102,10 +108,10 @@ def train_dagger(
 ) -> None:
     """Stage 2: the paper's network learns from that teacher while it drives itself.
 
-    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
+    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks. torchrun as for `privileged`.
     """
     stages.train_student(_configured(dagger.DaggerConfig, source, minutes), source, teacher, out)
-    print(f"written: {out / stages.POLICY_FILE}")
+    _written(out / stages.POLICY_FILE)
 
 
 @app.command("constrained")
@@ -126,8 +132,7 @@ def train_constrained(
     """
     config = _configured(constrained.ConstrainedConfig, source, minutes)
     stages.train_policy(config, source, start, teacher, out, device)
-    if parallel.rank() == 0:
-        print(f"written: {out / stages.POLICY_FILE}")
+    _written(out / stages.POLICY_FILE)
 
 
 @app.command("ablation")

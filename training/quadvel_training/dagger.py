@@ -28,13 +28,13 @@ from quadvel_policy.observation import (
 )
 from quadvel_sim.terrain import Terrain
 
-from . import privileged
+from . import parallel, privileged
 from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
 from .onnx_file import commit, export
-from .ppo import FAR
+from .ppo import FAR, living_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
 from .randomisation import Randomisation, actuator
 from .walking_rewards import sizes
@@ -112,6 +112,7 @@ class DaggerRun:
 
     def __init__(self, config: DaggerConfig, teacher_file: Path) -> None:
         self.config = c = config
+        parallel.join("cpu")
         torch.manual_seed(c.seed)
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
@@ -119,7 +120,7 @@ class DaggerRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed,
+            seed=c.seed + 1000 * parallel.rank(),
             timestep=c.timestep,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
@@ -151,12 +152,16 @@ class DaggerRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of the teacher's grid as it is now."""
+        """Go on from a checkpoint; robots start over, under commands of the teacher's grid as it is now.
+
+        Draws go on, too, unless there are several processes.
+        """
         self.student.load_state_dict(state["student"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.samples = state["samples"]
-        torch.set_rng_state(state["random"]["learner"])
-        self.env.rng.bit_generator.state = state["random"]["environments"]
+        if parallel.size() == 1:
+            torch.set_rng_state(state["random"]["learner"])
+            self.env.rng.bit_generator.state = state["random"]["environments"]
         self._start_over(np.arange(self.config.n))
 
     def _share(self) -> float:
@@ -217,7 +222,7 @@ class DaggerRun:
             fell |= env.fallen & alive
             alive &= ~(env.fallen | env.timed_out)
         masks[-1] = alive  # robots that end in the last tick count as ended, too
-        self.samples += c.length * c.n
+        self.samples += c.length * c.n * parallel.size()
         obs_t, label_t, mask_t = (
             torch.from_numpy(np.array(x, dtype=np.float32)) for x in (observations, labels, masks)
         )
@@ -240,9 +245,10 @@ class DaggerRun:
         for ids in torch.randperm(self.config.n).chunk(self.config.mini_batches):
             action, _ = self.student(obs[:, ids], select(start, ids))
             error = torch.nn.functional.huber_loss(action, label[:, ids], reduction="none", delta=FAR)
-            loss = (error.mean(-1) * mask[:, ids]).sum() / mask[:, ids].sum().clamp(min=1)
+            loss = living_mean(error.mean(-1), mask[:, ids])
             self.optimiser.zero_grad()
             loss.backward()
+            parallel.share_gradients(self.student)
             torch.nn.utils.clip_grad_norm_(self.student.parameters(), 1.0)
             self.optimiser.step()
             total += float(loss.detach())

@@ -87,7 +87,7 @@ class Rollout:
     label: Tensor | None = None  # (T, N, A) what a teacher would have done
 
 
-def _mean(values: Tensor, mask: Tensor) -> Tensor:
+def living_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Over the living samples of all processes: the mean of what each process returns here, and so of its gradients."""
     return (values * mask).sum() / parallel.mean(mask.sum()).clamp(min=1)
 
@@ -158,9 +158,9 @@ class Ppo:
         pull: weight of the distance to the rollout's labels; constraints: share of the configuration's weights.
         """
         advantage, target = self.advantages(r)
-        explained = 1 - _mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
-        centre = parallel.mean(_mean(advantage, r.mask))
-        spread = parallel.mean(_mean((advantage - centre) ** 2, r.mask)).sqrt()
+        explained = 1 - living_mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
+        centre = parallel.mean(living_mean(advantage, r.mask))
+        spread = parallel.mean(living_mean((advantage - centre) ** 2, r.mask)).sqrt()
         advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
             old_log_prob = self._log_prob(r.action - r.mean, r.noise)
@@ -201,7 +201,7 @@ class Ppo:
         steps, total = self.config.critic_steps, 0.0
         parts = zip(*(x.tensor_split(steps, dim=1) for x in (obs, target, mask)), strict=True)
         for part_obs, part_target, part_mask in parts:
-            loss = _mean((self.critic(part_obs)[0][..., 0] - part_target) ** 2, part_mask)
+            loss = living_mean((self.critic(part_obs)[0][..., 0] - part_target) ** 2, part_mask)
             self._step(self.critic_optimiser, self.critic, loss)
             total += float(loss.detach())
         return {"value_loss": total / steps}
@@ -223,7 +223,7 @@ class Ppo:
             -LOG_RATIO_BOUND, LOG_RATIO_BOUND
         ).exp()  # one that overflows spoils all weights
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
-        surrogate = -_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
+        surrogate = -living_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
         variance = (2 * actor.log_std).exp().detach()
 
         seen = ids < self.mirrored(r.reward.shape[1])
@@ -231,21 +231,21 @@ class Ppo:
         with torch.set_grad_enabled(c.symmetry > 0.0):  # else the term is but watched
             mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
-        symmetry = _mean(gap.sum(-1), mask[:, seen])
+        symmetry = living_mean(gap.sum(-1), mask[:, seen])
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
-        smoothness = _mean(bend.norm(dim=-1), mask[2:])
+        smoothness = living_mean(bend.norm(dim=-1), mask[2:])
 
         constrained = constraints * (c.symmetry * symmetry + c.smoothness * smoothness)
         loss = surrogate + constrained - c.entropy * actor.entropy()
         terms = {"surrogate": surrogate, "symmetry": symmetry, "smoothness": smoothness}
         if r.label is not None:
             away = torch.nn.functional.huber_loss(mean, r.label[:, ids], reduction="none", delta=FAR)
-            terms["away"] = _mean(away.mean(-1), mask)
+            terms["away"] = living_mean(away.mean(-1), mask)
             loss = loss + pull * terms["away"]
         self._step(self.actor_optimiser, actor, loss)
         if c.target_kl is not None:
             shift = ((mean.detach() - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1)
-            terms["kl"] = parallel.mean(_mean(shift, mask))
+            terms["kl"] = parallel.mean(living_mean(shift, mask))
         return {name: float(term.detach()) for name, term in terms.items()}
 
     def _step(self, optimiser: torch.optim.Optimizer, module: torch.nn.Module, loss: Tensor) -> None:

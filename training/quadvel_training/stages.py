@@ -39,11 +39,13 @@ def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -
 
 def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
     """Stage 2, from a checkpoint of stage 1; the policy file is written where it was stopped, too."""
-    describe(folder, "dagger", source, config)
     run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
+    if parallel.rank() == 0:
+        describe(folder, "dagger", source, config)
     spent = loop.train(run, config.budget, checkpoint)
-    about = made_of("dagger", source, config, checkpoint)
-    export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
+    if parallel.rank() == 0:
+        about = made_of("dagger", source, config, checkpoint)
+        export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
     return spent
 
 
