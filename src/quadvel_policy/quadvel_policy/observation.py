@@ -174,9 +174,9 @@ def _rate(field: str, value: Any) -> float:
 
 
 def _gains(field: str, value: Any) -> Vector:
-    gains = _per_joint(field, value)
-    if min(gains) < 0.0:
-        raise _refusal(field, value, "no gain below 0")
+    gains, most = _per_joint(field, value), MAX_GAINS[field]
+    if not 0.0 <= min(gains) <= max(gains) <= most:
+        raise _refusal(field, value, f"gains from 0 to {most:g}")
     return gains
 
 
@@ -200,6 +200,8 @@ def _text(field: str, value: Any) -> str:
         raise _refusal(field, value, "a text")
     return value
 
+
+MAX_GAINS = {"kp": 500.0, "kd": 20.0}  # N m/rad, N m s/rad: above all that drives of such robots are run with
 
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "schema": _schema,
