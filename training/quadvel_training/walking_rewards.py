@@ -69,7 +69,7 @@ class WalkingWeights:
     dragging: float = 0.4  # fine for each foot that stays down
     slip: float = 0.06  # fine, s/m, of each foot on the ground
     stumble: float = 3.0  # fine, s/m^2: clearance missing in swing times the foot's speed
-    hips: float = 0.3  # fine, 1/rad, of hips away from straight down
+    hips: float = 1.0  # fine, 1/rad, of hips away from straight down
     posture: float = 0.2  # fine in stance, 1/rad, off the nominal posture
     step: float = 0.1  # fine in stance for each foot in the air
     fidget: float = 1e-3  # fine in stance: joint speeds squared
