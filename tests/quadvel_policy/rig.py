@@ -10,7 +10,8 @@ import numpy as np
 
 from quadvel_description.robot import LIE_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
-from quadvel_policy.guards import GUARDS, Guard
+from quadvel_policy.guard import Guard
+from quadvel_policy.guards import GUARDS
 from quadvel_policy.supervisor import Supervisor, SupervisorConfig
 
 PERIOD = 0.005

@@ -18,7 +18,8 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
 from quadvel_policy.command_limits import LIMITS, CommandLimits
 from quadvel_policy.faults import page, table
-from quadvel_policy.guards import GUARDS, Guard, Level, MotorStatus, torque_of
+from quadvel_policy.guard import Guard, Level, MotorStatus
+from quadvel_policy.guards import GUARDS, torque_of
 from quadvel_policy.supervisor import OTHER_FAULTS
 
 Changes = dict[str, Any]

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 
-from .guards import Level
+from .guard import Level
 from .supervisor import FOLLOWING, Supervisor
 
 AGAIN = 5.0

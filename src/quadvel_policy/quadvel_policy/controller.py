@@ -29,7 +29,7 @@ from quadvel_nodes.node import read_parameters, run
 
 from .announcements import Announcements
 from .control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
-from .guards import MotorStatus as Motors
+from .guard import MotorStatus as Motors
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import linear_velocity, planar_velocity
 from .settings import setting

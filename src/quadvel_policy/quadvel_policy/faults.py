@@ -8,7 +8,8 @@ from collections.abc import Iterator
 import attrs
 
 from .command_limits import LIMITS
-from .guards import GUARDS, MOVING, Level
+from .guard import MOVING, Level
+from .guards import GUARDS
 from .supervisor import OTHER_FAULTS, SupervisorConfig
 
 WHAT_IS_DONE = {

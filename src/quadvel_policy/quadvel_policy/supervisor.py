@@ -18,21 +18,8 @@ from quadvel_description.state import JointCommand, RobotState
 
 from .backup_velocity import BackupVelocity, Estimator
 from .command_limits import CommandLimits, CommandLimitsConfig
-from .guards import (
-    GUARDS,
-    WALK,
-    AccelerometerImplausible,
-    EstimateStale,
-    EstimateWrong,
-    Finding,
-    Guard,
-    GuardConfig,
-    Level,
-    MotorStatus,
-    Obstacle,
-    Sight,
-    Watch,
-)
+from .guard import WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Sight, Watch
+from .guards import GUARDS, AccelerometerImplausible, EstimateStale, EstimateWrong, Obstacle
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
 from .settings import setting
 

@@ -33,7 +33,8 @@ from quadvel_nodes.messages import (
 )
 from quadvel_policy.command_mux import CommandMux, MuxInput
 from quadvel_policy.control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
-from quadvel_policy.guards import GUARDS, Guard
+from quadvel_policy.guard import Guard
+from quadvel_policy.guards import GUARDS
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import DT, Simulator
