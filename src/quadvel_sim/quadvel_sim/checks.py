@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import attrs
 import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
 
 
 def numbers(count: int, low: float = -np.inf) -> dict[str, Any]:
@@ -68,3 +72,52 @@ def or_none(field: dict[str, Any]) -> dict[str, Any]:
         "converter": attrs.converters.optional(field["converter"]),
         "validator": attrs.validators.optional(field["validator"]),
     }
+
+
+def points(least: int) -> dict[str, Any]:
+    """Field arguments: at least so many points, x and y in m; kept as a read-only array (n, 2)."""
+
+    def convert(value: Any) -> Array:
+        try:
+            values = np.array(value, dtype=float)
+        except (TypeError, ValueError):
+            values = np.array(np.nan)
+        values.flags.writeable = False
+        return values
+
+    def check(instance: object, attribute: attrs.Attribute[Any], value: Array) -> None:
+        if value.ndim != 2 or value.shape[1:] != (2,) or len(value) < least or not np.isfinite(value).all():
+            found = f"shape {value.shape}" if value.ndim else "no list of pairs of numbers"
+            raise ValueError(
+                f"{type(instance).__name__}.{attribute.name}: found {found}, expected {least} or more points [x, y]"
+            )
+        if least > 1 and not np.hypot(*np.diff(value, axis=0).T).all():
+            raise ValueError(
+                f"{type(instance).__name__}.{attribute.name}: found a point twice in a row, expected it once"
+            )
+
+    return {"converter": convert, "validator": check}
+
+
+def one_of(choices: Sequence[str]) -> dict[str, Any]:
+    """Field arguments: one of these words."""
+
+    def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
+        if value not in choices:
+            raise ValueError(
+                f"{type(instance).__name__}.{attribute.name}: found {value!r}, expected one of {', '.join(choices)}"
+            )
+
+    return {"validator": check}
+
+
+def truth_value() -> dict[str, Any]:
+    """Field arguments: true or false."""
+
+    def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
+        if not isinstance(value, bool):
+            raise ValueError(
+                f"{type(instance).__name__}.{attribute.name}: found {value!r}, expected true or false"
+            )
+
+    return {"validator": check}

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
-from quadvel_sim.checks import number, numbers, or_none, whole_number
+from quadvel_sim.checks import number, numbers, one_of, or_none, points, truth_value, whole_number
 from quadvel_sim.laser import SEEN, Laser
 from quadvel_sim.terrain import GEOM_NAME, perlin
 
@@ -38,8 +38,6 @@ _RIM = 0.005  # m, of a patch above the ground around it
 _LEG_RADIUS, _BOARD = 0.025, 0.03  # m, of tables
 _ARC = 8  # points of a turn
 _SOLREF = (0.01, 1.0)  # of all contacts, as the robot's own
-
-
 _BOX, _CYLINDER = mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_CYLINDER
 _COLOURS = {
     "grass": (0.33, 0.5, 0.25, 1.0),
@@ -66,53 +64,6 @@ SURFACES = {
     "grass": Surface(0.6, 0.03, 0.35),
     "gravel": Surface(0.5, 0.02, 0.12),
 }
-
-
-def points(least: int) -> dict[str, Any]:
-    """Field arguments: at least so many points, x and y in m; kept as a read-only array (n, 2)."""
-
-    def convert(value: Any) -> Array:
-        try:
-            values = np.array(value, dtype=float)
-        except (TypeError, ValueError):
-            values = np.array(np.nan)
-        values.flags.writeable = False
-        return values
-
-    def check(instance: object, attribute: attrs.Attribute[Any], value: Array) -> None:
-        if value.ndim != 2 or value.shape[1:] != (2,) or len(value) < least or not np.isfinite(value).all():
-            found = f"shape {value.shape}" if value.ndim else "no list of pairs of numbers"
-            raise ValueError(
-                f"{type(instance).__name__}.{attribute.name}: found {found}, expected {least} or more points [x, y]"
-            )
-        if least > 1 and not np.hypot(*np.diff(value, axis=0).T).all():
-            raise ValueError(
-                f"{type(instance).__name__}.{attribute.name}: found a point twice in a row, expected it once"
-            )
-
-    return {"converter": convert, "validator": check}
-
-
-def one_of(choices: Sequence[str]) -> dict[str, Any]:
-    """Field arguments: one of these words."""
-
-    def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
-        if value not in choices:
-            raise ValueError(
-                f"{type(instance).__name__}.{attribute.name}: found {value!r}, expected one of {', '.join(choices)}"
-            )
-
-    return {"validator": check}
-
-
-def _truth_value() -> dict[str, Any]:
-    def check(instance: object, attribute: attrs.Attribute[Any], value: object) -> None:
-        if not isinstance(value, bool):
-            raise ValueError(
-                f"{type(instance).__name__}.{attribute.name}: found {value!r}, expected true or false"
-            )
-
-    return {"validator": check}
 
 
 @attrs.frozen(eq=False, kw_only=True)
@@ -316,9 +267,9 @@ class Person:
 
     way: Array = attrs.field(**points(2))
     """Points, m, from one to the next."""
-    closed: bool = attrs.field(default=False, **_truth_value())
+    closed: bool = attrs.field(default=False, **truth_value())
     """Whether it goes on from the last point to the first, round after round; else it stays there."""
-    led: bool = attrs.field(default=False, **_truth_value())
+    led: bool = attrs.field(default=False, **truth_value())
     """Whether it is the one whom the robot is to follow."""
     speed: float = attrs.field(default=1.2, **number(0.1, 3.0))
     """m/s"""
