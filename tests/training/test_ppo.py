@@ -130,6 +130,18 @@ def test_the_symmetry_term_makes_a_recurrent_policy_symmetric():
     assert last < 0.2 * first
 
 
+def test_who_stands_may_prefer_a_side():
+    torch.manual_seed(0)
+    ppo = learner(epochs=1, mini_batches=1)
+    r = rollout(0.0, t=5, n=4)
+    mean = ppo.actor(r.obs)[0].detach()
+    gap = ((mean - MIRROR_ACTION(ppo.actor(MIRROR_OBS(r.obs))[0].detach())) ** 2).sum(-1)
+    r.standing = torch.zeros(5, 4)
+    r.standing[2:] = 1.0
+    expected = gap[:2].mean() / (2 * (2 * ppo.actor.log_std.detach()).exp().mean())
+    assert ppo.update(r)["symmetry"] == pytest.approx(float(expected), rel=1e-4)
+
+
 def test_the_mirrored_sequence_of_a_mirrored_memory_is_the_mirror_of_the_past():
     """Running the mirror of a whole sequence equals carrying the mirrored memory over a cut."""
     torch.manual_seed(0)

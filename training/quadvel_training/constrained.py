@@ -208,7 +208,7 @@ class ConstrainedRun:
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment."""
         c, env, past = self.config, self.env, self.past
-        names = ["obs", "critic_obs", "action", "mean", "reward", "ended", "cut", "mask"]
+        names = ["obs", "critic_obs", "standing", "action", "mean", "reward", "ended", "cut", "mask"]
         names += ["label"] if self.teacher else []
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().cpu().numpy()
@@ -217,6 +217,7 @@ class ConstrainedRun:
         for _ in range(c.length):
             with self.shares.of("sensing"):
                 obs, critic_obs = dagger.observe(env, self._action), self._critic_obs()
+                standing = env.contact.all(axis=1)
             with self.shares.of("inference"):
                 mean, state = self._act(obs, state)
                 label = [self.teacher.action()] if self.teacher else []
@@ -234,7 +235,7 @@ class ConstrainedRun:
                 reward -= c.stride * sum(sizes(past.stride)) + lasting * sum(sizes(past.lasting))
             self._action = action
             fell, late = env.fallen & alive, env.timed_out & ~env.fallen & alive
-            row = (obs, critic_obs, action, mean, reward, fell, late, alive.copy(), *label)
+            row = (obs, critic_obs, standing, action, mean, reward, fell, late, alive.copy(), *label)
             for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
             self.judgement.advance(velocity_error(env, command), TICK)

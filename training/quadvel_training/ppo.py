@@ -85,6 +85,9 @@ class Rollout:
     state: State | None = None  # of the actor at the start
     mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
     label: Tensor | None = None  # (T, N, A) what a teacher would have done
+    standing: Tensor | None = (
+        None  # (T, N) 1 on four feet, where a robot may prefer a side: it has to begin with one
+    )
 
 
 def living_mean(values: Tensor, mask: Tensor) -> Tensor:
@@ -231,7 +234,8 @@ class Ppo:
         with torch.set_grad_enabled(c.symmetry > 0.0):  # else the term is but watched
             mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
-        symmetry = living_mean(gap.sum(-1), mask[:, seen])
+        stepping = mask[:, seen] if r.standing is None else mask[:, seen] * (1 - r.standing[:, ids[seen]])
+        symmetry = living_mean(gap.sum(-1), stepping)
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
         smoothness = living_mean(bend.norm(dim=-1), mask[2:])
 

@@ -279,14 +279,14 @@ class PrivilegedRun:
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment with exploration noise."""
         env, c = self.env, self.config
-        names = ("obs", "critic_obs", "action", "mean", "reward", "ended", "cut")
+        names = ("obs", "critic_obs", "standing", "action", "mean", "reward", "ended", "cut")
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().detach().numpy()
         terms: dict[str, float] = {}
         seen = np.zeros(5)
         for _ in range(c.length):
             obs = observe(env, self.past, self._actions[self._ago - 1])
-            critic_obs = self._critic_obs(obs)
+            critic_obs, standing = self._critic_obs(obs), env.contact.all(axis=1)
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
             drawn = mean + std * env.rng.standard_normal(mean.shape, dtype=np.float32)
@@ -300,7 +300,8 @@ class PrivilegedRun:
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
-            for name, value in zip(names, (obs, critic_obs, drawn, mean, reward, fell, late), strict=True):
+            row = (obs, critic_obs, standing, drawn, mean, reward, fell, late)
+            for name, value in zip(names, row, strict=True):
                 keep[name].append(value)
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
