@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_training.networks import Gaussian, Mlp, Recurrent, torch_mirror  # noqa: E402
-from quadvel_training.ppo import Ppo, PpoConfig, Rollout, select  # noqa: E402
+from quadvel_training.ppo import Ppo, PpoConfig, Rollout, select, spreads  # noqa: E402
 
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
 
@@ -180,14 +180,15 @@ def test_the_gradient_under_correlated_exploration_is_that_of_the_return():
     network = Swing()
     actor = Gaussian(network, 1, 0.1)
     ppo = Ppo(actor, ConstantCritic(0.0), PpoConfig(correlation=correlation), lambda x: x, lambda x: x)
-    noise = torch.zeros(t, n, 1)
+    noise, spread = torch.zeros(t, n, 1), torch.from_numpy(spreads(n))
     for k in range(t):
-        noise[k] = (correlation * noise[k - 1] if k else 0.0) + 0.1 * torch.randn(n, 1)
+        noise[k] = (correlation * noise[k - 1] if k else 0.0) + 0.1 * spread * torch.randn(n, 1)
     reward = -((noise - (wave @ wanted)[:, None, None]) ** 2)[..., 0]
     advantage = reward.flip(0).cumsum(0).flip(0)
     advantage = advantage - advantage.mean(1, keepdim=True)
-    mean, _ = network(noise)
-    (ppo._log_prob(noise - (mean - mean.detach()), torch.zeros(n, 1)) * advantage).mean(1).sum().backward()
+    r = rollout(0.0, t=t, n=n)
+    r.action, r.noise, r.spread = noise, torch.zeros(n, 1), spread
+    (ppo._log_prob(r, slice(None), network(noise)[0]) * advantage).mean(1).sum().backward()
     expected = 2 * wave.T @ (wave @ wanted)  # of the sum of rewards
     found = network.theta.grad
     assert torch.allclose(found, expected, atol=0.15 * expected.norm().item())

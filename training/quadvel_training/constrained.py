@@ -25,7 +25,7 @@ from .command_grid import CommandGrid, GridConfig
 from .env import TICK, EnvConfig, VelocityEnv, cores
 from .loop import Budget, Shares, linear, load
 from .networks import Gaussian, Mlp, Recurrent, State, torch_mirror
-from .ppo import GENTLE, Ppo, PpoConfig, Rollout
+from .ppo import GENTLE, Ppo, PpoConfig, Rollout, spreads
 from .privileged import ACTION_BOUND, Judgement, Past, velocity_error
 from .randomisation import Randomisation, actuator
 from .rewards import RewardWeights, Table2
@@ -125,6 +125,7 @@ class ConstrainedRun:
         self.samples = self.updates = 0
         self._action = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
+        self._spread = spreads(c.n)
         self._state = self._initial_state(c.n)
         self._mirrored = self._initial_state(self.ppo.mirrored(c.n))
 
@@ -223,7 +224,7 @@ class ConstrainedRun:
                 label = [self.teacher.action()] if self.teacher else []
             with self.shares.of("physics"):
                 drawn = env.rng.standard_normal((c.n, 12), dtype=np.float32)
-                self._noise = np.float32(c.ppo.correlation) * self._noise + std * drawn
+                self._noise = np.float32(c.ppo.correlation) * self._noise + std * self._spread * drawn
                 action, command = mean + self._noise, env.command.copy()
                 env.tick(self.map.targets(action))
             with self.shares.of("sensing"):
@@ -244,7 +245,7 @@ class ConstrainedRun:
         self.judgement.tell(self.grid)
         self.samples += c.length * c.n * parallel.size()
         rows = {name: np.array(value, dtype=np.float32) for name, value in keep.items()}
-        rows |= {"noise": before, "last_critic_obs": self._critic_obs()}
+        rows |= {"noise": before, "spread": self._spread, "last_critic_obs": self._critic_obs()}
         t = {name: torch.from_numpy(value).to(self.device) for name, value in rows.items()}
         rollout = Rollout(**t, state=start, mirrored_state=mirrored_start)
         seen = self._figures(t, alive)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import attrs
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -85,6 +86,7 @@ class Rollout:
     state: State | None = None  # of the actor at the start
     mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
     label: Tensor | None = None  # (T, N, A) what a teacher would have done
+    spread: Tensor | None = None  # (N, 1) of each robot's exploration, a share of the policy's; None: 1
     standing: Tensor | None = (
         None  # (T, N) 1 on four feet, where a robot may prefer a side: it has to begin with one
     )
@@ -93,6 +95,14 @@ class Rollout:
 def living_mean(values: Tensor, mask: Tensor) -> Tensor:
     """Over the living samples of all processes: the mean of what each process returns here, and so of its gradients."""
     return (values * mask).sum() / parallel.mean(mask.sum()).clamp(min=1)
+
+
+def spreads(n: int) -> np.ndarray:
+    """Of the exploration of `n` robots (n, 1): the last quarter of them explores little.
+
+    What noise alone does for the others, such as to begin with one of two legs, the policy has to do for them.
+    """
+    return np.where(np.arange(n)[:, None] < 0.75 * n, 1.0, 0.3).astype(np.float32)
 
 
 class Ppo:
@@ -166,7 +176,7 @@ class Ppo:
         spread = parallel.mean(living_mean((advantage - centre) ** 2, r.mask)).sqrt()
         advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
-            old_log_prob = self._log_prob(r.action - r.mean, r.noise)
+            old_log_prob = self._log_prob(r, slice(None), r.mean)
         total: dict[str, float] = {}
         batches = 0
         for ids in self._mini_batches(r.reward.shape[1], r.reward.device):
@@ -187,13 +197,15 @@ class Ppo:
         """What was drawn anew in every sample of correlated exploration (T, N, A), of which `before` (N, A) was the last."""
         return noise - self.config.correlation * torch.cat([before[None], noise[:-1]])
 
-    def _log_prob(self, noise: Tensor, before: Tensor) -> Tensor:
-        """Log density of the exploration, (T, N).
+    def _log_prob(self, r: Rollout, ids: Tensor | slice, mean: Tensor) -> Tensor:
+        """Log density of the actions that robots `ids` took, (T, N), if the policy meant `mean`, but for a constant.
 
         Of the draws given the whole past: what the actions deviate by now depends on what the mean was then. With the
         decayed noise taken as a given offset, the gradient would be that of a mean which changes along with the noise.
         """
-        draws = self._draws(noise, before)
+        draws = self._draws(r.action[:, ids] - mean, r.noise[ids])
+        if r.spread is not None:
+            draws = draws / r.spread[ids]
         return self.actor.log_prob(torch.zeros_like(draws), draws)
 
     def _mini_batches(self, n: int, device: torch.device) -> Iterator[Tensor]:
@@ -221,7 +233,7 @@ class Ppo:
         c, actor = self.config, self.actor
         pull, constraints = weights
         mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
-        log_ratio = self._log_prob(r.action[:, ids] - mean, r.noise[ids]) - old_log_prob
+        log_ratio = self._log_prob(r, ids, mean) - old_log_prob
         ratio = log_ratio.clamp(
             -LOG_RATIO_BOUND, LOG_RATIO_BOUND
         ).exp()  # one that overflows spoils all weights

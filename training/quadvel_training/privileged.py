@@ -24,7 +24,7 @@ from .command_grid import CommandGrid, GridConfig
 from .env import EnvConfig, VelocityEnv, cores
 from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
-from .ppo import Ppo, PpoConfig, Rollout
+from .ppo import Ppo, PpoConfig, Rollout, spreads
 from .randomisation import Randomisation, actuator
 from .walking_rewards import SAMPLE, WalkingRewards, WalkingWeights, sizes
 
@@ -222,6 +222,7 @@ class PrivilegedRun:
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
+        self._spread = spreads(c.n)
         self._ago = round(SAMPLE / c.period)  # samples between its action and the one that it sees
         self._actions = np.zeros((max(2, self._ago), c.n, 12), np.float32)  # the last ones, the newest first
 
@@ -289,7 +290,7 @@ class PrivilegedRun:
             critic_obs, standing = self._critic_obs(obs), env.contact.all(axis=1)
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
-            drawn = mean + std * env.rng.standard_normal(mean.shape, dtype=np.float32)
+            drawn = mean + std * self._spread * env.rng.standard_normal(mean.shape, dtype=np.float32)
             action = drawn.clip(-ACTION_BOUND, ACTION_BOUND)
             command = env.command.copy()
             touched = self.past.air.copy()
@@ -316,6 +317,7 @@ class PrivilegedRun:
         rollout = Rollout(
             **t,
             noise=torch.zeros(c.n, 12),
+            spread=torch.from_numpy(self._spread),
             mask=torch.ones_like(t["reward"]),
             last_critic_obs=torch.from_numpy(last),
         )
