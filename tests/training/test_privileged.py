@@ -227,6 +227,23 @@ def test_feet_are_to_step_while_walking_and_to_stay_in_stance():
     assert (terms["step"][:2] == 0.0).all()
 
 
+def test_who_has_stood_is_to_begin_with_its_left_front_leg():
+    env = VelocityEnv(CALM)
+    rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
+    command = np.array([[0.5, 0, 0, 0]] * 4, float)
+    env.contact[:] = True
+    for _ in range(15):
+        past.advance(command)
+    assert past.standing.all()
+    past.down[3] = 0.1
+    env.contact[0, [0, 3]] = env.contact[1, [1, 2]] = env.contact[3, [0, 3]] = False
+    past.advance(command)
+    terms = rewards.terms(command, past, np.zeros((4, 4)), np.zeros((3, 4, 12)))
+    assert (terms["begin"] < 0.0).tolist() == [True, False, False, False]
+    past.advance(command)
+    assert not past.began.any()
+
+
 def test_exploration_stays_wide_until_a_gait_has_formed():
     run = PrivilegedRun(SMALL)
     with torch.no_grad():

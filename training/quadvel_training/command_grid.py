@@ -32,7 +32,7 @@ class GridConfig:
     vy: float = 2.2  # m/s, either way
     wz: float = 6.3  # rad/s, either way
     curve: float = 4.0  # m/s^2, of `CommandLimits`
-    stance: float = 0.2  # share of stance commands: setting off is where robots fall most
+    stance: float = 0.3  # share of stance commands: setting off is where robots fall most
     straight: float = 0.25  # share of commands without turning,
     near: float = 0.2  # of commands near rest, with and without turning, which are few among all cells,
     axis: float = 0.15  # of commands along one axis alone, the fastest ones among them; the rest may be any

@@ -218,7 +218,7 @@ class ConstrainedRun:
         for _ in range(c.length):
             with self.shares.of("sensing"):
                 obs, critic_obs = dagger.observe(env, self._action), self._critic_obs()
-                standing = env.contact.all(axis=1)
+                standing = past.standing
             with self.shares.of("inference"):
                 mean, state = self._act(obs, state)
                 label = [self.teacher.action()] if self.teacher else []

@@ -33,6 +33,7 @@ ACTION_BOUND = 4.0  # of the network's unit
 STRIDE = 0.35  # s, over which errors are low-passed: about a stride
 LONG = 1.5  # s, the same for what lasts
 TRANSIENT = 1.0  # s after a new command that what lasts, and the judgement of the command, leave out
+STOOD = 0.2  # s on four feet, after which a robot that sets off has to begin with a side
 TALL = 0.38  # m, about the height of a walking trunk
 
 
@@ -64,6 +65,7 @@ class Past:
 
     stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG; the latter
     starts at zero with every new command, TRANSIENT after it. air, down (n, 4): s since the foot left the ground or touched it.
+    began (n, 4) bool: feet that a robot that STOOD has just lifted.
     """
 
     def __init__(self, env: VelocityEnv) -> None:
@@ -71,6 +73,7 @@ class Past:
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
+        self.began = np.zeros((n, 4), bool)
         self._age = np.zeros(n)  # s, of the command
 
     def reset(self, ids: np.ndarray) -> None:
@@ -87,8 +90,14 @@ class Past:
         settled = (self._age > TRANSIENT)[:, None]
         self.lasting += (error - self.lasting) * settled * period / LONG
         self.lasting[env.changed] = self._age[env.changed] = 0.0
+        self.began = ~env.contact & self.standing[:, None]
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
+
+    @property
+    def standing(self) -> np.ndarray:
+        """Which robots have stood on four feet for so long that setting off means to choose a side, (n,) bool."""
+        return np.asarray((self.down > STOOD).all(axis=1))
 
 
 def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
@@ -287,7 +296,7 @@ class PrivilegedRun:
         seen = np.zeros(5)
         for _ in range(c.length):
             obs = observe(env, self.past, self._actions[self._ago - 1])
-            critic_obs, standing = self._critic_obs(obs), env.contact.all(axis=1)
+            critic_obs, standing = self._critic_obs(obs), self.past.standing
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
             drawn = mean + std * self._spread * env.rng.standard_normal(mean.shape, dtype=np.float32)
