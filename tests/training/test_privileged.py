@@ -181,24 +181,6 @@ def test_no_sample_is_worth_more_or_less_than_the_bounds():
     assert (rewards.total(great, np.zeros(4, bool)) == HIGHEST).all()
 
 
-def test_a_second_is_worth_the_same_in_long_and_in_short_samples():
-    worth = []
-    for period, timestep in ((0.02, 0.004), (0.01, 0.0025)):
-        env = VelocityEnv(attrs.evolve(CALM, period=period, timestep=timestep))
-        env.velocity[:, 2] = 0.3
-        env.contact[:] = True
-        rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)
-        command, fell = np.array([[0.5, 0, 0, 0]] * 4), np.zeros(4, bool)
-        actions = np.linspace(0, 0.1 * period / 0.02, 3)[:, None, None] * np.ones((1, 4, 12))
-        terms = rewards.terms(command, past, np.zeros((4, 4)), actions) | {"acceleration": np.zeros(4)}
-        lasting = rewards.total(terms, fell) / period
-        landed = rewards.terms(command, past, np.full((4, 4), 0.1), actions) | {"acceleration": np.zeros(4)}
-        landing = rewards.total(landed, fell) - lasting * period
-        fall = rewards.total(terms, ~fell) - lasting * period
-        worth.append((lasting[0], landing[0], fall[0]))
-    np.testing.assert_allclose(*worth, rtol=0.05)
-
-
 def test_following_turns_pays_as_following_speeds_does():
     env = VelocityEnv(CALM)
     rewards, past = WalkingRewards(env, WalkingWeights()), Past(env)

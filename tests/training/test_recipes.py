@@ -50,7 +50,6 @@ def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
     [
         ("privileged", PrivilegedConfig),
         ("privileged_rough", PrivilegedConfig),
-        ("privileged_last", PrivilegedConfig),
         ("dagger", DaggerConfig),
         ("crl_eam", ConstrainedConfig),
     ],

@@ -1,6 +1,6 @@
 """Stage 1: a memoryless teacher that sees the true state finds a gait from random weights, by rewards alone.
 
-No clock, no gait, no reference motion. It acts 50 times a second, at last 100 times, learns by PPO with a mirror loss, and
+No clock, no gait, no reference motion. It acts 50 times a second, learns by PPO with a mirror loss, and
 its commands grow with what it follows (`command_grid`). What it sees of the past, errors over a stride and over some
 seconds, a recurrent student can keep for itself.
 """
@@ -147,8 +147,7 @@ class PrivilegedConfig:
     budget: Budget = Budget(samples=2e8, minutes=6e3)
     n: int = 512
     threads: int = attrs.field(factory=cores)
-    length: int = 24  # samples a sequence, 0.48 s
-    period: float = 0.02  # s a sample
+    length: int = 24  # samples of 20 ms a sequence, 0.48 s
     timestep: float = 0.004  # s, of physics
     std: float = 0.7  # of the exploration at first, in the network's unit; an upper bound for it that falls
     final_std: float = 0.22  # to this
@@ -216,7 +215,7 @@ class PrivilegedRun:
             n=c.n,
             threads=c.threads,
             seed=c.seed + 1000 * parallel.rank(),
-            period=c.period,
+            period=SAMPLE,
             timestep=c.timestep,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
@@ -232,8 +231,7 @@ class PrivilegedRun:
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
         self._spread = spreads(c.n)
-        self._ago = round(SAMPLE / c.period)  # samples between its action and the one that it sees
-        self._actions = np.zeros((max(2, self._ago), c.n, 12), np.float32)  # the last ones, the newest first
+        self._actions = np.zeros((2, c.n, 12), np.float32)  # the last ones, the newest first
 
     def state(self) -> dict[str, Any]:
         """What a resumed run needs."""
@@ -295,7 +293,7 @@ class PrivilegedRun:
         terms: dict[str, float] = {}
         seen = np.zeros(5)
         for _ in range(c.length):
-            obs = observe(env, self.past, self._actions[self._ago - 1])
+            obs = observe(env, self.past, self._actions[0])
             critic_obs, standing = self._critic_obs(obs), self.past.standing
             with torch.no_grad():
                 mean = self.actor(torch.from_numpy(obs))[0].numpy()
@@ -305,8 +303,8 @@ class PrivilegedRun:
             touched = self.past.air.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
-            self.judgement.advance(velocity_error(env, command), c.period)
-            parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions[:2]]))
+            self.judgement.advance(velocity_error(env, command), SAMPLE)
+            parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions]))
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
             fell, late = env.fallen.copy(), env.timed_out & ~env.fallen
@@ -322,7 +320,7 @@ class PrivilegedRun:
         self.judgement.tell(self.grid)
         self.samples += c.length * c.n * parallel.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
-        last = self._critic_obs(observe(env, self.past, self._actions[self._ago - 1]))
+        last = self._critic_obs(observe(env, self.past, self._actions[0]))
         rollout = Rollout(
             **t,
             noise=torch.zeros(c.n, 12),
@@ -334,7 +332,7 @@ class PrivilegedRun:
         return rollout, {
             "error_xy": xy,
             "error_wz": wz,
-            "falls_per_minute": 60 * falls / c.period,
+            "falls_per_minute": 60 * falls / SAMPLE,
             "broken": broken * c.length,
             "contact_ratio": contact,
             "reward": float(t["reward"].mean()),

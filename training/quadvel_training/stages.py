@@ -17,7 +17,7 @@ from .privileged import Numbered, PrivilegedConfig, PrivilegedRun
 from .run_folder import Evaluated, describe, made_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
-TEACHER_PARTS = ("privileged", "privileged_rough", "privileged_last")  # recipes, one after the other
+TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, one after the other
 ABLATION = ("rl_pd", "rl_eam", "crl_eam")
 TEACHER, STUDENT, POLICY, ESTIMATOR = (
     "privileged.pt",

@@ -14,7 +14,7 @@ from quadvel_description import robot
 
 from .env import VelocityEnv
 
-SAMPLE = 0.02  # s, of which the weights are; shorter samples count for so much less, what happens at an instant counts as it is
+SAMPLE = 0.02  # s, for which the teacher holds an action, and which the weights are for
 LOWEST, HIGHEST = -6.0, 4.0  # of a sample's sum of terms, a fall apart: nothing may drown all else
 CARRIED = 0.36  # m, wanted height of the trunk
 LIFT = 0.06  # m, clearance wanted in swing
@@ -88,7 +88,6 @@ class WalkingRewards:
 
     def __init__(self, env: VelocityEnv, weights: WalkingWeights) -> None:
         self.env, self.weights = env, weights
-        self._samples = SAMPLE / env.config.period  # of the environment in one of SAMPLE
         self._dq = env.dq.copy()
 
     def reset(self, ids: np.ndarray) -> None:
@@ -99,7 +98,7 @@ class WalkingRewards:
         """The reward (n,) of these terms, bounded, and of a fall (n,)."""
         w = self.weights
         bounded = np.clip(np.sum(list(terms.values()), axis=0), LOWEST, HIGHEST)
-        return np.asarray(w.scale * (bounded / self._samples - w.fall * fell))
+        return np.asarray(w.scale * (bounded - w.fall * fell))
 
     def terms(
         self, command: np.ndarray, past: Past, air: np.ndarray, actions: np.ndarray
@@ -146,8 +145,8 @@ class WalkingRewards:
             "height": -w.height * np.minimum((env.height - CARRIED) ** 2, 0.02),
             "power": -w.power * env.power / (1 + 0.5 * speed),
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
-            "smoothness": -self._samples * w.rate * np.sum((now - before) ** 2, axis=1)
-            - self._samples**2 * w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
+            "smoothness": -w.rate * np.sum((now - before) ** 2, axis=1)
+            - w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
             "hips": -w.hips * hips_astray(env, command),
             "alive": np.full(len(now), w.alive),
         }
@@ -160,10 +159,8 @@ class WalkingRewards:
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
         missing = np.maximum(LIFT - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
         return {
-            "swing": self._samples
-            * w.swing
-            * (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1),
-            "begin": -self._samples * w.begin * past.began[:, SECOND].sum(axis=1),
+            "swing": w.swing * (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1),
+            "begin": -w.begin * past.began[:, SECOND].sum(axis=1),
             "dragging": -w.dragging * (past.down > LONG_DOWN).sum(axis=1),
             "slip": -w.slip * (np.minimum(speed, 3.0) * env.contact).sum(axis=1),
             "stumble": -w.stumble * missing.sum(axis=1),
