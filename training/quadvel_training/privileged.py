@@ -65,7 +65,6 @@ class Past:
 
     stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG; the latter
     starts at zero with every new command, TRANSIENT after it. air, down (n, 4): s since the foot left the ground or touched it.
-    began (n, 4) bool: feet that a robot that STOOD has just lifted.
     """
 
     def __init__(self, env: VelocityEnv) -> None:
@@ -73,7 +72,6 @@ class Past:
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
-        self.began = np.zeros((n, 4), bool)
         self._age = np.zeros(n)  # s, of the command
 
     def reset(self, ids: np.ndarray) -> None:
@@ -90,7 +88,6 @@ class Past:
         settled = (self._age > TRANSIENT)[:, None]
         self.lasting += (error - self.lasting) * settled * period / LONG
         self.lasting[env.changed] = self._age[env.changed] = 0.0
-        self.began = ~env.contact & self.standing[:, None]
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
 

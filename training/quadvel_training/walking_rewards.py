@@ -18,7 +18,6 @@ SAMPLE = 0.02  # s, for which the teacher holds an action, and which the weights
 LOWEST, HIGHEST = -6.0, 4.0  # of a sample's sum of terms, a fall apart: nothing may drown all else
 CARRIED = 0.36  # m, wanted height of the trunk
 LIFT = 0.06  # m, clearance wanted in swing
-SECOND = [0, 3]  # feet that a robot that stands is not to begin with: the pair of front right and rear left
 LONG_DOWN = 0.4  # s: a foot that is down for longer while walking is being dragged along
 
 
@@ -43,7 +42,6 @@ class Past(Protocol):
     lasting: np.ndarray
     air: np.ndarray
     down: np.ndarray
-    began: np.ndarray
 
 
 @attrs.frozen
@@ -69,9 +67,6 @@ class WalkingWeights:
     bend: float = 0.008  # fine: second difference of the action squared
     swing: float = 1.2  # at touchdown: seconds in the air beyond what suits the speed, within -0.25 and 0.1
     dragging: float = 0.4  # fine for each foot that stays down
-    begin: float = (
-        2.0  # fine for each of the SECOND feet lifted first: left and right alike, it leans forward and falls
-    )
     slip: float = 0.06  # fine, s/m, of each foot on the ground
     stumble: float = 3.0  # fine, s/m^2: clearance missing in swing times the foot's speed
     hips: float = 1.0  # fine, 1/rad, of hips away from straight down
@@ -160,7 +155,6 @@ class WalkingRewards:
         missing = np.maximum(LIFT - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
         return {
             "swing": w.swing * (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1),
-            "begin": -w.begin * past.began[:, SECOND].sum(axis=1),
             "dragging": -w.dragging * (past.down > LONG_DOWN).sum(axis=1),
             "slip": -w.slip * (np.minimum(speed, 3.0) * env.contact).sum(axis=1),
             "stumble": -w.stumble * missing.sum(axis=1),
