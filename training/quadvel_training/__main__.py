@@ -35,7 +35,8 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Train quadvel's policy and estimator. `all` runs the stages one after the other: privileged, dagger, constrained, "
     "estimator; `ablation` and `tune` run the last but one with recipes of their own. Every run resumes where its directory "
-    "stands; Ctrl-C saves.",
+    "stands; Ctrl-C saves. Stages learn in several processes, or on several machines, where torchrun starts them: "
+    "torchrun --nproc-per-node 2 -m -- quadvel_training all",
 )
 
 Out = Annotated[
@@ -68,10 +69,10 @@ def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> 
     return config
 
 
-def _written(path: Path) -> None:
-    """Say so, in the one process that wrote it."""
+def _written(*paths: Path) -> None:
+    """Say so, in the one process that wrote them."""
     if parallel.rank() == 0:
-        print(f"written: {path}")
+        print("written:", *paths)
 
 
 @app.command("all")
@@ -82,7 +83,7 @@ def train_everything(out: Out = Path("out/training"), device: Device = "cpu") ->
     """
     if not stages.everything(out, device):
         raise typer.Exit(1)
-    print(f"written: {out}/constrained/{stages.POLICY_FILE}, {out}/estimator/{stages.ESTIMATOR_FILE}")
+    _written(out / "constrained" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
 
 
 @app.command("privileged")
@@ -91,10 +92,7 @@ def train_privileged(
 ) -> None:
     """Stage 1: a memoryless teacher finds its gait from random weights, by rewards alone.
 
-    \b
     Numbered checkpoints go to DIR/kept; any of them, copied to DIR/privileged.pt, is where the same command goes on from.
-    With torchrun, several processes learn together, here one on each of two cores:
-      torchrun --nproc-per-node 2 -m -- quadvel_training privileged ...
     """
     stages.train_teacher(_configured(privileged.PrivilegedConfig, source, minutes), source, out)
 
@@ -108,7 +106,7 @@ def train_dagger(
 ) -> None:
     """Stage 2: the paper's network learns from that teacher while it drives itself.
 
-    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks. torchrun as for `privileged`.
+    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
     """
     stages.train_student(_configured(dagger.DaggerConfig, source, minutes), source, teacher, out)
     _written(out / stages.POLICY_FILE)
@@ -125,10 +123,7 @@ def train_constrained(
 ) -> None:
     """Stage 3: constrained reinforcement learning of that network, pulled by the teacher at first.
 
-    \b
     Writes DIR/policy.onnx; on the way, policies and what a quick evaluation says of them go to DIR/kept.
-    With torchrun, several processes or machines learn together:
-      torchrun --nproc-per-node 2 -m -- quadvel_training constrained ...
     """
     config = _configured(constrained.ConstrainedConfig, source, minutes)
     stages.train_policy(config, source, start, teacher, out, device)
@@ -154,7 +149,7 @@ def train_ablation(
     """
     if not stages.ablation(start, teacher, samples, out, device):
         raise typer.Exit(1)
-    print(f"written: {', '.join(f'{out}/{name}/{stages.POLICY_FILE}' for name in stages.ABLATION)}")
+    _written(*(out / name / stages.POLICY_FILE for name in stages.ABLATION))
 
 
 def _actuator_file(path: Path) -> Path:
@@ -184,7 +179,7 @@ def tune_policy(
     Before and after, on the plants of the gap:
       quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/policy.onnx
     """
-    print(f"written: {stages.tune(actuator, policy, minutes, out, device)}")
+    _written(stages.tune(actuator, policy, minutes, out, device))
 
 
 @app.command("record")
@@ -200,7 +195,7 @@ def record_log(
         gap.record_walk(policy, plant, out)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
-    print(f"written: {out}")
+    _written(out)
 
 
 @app.command("estimator")
@@ -212,7 +207,7 @@ def train_estimator(
 ) -> None:
     """The linear-velocity estimator, on the policy's own walks: DIR/estimator.onnx."""
     stages.train_estimator(_configured(estimator.EstimatorConfig, source, minutes), source, policy, out)
-    print(f"written: {out / stages.ESTIMATOR_FILE}")
+    _written(out / stages.ESTIMATOR_FILE)
 
 
 @app.command("kalman")
@@ -246,7 +241,7 @@ def train_legs(scans: Scans, out: Out = Path("out/training/legs"), source: Recip
     network = leg_classifier.train(config, list(real.values()), made)
     about = {"files": [file.name for file in real], "configuration": attrs.asdict(config)}
     leg_classifier.export(network, out / "legs.onnx", about)
-    print(f"written: {out / 'legs.onnx'}")
+    _written(out / "legs.onnx")
 
 
 @app.command("legs-left-out")
@@ -269,7 +264,7 @@ def write_card(
     """The model card of a network, written beside it: FILE.md of FILE.onnx."""
     path = network.with_suffix(".md")
     path.write_text(card(network, evaluations))
-    print(f"written: {path}")
+    _written(path)
 
 
 def main() -> None:

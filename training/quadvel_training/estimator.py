@@ -18,10 +18,12 @@ from quadvel_description.robot import GRAVITY
 from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
+from . import parallel
 from .env import TICK, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State, select
 from .onnx_file import commit, export
+from .ppo import living_mean
 from .randomisation import Randomisation
 from .walks import Walks, both_grounds
 
@@ -155,11 +157,10 @@ def loss_terms(
 
     Trained on the likelihood together, a velocity that is hard to see is given up for a large variance.
     """
-    alive = mask.sum().clamp(min=1)
     square = (truth - output[..., :3]) ** 2
     log_variance = output[..., 3:].clamp(-10.0, 4.0)
     likelihood = 0.5 * (square.detach() * (-log_variance).exp() + log_variance)
-    return (square.sum(-1) * mask).sum() / alive, (likelihood.sum(-1) * mask).sum() / alive
+    return living_mean(square.sum(-1), mask), living_mean(likelihood.sum(-1), mask)
 
 
 class EstimatorRun:
@@ -167,6 +168,7 @@ class EstimatorRun:
 
     def __init__(self, config: EstimatorConfig, actor: Recurrent) -> None:
         self.config = config
+        parallel.join("cpu")
         torch.manual_seed(config.seed)
         self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
@@ -174,7 +176,12 @@ class EstimatorRun:
         self.walks = [
             Walk(walks, self.network)
             for walks in both_grounds(
-                config.n, config.seed, config.commands, config.randomisation, config.rough, actor
+                config.n,
+                config.seed + 1000 * parallel.rank(),
+                config.commands,
+                config.randomisation,
+                config.rough,
+                actor,
             )
         ]
 
@@ -212,7 +219,7 @@ class EstimatorRun:
                     seen[name] += value / (c.mini_batches * c.epochs)
         for walk in self.walks:
             walk.start_over(c.forget)
-        self.samples += c.length * c.n
+        self.samples += c.length * c.n * parallel.size()
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 
     def _learn(self, ids: torch.Tensor, data: list[Sequence], remember: bool) -> dict[str, float]:
@@ -228,6 +235,7 @@ class EstimatorRun:
         loss = torch.stack(losses).mean()
         self.optimiser.zero_grad()
         loss.backward()
+        parallel.share_gradients(self.network)
         torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self.optimiser.step()
         return {"flat": squares[0], "rough": squares[1], "nll": float(likelihood.detach())}

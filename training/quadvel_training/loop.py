@@ -142,6 +142,7 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
             journal.end()
     if journal:
         journal.save()
+    parallel.from_first(None)  # none goes on before all is written
     return spent
 
 

@@ -69,10 +69,12 @@ def train_policy(
 
 def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, folder: Path) -> bool:
     """The velocity estimator on the walks of a checkpoint of stage 2 or 3; its file is written where it was stopped, too."""
-    describe(folder, "estimator", source, config)
     run, checkpoint = EstimatorRun(config, policy_of(policy)), folder / ESTIMATOR
+    if parallel.rank() == 0:
+        describe(folder, "estimator", source, config)
     spent = loop.train(run, config.budget, checkpoint)
-    run.export(folder / ESTIMATOR_FILE, made_of("estimator", source, config, checkpoint))
+    if parallel.rank() == 0:
+        run.export(folder / ESTIMATOR_FILE, made_of("estimator", source, config, checkpoint))
     return spent
 
 
