@@ -72,7 +72,6 @@ def test_the_teacher_knows_what_was_done_20_ms_ago(run):
         seen.append(teacher._executed[0][0, 0])
         teacher.advance(np.full((8, 12), i, np.float32))
     assert seen == [0, 0, 0, 0, 0, 1]
-    assert PrivilegedConfig().period == dagger.AGO * dagger.TICK
 
 
 def test_what_the_teacher_says_comes_as_late_as_actions_that_are_held_and_forgets_who_starts_over(run):

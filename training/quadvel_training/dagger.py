@@ -37,9 +37,9 @@ from .onnx_file import commit, export
 from .ppo import FAR, living_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
 from .randomisation import Randomisation, actuator
-from .walking_rewards import sizes
+from .walking_rewards import SAMPLE, sizes
 
-AGO = 4  # ticks between the teacher's actions as it learned them
+AGO = round(SAMPLE / TICK)  # ticks between the teacher's actions as it learned them
 SPREAD = 3
 """Ticks over which what it says is averaged: it learned with actions that are held, which come so much later than at once"""
 
