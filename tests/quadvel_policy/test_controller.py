@@ -107,7 +107,7 @@ def test_each_state_is_answered_by_its_tick(robot: Robot) -> None:
     assert robot.step().mode == MODE_DAMPING
     answer = robot.stand()
     assert answer.mode == MODE_SERVO
-    np.testing.assert_allclose(answer.kp, np.full(12, 100.0))
+    np.testing.assert_allclose(answer.kp, np.full(12, 150.0))
     np.testing.assert_allclose(answer.q, NOMINAL_Q, atol=1e-6)
     assert list(dict.fromkeys(answer.tick for answer in robot.answers)) == [5, 10, 15, 20, 25]
 

@@ -21,7 +21,9 @@ STILL, STEP_IN_PLACE = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.1, 0.0)
 class Stand:
     """A simulated robot that lies, and a supervisor whose policy holds the nominal posture."""
 
-    def __init__(self, make_policy: Any, slope: float = 0.0, heading: float = 0.0) -> None:
+    def __init__(
+        self, make_policy: Any, slope: float = 0.0, heading: float = 0.0, auto_stand: bool = True
+    ) -> None:
         """slope, heading: rad; where the heading is zero the robot looks uphill."""
         sag = mjcf.gravity_torque(mjcf.load_model(mjcf.Plant())) / KP
         terrain = Terrain("slope", slope=slope)
@@ -31,7 +33,7 @@ class Stand:
         mujoco.mju_mulQuat(quaternion, terrain.tilt, turned)
         self.simulator.place(attrs.evolve(self.simulator.truth(), quaternion=quaternion), LIE_Q, np.zeros(12))
         self.supervisor = Supervisor(
-            make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=True)
+            make_policy(action_offset=tuple(NOMINAL_Q + sag)), SupervisorConfig(auto_stand=auto_stand)
         )
         self.torques: list[np.ndarray] = []
 
@@ -84,6 +86,25 @@ def test_it_stands_up_on_a_slope_of_15_degrees_stays_there_and_lies_down(
     assert stand.supervisor.request("lie_down")[0]
     stand.run(1.5)
     assert stand.supervisor.mode == "passive", stand.supervisor.reason
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_it_comes_to_rest_in_stance_with_its_feet_somewhat_off_their_places(
+    make_policy: Any, seed: int
+) -> None:
+    stand = Stand(make_policy, auto_stand=False)
+    stand.simulator.reset("stand")
+    off = np.random.default_rng(seed).uniform(-0.15, 0.15, 12)
+    stand.simulator.place(stand.simulator.truth(), NOMINAL_Q + off, np.zeros(12))
+    stand.run(0.01)
+    assert stand.supervisor.request("stance")[0]
+    stand.run(2.0)
+    tilts = []
+    for _ in range(100):
+        stand.run(0.01)
+        tilts.append(2.0 * stand.simulator.truth().quaternion[1:3])
+    assert stand.supervisor.mode == "stance", stand.supervisor.reason
+    assert np.ptp(tilts, axis=0).max() < 0.05  # rad
 
 
 def test_a_robot_that_is_pushed_over_goes_to_damping(stand: Stand) -> None:

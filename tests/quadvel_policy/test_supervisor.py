@@ -49,8 +49,8 @@ def test_standing_up_goes_through_lying_to_the_nominal_posture(rig: Rig) -> None
     assert rig.mode == "stance"
     rig.run(0.3)
     np.testing.assert_allclose(rig.asked.q, NOMINAL_Q, atol=1e-9)
-    np.testing.assert_array_equal(rig.asked.kp, np.full(12, 100.0))
-    np.testing.assert_array_equal(rig.asked.kd, np.full(12, 3.0))
+    np.testing.assert_array_equal(rig.asked.kp, np.full(12, 150.0))
+    np.testing.assert_array_equal(rig.asked.kd, np.full(12, 4.0))
 
 
 def test_it_stands_up_by_itself_once_if_told_so(policy: Any) -> None:

@@ -76,8 +76,8 @@ class SupervisorConfig(GuardConfig, CommandLimitsConfig):
     require_operator: bool = setting(
         False, "walk only after ~/enable_walking was called (set it on a robot)", positive=False
     )
-    stand_kp: float = setting(100.0, "gain of standing up, stance and lying down, N m/rad")
-    stand_kd: float = setting(3.0, "damping of standing up, stance and lying down, N m s/rad")
+    stand_kp: float = setting(150.0, "gain of standing up, stance and lying down, N m/rad")
+    stand_kd: float = setting(4.0, "damping of standing up, stance and lying down, N m s/rad")
     damping_kd: float = setting(5.0, "damping when passive or in fault, N m s/rad")
     fold_time: float = setting(0.8, "first part of standing up: to the lying posture, s")
     rise_time: float = setting(1.2, "second part of standing up: to the nominal posture, s")
