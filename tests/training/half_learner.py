@@ -1,17 +1,19 @@
-"""One update of a policy on a part of 8 robots. As a program: a process of several, with the last 4 of them."""
+"""One update of a policy on a part of 8 robots, and a run of them. As a program: a process of two, with the last 4 of them."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
 
+import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 
 from test_ppo import learner, rollout
 
-from quadvel_training import parallel
+from quadvel_training import loop, parallel
+from quadvel_training.privileged import PrivilegedConfig, PrivilegedRun
 
 
 def update(part: slice) -> dict[str, torch.Tensor]:
@@ -30,9 +32,19 @@ def update(part: slice) -> dict[str, torch.Tensor]:
     return ppo.actor.state_dict() | {"kl": torch.tensor(kl)}
 
 
+def run(checkpoint: Path) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray, int]:
+    """Two updates of stage 1, and one more of a run that goes on: the weights, grid, commands and samples of this process."""
+    config = PrivilegedConfig(n=8, threads=1, length=4)
+    loop.train(PrivilegedRun(config), loop.Budget(2 * 8 * 4, 10.0), checkpoint)
+    again = PrivilegedRun(config)
+    assert loop.train(again, loop.Budget(3 * 8 * 4, 10.0), checkpoint)
+    return again.actor.state_dict(), again.grid.success, again.env.command, again.samples
+
+
 if __name__ == "__main__":
     parallel.join("cpu")
     update(slice(4, 8))
+    parallel.gather(run(Path(sys.argv[1])))
     assert parallel.from_first("second") == "first"
     assert parallel.gather("second") == ["first", "second"]
     parallel.leave()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import attrs
 import numpy as np
 import pytest
@@ -183,12 +185,25 @@ def test_a_run_resumes_where_its_checkpoint_stands(tmp_path):
     assert kept["seconds"] > 0.0
 
 
+def test_ctrl_c_ends_a_run_after_the_update_under_way(tmp_path, capsys):
+    class Interrupted(Counter):
+        def step(self, done):
+            signal.raise_signal(signal.SIGINT)
+            return super().step(done)
+
+    assert not loop.train(Interrupted(), loop.Budget(samples=50, minutes=1.0), tmp_path / "run.pt")
+    assert loop.load(tmp_path / "run.pt")["samples"] == 10
+    assert "stopped" in capsys.readouterr().out
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
 def test_a_resumed_run_of_stage_3_draws_on_where_it_was_saved(tmp_path):
     config = ConstrainedConfig(n=3, length=3, threads=1, critic_first=0)
     first = ConstrainedRun(config)
     seen = first.step(0.0)
     assert sum(seen[part] for part in PARTS) == pytest.approx(1.0)
     loop.save(first.state(), tmp_path / "constrained.pt")
+    first._start_over(np.arange(3))
     expected = first.env.rng.random(), torch.rand(1)
     second = ConstrainedRun(config)
     second.restore(loop.load(tmp_path / "constrained.pt"))

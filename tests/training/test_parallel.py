@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
@@ -18,7 +19,7 @@ HERE = Path(__file__).parent
 
 
 @pytest.fixture
-def another(monkeypatch):
+def another(monkeypatch, tmp_path):
     """This process is the first of two; the other one runs."""
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -28,7 +29,9 @@ def another(monkeypatch):
     other = os.environ | {"RANK": "1", "LOCAL_RANK": "1"}
     monkeypatch.setenv("RANK", "0")
     monkeypatch.setenv("LOCAL_RANK", "0")
-    with subprocess.Popen([sys.executable, HERE / "half_learner.py"], env=other) as process:
+    with subprocess.Popen(
+        [sys.executable, HERE / "half_learner.py", tmp_path / "run.pt"], env=other
+    ) as process:
         try:
             parallel.join("cpu")
             yield process
@@ -37,11 +40,17 @@ def another(monkeypatch):
             process.kill()
 
 
-def test_two_processes_with_half_of_the_robots_each_take_the_step_of_one_with_all(another, monkeypatch):
+def test_two_processes_with_half_of_the_robots_each_learn_as_one(another, monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(HERE)
-    from half_learner import update
+    from half_learner import run, update
 
     together = update(slice(0, 4))
+    (weights, grid, command, samples), other = parallel.gather(run(tmp_path / "run.pt"))
+    assert samples == other[3] == 3 * 8 * 4
+    assert np.array_equal(grid, other[1])
+    assert not np.array_equal(command, other[2])
+    for name, mine in weights.items():
+        assert torch.equal(mine, other[0][name]), name
     assert parallel.from_first("first") == "first"
     assert parallel.gather("first") == ["first", "second"]
     assert another.wait(30) == 0

@@ -137,8 +137,8 @@ def test_who_stands_may_prefer_a_side():
     mean = ppo.actor(r.obs)[0].detach()
     gap = ((mean - MIRROR_ACTION(ppo.actor(MIRROR_OBS(r.obs))[0].detach())) ** 2).sum(-1)
     r.standing = torch.zeros(5, 4)
-    r.standing[2:] = 1.0
-    expected = gap[:2].mean() / (2 * (2 * ppo.actor.log_std.detach()).exp().mean())
+    r.standing[2:, 1] = r.standing[:, 2] = 1.0
+    expected = gap[r.standing == 0.0].mean() / (2 * (2 * ppo.actor.log_std.detach()).exp().mean())
     assert ppo.update(r)["symmetry"] == pytest.approx(float(expected), rel=1e-4)
 
 
@@ -160,6 +160,15 @@ def test_smoothness_is_the_mean_norm_of_the_second_difference():
     mean = ppo.actor(r.obs)[0].detach().numpy()
     expected = np.linalg.norm(np.diff(mean, n=2, axis=0), axis=-1).mean()
     assert ppo.update(r)["smoothness"] == pytest.approx(expected, rel=1e-4)
+
+
+def test_each_robots_actions_are_judged_by_its_own_spread():
+    torch.manual_seed(0)
+    ppo = learner(correlation=0.9)
+    r = rollout(0.0, t=5, n=8)
+    r.action, r.spread = 0.1 * torch.randn(5, 8, 12), torch.from_numpy(spreads(8))
+    ids = torch.tensor([7, 2, 6, 0])
+    assert torch.equal(ppo._log_prob(r, ids, r.mean[:, ids]), ppo._log_prob(r, slice(None), r.mean)[:, ids])
 
 
 def test_the_gradient_under_correlated_exploration_is_that_of_the_return():

@@ -213,7 +213,10 @@ def test_a_robot_stands_once_its_four_feet_have_been_down_for_a_while():
     env = VelocityEnv(CALM)
     past, command = Past(env), np.zeros((4, 4))
     env.contact[:] = True
-    for _ in range(round(1.5 * privileged.STOOD / env.config.period)):
+    for _ in range(round(0.5 * privileged.STOOD / env.config.period)):
+        past.advance(command)
+    assert not past.standing.any()
+    for _ in range(round(privileged.STOOD / env.config.period)):
         past.advance(command)
         env.contact[1, 2] = False
     assert past.standing.tolist() == [True, False, True, True]
@@ -252,20 +255,28 @@ def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
 
 
 def test_the_grid_hears_how_robots_of_all_processes_followed(monkeypatch, grid):
-    command, over, stood = np.array([[1.0, 0, 0, 0], [0.5, 0, 0, 0]]), np.ones(2, bool), np.zeros(2, bool)
+    command, fell = np.array([[1.0, 0, 0, 0], [0.5, 0, 0, 0]]), np.zeros(2, bool)
     mine, other = Judgement(2), Judgement(2)
-    for judgement in (mine, other):
-        for _ in range(100):
-            judgement.advance(np.zeros((2, 3)), 0.02)
-    other.end(command, over, ~stood)
-    mine.end(command, over, stood)
-    monkeypatch.setattr(parallel, "gather", lambda own: [other._over, own])
-    both = CommandGrid(GridConfig())
-    mine.tell(both)
-    one = grid.cell_of(command[0, :3])
-    assert both.success[one] > 0.0
+    for _ in range(100):
+        other.advance(np.zeros((2, 3)), 0.02)
+    other.end(command, np.ones(2, bool), fell)
+    monkeypatch.setattr(parallel, "gather", lambda own: [own, other._over])
     mine.tell(grid)
-    assert grid.success[one] == 0.0
+    assert grid.success[grid.cell_of(command[0, :3])] > 0.0
+    monkeypatch.setattr(parallel, "gather", lambda own: [own])
+    other.tell(again := CommandGrid(GridConfig()))
+    assert np.array_equal(again.success, grid.success)
+    other.tell(fresh := CommandGrid(GridConfig()))
+    assert not fresh.success.any()
+
+
+def test_a_quarter_of_the_robots_explores_little_and_the_learner_knows_which():
+    run = PrivilegedRun(attrs.evolve(SMALL, n=40, length=12))
+    rollout, _ = run.collect()
+    drawn = (rollout.action - rollout.mean).std(dim=(0, 2))
+    assert drawn[30:].max() < 0.5 * drawn[:30].min()
+    assert torch.allclose(drawn[30:].mean() / drawn[:30].mean(), rollout.spread[-1], rtol=0.1)
+    assert rollout.standing.shape == rollout.reward.shape
 
 
 def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():

@@ -35,8 +35,8 @@ app = typer.Typer(
     no_args_is_help=True,
     help="Train quadvel's policy and estimator. `all` runs the stages one after the other: privileged, dagger, constrained, "
     "estimator; `ablation` and `tune` run the last but one with recipes of their own. Every run resumes where its directory "
-    "stands; Ctrl-C saves. Stages learn in several processes, or on several machines, where torchrun starts them: "
-    "torchrun --nproc-per-node 2 -m -- quadvel_training all",
+    "stands; Ctrl-C saves. Stages learn in several processes where torchrun starts them, on several "
+    "machines if these share the directory: torchrun --nproc-per-node 2 -m -- quadvel_training all",
 )
 
 Out = Annotated[

@@ -42,7 +42,7 @@ class ConstrainedConfig:
     """One run; a recipe file sets these fields."""
 
     budget: Budget = Budget(samples=1e8, minutes=6e3)
-    n: int = 512
+    n: int = 512  # robots, of all processes together
     threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
     std: float = 0.045  # of what exploration draws anew in every tick, in the network's unit, at first,
@@ -88,8 +88,8 @@ class ConstrainedRun:
 
         teacher: checkpoint of `privileged`; without it nothing pulls.
         """
-        self.config = c = config
         self.device = parallel.join(device)
+        self.config = c = attrs.evolve(config, n=parallel.share(config.n))
         torch.manual_seed(c.seed)
         known = load(start) if start else {}
         self.grid = CommandGrid(c.grid)
@@ -98,7 +98,7 @@ class ConstrainedRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed + 1000 * parallel.rank(),
+            seed=parallel.seed_of(c.seed),
             timestep=c.timestep,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
@@ -162,16 +162,15 @@ class ConstrainedRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
+        """Go on from a checkpoint; robots start over, under commands of its grid."""
         self.actor.load_state_dict(state["actor"])
         self.average.load_state_dict(state["average"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples, self.updates = state["samples"], state["updates"]
-        if parallel.size() == 1:
-            torch.set_rng_state(state["random"]["learner"])
-            self.env.rng.bit_generator.state = state["random"]["environments"]
+        parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
+        self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
         """One rollout, one update."""
@@ -269,8 +268,11 @@ class ConstrainedRun:
         with torch.no_grad():
             _, mirrored = self.actor(self.mirror_obs(obs[:, :seen]), self._mirrored)
         self._state, self._mirrored = state, mirrored
-        if not len(over):
-            return
+        if len(over):
+            self._start_over(over)
+
+    def _start_over(self, over: np.ndarray) -> None:
+        """New robots in the place of `over`, without a past."""
         self.env.reset(over)
         self.rewards.reset(over)
         self.past.reset(over)
@@ -279,8 +281,10 @@ class ConstrainedRun:
         self.judgement.close(over)
         self._noise = self._noise.copy()  # the rollout holds the one before
         self._action[over] = self._noise[over] = 0.0
-        self._state, self._mirrored = (tuple(m.clone() for m in pair) for pair in (state, mirrored))
+        self._state, self._mirrored = (
+            tuple(m.clone() for m in pair) for pair in (self._state, self._mirrored)
+        )
         for memory in self._state:
             memory[:, over] = 0.0
         for memory in self._mirrored:
-            memory[:, over[over < seen]] = 0.0
+            memory[:, over[over < memory.shape[1]]] = 0.0

@@ -49,7 +49,7 @@ class DaggerConfig:
     """One run of stage 2."""
 
     budget: Budget = Budget(samples=2e7, minutes=60.0)
-    n: int = 512
+    n: int = 512  # robots, of all processes together
     threads: int = attrs.field(factory=cores)
     length: int = 64  # ticks a sequence, 0.32 s
     mini_batches: int = 8  # steps of the optimiser a sequence
@@ -71,8 +71,8 @@ class DaggerConfig:
 class Teacher:
     """The teacher of a checkpoint in a batch of environments, evaluated at every tick, its actions averaged over SPREAD of them.
 
-    Evaluated at every tick and not averaged, a teacher that learned with actions held for 20 ms fell in 5 of 88 runs where it
-    fell in none held or averaged (decision 43).
+    Asked at every tick and not averaged, a teacher that learned with actions held for 20 ms falls where it does not fall held
+    (decision 43).
     """
 
     def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, past: Past) -> None:
@@ -111,8 +111,8 @@ class DaggerRun:
     """Teacher, student and environment of stage 2."""
 
     def __init__(self, config: DaggerConfig, teacher_file: Path) -> None:
-        self.config = c = config
         parallel.join("cpu")
+        self.config = c = attrs.evolve(config, n=parallel.share(config.n))
         torch.manual_seed(c.seed)
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
@@ -120,7 +120,7 @@ class DaggerRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed + 1000 * parallel.rank(),
+            seed=parallel.seed_of(c.seed),
             timestep=c.timestep,
             actuator=actuator(c.actuator),
             terrain=c.terrain,
@@ -152,16 +152,11 @@ class DaggerRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of the teacher's grid as it is now.
-
-        Draws go on, too, unless there are several processes.
-        """
+        """Go on from a checkpoint; robots start over, under commands of the teacher's grid as it is now."""
         self.student.load_state_dict(state["student"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.samples = state["samples"]
-        if parallel.size() == 1:
-            torch.set_rng_state(state["random"]["learner"])
-            self.env.rng.bit_generator.state = state["random"]["environments"]
+        parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def _share(self) -> float:

@@ -133,7 +133,7 @@ class Walk:
 
 @attrs.frozen
 class EstimatorConfig:
-    """One run; half of the `n` environments walk on flat ground, half on rough."""
+    """One run; half of the `n` robots of all processes walk on flat ground, half on rough."""
 
     budget: Budget = Budget(samples=8e6, minutes=15.0)
     n: int = 512
@@ -167,8 +167,8 @@ class EstimatorRun:
     """Walks on both grounds, one network, one optimiser."""
 
     def __init__(self, config: EstimatorConfig, actor: Recurrent) -> None:
-        self.config = config
         parallel.join("cpu")
+        self.config = config = attrs.evolve(config, n=parallel.share(config.n))
         torch.manual_seed(config.seed)
         self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
@@ -177,7 +177,7 @@ class EstimatorRun:
             Walk(walks, self.network)
             for walks in both_grounds(
                 config.n,
-                config.seed + 1000 * parallel.rank(),
+                parallel.seed_of(config.seed),
                 config.commands,
                 config.randomisation,
                 config.rough,

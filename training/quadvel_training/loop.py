@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import signal
 import time
 from collections import defaultdict
 from collections.abc import Iterator
@@ -50,16 +51,39 @@ class Run(Protocol):
         ...
 
 
-class Keeper(Protocol):
-    """Keeps and judges what a run has become on its way."""
+class Keeper:
+    """Keeps and judges what a run has become, every so many samples."""
+
+    def __init__(self, every: float) -> None:
+        self._every = every
+        self._asked_at: int | None = None
 
     def due(self, samples: int) -> bool:
-        """Whether it is time."""
-        ...
+        """Whether a multiple of `every` was passed since this was asked last."""
+        before, self._asked_at = self._asked_at, samples
+        return before is not None and samples // self._every > before // self._every
 
     def keep(self) -> dict[str, float]:
         """Keep the run as it is now; returns what is worth plotting."""
-        ...
+        raise NotImplementedError
+
+
+class Interrupt:
+    """Ctrl-C, to be taken up between two updates; a second one ends the process where it is."""
+
+    def __init__(self) -> None:
+        self.asked = False
+
+    def __enter__(self) -> Interrupt:
+        self._before = signal.signal(signal.SIGINT, self._ask)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        signal.signal(signal.SIGINT, self._before)
+
+    def _ask(self, *_: object) -> None:
+        self.asked = True
+        signal.signal(signal.SIGINT, self._before)
 
 
 class Shares:
@@ -118,32 +142,34 @@ def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
 def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = None) -> bool:
     """Resume from `checkpoint` if it is there, run until the budget is spent, save on the way and at the end.
 
-    Ctrl-C ends it early with everything saved; returns whether the budget is spent. Of several processes the first one
-    writes, and says when it is over.
+    Ctrl-C ends it after the update under way, with everything saved; returns whether the budget is spent. Of several
+    processes the first one writes, and says when it is over.
     """
     known = load(checkpoint) if checkpoint.exists() else {}
     if known or parallel.size() > 1:
         run.restore(parallel.from_first(known or run.state()))
     journal = _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if parallel.rank() == 0 else None
-    started, spent = time.monotonic(), False
+    started, done, stopped = time.monotonic(), 0.0, False
     try:
-        while not spent:
-            minutes = (time.monotonic() - started) / 60
-            done = parallel.from_first(max(run.samples / budget.samples, minutes / budget.minutes))
-            spent = done >= 1.0
-            if not spent:
+        with Interrupt() as interrupt:
+            while True:
+                minutes = (time.monotonic() - started) / 60
+                done = max(run.samples / budget.samples, minutes / budget.minutes)
+                done, stopped = parallel.from_first((done, interrupt.asked))
+                if stopped or done >= 1.0:
+                    break
                 seen = run.step(done)
                 if journal:
                     journal.note(done, seen)
-    except KeyboardInterrupt:
-        print("stopped; the checkpoint holds everything so far")
     finally:
         if journal:
             journal.end()
     if journal:
         journal.save()
+        if stopped:
+            print("stopped; the checkpoint holds everything so far")
     parallel.from_first(None)  # none goes on before all is written
-    return spent
+    return bool(done >= 1.0)
 
 
 class _Journal:

@@ -1,6 +1,6 @@
 """Several processes as one learner, started by torchrun: mean gradients, one start, one end, one writer.
 
-Each process has environments of its own. A single process, started without torchrun, passes through here for free.
+Each process has its share of the robots. A single process, started without torchrun, passes through here for free.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import importlib
 import os
 from typing import Any
 
+import numpy as np
 import torch
 import torch.distributed as dist
 
@@ -20,7 +21,7 @@ def join(device: str) -> torch.device:
         return torch.device(device)
     if not dist.is_initialized():
         importlib.import_module("torch._dynamo")  # imported later, by an optimiser, it keeps the group
-        dist.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+        dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
         atexit.register(leave)
     local = int(os.environ["LOCAL_RANK"])
     return torch.device(device, local) if device == "cuda" else torch.device(device)
@@ -40,6 +41,31 @@ def rank() -> int:
 def size() -> int:
     """How many processes learn together."""
     return int(dist.get_world_size()) if dist.is_initialized() else 1
+
+
+def share(n: int) -> int:
+    """Of `n` robots those of this process. Raises ValueError where they cannot be shared out."""
+    if n % size():
+        raise ValueError(f"n is {n} robots, expected a multiple of the {size()} processes")
+    return n // size()
+
+
+def seed_of(seed: int) -> int:
+    """Of this process's draws, where all are given `seed`."""
+    return seed + 1000 * rank()
+
+
+def go_on_drawing(kept: dict[str, Any], rng: np.random.Generator, seed: int, samples: int) -> None:
+    """Random numbers that go on after `samples`: those of a checkpoint, `kept`; of several processes new ones for each.
+
+    kept: {"learner": of torch, "environments": of `rng`}, as one process left them.
+    """
+    if size() == 1:
+        torch.set_rng_state(kept["learner"])
+        rng.bit_generator.state = kept["environments"]
+    else:
+        torch.manual_seed(seed + samples)
+        rng.bit_generator.state = np.random.default_rng([seed, samples, rank()]).bit_generator.state
 
 
 def mean(value: torch.Tensor) -> torch.Tensor:

@@ -1,7 +1,7 @@
 """Proximal policy optimisation with the paper's two constraints (Eq. 6 to 8), for memoryless and recurrent actors alike.
 
-Sequences are cut at fixed lengths and never contain a reset: an environment that ends within a sequence is masked from
-there on and starts over with the next one, so a recurrent pass is one call of the fused LSTM.
+Sequences are cut at fixed lengths. Those of a recurrent actor never contain a reset: an environment that ends within a
+sequence is masked from there on and starts over with the next one, so a recurrent pass is one call of the fused LSTM.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class PpoConfig:
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
     target_kl: float | None = 0.01
-    """of an update, as if exploration were white: correlated, lasting shifts would count too little; None keeps the rate, as
-    it must where an update is a single step, before which nothing has shifted yet"""
+    """of an update, as if exploration were white, and that of all robots the same: correlated, lasting shifts would count too
+    little; None keeps the rate, as it must where an update is a single step, before which nothing has shifted yet"""
     entropy: float = 0.0
     symmetry: float = 0.5  # w_sym of Eq. 8
     smoothness: float = 0.0  # w_smooth of Eq. 8

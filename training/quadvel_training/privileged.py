@@ -142,7 +142,7 @@ class PrivilegedConfig:
     """One run of stage 1."""
 
     budget: Budget = Budget(samples=2e8, minutes=6e3)
-    n: int = 512
+    n: int = 512  # robots, of all processes together
     threads: int = attrs.field(factory=cores)
     length: int = 24  # samples of 20 ms a sequence, 0.48 s
     timestep: float = 0.004  # s, of physics
@@ -204,14 +204,14 @@ class PrivilegedRun:
     """Environment and learner of stage 1."""
 
     def __init__(self, config: PrivilegedConfig) -> None:
-        self.config = c = config
         parallel.join("cpu")
+        self.config = c = attrs.evolve(config, n=parallel.share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=c.seed + 1000 * parallel.rank(),
+            seed=parallel.seed_of(c.seed),
             period=SAMPLE,
             timestep=c.timestep,
             actuator=actuator(c.actuator),
@@ -242,15 +242,13 @@ class PrivilegedRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, with draws that go on unless there are several processes."""
+        """Go on from a checkpoint; robots start over, under commands of its grid."""
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
-        if parallel.size() == 1:
-            torch.set_rng_state(state["random"]["learner"])
-            self.env.rng.bit_generator.state = state["random"]["environments"]
+        parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
@@ -336,18 +334,12 @@ class PrivilegedRun:
         } | {f"reward/{name}": value for name, value in terms.items()}
 
 
-class Numbered:
-    """Keeps a numbered checkpoint in FOLDER/kept every so many samples."""
+class Numbered(loop.Keeper):
+    """Keeps a numbered checkpoint in FOLDER/kept every so many samples, the configuration's `keep`."""
 
     def __init__(self, run: PrivilegedRun, folder: Path) -> None:
+        super().__init__(run.config.keep)
         self._run, self._folder = run, folder
-        self._asked_at: int | None = None
-
-    def due(self, samples: int) -> bool:
-        """Whether a multiple of the configuration's `keep` was passed since this was asked last."""
-        before, self._asked_at = self._asked_at, samples
-        every = self._run.config.keep
-        return before is not None and samples // every > before // every
 
     def keep(self) -> dict[str, float]:
         """Write the checkpoint, named by its thousands of samples."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import attrs
 import cattrs
 
 from quadvel_eval.grid import cells, run_cell, run_stance, summarise
@@ -16,7 +15,7 @@ from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.report import write_json
 from quadvel_eval.walk import Setup
 
-from . import loop
+from . import loop, parallel
 from .constrained import ConstrainedRun
 from .onnx_file import commit
 from .randomisation import ACTUATORS, actuator
@@ -25,7 +24,9 @@ COMMANDS = cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and w
 
 
 def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
-    """Write run.json: what this directory's run is; where it is resumed, what it is from now on."""
+    """Write run.json: what this directory's run is; where it is resumed, what it is from now on. One process does."""
+    if parallel.rank() > 0:
+        return
     folder.mkdir(parents=True, exist_ok=True)
     about = {"stage": stage, "recipe": recipe.stem if recipe else None, "commit": commit()}
     write_json(folder / "run.json", about | {"configuration": cattrs.unstructure(config)})
@@ -49,22 +50,15 @@ def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> d
     return about | {"configuration": configuration}
 
 
-@attrs.define
-class Evaluated:
+class Evaluated(loop.Keeper):
     """Keeps the run's policy every so many samples and evaluates it on a quarter of the quick grid, one seed.
 
     On the drives as they are known best: those of an actuator file where the run has one, else Table 4.
     """
 
-    run: ConstrainedRun
-    folder: Path
-    _asked_at: int | None = attrs.field(default=None, init=False)
-
-    def due(self, samples: int) -> bool:
-        """Whether a multiple of the configuration's `keep` was passed since this was asked last."""
-        before, self._asked_at = self._asked_at, samples
-        every = self.run.config.keep
-        return before is not None and samples // every > before // every
+    def __init__(self, run: ConstrainedRun, folder: Path) -> None:
+        super().__init__(run.config.keep)
+        self.run, self.folder = run, folder
 
     def keep(self) -> dict[str, float]:
         """Checkpoint, policy file and evaluation; falls and errors (m/s) for the curves."""

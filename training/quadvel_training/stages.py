@@ -32,16 +32,14 @@ NO_LIMIT = 1e6  # minutes
 def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -> bool:
     """Stage 1; whether its budget is spent. source, here and below: the recipe file, for the record."""
     run = PrivilegedRun(config)
-    if parallel.rank() == 0:
-        describe(folder, "privileged", source, config)
+    describe(folder, "privileged", source, config)
     return loop.train(run, config.budget, folder / TEACHER, Numbered(run, folder))
 
 
 def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
     """Stage 2, from a checkpoint of stage 1; the policy file is written where it was stopped, too."""
     run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
-    if parallel.rank() == 0:
-        describe(folder, "dagger", source, config)
+    describe(folder, "dagger", source, config)
     spent = loop.train(run, config.budget, checkpoint)
     if parallel.rank() == 0:
         about = made_of("dagger", source, config, checkpoint)
@@ -59,8 +57,7 @@ def train_policy(
 ) -> bool:
     """Stage 3, from a checkpoint of stage 2 or of its own, pulled by that of the `teacher`; policy file as in stage 2."""
     run, checkpoint = ConstrainedRun(config, start, teacher, device), folder / POLICY
-    if parallel.rank() == 0:
-        describe(folder, "constrained", source, config)
+    describe(folder, "constrained", source, config)
     spent = loop.train(run, config.budget, checkpoint, Evaluated(run, folder))
     if parallel.rank() == 0:
         run.write_policy(folder / POLICY_FILE, made_of("constrained", source, config, checkpoint))
@@ -70,8 +67,7 @@ def train_policy(
 def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, folder: Path) -> bool:
     """The velocity estimator on the walks of a checkpoint of stage 2 or 3; its file is written where it was stopped, too."""
     run, checkpoint = EstimatorRun(config, policy_of(policy)), folder / ESTIMATOR
-    if parallel.rank() == 0:
-        describe(folder, "estimator", source, config)
+    describe(folder, "estimator", source, config)
     spent = loop.train(run, config.budget, checkpoint)
     if parallel.rank() == 0:
         run.export(folder / ESTIMATOR_FILE, made_of("estimator", source, config, checkpoint))
