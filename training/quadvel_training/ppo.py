@@ -22,6 +22,8 @@ LOG_RATIO_BOUND = 10.0  # of the likelihoods now and when it was drawn; the clip
 FAR = (
     0.5  # of the network's unit: what a teacher asks of a robot that is about to fall must not drown all else
 )
+QUIET_SHARE = 0.25  # of the robots, the last ones, explore little:
+QUIET = 0.3  # of what the others do, so that a policy works without noise, too
 ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
 
 
@@ -88,7 +90,7 @@ class Rollout:
     label: Tensor | None = None  # (T, N, A) what a teacher would have done
     spread: Tensor | None = None  # (N, 1) of each robot's exploration, a share of the policy's; None: 1
     standing: Tensor | None = (
-        None  # (T, N) 1 on four feet, where a robot may prefer a side: it has to begin with one
+        None  # (T, N) 1 on four feet, where it may prefer a side: it has to begin with one
     )
 
 
@@ -98,11 +100,11 @@ def living_mean(values: Tensor, mask: Tensor) -> Tensor:
 
 
 def spreads(n: int) -> np.ndarray:
-    """Of the exploration of `n` robots (n, 1): the last quarter of them explores little.
+    """How much each of `n` robots explores, (n, 1), as a share of the policy's exploration.
 
-    What noise alone does for the others, such as to begin with one of two legs, the policy has to do for them.
+    What noise alone does for most of them, such as to begin with one of two legs, the policy has to do for the quiet ones.
     """
-    return np.where(np.arange(n)[:, None] < 0.75 * n, 1.0, 0.3).astype(np.float32)
+    return np.where(np.arange(n)[:, None] < (1.0 - QUIET_SHARE) * n, 1.0, QUIET).astype(np.float32)
 
 
 class Ppo:

@@ -164,14 +164,16 @@ class PrivilegedConfig:
     ppo: PpoConfig = PpoConfig(target_kl=0.012, entropy=0.002, symmetry=0.3)
 
 
+Judged = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""What `CommandGrid.note` takes: commands, mean errors, falls"""
+
+
 class Judgement:
     """How the command that each robot has now has been followed so far, from TRANSIENT after its start on."""
 
     def __init__(self, n: int) -> None:
         self._sum, self._age = np.zeros((n, 3)), np.zeros(n)
-        self._over: list[
-            tuple[np.ndarray, np.ndarray, np.ndarray]
-        ] = []  # what `CommandGrid.note` is told next
+        self._over: list[Judged] = []
 
     def advance(self, error: np.ndarray, period: float) -> None:
         """Note the errors (n, 3) of one sample."""
