@@ -45,7 +45,7 @@ def test_commands_pass_the_ramp_of_the_mux_and_the_limits_of_the_policy(
     for _ in range(400):
         loop.tick((9.0, 0.0, 0.0))
         asked.append(loop.supervisor.command[0])
-    assert np.diff(asked).max() == pytest.approx(1.2 * 0.005)  # 1.2 m/s^2
+    assert np.diff(asked).max() == pytest.approx(2.0 * 0.005)  # 2 m/s^2
     assert asked[-1] == 2.0
 
 

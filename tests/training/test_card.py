@@ -39,7 +39,7 @@ def test_a_policys_card_names_its_figures_and_where_it_fails(evaluation):
     text, metadata = card(SHIPPED_POLICY, [evaluation]), PolicyFile().metadata
     low, high = metadata.command_limits["vx"]
     for said in (
-        f"| samples | {metadata.recipe['samples']:,} |",
+        f"| samples | {metadata.recipe['samples']} |",
         "| largest error, m/s | 0.11 |",
         "aliengo: ΔKp -0.706 N m/rad",
         f"Commands beyond vx {low:g} to {high:g} m/s",
@@ -53,7 +53,7 @@ def test_an_estimators_card_says_under_which_policy_it_was_measured(evaluation):
     text = card(SHIPPED_MODEL, [evaluation])
     assert "| learned estimator, largest RMSE, m/s | 0.01 |" in text
     assert "largest error" not in text
-    assert "Measured on walks under aliengo.onnx" in text
+    assert "Measured on walks under crl_eam.onnx" in text
 
 
 def test_an_evaluation_of_another_network_is_refused(evaluation, tmp_path):
@@ -61,5 +61,5 @@ def test_an_evaluation_of_another_network_is_refused(evaluation, tmp_path):
     model = onnx.load(SHIPPED_POLICY)
     model.doc_string = "another one"
     onnx.save(model, other)
-    with pytest.raises(ValueError, match=r"is an evaluation of .*aliengo[.]onnx, expected one of .*other"):
+    with pytest.raises(ValueError, match=r"is an evaluation of .*crl_eam[.]onnx, expected one of .*other"):
         card(other, [evaluation])

@@ -41,7 +41,7 @@ class MuxConfig:
         metadata={"description": "largest vx, vy, wz passed on, m/s, rad/s"},
     )
     acceleration: Axes = attrs.field(
-        default=(1.2, 0.8, 1.5),
+        default=(2.0, 1.4, 6.0),
         validator=_axes,
         metadata={"description": "largest change of a command away from zero, m/s^2, rad/s^2"},
     )

@@ -15,7 +15,7 @@ from quadvel_description.recurrent_network import RecurrentNetwork
 
 from .observation import JOINTS, RATE_HZ, REQUIRED_FIELDS, MetadataError, PolicyMetadata
 
-SHIPPED_POLICY = Path(__file__).parent / "policies" / "aliengo.onnx"
+SHIPPED_POLICY = Path(__file__).parent / "policies" / "crl_eam.onnx"
 
 
 class PolicyFile:
