@@ -121,12 +121,20 @@ def test_the_ablation_gives_every_recipe_the_same_and_goes_on_where_it_was_stopp
     runs, stop_after = [], 2
 
     def train(config, source, start, teacher, folder, device):
-        runs.append((source.stem, start.name, teacher.name, config.budget.samples, folder.name))
+        shares = (
+            config.pull_samples / config.budget.samples,
+            config.constraint_samples / config.budget.samples,
+        )
+        same = (config.budget.samples, config.n, config.seed, *np.round(shares, 9))
+        runs.append((source.stem, start.name, teacher.name, same, folder.name))
         return len(runs) != stop_after
 
     monkeypatch.setattr(stages, "train_policy", train)
     start, teacher = tmp_path / "start.pt", tmp_path / "teacher.pt"
-    assert not stages.ablation(start, teacher, 100.0, tmp_path, "cpu")
-    assert stages.ablation(start, teacher, 100.0, tmp_path, "cpu")
+    assert not stages.ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
+    assert stages.ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
     order = ["rl_pd", "rl_eam", "rl_pd", "rl_eam", "crl_eam"]
-    assert runs == [(name, "start.pt", "teacher.pt", 100.0, name) for name in order]
+    own = recipe.read(ConstrainedConfig, stages.RECIPES / "crl_eam.yaml")
+    shares = own.pull_samples / own.budget.samples, own.constraint_samples / own.budget.samples
+    same = (100.0, 64, 7, *np.round(shares, 9))
+    assert runs == [(name, "start.pt", "teacher.pt", same, name) for name in order]

@@ -135,6 +135,8 @@ def train_ablation(
     start: Annotated[Path, typer.Option(help="Checkpoint of `dagger` that all three start from.")] = STUDENT,
     teacher: TeacherFile = TEACHER,
     samples: Annotated[float, typer.Option(help="Of each recipe, the budget that is equal for all.")] = 6e7,
+    robots: Annotated[int, typer.Option(min=2, help="Fewer learn in more, noisier steps.")] = 512,
+    seed: Annotated[int, typer.Option(help="Of all draws.")] = 3,
     out: Annotated[Path, typer.Option(help="Folder for the runs and their policy files.")] = Path(
         "out/ablation"
     ),
@@ -142,12 +144,14 @@ def train_ablation(
 ) -> None:
     """Train rl_pd, rl_eam and crl_eam from one start, one after the other; goes on where it was stopped.
 
+    Pull, exploration and constraints change over the same shares of the budget as in the recipe's own.
+
     \b
     Then:
       quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx \\
         --policy rl_eam=out/ablation/rl_eam/policy.onnx --policy crl_eam=out/ablation/crl_eam/policy.onnx
     """
-    if not stages.ablation(start, teacher, samples, out, device):
+    if not stages.ablation(start, teacher, samples, robots, seed, out, device):
         raise typer.Exit(1)
     _written(*(out / name / stages.POLICY_FILE for name in stages.ABLATION))
 

@@ -99,17 +99,30 @@ def _recipe(kind: type[Any], name: str) -> tuple[Any, Path]:
     return recipe.read(kind, source), source
 
 
-def ablation(start: Path, teacher: Path, samples: float, out: Path, device: str) -> bool:
+def ablation(
+    start: Path, teacher: Path, samples: float, robots: int, seed: int, out: Path, device: str
+) -> bool:
     """Train the three recipes from one start, `samples` each, one after the other; policies are OUT/RECIPE/policy.onnx.
 
     Goes on where it was stopped; whether all are done.
     """
     for name in ABLATION:
         config, source = _recipe(ConstrainedConfig, name)
-        config = attrs.evolve(config, budget=Budget(samples, NO_LIMIT))
+        config = attrs.evolve(within(config, samples), n=robots, seed=seed)
         if not train_policy(config, source, start, teacher, out / name, device):
             return False
     return True
+
+
+def within(config: ConstrainedConfig, samples: float) -> ConstrainedConfig:
+    """The run with another budget: what fades or grows in it does so over the same shares of its samples."""
+    share = samples / config.budget.samples
+    scheduled = ("std_samples", "pull_samples", "constraint_samples")
+    return attrs.evolve(
+        config,
+        budget=Budget(samples, NO_LIMIT),
+        **{name: share * getattr(config, name) for name in scheduled},
+    )
 
 
 def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
