@@ -58,6 +58,8 @@ def test_a_sustained_velocity_is_near_its_command(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sustained, "COUNTED", 1.0)
     found = ours(Sustained(shares=(0.3,), directions=("left",)))
     assert found["left: reached"] == pytest.approx(found["left: largest command that was tried"], abs=0.15)
+    for drive in ("fastest joint, share of its drive's speed", "largest torque, share of its drive's"):
+        assert 0.1 < found[f"left: {drive}"] < 1.0
 
 
 def test_a_walk_has_gait_cycles_on_all_legs(monkeypatch: pytest.MonkeyPatch) -> None:

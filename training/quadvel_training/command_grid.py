@@ -41,8 +41,11 @@ class GridConfig:
     error_wz: float = 0.12  # rad/s, the same of yaw,
     error_share: float = 0.06  # and so much more with every m/s and rad/s of the command
 
-    answered: CommandLimits = CommandLimits((-3.2, -2.0, -6.0), (4.2, 2.0, 6.0), curve=3.6)
-    """The commands that a policy file answers, m/s, rad/s, m/s^2; the grid goes beyond, so that none is at the edge of it."""
+    answered: CommandLimits = CommandLimits((-3.2, -2.0, -6.0), (3.1, 2.0, 6.0), curve=3.6)
+    """The commands that a policy file answers, m/s, rad/s, m/s^2; the grid goes beyond, so that none is at the edge of it.
+
+    Ahead at 3.3 m/s, swinging calves reach the speed at which the supervisor stops the robot, on some of the robots that vary.
+    """
 
     def limits(self) -> CommandLimits:
         """The commands that belong to the grid."""

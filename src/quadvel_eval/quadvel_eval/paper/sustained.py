@@ -1,4 +1,5 @@
-"""Section 4.3: the largest velocities that the robot keeps up, forward, backward, sideways and spinning."""
+"""Section 4.3: the largest velocities that the robot keeps up, forward, backward, sideways and spinning, and what they
+ask of the drives."""
 
 from __future__ import annotations
 
@@ -10,10 +11,12 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
+from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
+
 from ..robot_loop import PERIOD
-from ..walk import Setup, make_loop, record
+from ..walk import Setup, make_loop, record_to_the_fall
 from .cells import Command, falls, limits, reach
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, largest, select
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
 
 ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
 KEPT = 5.0  # s at the full command, of which the last 4 count
@@ -26,15 +29,31 @@ DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s
     "spin left": ((0.0, 0.0, 1.0), 6.0),
     "spin right": ((0.0, 0.0, -1.0), 6.0),
 }
+DRIVES = {
+    "joint_speed": "fastest joint, share of its drive's speed",
+    "torque": "largest torque, share of its drive's",
+}
 
 
-def sustain(setup: Setup, seed: int, direction: Command, speed: float) -> float | None:
-    """Mean velocity along `direction` (m/s, rad/s) at a command of `speed` that is kept up; None where it fell."""
+def sustain(setup: Setup, seed: int, direction: Command, speed: float) -> Record:
+    """What became of a command of `speed` that is kept up, over the last seconds, or those before the robot fell or stopped.
+
+    `reached`: mean velocity along `direction` (m/s, rad/s), None where it `fell`; `ended`: the supervisor's reason then;
+    `joint_speed`, `torque`: the largest of all joints, as shares of what their drives can do.
+    """
     along = np.array(direction)
     rise = speed / (2 * ACCELERATION if along[2] else ACCELERATION)
     shares = np.minimum(np.arange(round((rise + KEPT) / PERIOD)) * PERIOD / rise, 1.0)
-    walk = record(make_loop(setup, seed, ()), [(share * speed * along, PERIOD) for share in shares])
-    return None if walk is None else float(walk.velocity[-round(COUNTED / PERIOD) :].mean(axis=0) @ along)
+    loop, last = make_loop(setup, seed, ()), slice(-round(COUNTED / PERIOD), None)
+    walk, stood = record_to_the_fall(loop, [(share * speed * along, PERIOD) for share in shares])
+    assert walk is not None  # it stood when it began
+    return {
+        "reached": float(walk.velocity[last].mean(axis=0) @ along) if stood else None,
+        "fell": int(not stood),
+        "ended": "" if stood else loop.supervisor.reason,
+        "joint_speed": float((np.abs(walk.joint_velocity[last]) / VELOCITY_LIMIT).max()),
+        "torque": float((np.abs(walk.torque[last]) / TORQUE_LIMIT).max()),
+    }
 
 
 @attrs.frozen
@@ -46,7 +65,9 @@ class Sustained(Section):
     method: ClassVar[str] = (
         "The command rises at 0.7 m/s² (spins: 1.4 rad/s²) to 60, 80, 90 and 100 % of the policy's own limit in that "
         "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and is held for 5 s. What counts is the "
-        "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table."
+        "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table. Beside it stands what "
+        "the command asks of the drives: the largest speed and torque of any joint, as shares of what its drive can do. The "
+        "supervisor stops a robot whose joints move at 1.25 times that speed."
     )
     shares: tuple[float, ...] = (0.6, 0.8, 0.9, 1.0)
     directions: tuple[str, ...] = tuple(DIRECTIONS)
@@ -64,13 +85,13 @@ class Sustained(Section):
         return jobs
 
     def judge(self, answers: Answers) -> list[Record]:
-        return [{**labels, "reached": speed, "fell": int(speed is None)} for labels, speed in answers]
+        return [{**labels, **became} for labels, became in answers]
 
     def figure(self, records: Sequence[Record]) -> Figure:
         policies = distinct(records, "policy")
         names = distinct(records, "direction")
-        figure = Figure(figsize=(9.0, 3.8), layout="constrained")
-        walks, spins = figure.subplots(1, 2, width_ratios=(2, 1))
+        figure = Figure(figsize=(12.5, 3.8), layout="constrained")
+        walks, spins, drives = figure.subplots(1, 3, width_ratios=(2, 1, 2))
         for panel, spinning, unit in ((walks, False, "m/s"), (spins, True, "rad/s")):
             mine = [name for name in names if name.startswith("spin") == spinning]
             places, width = np.arange(len(mine)), 0.8 / len(policies)
@@ -82,6 +103,14 @@ class Sustained(Section):
             panel.set_xticks(places + 0.4, mine)
             panel.set_ylabel(f"sustained velocity, {unit}")
         walks.legend()
+        for name in names:
+            mine = select(records, direction=name, policy=policies[-1])
+            drives.plot(column(mine, "command"), column(mine, "joint_speed"), "o-", label=name)
+        drives.axhline(1.0, color="black", linestyle="--")
+        drives.set_xlabel("command, m/s, rad/s")
+        drives.set_ylabel("fastest joint, share of its drive's speed")
+        drives.set_title(policies[-1])
+        drives.legend(fontsize="small")
         return figure
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
@@ -93,5 +122,9 @@ class Sustained(Section):
             rows += [
                 Row(f"{name}: reached", unit, paper, reached, 2, key=True),
                 Row(f"{name}: largest command that was tried", unit, None, tried, 2),
+                *(
+                    Row(f"{name}: {what}", "", None, by_policy(mine, partial(largest, name=key)), 2)
+                    for key, what in DRIVES.items()
+                ),
             ]
         return [*rows, Row("falls", "", 0.0, by_policy(records, falls), 0)]
