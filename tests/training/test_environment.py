@@ -157,6 +157,15 @@ def test_lifting_feet_pays_only_while_walking_and_posture_counts_only_in_stance(
     assert table.terms(np.zeros((4, 12)))["foot_clearance"][0] == pytest.approx(0.12)
 
 
+def test_joints_nearly_as_fast_as_their_drives_are_fined():
+    env = VelocityEnv(EnvConfig(n=2, threads=1, randomisation=Randomisation.none()))
+    env.dq = np.zeros((2, 12))
+    env.dq[0, :6] = 0.89 * robot.VELOCITY_LIMIT[:6]
+    env.dq[1, 1], env.dq[1, 5] = 19.0, -15.301  # of 20 and 15.89 rad/s
+    fine = Table2(env, RewardWeights()).terms(np.zeros((2, 12)))["overspeed"]
+    assert fine == pytest.approx([0.0, -2.0])
+
+
 class Counter:
     """A run that counts."""
 

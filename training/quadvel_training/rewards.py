@@ -10,14 +10,17 @@ from quadvel_description import robot
 from .env import HEAT, TICK, VelocityEnv
 from .walking_rewards import hips_astray
 
+FAST = 0.9  # share of the speed of a joint's drive, beyond which `overspeed` fines it
+
 
 @attrs.frozen
 class RewardWeights:
     """Coefficients of Table 2.
 
-    `action_smoothness` is Section 4.4's, for the recipes without constraints. Four are our own: `tracking_width`, within
-    which the tracking rewards tell errors apart (1 is Table 2's), `hips` against hips away from straight down, and, in stance,
-    `stillness` against motion and `posture` against joints that are not where they are in the nominal posture.
+    `action_smoothness` is Section 4.4's, for the recipes without constraints. Five are our own: `tracking_width`, within
+    which the tracking rewards tell errors apart (1 is Table 2's), `hips` against hips away from straight down, `overspeed`
+    against joints that move nearly as fast as their drives can or faster, and, in stance, `stillness` against motion and
+    `posture` against joints that are not where they are in the nominal posture.
     """
 
     linear_tracking: float = 0.5
@@ -34,6 +37,7 @@ class RewardWeights:
     foot_clearance: float = 3.0
     action_smoothness: float = 0.0
     hips: float = 0.0
+    overspeed: float = 0.0
     stillness: float = 0.0
     posture: float = 0.0
     tracking_width: float = 1.0  # m/s, rad/s
@@ -81,6 +85,7 @@ class Table2:
             "foot_clearance": clearance.sum(axis=1) * decay,
             "action_smoothness": -np.abs(bend).sum(axis=1),
             "hips": -hips_astray(env, c),
+            "overspeed": -np.maximum(np.abs(env.dq) - FAST * robot.VELOCITY_LIMIT, 0.0).sum(axis=1),
             "posture": -np.abs(env.q - robot.NOMINAL_Q).sum(axis=1) * ~walking,
             "stillness": -(np.hypot(v[:, 0], v[:, 1]) + 0.05 * np.abs(env.dq).sum(axis=1)) * ~walking,
         }
