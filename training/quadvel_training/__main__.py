@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +17,7 @@ from quadvel_eval.paper import gap
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
 from . import (
+    closing,
     constrained,
     dagger,
     env,
@@ -186,13 +188,15 @@ def tune_policy(
     _written(stages.tune(actuator, policy, minutes, out, device))
 
 
+Plant = Annotated[str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.plants())}.")]
+WalkingPolicy = Annotated[Path, typer.Option(help="Policy file that walks.", exists=True)]
+
+
 @app.command("record")
 def record_log(
-    plant: Annotated[
-        str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.plants())}.")
-    ],
+    plant: Plant,
     out: Annotated[Path, typer.Option(help="NPZ file for `quadvel identify`.")],
-    policy: Annotated[Path, typer.Option(help="Policy file that walks.", exists=True)] = SHIPPED_POLICY,
+    policy: WalkingPolicy = SHIPPED_POLICY,
 ) -> None:
     """Record a walk on a plant whose drives hold what training never saw, as a log for `quadvel identify`."""
     try:
@@ -200,6 +204,26 @@ def record_log(
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     _written(out)
+
+
+@app.command("close-the-loop")
+def close_the_loop(
+    checkpoint: Annotated[
+        Path, typer.Option(help="Checkpoint of `constrained` that POLICY was written from.", exists=True)
+    ],
+    plant: Plant = "friction",
+    policy: WalkingPolicy = SHIPPED_POLICY,
+    minutes: Annotated[float, typer.Option(min=0.1, help="How long the policy is tuned.")] = 20.0,
+    out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("out/loop"),
+) -> None:
+    """Record a walk on a plant that training never saw, correct the model, tune the policy on it, and compare.
+
+    Runs `record`, `quadvel identify`, `tune` and `quadvel paper --only gap`; files that are there already are kept.
+    """
+    try:
+        _written(closing.close_the_loop(plant, policy, checkpoint, minutes, out))
+    except subprocess.CalledProcessError as error:
+        raise typer.Exit(error.returncode) from None
 
 
 @app.command("estimator")

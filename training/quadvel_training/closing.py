@@ -1,0 +1,52 @@
+"""The loop closed on a plant that training never saw, as the commands that one would type: a walk is recorded, the model
+corrected from it, the policy tuned on that model, and both policies compared on the same plants."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from .env import cores
+
+STEPS = (  # the file that a step ends with, and what python runs for it
+    ("{out}/walk.npz", "-m quadvel_training record --plant {plant} --policy {policy} --out {file}"),
+    ("{out}/identified/actuator.yaml", "-m quadvel_bringup identify {out}/walk.npz --out {out}/identified"),
+    (
+        "{out}/tuned/policy.onnx",
+        "-m torch.distributed.run --standalone --nproc-per-node={cores} -m -- quadvel_training tune "
+        "--actuator {out}/identified/actuator.yaml --policy {checkpoint} --minutes {minutes} --out {out}/tuned",
+    ),
+    (
+        "{out}/gap/README.md",
+        "-m quadvel_bringup paper --only gap --out {out}/gap --policy before={policy} --policy after={out}/tuned/policy.onnx",
+    ),
+)
+
+
+def steps(
+    plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path
+) -> list[tuple[Path, list[str]]]:
+    """STEPS for these: files and arguments of python. policy: the policy file that was written from `checkpoint`."""
+    known = {"plant": plant, "policy": policy, "checkpoint": checkpoint, "minutes": minutes, "out": out}
+    known["cores"] = cores()
+    filled = [(file.format(**known), command) for file, command in STEPS]
+    return [
+        (Path(file), [word.format(file=file, **known) for word in command.split()])
+        for file, command in filled
+    ]
+
+
+def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path) -> Path:
+    """Run the steps whose files are not there yet; returns the page with both policies' errors.
+
+    Each command is printed before it runs. subprocess.CalledProcessError where one fails.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    for file, arguments in (all_of_them := steps(plant, policy, checkpoint, minutes, out)):
+        if file.exists():
+            print(f"kept: {file}", flush=True)
+        else:
+            print("$ python " + " ".join(arguments), flush=True)
+            subprocess.run([sys.executable, *arguments], check=True)
+    return all_of_them[-1][0]
