@@ -14,14 +14,14 @@ INPUTS = {"obs": (1, 3), "h_in": (1, 1, 2 * MEMORY), "c_in": (1, 1, MEMORY)}
 
 
 def network(
-    order: tuple[str, ...] = ("obs", "h", "clock", "bent"), nested: bool = False, **gemm: float
+    order: tuple[str, ...] = ("obs", "h", "kept", "bent"), nested: bool = False, **gemm: float
 ) -> ModelProto:
-    """A product of `order` put together, where h and clock are halves of h_in and bent is made of obs; `gemm`: its attributes.
+    """A product of `order` put together, where h and kept are halves of h_in and bent is made of obs; `gemm`: its attributes.
 
     nested: all but the first are put together first.
     """
     rng = np.random.default_rng(0)
-    widths = {"obs": 3, "bent": 3, "h": MEMORY, "clock": MEMORY}
+    widths = {"obs": 3, "bent": 3, "h": MEMORY, "kept": MEMORY}
     weight = rng.normal(size=(sum(widths[name] for name in order), MEMORY)).astype(np.float32)
     constants = {
         "W": np.ascontiguousarray(weight.T) if gemm.get("transB") else weight,
@@ -38,12 +38,12 @@ def network(
         ]
     nodes = [
         helper.make_node("Reshape", ["h_in", "flat"], ["memory"]),
-        helper.make_node("Split", ["memory", "halves"], ["h", "clock"], axis=1),
+        helper.make_node("Split", ["memory", "halves"], ["h", "kept"], axis=1),
         helper.make_node("Tanh", ["obs"], ["bent"]),
         *joining,
         helper.make_node("Gemm", ["joined", "W", "b"], ["sum"], **gemm),
         helper.make_node("Sigmoid", ["sum"], ["actions"]),
-        helper.make_node("Concat", ["actions", "clock"], ["after"], axis=1),
+        helper.make_node("Concat", ["actions", "kept"], ["after"], axis=1),
         helper.make_node("Reshape", ["after", "deep"], ["h_out"]),
         helper.make_node("Tanh", ["c_in"], ["c_out"]),
     ]
@@ -73,7 +73,7 @@ def run(model: ModelProto, given: dict[str, np.ndarray]) -> dict[str, np.ndarray
     "model",
     [
         network(),
-        network(("h", "bent", "clock", "obs")),
+        network(("h", "bent", "kept", "obs")),
         network(("obs", "h")),
         network(transB=1),
         network(nested=True),
@@ -94,7 +94,7 @@ def test_both_parts_together_are_the_network(model: ModelProto) -> None:
 
 @pytest.mark.parametrize(
     "model",
-    [network(("obs", "bent")), network(("h", "clock")), network(alpha=0.5)],
+    [network(("obs", "bent")), network(("h", "kept")), network(alpha=0.5)],
     ids=["all awaits", "nothing awaits", "a scaled product"],
 )
 def test_a_network_without_a_product_of_both_kinds_stays_whole(model: ModelProto) -> None:

@@ -1,4 +1,4 @@
-"""Stage 2 without a clock: the student, its teacher at every tick, and the policy file that is the network and no more."""
+"""Stage 2: the student, its teacher at every tick, and the policy file that is the network and no more."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Stage 1 without a clock: the grid of commands, the rewards, and a run that survives broken physics and being killed."""
+"""Stage 1: the grid of commands, the rewards, and a run that survives broken physics and being killed."""
 
 from __future__ import annotations
 

@@ -123,7 +123,7 @@ def train_constrained(
     minutes: Minutes = None,
     device: Device = "cpu",
 ) -> None:
-    """Stage 3: constrained reinforcement learning of that network, pulled by the teacher at first.
+    """Stage 3: constrained reinforcement learning of that network, pulled by the teacher, strongly at first.
 
     Writes DIR/policy.onnx; on the way, policies and what a quick evaluation says of them go to DIR/kept.
     """

@@ -1,7 +1,7 @@
 """Stage 3: constrained reinforcement learning of the paper's plain network at 200 Hz (Section 3.3).
 
-Starts from the student of `dagger`, whose teacher pulls it back at first: what an action costs shows at once, what it gains
-only after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and fines
+Starts from the student of `dagger`, whose teacher pulls it back, strongly at first: what an action costs shows at once, what it
+gains only after a stride. The pull fades, the constraints on symmetry and smoothness grow. Rewards are those of Table 2, and fines
 for the error over a stride and for the one that lasts: steady errors are the policy's own to remove. Exploration is
 correlated in time, as soft gains filter white noise away at 200 Hz.
 """

@@ -1,6 +1,6 @@
 """Stage 1: a memoryless teacher that sees the true state finds a gait from random weights, by rewards alone.
 
-No clock, no gait, no reference motion. It acts 50 times a second, learns by PPO with a mirror loss, and
+No reference motion. It acts 50 times a second, learns by PPO with a mirror loss, and
 its commands grow with what it follows (`command_grid`). What it sees of the past, errors over a stride and over some
 seconds, a recurrent student can keep for itself.
 """

@@ -28,7 +28,7 @@ Array = NDArray[np.float64]
 
 PERIOD = 0.05  # s, from one step to the next
 SIDES = {"behind": 0, "left": 1, "right": -1}
-CURVE = 3.0  # m/s^2, to which a turn at speed is held, below what the shipped policy allows
+CURVE = 3.0  # m/s^2, to which a turn at speed is held; above 1.3 m/s the shipped policy holds turns tighter itself
 BACKWARD = 0.4  # m/s, where the scanner sees what is behind
 BEHIND = np.linspace(-0.5, 0.5, 7) + np.pi  # rad, what has to be seen there
 JERK = np.array([10.0, 8.0, 16.0])  # m/s^3, rad/s^3, of commands

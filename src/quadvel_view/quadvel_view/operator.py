@@ -23,7 +23,7 @@ STOP_AGAIN = 0.25
 """s after which a STOP that was not heeded is said again"""
 BRAKING = ("passive", "fault")
 """Modes in which the joints brake"""
-TOP_SPEED = np.array([3.5, 2.1, 3.0])
+TOP_SPEED = np.array([3.2, 2.0, 3.0])
 """m/s, m/s, rad/s: no hand asks for more"""
 
 
