@@ -64,7 +64,7 @@ class ConstrainedConfig:
     )
     averaged: int = 150  # updates over which the weights of the policy are averaged: single steps leave steady errors behind
     keep: float = 5e6  # samples between policies that are kept and evaluated
-    actuator: str = "eam"  # or ideal, or an actuator file
+    actuator: str = "eam"  # or limited, ideal, or an actuator file
     timestep: float = 0.0025
     seed: int = 3
     grid: GridConfig = GridConfig()  # the student's; its open cells come with it

@@ -8,9 +8,21 @@ import numpy as np
 from mujoco.batch import Batch
 
 from quadvel_actuator.model import ActuatorModel
-from quadvel_actuator.parameters import ActuatorParameters
+from quadvel_actuator.parameters import ActuatorParameters, Effect
+from quadvel_description.robot import JOINT_NAMES
 
-ACTUATORS = {"eam": ActuatorParameters.default, "ideal": ActuatorParameters.ideal}
+STALL, NO_LOAD = (24.0, 60.0), (12.0, 30.0)  # N m, rad/s, of `limited`, drawn for each robot
+
+
+def limited() -> ActuatorParameters:
+    """The shipped actuator model with torque limits that fall with the speed, of drives from weak to strong."""
+    middle = {"stall": float(np.mean(STALL)), "no_load": float(np.mean(NO_LOAD))}
+    ranges = {"stall": STALL, "no_load": NO_LOAD}
+    effect = Effect("torque_speed_limit", JOINT_NAMES, middle, intervals=ranges)
+    return attrs.evolve(ActuatorParameters.default(), name="aliengo, limited", effects=(effect,))
+
+
+ACTUATORS = {"eam": ActuatorParameters.default, "limited": limited, "ideal": ActuatorParameters.ideal}
 
 
 @attrs.frozen
@@ -141,7 +153,7 @@ class PlantSampler:
 
 
 def actuator(name: str) -> ActuatorParameters:
-    """The joints of a recipe: `eam` is Table 4, `ideal` plain PD, anything else an actuator file."""
+    """The joints of a recipe: `eam` is Table 4, `limited` the same with limits, `ideal` plain PD, else an actuator file."""
     return ACTUATORS[name]() if name in ACTUATORS else ActuatorParameters.load(name)
 
 
