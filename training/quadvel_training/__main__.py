@@ -54,7 +54,7 @@ Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
 Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
 TEACHER = Path("out/training/privileged") / stages.TEACHER
 STUDENT = Path("out/training/dagger") / stages.STUDENT
-POLICY = Path("out/training/constrained") / stages.POLICY
+POLICY = Path("out/training/constrained_fine") / stages.POLICY
 TeacherFile = Annotated[
     Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.", dir_okay=False)
 ]
@@ -81,11 +81,11 @@ def _written(*paths: Path) -> None:
 def train_everything(out: Out = Path("out/training"), device: Device = "cpu") -> None:
     """From random weights to policy and estimator: every stage with its recipe, in folders of DIR; days of two cores.
 
-    Ends with DIR/constrained/policy.onnx and DIR/estimator/estimator.onnx. Goes on where it was stopped.
+    Ends with DIR/constrained_fine/policy.onnx and DIR/estimator/estimator.onnx. Goes on where it was stopped.
     """
     if not stages.everything(out, device):
         raise typer.Exit(1)
-    _written(out / "constrained" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
+    _written(out / "constrained_fine" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
 
 
 @app.command("privileged")
@@ -116,7 +116,7 @@ def train_dagger(
 
 @app.command("constrained")
 def train_constrained(
-    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger`.")] = STUDENT,
+    start: Annotated[Path, typer.Option(help="Checkpoint of `dagger`, or of this stage.")] = STUDENT,
     teacher: TeacherFile = TEACHER,
     out: Out = Path("out/training/constrained"),
     source: Recipe = None,

@@ -18,6 +18,7 @@ from .run_folder import Evaluated, describe, made_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
 TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, one after the other
+POLICY_PARTS = {"constrained": "crl_eam", "constrained_fine": "crl_eam_fine"}  # folders and recipes, likewise
 ABLATION = ("rl_pd", "rl_eam", "crl_eam")
 TEACHER, STUDENT, POLICY, ESTIMATOR = (
     "privileged.pt",
@@ -79,18 +80,19 @@ def everything(out: Path, device: str) -> bool:
 
     Returns whether all are done.
     """
-    teacher, student, policy, estimator = (
-        out / name for name in ("privileged", "dagger", "constrained", "estimator")
-    )
+    teacher, student, estimator = (out / name for name in ("privileged", "dagger", "estimator"))
     for part in TEACHER_PARTS:
         if not train_teacher(*_recipe(PrivilegedConfig, part), teacher):
             return False
     if not train_student(*_recipe(DaggerConfig, "dagger"), teacher / TEACHER, student):
         return False
-    stage3 = _recipe(ConstrainedConfig, "crl_eam")
-    if not train_policy(*stage3, student / STUDENT, teacher / TEACHER, policy, device):
-        return False
-    return train_estimator(*_recipe(EstimatorConfig, "estimator"), policy / POLICY, estimator)
+    start = student / STUDENT
+    for folder, part in POLICY_PARTS.items():
+        stage3 = _recipe(ConstrainedConfig, part)
+        if not train_policy(*stage3, start, teacher / TEACHER, out / folder, device):
+            return False
+        start = out / folder / POLICY
+    return train_estimator(*_recipe(EstimatorConfig, "estimator"), start, estimator)
 
 
 def _recipe(kind: type[Any], name: str) -> tuple[Any, Path]:
