@@ -120,7 +120,7 @@ LEFT_OUT = {
     "quadvel paper --out out/ablation --policy rl_pd=a.onnx --policy crl_eam=b.onnx --only tracking --only gap": "the same",
     "quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx "
     "--policy rl_eam=out/ablation/rl_eam/policy.onnx --policy crl_eam=out/ablation/crl_eam/policy.onnx": "the same",
-    "quadvel paper --out out/loop/gap --only gap --policy before=out/training/constrained/policy.onnx "
+    "quadvel paper --out out/loop/gap --only gap --policy before=src/quadvel_policy/quadvel_policy/policies/crl_eam.onnx "
     "--policy after=out/loop/tuned/policy.onnx": "the same",
     "quadvel identify go2_walk_1.npz --holdout go2_walk_2.npz --gains 35 0.5 --robot go2 --out out/go2_1": "measured logs that "
     "are no part of this repository; tests/quadvel_sysid/test_measured.py takes them where they are",

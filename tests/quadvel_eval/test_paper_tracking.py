@@ -71,9 +71,12 @@ def test_the_grid_has_every_command_with_every_seed_on_both_plants() -> None:
 def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     section = Sustained()
     labels = {"policy": "mine", "direction": "forward", "limit": 4.0}
-    records = section.judge([({**labels, "command": 3.0}, 2.9), ({**labels, "command": 4.0}, None)])
+    stood = {"reached": 2.9, "fell": 0, "ended": "", "joint_speed": 0.9, "torque": 0.7}
+    fell = {"reached": None, "fell": 1, "ended": "the robot fell", "joint_speed": 1.2, "torque": 1.0}
+    records = section.judge([({**labels, "command": 3.0}, stood), ({**labels, "command": 4.0}, fell)])
     rows = {row.what: row for row in section.rows(records)}
     assert rows["forward: reached"].ours == {"mine": 2.9}
     assert rows["forward: reached"].paper == 4.2
+    assert rows["forward: fastest joint, share of its drive's speed"].ours == {"mine": 1.2}
     assert rows["falls"].ours == {"mine": 1.0}
     section.figure(records)
