@@ -3,6 +3,7 @@ corrected from it, the policy tuned on that model, and both policies compared on
 
 from __future__ import annotations
 
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -47,6 +48,6 @@ def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, o
         if file.exists():
             print(f"kept: {file}", flush=True)
         else:
-            print("$ python " + " ".join(arguments), flush=True)
+            print("$ python", shlex.join(arguments), flush=True)
             subprocess.run([sys.executable, *arguments], check=True)
     return all_of_them[-1][0]

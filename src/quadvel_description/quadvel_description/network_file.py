@@ -15,9 +15,7 @@ from pathlib import Path
 from google.protobuf.message import DecodeError, Message
 from onnx import ModelProto, TensorProto
 
-LARGEST = (
-    16_000_000  # bytes, ten times the shipped policy; a core reads so many weights in a third of a 5 ms step
-)
+LARGEST = 16_000_000  # bytes, ten times the shipped policy; a core reads so many in a third of a 5 ms step
 MOST_PARTS = 50_000  # nodes, attributes, tensors and what else is told apart; the shipped policy has 100
 LARGEST_TENSOR = LARGEST // 4  # numbers
 OPSETS = range(13, 22)  # from the one that has axes as inputs to the last that onnxruntime 1.20 runs
