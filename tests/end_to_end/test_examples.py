@@ -53,6 +53,7 @@ ROBOT = [
     Step("quadvel push --fy 60"),
     Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
     Step("quadvel reset"),
+    Step("quadvel reset --terrain slope --slope 0.175"),
     Step("quadvel mode passive"),
     Step("quadvel mode stand_up"),
 ]

@@ -121,6 +121,27 @@ def test_the_services_reset_pause_step_and_push(start: Start, peer: Any) -> None
     peer.spin_until(lambda: states[-1].tick > tick + 30)
 
 
+def test_a_reset_puts_the_robot_on_other_ground(start: Start, peer: Any) -> None:
+    start(mode="lockstep", keyframe="stand")
+    peer.answer = answer
+    states = peer.heard["low_state"]
+    peer.spin_until(lambda: len(states) > 5)
+    tick = states[-1].tick
+    response = peer.call("reset", keyframe="stand", terrain="slope", slope=0.2)
+    assert (response.success, response.message) == (
+        True,
+        "the robot is back in posture stand, on slope ground",
+    )
+    peer.spin_until(lambda: states[-1].tick > tick + 20)  # time goes on
+    odom = peer.heard["ground_truth/odom"]
+    peer.spin_until(lambda: abs(odom[-1].pose.pose.orientation.y + np.sin(0.1)) < 0.02)  # uphill
+    response = peer.call("reset", terrain="swamp")
+    assert not response.success
+    assert response.message == "Terrain.kind: found 'swamp', expected one of flat, slope, rough"
+    assert peer.call("reset", keyframe="stand", terrain="flat").success
+    peer.spin_until(lambda: abs(odom[-1].pose.pose.orientation.y) < 0.02)
+
+
 def test_bad_commands_are_refused_counted_and_named(start: Start, peer: Any) -> None:
     start(mode="realtime")
     states = peer.heard["low_state"]

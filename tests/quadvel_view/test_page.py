@@ -169,8 +169,9 @@ def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
     page.page.mouse.up()
     page.page.click("#stop")
     page.until("!state.stopped")
+    page.page.select_option("#ground", "rough")
     page.page.click("[data-do=reset]")
-    page.until("state.said.includes('lie')")
+    page.until("state.said.includes('lie, on rough ground')")
     page.page.click("[data-do=stand_up]")
     page.until("state.mode === 'stance'")
 

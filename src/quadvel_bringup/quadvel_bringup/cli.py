@@ -254,16 +254,23 @@ def status() -> None:
 @app.command()
 def reset(
     keyframe: Annotated[Literal["lie", "stand"], typer.Option(help="Its posture.")] = "lie",
+    terrain: Annotated[
+        Literal["flat", "slope", "rough"] | None,
+        typer.Option(help="Ground to start on.", show_default="the ground that is there"),
+    ] = None,
+    slope: Annotated[float, typer.Option(help="With slope or rough: inclination, rad.")] = 0.0,
 ) -> None:
-    """Put the simulated robot back to where it started.
+    """Put the simulated robot back to where it started, or on other ground.
 
     \b
     After a fall:
       quadvel reset
       quadvel mode passive
       quadvel mode stand_up
+    On a slope of 10 degrees that rises ahead:
+      quadvel reset --terrain slope --slope 0.175
     """
-    raise typer.Exit(_with_middleware("orders").reset(keyframe))
+    raise typer.Exit(_with_middleware("orders").reset(keyframe, terrain or "", slope))
 
 
 @app.command()

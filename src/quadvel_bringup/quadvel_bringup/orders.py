@@ -56,9 +56,9 @@ def enable(enabled: bool) -> int:
         return _told(session.call(SetBool, ["controller/enable_walking"], lambda: CONTROLLER, data=enabled))
 
 
-def reset(keyframe: str) -> int:
-    """Put the simulated robot back."""
-    return _to_simulation("reset", ResetSim, keyframe=keyframe)
+def reset(keyframe: str, terrain: str = "", slope: float = 0.0) -> int:
+    """Put the simulated robot back, on other ground where `terrain` names one."""
+    return _to_simulation("reset", ResetSim, keyframe=keyframe, terrain=terrain, slope=slope)
 
 
 def pause(paused: bool) -> int:

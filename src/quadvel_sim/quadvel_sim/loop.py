@@ -134,12 +134,15 @@ class SimulationLoop:
             if self.mode == LOCKSTEP or self._waits_since is not None:
                 self._condition.notify_all()
 
-    def reset(self, keyframe: str) -> None:
-        """Put the robot back, which takes a period; time goes on. ValueError where `keyframe` is unknown."""
+    def reset(self, keyframe: str, simulator: Simulator | None = None) -> None:
+        """Put the robot back, which takes a period, in another `simulator` if one is given; time goes on.
+
+        ValueError where `keyframe` is unknown.
+        """
         with self._condition:
-            after = self.tick + self.period
-            self.simulator.reset(keyframe)
-            self._before_reset = after
+            after, simulator = self.tick + self.period, simulator or self.simulator
+            simulator.reset(keyframe)
+            self.simulator, self._before_reset = simulator, after
             self._anchor()
             self._inbox.clear()
             self._answered, self._answered_tick = False, None

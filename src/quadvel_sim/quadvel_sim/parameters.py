@@ -74,7 +74,7 @@ class PlantParameters(Scheduling):
         """The simulation asked for. ValueError names what it cannot be."""
         return SimulatorConfig(
             actuator=self._actuator(),
-            terrain=self._terrain(),
+            terrain=self.ground(self.terrain, self.slope),
             world=World.load(self.world) if self.world else None,
             noise=SensorNoise(
                 self.noise_q,
@@ -92,8 +92,9 @@ class PlantParameters(Scheduling):
             watchdog_kd=self.watchdog_kd,
         )
 
-    def _terrain(self) -> Terrain:
-        return Terrain(self.terrain, self.slope, self.roughness, self.wavelength, seed=self.terrain_seed)
+    def ground(self, kind: str, slope: float) -> Terrain:
+        """Ground of a kind, inclined by `slope` (rad), with the roughness asked for. ValueError names what it cannot be."""
+        return Terrain(kind, slope, self.roughness, self.wavelength, seed=self.terrain_seed)
 
     def _actuator(self) -> ActuatorParameters:
         if not self.actuator_file:

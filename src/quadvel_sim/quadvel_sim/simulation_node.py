@@ -11,6 +11,7 @@ from collections.abc import Callable
 from threading import Thread
 from typing import Any, Generic, TypeVar
 
+import attrs
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import Point
 from nav_msgs.msg import Odometry
@@ -55,7 +56,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         make_simulator: Callable[[SimulatorConfig], Simulator] = Simulator,
     ) -> None:
         super().__init__(name)
-        self._settings = read_parameters(self, parameters)
+        self._settings, self._make_simulator = read_parameters(self, parameters), make_simulator
         simulator = make_simulator(self._settings.config())
         simulator.reset(self._settings.keyframe)
         self._system_time = SystemTime()
@@ -111,14 +112,14 @@ class SimulationNode(Node, ABC, Generic[Settings]):
 
     def _publish_ground(self, terrain: Terrain) -> None:
         """The ground in the frame odom, once, for who looks; flat ground everybody can imagine."""
-        if terrain.kind == "flat":
-            return
-        marker = Marker(ns="ground", type=Marker.TRIANGLE_LIST, action=Marker.ADD)
+        flat = terrain.kind == "flat"
+        marker = Marker(ns="ground", type=Marker.TRIANGLE_LIST, action=Marker.DELETE if flat else Marker.ADD)
         marker.header.frame_id = ODOM
         marker.pose.orientation.w = marker.scale.x = marker.scale.y = marker.scale.z = 1.0
         marker.color.r, marker.color.g, marker.color.b, marker.color.a = GROUND_COLOUR
         step = GROUND_STEP if terrain.kind == "rough" else GROUND_SIZE
-        marker.points = [Point(x=x, y=y, z=z) for x, y, z in terrain.triangles(GROUND_SIZE, step).tolist()]
+        corners = [] if flat else terrain.triangles(GROUND_SIZE, step).tolist()
+        marker.points = [Point(x=x, y=y, z=z) for x, y, z in corners]
         self._ground.publish(marker)
 
     # In the simulation's thread.
@@ -160,10 +161,19 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     # In the executor's thread.
 
     def _on_reset(self, request: Any, response: Any) -> Any:
-        keyframe = request.keyframe or "lie"
-        return self._carry_out(
-            response, f"the robot is back in posture {keyframe}", self._loop.reset, keyframe
-        )
+        keyframe, terrain = request.keyframe or "lie", request.terrain
+        done = f"the robot is back in posture {keyframe}" + (f", on {terrain} ground" if terrain else "")
+        return self._carry_out(response, done, self._reset, keyframe, terrain, request.slope)
+
+    def _reset(self, keyframe: str, terrain: str, slope: float) -> None:
+        """Put the robot back, on other ground where that has a name: in a simulator of its own."""
+        if not terrain:
+            self._loop.reset(keyframe)
+            return
+        ground = self._settings.ground(terrain, slope)
+        config = attrs.evolve(self._loop.simulator.config, terrain=ground)
+        self._loop.reset(keyframe, self._make_simulator(config))
+        self._publish_ground(ground)
 
     def _on_pause(self, request: Any, response: Any) -> Any:
         done = "paused" if request.data else "running"
@@ -214,7 +224,9 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if level == DiagnosticStatus.WARN:
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
         if report.fallen and not self._has_fallen:
-            self.get_logger().warning("the robot has fallen; ~/reset puts it back")
+            self.get_logger().warning(
+                "the trunk is on the ground or tilted; after a fall, ~/reset puts the robot back"
+            )
         self._has_fallen = report.fallen
 
     def _in_world(self, report: LoopReport) -> dict[str, object]:

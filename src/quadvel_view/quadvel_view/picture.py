@@ -186,7 +186,8 @@ class RobotPicture:
         self.path = np.array([_vector(one.pose.position) for one in message.poses]).reshape(-1, 3)
 
     def _ground(self, message: Any, now: float) -> None:
-        if message.type == TRIANGLES:
+        self.ground = None
+        if message.type == TRIANGLES and message.points:
             self.ground = Ground(np.array([(p.x, p.y, p.z) for p in message.points]).reshape(-1, 3))
 
 

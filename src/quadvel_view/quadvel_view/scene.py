@@ -19,7 +19,7 @@ from quadvel_description import robot
 from quadvel_description.frames import moving_links
 from quadvel_description.urdf import urdf
 
-from .picture import Person, RobotPicture
+from .picture import Ground, Person, RobotPicture
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
@@ -87,14 +87,8 @@ class Scene:
             self._draw_world(picture)
 
     def _draw_world(self, picture: RobotPicture) -> None:
-        if self._is_new("ground", picture.ground) and picture.ground is not None:
-            self._grid.visible = False
-            corners = picture.ground.vertices
-            faces = np.arange(len(corners)).reshape(-1, 3)
-            merged = trimesh.Trimesh(corners, faces)  # with one vertex where triangles meet, for smooth light
-            self._server.scene.add_mesh_simple(
-                "/world/ground", merged.vertices, merged.faces, color=GROUND, side="double", cast_shadow=False
-            )
+        if self._is_new("ground", picture.ground):
+            self._draw_ground(picture.ground)
         if self._is_new("scan", picture.scan):
             self._server.scene.add_point_cloud(
                 "/world/scan", picture.scan, SCAN, point_size=0.035, point_shape="circle", precision="float32"
@@ -105,6 +99,18 @@ class Scene:
             self._draw_line("/world/path", picture.path, PATH)
         if self._is_new("persons", picture.persons):
             self._draw_persons(picture)
+
+    def _draw_ground(self, ground: Ground | None) -> None:
+        """The ground as it is, or the grid where it is flat."""
+        self._grid.visible = ground is None
+        if ground is None:
+            self._server.scene.remove_by_name("/world/ground")
+            return
+        faces = np.arange(len(ground.vertices)).reshape(-1, 3)
+        merged = trimesh.Trimesh(ground.vertices, faces)  # one vertex where triangles meet, for smooth light
+        self._server.scene.add_mesh_simple(
+            "/world/ground", merged.vertices, merged.faces, color=GROUND, side="double", cast_shadow=False
+        )
 
     def _draw_line(self, name: str, points: Array, colour: Colour) -> None:
         if len(points) < 2:

@@ -35,6 +35,7 @@ NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 MODES = ("passive", "stand_up", "stance", "walk", "lie_down")
 SIMULATIONS = ("sim_node", "board")
 PUSH, PUSH_TIME = 60.0, 0.2  # N, s
+SLOPE = 0.175  # rad, of the page's slope
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -168,7 +169,10 @@ class View(Node):
         elif order == "allow":
             self._call(self._enable, SetBool.Request(data=True), "allow walking")
         elif order == "reset":
-            self._call(_ready(self._resets), ResetSim.Request(keyframe="lie"), "reset")
+            terrain = str(word.get("terrain") or "")
+            slope = SLOPE if terrain == "slope" else 0.0
+            request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
+            self._call(_ready(self._resets), request, "reset")
         elif order == "push":
             force = Vector3(y=-PUSH if word.get("to") == "right" else PUSH)
             request = Push.Request(body="trunk", wrench=Wrench(force=force), duration=PUSH_TIME)
