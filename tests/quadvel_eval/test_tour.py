@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from io import StringIO
 from pathlib import Path
 
 import attrs
@@ -69,7 +71,9 @@ def test_figures_tell_errors_distance_losses_and_leave_the_start_out() -> None:
 
 def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
     setup = TourSetup(world="corridor", metres=5.0)
-    assert run_tour(setup, tmp_path, Console(quiet=True))
+    said = StringIO()
+    assert run_tour(setup, tmp_path, Console(file=said, width=120))
+    assert re.search(r"^[2-4] of \d m: ", said.getvalue(), re.MULTILINE)  # where no terminal shows a bar
     found = json.loads((tmp_path / "tour.json").read_text())
     assert found["walked"] > 5.0
     assert not found["fell"]

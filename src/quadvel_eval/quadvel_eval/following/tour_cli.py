@@ -11,6 +11,7 @@ from .tour import Moment, Tour, TourSetup
 from .tour_report import tour_table, write_tour
 
 EVERY = 20  # moments, a second: how often the bar moves
+LINES = 20  # in all, where there is no terminal that shows a bar
 
 
 def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
@@ -28,11 +29,15 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
     )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("sets out", total=setup.metres)
+        told = 0.0
         try:
             for moment in tour.moments():
                 moments.append(moment)
                 if len(moments) % EVERY == 0:
                     bar.update(task, completed=tour.walked, description=moment.words)
+                if not console.is_terminal and tour.walked >= told:
+                    console.print(f"{tour.walked:.0f} of {setup.metres:.0f} m: {moment.words}")
+                    told += setup.metres / LINES
         except KeyboardInterrupt:
             console.print("stopped")
     if not moments:
