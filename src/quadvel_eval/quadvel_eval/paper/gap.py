@@ -88,11 +88,12 @@ class Gap(Section):
     name: ClassVar[str] = "gap"
     title: ClassVar[str] = "The gap: drives that hold what the model lacks"
     method: ClassVar[str] = (
-        "Ten commands of 6 s on the plant of the actuator model and on four whose drives hold, in addition, dry friction (1.2 N m, 1.8 "
-        "at rest), a torque limit of 24 N m that falls to nothing at 12 rad/s in the direction of motion, 3 ms more "
-        "delay of the commands, and a backlash of ±15 mrad. The shipped policy's training drew torque limits, and none of the others. Errors are those of the robots that did not fall; the cut of the "
-        "error is against the first policy, on the walks that neither fell on. The paper's own gap is that between simulation "
-        "and robot: RL-PD fell 3 times there, the EAM policies never."
+        "Ten commands of 6 s on the plant of the actuator model and on four whose drives hold, in addition, dry friction "
+        "(1.2 N m, 1.8 at rest), a torque limit of 24 N m that falls to nothing at 12 rad/s in the direction of motion, 3 ms "
+        "more delay of the commands, and a backlash of ±15 mrad. The shipped policy's training drew torque limits, and none of "
+        "the others. Errors are those of the robots that did not fall; the cut of the error is against the first policy, on the "
+        "walks that neither fell on. The paper's own gap is that between simulation and robot: RL-PD fell 3 times there, the EAM "
+        "policies never."
     )
     commands: tuple[Command, ...] = COMMANDS
 
