@@ -74,7 +74,7 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
     series = Model(
-        Samples([log]), 0.001, np.ones((2, 4)), np.array([zero, zero]), np.zeros((2, 4)), zero,
+        Samples([log]), 0.001, np.ones((2, 4)), zero, np.zeros((2, 4)), zero,
         (Applied(law, active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-8)
@@ -110,7 +110,7 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
     for noise in (0.0, 1.0):
         tau = noise * np.random.default_rng(0).standard_normal(q.shape)
         log = Log("coupled", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=tau)
-        gains = np.ones((2, 4)), np.array([zero, zero])
+        gains = np.ones((2, 4)), zero
         torques.append(Model(Samples([log]), 0.0, *gains, np.zeros((2, 4)), zero, (coupled,)).predict())
     np.testing.assert_array_equal(*torques)
 
@@ -155,7 +155,7 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     model = Model(
-        samples, 0.0, np.ones((2, 4)), np.array([zero, zero]), np.repeat([[0.004], [0.002]], 4, axis=1), zero,
+        samples, 0.0, np.ones((2, 4)), zero, np.repeat([[0.004], [0.002]], 4, axis=1), zero,
         (Applied(law, every, values, np.arange(4)),),
     )  # fmt: skip
     unknowns = Unknowns.of(model)

@@ -2,9 +2,10 @@
 
 import attrs
 import numpy as np
+import pytest
 from simulated_joints import parameters, record
 
-from quadvel_sysid.criterion import WHITE_LEVEL, clusters, noise_variance, normality, whiteness
+from quadvel_sysid.criterion import LEVEL, WHITE_LEVEL, Parts, clusters, noise_variance, normality, whiteness
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.signals import Samples
 
@@ -31,6 +32,32 @@ def test_a_stand_says_once_what_it_says_and_motion_each_tenth_of_a_second() -> N
     at = log.t[stood]
     assert len(at) == 31
     assert not ((at > BEGIN + 0.05) & (at < END - 0.05)).any()
+
+
+def test_what_shakes_all_joints_alike_counts_once() -> None:
+    """Of noise that joints share, and a change that has nothing to do with it, a hundredth is called significant."""
+    rng, rows = np.random.default_rng(0), np.ones((5000, 6), dtype=bool)
+    parts = Parts(rows, rows, rows, np.arange(0, 5000, 100))
+
+    def slow() -> np.ndarray:
+        return np.repeat(rng.normal(size=(50, 1)), 100, axis=0)
+
+    called = 0
+    for _ in range(400):
+        before = slow() + rng.normal(size=(5000, 6))
+        called += parts.compare(before, before - 0.05 * slow(), rows).p < LEVEL
+    assert called <= 12
+
+
+def test_a_torque_in_coarse_ticks_has_the_noise_of_rounding_and_a_constant_one_that_of_the_others() -> None:
+    log = record(parameters(), joints=3, seconds=2.0)
+    tau = log.tau.copy()
+    tau[:, 1] = np.round(tau[:, 1] / 4.0) * 4.0
+    tau[:, 2] = 0.0
+    samples = Samples([attrs.evolve(log, tau=tau)])
+    noise = noise_variance(samples, samples.judged, samples.tau)
+    assert noise[1] == pytest.approx(4.0**2 / 12.0, rel=1e-6)
+    assert noise[2] == np.mean(noise[:2])
 
 
 def test_a_fast_sway_about_one_posture_is_motion() -> None:

@@ -25,7 +25,7 @@ def _log(seconds, seed=0, **values):
 def _fitted(log, input_delay, output_delay):
     samples = Samples([log])
     delays = np.repeat([[input_delay], [output_delay]], 2, axis=1)
-    model = Model(samples, 0.001, np.ones((2, 2)), np.array([ONE, ONE]), delays, ONE)
+    model = Model(samples, 0.001, np.ones((2, 2)), ONE, delays, ONE)
     return fit(model, samples.judged, 20), samples.judged
 
 
@@ -77,7 +77,7 @@ def _model(drive, log, window, delays):
     """With the gains of the drive."""
     gains = np.array([1.0 + drive.delta_kp / drive.kp_ref, 1.0 + drive.delta_kd / drive.kd_ref])
     each = np.repeat(np.asarray(delays)[:, None], 2, axis=1)
-    return Model(Samples([log]), window, gains[:, None] * np.ones(2), np.array([ONE, ONE]), each, ONE)
+    return Model(Samples([log]), window, gains[:, None] * np.ones(2), ONE, each, ONE)
 
 
 def _run(drive, log, delays):
@@ -123,7 +123,7 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     samples = Samples([log])
     eam = fit_eam(samples, samples.judged)
     delays = np.stack([eam.input_delay, eam.output_delay])
-    model = Model(samples, eam.window, eam.gains, np.array([ONE, ONE]), delays, ONE)
+    model = Model(samples, eam.window, eam.gains, ONE, delays, ONE)
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
     assert latest(model, samples.judged).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
 
@@ -133,7 +133,7 @@ def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found()
     log = _driven(0.001, 0.00525, 2)
     samples = Samples([log])
     off = np.repeat([[0.0095], [0.0005]], 2, axis=1)
-    stuck = fit(Model(samples, 0.0, np.ones((2, 2)), np.array([ONE, ONE]), off, ONE), samples.judged)
+    stuck = fit(Model(samples, 0.0, np.ones((2, 2)), ONE, off, ONE), samples.judged)
     found = profiled(stuck, samples.judged)
     assert squared_error(found, samples.judged) < 1.05 * 0.04 * samples.judged.sum()
     np.testing.assert_allclose(found.delays.sum(axis=0), 0.008, atol=5e-4)

@@ -300,3 +300,9 @@ def test_a_file_of_nothing_but_zeros_is_refused_within_little_memory(tmp_path: P
 def test_a_long_log_is_kept_in_single_precision() -> None:
     assert files.precision(files.LONG + 1) == np.float32
     assert files.precision(files.LONG) == np.float64
+
+
+def test_a_command_counts_from_its_time_whatever_rounding_makes_of_it(tmp_path: Path) -> None:
+    log = read_log(npz(tmp_path / "a.npz"))
+    at = (log.t_cmd - 0.1) + 0.1
+    assert (log.command_rows(at) == np.arange(len(at))).all()

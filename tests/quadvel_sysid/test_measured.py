@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.read_log import read_log
 
 LEG = ("FR_hip", "FR_thigh", "FR_calf")
@@ -25,7 +25,7 @@ def walks():
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["1 to 2", "2 to 1"])
 def test_a_walk_explains_the_other_with_at_most_half_of_the_error_of_the_eam(walks, order):
     fitted, judged = (walks[k] for k in order)
-    report = identify([fitted], [judged], Options(gains=GAINS)).report
+    report = identify([fitted], [judged], gains=GAINS).report
     effects = [effect["name"] for effect in report["effects"]]
     assert "armature" in effects[:2]
     assert report["after"]["heldout_mse"] < 0.5 * report["before"]["heldout_mse"]

@@ -13,7 +13,7 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import Simulator
-from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.motion import implied
@@ -52,7 +52,7 @@ def test_without_torque_and_gains_nothing_has_a_scale():
     log = attrs.evolve(_swinging(), kp=None, kd=None)
     with pytest.raises(LogError, match="tau, kp, kd: not in the log"):
         identify([log])
-    assert identify([log], options=Options(gains=(30.0, 0.5))).report["effects"] == []
+    assert identify([log], gains=(30.0, 0.5)).report["effects"] == []
 
 
 def _hung(friction, seconds=5.0, seed=0):
@@ -107,7 +107,7 @@ def test_friction_of_a_hung_leg_is_found_on_the_joint_that_has_it():
 def test_a_leg_that_swings_is_carried_as_one_body():
     """The torque that the motion implies is the one that the drives gave, though the joints push each other."""
     log = _hung(np.zeros(12), 3.0)
-    coarse, body = implied(log, None, None)
+    coarse, body = implied(log)
     assert np.all(body.inertia > 0.0)
     given = np.array([np.interp(coarse.t, log.t, tau) for tau in log.tau.T]).T
     assert np.all(np.std(coarse.tau - given, axis=0) < 0.2 * np.std(given, axis=0))
@@ -120,7 +120,7 @@ def test_a_measured_leg_in_the_air_is_never_replayed_worse_than_before():
     leg = [name.startswith("FL") for name in log.joints]
     states = {name: getattr(log, name)[:, leg] for name in ("q", "dq", "valid", "q_des", "kp", "kd")}
     one = attrs.evolve(log, joints=tuple(np.array(log.joints)[leg].tolist()), **states)
-    report = identify([one], options=Options(values=6000)).report
+    report = identify([one], values=6000).report
     assert 0.01 < min(report["motion"]["inertia"]["value"]) < max(report["motion"]["inertia"]["value"]) < 0.1
     for name in ("heldout_q_rms_rad", "heldout_dq_rms_rad_s"):
         assert report["after"][name] <= report["before"][name]

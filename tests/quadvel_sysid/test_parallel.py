@@ -10,7 +10,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
-from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.identify import identify
 from quadvel_sysid.parallel import side_by_side
 from quadvel_sysid.signals import Samples
 
@@ -38,5 +38,5 @@ def test_the_report_of_two_cores_is_that_of_one():
     joints = NAMES[:2]
     truth = attrs.evolve(parameters((Effect("quadratic_drag", joints[:1], {"c": 0.05}),)), joints=joints)
     log = record(truth, 2, 3.0, 500, seed=4)
-    one, two = (json.dumps(identify([log], options=Options(cores=n)).report, default=float) for n in (1, 2))
+    one, two = (json.dumps(identify([log], cores=n).report, default=float) for n in (1, 2))
     assert one == two

@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
-from quadvel_sysid.identify import Options, identify
+from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.replay import STRETCH, Legs, deviations, stretches
 
@@ -57,7 +57,8 @@ def test_a_model_that_gives_the_measured_torque_stays_on_the_track():
     legs, begins = Legs.of("aliengo", log.joints), np.array([0.5, 1.0, 1.5])
     with_it, _ = deviations(log, truth, legs, begins)
     without, _ = deviations(log, attrs.evolve(truth, delta_kp=truth.delta_kp + 3.0), legs, begins)
-    assert np.sqrt(np.mean(with_it**2)) < 0.1 * np.sqrt(np.mean(without**2))
+    # A row's torque is here the mean of the millisecond after it, half a step late for a replay.
+    assert np.sqrt(np.mean(with_it**2)) < 0.12 * np.sqrt(np.mean(without**2))
 
 
 def test_stretches_lie_in_the_rows_asked_for_and_not_across_a_gap():
@@ -74,12 +75,12 @@ def test_stretches_lie_in_the_rows_asked_for_and_not_across_a_gap():
 
 def test_the_report_says_how_far_the_legs_leave_their_track_before_and_after():
     friction = Effect("coulomb_friction", NAMES[:3], {"c": 1.5, "v_0": 0.05})
-    log = record(attrs.evolve(parameters((friction,)), joints=NAMES[:3]), 3, 5.0, 500, seed=2)
-    report = identify([log], options=Options(robot="aliengo")).report
+    log = record(attrs.evolve(parameters((friction,)), joints=NAMES[:3]), 3, 3.0, 500, seed=2)
+    report = identify([log], robot="aliengo").report
     before, after = report["replay"]["before"], report["replay"]["after"]
     assert after["q_rms_rad"] < 0.5 * before["q_rms_rad"]
     assert len(after["q_rms_rad_per_joint"]) == 3
-    assert after["stretches"] > 3
+    assert after["stretches"] >= 2
 
 
 @pytest.mark.parametrize(
@@ -109,7 +110,11 @@ def test_a_file_that_is_no_description_is_named(tmp_path):
 def test_a_log_without_torque_is_not_identified_with_a_replay():
     log = record(attrs.evolve(parameters(), joints=NAMES[:2]), 2, 2.0, 1000, load=0.0)
     with pytest.raises(LogError, match="tau: not in the log, expected the torque to replay"):
-        identify([attrs.evolve(log, tau=None)], options=Options(robot="aliengo"))
+        identify([attrs.evolve(log, tau=None)], robot="aliengo")
+    with pytest.raises(
+        LogError, match=r"kd: not in the log, expected the commanded gains \(or --gains KP KD\)"
+    ):
+        identify([attrs.evolve(log, kd=None)], robot="aliengo")
 
 
 def test_a_log_without_torque_is_not_replayed():

@@ -71,7 +71,7 @@ REPORT: dict[str, Any] = {
             "p_value": 0.001,
         },
     ],
-    "rejected": [{"name": "backlash", "heldout_gain": -0.001, "reason": "no gain on held-out blocks"}],
+    "rejected": [{"name": "backlash", "selecting_gain": -0.001, "reason": "no gain on held-out blocks"}],
     "unexplained": {
         "verdict": "structured",
         "fraction": 0.016,

@@ -50,7 +50,7 @@ def test_the_error_and_the_p_value_are_of_rows_that_chose_nothing():
     """What is changed on the rows that are reported alone changes no choice and no value of the fit before."""
     log = _log(FRICTION)
     first = identify([log]).report
-    block = (log.t / 0.2).astype(int) % 5 == 4  # s; as `readings.divided` has it
+    block = (log.t / 0.2).astype(int) % 5 == 4  # s; as `preparation.divided` has it
     loud = log.tau.copy()
     loud[block] += 0.5 * (-1.0) ** (log.t[block, None] * 500.0).round()
     second = identify([attrs.evolve(log, tau=loud)]).report

@@ -55,3 +55,11 @@ def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
     share = (np.abs(s.q_des - s.q) < widths[:, None]).mean(axis=1)
     assert np.diff(share, axis=0).max() < 0.05
     assert (share[-1] > 0.95).all()
+
+
+def test_a_log_that_is_slower_than_its_companion_is_judged_as_well():
+    fast, slow = _log(seconds=2.0), _log(seconds=2.0, seed=3)
+    every = np.arange(len(slow.t)) % 4 == 0
+    samples = Samples([fast, slow.of_rows(every)])
+    assert samples.judged[samples.log_of_row == 1].mean() > 0.9
+    assert samples.start[samples.log_of_row == 1].sum() == 1

@@ -41,7 +41,7 @@ def test_a_slew_limit_is_followed_between_the_rows():
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
     limit = Applied(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
-    model = Model(Samples([log]), 0.0, gains, np.array([one, one]), np.zeros((2, 1)), one, (limit,))
+    model = Model(Samples([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
     limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
     assert np.sqrt(np.mean((model.predict()[:, 0] - tau)[10:] ** 2)) < 0.008
@@ -52,7 +52,7 @@ def _of_one_joint(log, law, value, input_delay=0.0):
     applied = Applied(law, np.ones(1, dtype=bool), np.array([[value]]), one)
     gains = np.array([[30.0], [1.0]])
     delays = np.array([[input_delay], [0.0]])
-    return Model(Samples([log]), 0.0, gains, np.array([one, one]), delays, one, (applied,))
+    return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
 
 
 def test_a_lag_at_other_delays_is_computed_anew_where_rows_see_the_same_commands():

@@ -42,7 +42,7 @@ class Account:
         """Twice the negative log likelihood of a row's torque, of normal noise of unknown variance, and what parameters cost."""
         return float(
             np.log((self.left + _TINY) / (self.judge.noise + _TINY)).sum()
-        ) + PER_PARAMETER * parameters(self.model)
+        ) + PER_PARAMETER * parameter_count(self.model)
 
     def against(self, before: Account) -> Comparison:
         """On the rows that select."""
@@ -61,9 +61,9 @@ class Account:
         return self.model.applied[-1]
 
 
-def parameters(model: Model) -> float:
+def parameter_count(model: Model) -> float:
     """How many parameters a model has, each joint's own counted, those of the plain model not."""
-    total = 2.0 * (len(np.unique(model.gain_groups[0])) + len(np.unique(model.delay_groups)) - 2)
+    total = 2.0 * (len(np.unique(model.gain_groups)) + len(np.unique(model.delay_groups)) - 2)
     for one in model.applied:
         total += complexity(one.law) * len(np.unique(one.groups[one.active]))
     return total
@@ -77,9 +77,9 @@ class Judge:
     noise: Array
     """variance of the torque's noise (J,), N^2 m^2"""
 
-    def fitted(self, model: Model, iterations: int = 12) -> Account:
+    def fitted(self, model: Model) -> Account:
         """The model fitted to the rows for that."""
-        return Account(fit(model, self.parts.fit, iterations), self)
+        return Account(fit(model, self.parts.fit), self)
 
     def profiled(self, account: Account) -> Account:
         """With its delays sought on a grid once more: what was added may have hidden the right ones."""

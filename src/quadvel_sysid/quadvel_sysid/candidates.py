@@ -13,7 +13,7 @@ from quadvel_actuator.effects import EffectLaw
 
 from . import library
 from .account import Account
-from .fit import fit
+from .fit import beside, fit
 from .library import Context, SignalTerm
 from .model import Model
 from .parallel import side_by_side
@@ -42,17 +42,9 @@ class Candidates:
     def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
         return (one for one in candidates if self._among is None or key(one) in self._among)
 
-    def tried(self, kinds: str) -> int:
-        """How many laws, or sets of signals, were looked at."""
-        return self._laws[1] if kinds == LAWS else self._terms[1]
-
-    @property
-    def laws(self) -> list[Account]:
-        return self._laws[0]
-
-    @property
-    def terms(self) -> list[Account]:
-        return self._terms[0]
+    def found(self, kinds: str) -> tuple[list[Account], int]:
+        """Laws, or terms, and of how many laws, or sets of signals, these are the best."""
+        return self._laws if kinds == LAWS else self._terms
 
     @cached_property
     def _laws(self) -> tuple[list[Account], int]:
@@ -86,7 +78,17 @@ class Candidates:
         first.sort(key=lambda one: one.criterion)
         best, others = first[:SIMPLIFIED], first[SIMPLIFIED:]
         last = len(self._context.model.applied)
-        return self._side_by_side(lambda k: self._judge.tied(best[k], last).model, len(best)) + others
+        return (
+            self._side_by_side(lambda k: self._judge.tied(self._deeper(best[k]), last).model, len(best))
+            + others
+        )
+
+    def _deeper(self, account: Account) -> Account:
+        """The account, from other delays where that is better: a term is screened at one pair of delays alone."""
+        if not isinstance(account.last.law, SignalTerm):
+            return account
+        other = Account(beside(account.model, self._judge.parts.fit), self._judge)
+        return min(account, other, key=lambda one: one.criterion)
 
     def _side_by_side(self, work: Callable[[int], Model], count: int) -> list[Account]:
         models = side_by_side(work, count, self._cores, self._context.samples)

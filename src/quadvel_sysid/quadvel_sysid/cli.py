@@ -204,7 +204,7 @@ def _material(
         long = sum(log.q.size for log in data.logs) >= _LONG
         from .material import gathered  # what is wrong with the files shows before the engine is loaded
 
-        return gathered(data, gains, progress=tell), long
+        return gathered(data, progress=tell), long
 
 
 def errors(report: Mapping[str, Any]) -> str:

@@ -1,8 +1,8 @@
 """How sure the parameters are: 95 % intervals from the slopes of the prediction, with residuals that may be correlated.
 
 Two covariances are compared and the wider one counts: that of white residuals, and the cluster-robust sandwich of sums over
-0.1 s, which holds whatever the correlation within a cluster. Gains and delays are unknowns of it, too. Where a law may have
-other shapes that the log does not tell apart, what these say of its parameters lies within the interval.
+0.1 s and all joints, which holds whatever the correlation within a cluster. Gains and delays are unknowns of it, too. Where a
+law may have other shapes that the log does not tell apart, what these say of its parameters lies within the interval.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from .fit import fit, normal_equations, squared_error
 from .model import LONGEST, Model, Unknowns
 from .signals import Array, Bools
 
-LEVEL = 0.95
+CONFIDENCE = 0.95
 _CLOCK = 0.25e-3
 """s, by which times may be off besides: the clock of a drive, whose step is up to 1 ms, is in no log"""
-_BENT, _BENT_GAIN = 0.01, 0.005
+_SYSTEMATIC, _SYSTEMATIC_GAIN = 0.01, 0.005
 """of an effect's value, of a gain, by which they may be off besides: a log holds noisy samples of a motion, not the motion"""
 _AS_WELL = 1.003
 """of the error: a shape of a law that leaves no more explains the log as well"""
@@ -46,10 +46,10 @@ def intervals(model: Model, parts: Parts) -> Intervals:
         random = one.law.chance(dict(zip(one.law.names, one.values, strict=True)), model.signals)
         chance = np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
         clock = np.array([[_CLOCK if parameter.unit == "s" else 0.0] for parameter in one.law.parameters])
-        systematic = np.maximum(clock, _BENT * np.abs(one.values)) * one.active
+        systematic = np.maximum(clock, _SYSTEMATIC * np.abs(one.values)) * one.active
         effects.append(chance + _shape_error(model, index, parts.every) + systematic)
     size = np.abs(model.gains)
-    gains = np.minimum(wide[:2] + _BENT_GAIN * size, np.maximum(1.0, size))  # or anything from 0 on
+    gains = np.minimum(wide[:2] + _SYSTEMATIC_GAIN * size, np.maximum(1.0, size))  # or anything from 0 on
     delays = wide[-2:] + _CLOCK
     delays[0] = np.maximum(delays[0], plateau(model, parts.every) + _CLOCK)
     return Intervals(gains, tuple(effects), np.minimum(delays, LONGEST[:, None]), on_bound(model))
@@ -65,16 +65,16 @@ def _half_widths(model: Model, parts: Parts, rows: Bools) -> Array:
     inverse /= np.outer(scale, scale)
     noise = np.sum(left**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
     white = unknowns.gathered(noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
-    meat, units = np.zeros_like(hessian), 0
+    sums = np.zeros((len(parts.starts), unknowns.count))
     for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
         used = unknowns.index[:, j] >= 0
-        sums = parts.sums(moment[used].T)
-        units += int((parts.sums(rows[:, j].astype(float)) > 0).sum())
-        at = unknowns.index[used, j]
-        np.add.at(meat, (at[:, None], at[None]), sums.T @ sums)
+        sums[:, unknowns.index[used, j]] += parts.sums(moment[used].T)
+    meat = sums.T @ sums
+    units = int((parts.sums(rows.any(axis=1).astype(float)) > 0).sum())
+    of_joint = int((unknowns.index >= 0).any(axis=1).sum())
     variance = np.maximum(*(np.diagonal(inverse @ middle @ inverse) for middle in (white, meat)))
     variance = np.maximum(variance * (1.0 + unknowns.count / freedom), 0.0)
-    half = np.sqrt(variance) * stats.t.ppf(0.5 + LEVEL / 2, max(units - unknowns.count, 5))
+    half = np.sqrt(variance) * stats.t.ppf(0.5 + CONFIDENCE / 2, max(units - of_joint, 5))
     return np.where(unknowns.index >= 0, half[unknowns.index], 0.0)
 
 

@@ -19,7 +19,7 @@ from .signals import Array, Bools, Samples
 CLUSTER = 0.1
 """s: what residuals add up to over so long counts as independent"""
 STILL = 0.02
-"""rad: while no joint has moved so far, a robot says but once what it says: clusters reach on"""
+"""rad: a cluster goes on until some joint has moved by this much: samples at rest are not independent"""
 LEVEL = 0.01
 """An effect is named if chance would bring its gain with less than this probability, all candidates counted"""
 WORTH = 0.03
@@ -78,7 +78,8 @@ class Comparison:
     """Two predictions on some rows, summed over clusters and for each joint, (clusters, J).
 
     A score test: with residuals e0 and e1 and the difference of the predictions d = e0 - e1, the sum of e0 d is zero but
-    for noise if d has nothing to do with what was measured. The size of that noise is the clusters' sums of e1 d.
+    for noise if d has nothing to do with what was measured. The size of that noise is the clusters' sums of e1 d, over the
+    joints as well: what shakes a robot shakes its joints together.
     """
 
     fall: Array  # e0^2 - e1^2
@@ -101,22 +102,26 @@ class Comparison:
     @property
     def p_joints(self) -> Array:
         """Of each joint: how likely chance brings such a score, one-sided, (J,); 1 where the error does not fall."""
-        used = self.rows > 0
-        size = np.sqrt(np.sum(self.noise**2, axis=0)) + 1e-300
-        p = stats.t.sf(self.score.sum(axis=0) / size, np.maximum(used.sum(axis=0) - 1, 1))
-        chance: Array = np.where((self.fall.sum(axis=0) > 0.0) & (used.sum(axis=0) >= 4), p, 1.0)
-        return chance
+        return _chance(self.fall, self.score, self.noise, self.rows)
 
     @property
     def p(self) -> float:
         """Of all joints together or, Bonferroni's way, of the clearest one alone, whichever says more."""
-        count = int((self.rows > 0).sum())
-        if count < 4 or self.fall.sum() <= 0.0:
-            together = 1.0
-        else:
-            size = float(np.sqrt(np.sum(self.noise**2))) + 1e-300
-            together = float(stats.t.sf(self.score.sum() / size, count - 1))
-        return float(min(together, 1.0, self.p_joints.min() * self.rows.shape[1]))
+        sums = (x.sum(axis=1, keepdims=True) for x in (self.fall, self.score, self.noise, self.rows))
+        return float(min(_chance(*sums)[0], self.p_joints.min() * self.rows.shape[1]))
+
+
+_FEWEST = 4
+"""Clusters below which nothing is known of the size of the noise"""
+
+
+def _chance(fall: Array, score: Array, noise: Array, rows: Array) -> Array:
+    """p-values (K,) of a score test on the sums of clusters (clusters, K), one-sided; 1 where the error does not fall."""
+    used = (rows > 0).sum(axis=0)
+    size = np.sqrt(np.sum(noise**2, axis=0)) + 1e-300
+    p = stats.t.sf(score.sum(axis=0) / size, np.maximum(used - 1, 1))
+    chance: Array = np.where((fall.sum(axis=0) > 0.0) & (used >= _FEWEST), p, 1.0)
+    return chance
 
 
 WHITE_LEVEL = 0.001
@@ -148,9 +153,8 @@ def whiteness(residual: Array, rows: Bools, start: Bools, overlap: int = 0) -> A
 
 def normality(residual: Array, rows: Bools) -> Array:
     """p-values (J,) of a residual's kurtosis on `rows`: an effect that comes and goes within rows shows by it alone."""
-    return np.array(
-        [stats.kurtosistest(one[keep]).pvalue for one, keep in zip(residual.T, rows.T, strict=True)]
-    )
+    each = (one[keep] for one, keep in zip(residual.T, rows.T, strict=True))
+    return np.array([stats.kurtosistest(one).pvalue if np.ptp(one) > 0.0 else 1.0 for one in each])
 
 
 def clusters(samples: Samples) -> NDArray[np.intp]:
@@ -176,9 +180,21 @@ _INNER, _INNER_VARIANCE = 0.9, 0.5607  # of a normal variable's variance lies wi
 def noise_variance(samples: Samples, rows: Bools, residual: Array) -> Array:
     """Variance of the torque's noise (J,), N^2 m^2, from differences of consecutive rows, which a smooth torque hardly has.
 
-    Commands that step are no noise: differences are also taken of what a model leaves, and the lesser counts.
+    Commands that step are no noise: differences are also taken of what a model leaves, and the lesser counts. Where a torque
+    comes in coarse ticks most rows repeat the one before: it is off by the rounding to them at least. One that never changes
+    has the noise of the others.
     """
-    return np.minimum(_local(samples.tau, samples, rows), _local(residual, samples, rows))
+    found = np.minimum(_local(samples.tau, samples, rows), _local(residual, samples, rows))
+    ticks = np.array([_tick(one[keep]) for one, keep in zip(samples.tau.T, rows.T, strict=True)])
+    found = np.maximum(found, ticks**2 / 12.0)
+    shows = found > 0.0
+    return np.where(shows, found, found[shows].mean() if shows.any() else 1.0)
+
+
+def _tick(x: Array) -> float:
+    """The least difference of two different values, but for rounding; 0 where there are none."""
+    span = float(np.ptp(x))
+    return span * float(np.diff(np.unique(np.round(x / span, 9))).min()) if span > 0.0 else 0.0
 
 
 def encoder_variance(samples: Samples, rows: Bools, kp: float, kd: float) -> Array:

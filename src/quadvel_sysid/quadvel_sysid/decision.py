@@ -24,10 +24,8 @@ def _nothing_added(report: Mapping[str, Any]) -> str:
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
     rest = report["unexplained"]
     if rest["verdict"] != "white":
-        return (
-            f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on "
-            f"{', '.join(rest['depends_on'])}."
-        )
+        signals = ", ".join(rest["depends_on"])
+        return f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on {signals}."
     floor = f"(noise floor {report['noise_floor']:.3g}), and no effect is added."
     if after < _LESS * before:
         return (

@@ -1,27 +1,25 @@
 """The empirical actuator model as the paper identifies it (Section 3.1), with delays below a millisecond.
 
-For every pair of delays on a fine grid the gains follow by linear regression; the pairs whose error is below 1.5
-times the least one are kept, and the noise is the least error. The cross products that the regressions need are
-summed once for each delay, not once for each pair, which is what makes the grid cheap.
+For every pair of delays on a fine grid the gains, which all joints share, follow by linear regression; the pair that leaves
+least is the model's, and what it leaves is the noise. The cross products that the regressions need are summed once for each
+delay, not once for each pair, which is what makes the grid cheap.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import attrs
 import numpy as np
-from numpy.typing import NDArray
 
-from quadvel_actuator.parameters import PROBABLE, DelayPair
-
+from .log_signals import LogSignals
 from .signals import Array, Bools, Samples, scattered
 
 LONGEST_INPUT, LONGEST_OUTPUT = 0.020, 0.006  # s
 WINDOWS = (0.0, 0.001)
 """s, steps that a drive may have"""
 
+_COARSE = 0.001  # s, step of the first grid
 _REFINEMENTS = ((0.00075, 0.00025), (0.0002, 0.00005))  # s: reach about the best pair so far, step
 _ENOUGH = 1500  # rows for the first, coarse look
 _CHUNK = 20000  # rows summed at once
@@ -29,7 +27,7 @@ _CHUNK = 20000  # rows summed at once
 
 @attrs.frozen(eq=False)
 class Eam:
-    """Gains and delays of all joints together, or of each (J,)."""
+    """Gains and delays of each joint, all joints alike."""
 
     gains: Array
     """(2, J): real over commanded kp and kd"""
@@ -41,8 +39,6 @@ class Eam:
     """the drive's step, s: commands are means over it"""
     mse: float
     """over the rows that were fitted, N^2 m^2"""
-    pairs: tuple[DelayPair, ...] = ()
-    """the probable pairs, the best one first"""
 
     def predict(self, samples: Samples) -> Array:
         """Torque of every row, (N, J), N m."""
@@ -58,177 +54,98 @@ def pd_torque(
     return torque
 
 
-class _Sums:
-    """Cross products of the shifted commands and states, so that any pair's regression is a 2 by 2 system.
-
-    The torque is g0 (C - Q) + g1 (D - V) + F with C = kp q_des, D = kd dq_des, F = tau_ff shifted by the sum of both
-    delays, Q = kp q and V = kd dq shifted by the output delay. A delay index `i` is a sum, `o` an output delay.
-    """
-
-    def __init__(
-        self, samples: Samples, rows: Bools, totals: Array, outputs: Array, window: float, at: float
-    ):
-        j = len(samples.joints)
-        shape = (j, len(totals), len(outputs))
-        self.aa, self.ab, self.bb, self.ay, self.by, self.yy = (np.zeros(shape) for _ in range(6))
-        self.count = rows.sum(axis=0)
-        offset = 0
-        for one in samples.logs:
-            t = np.asarray(one.log.t, dtype=float)
-            for first in range(0, len(t), _CHUNK):
-                part = slice(first, min(first + _CHUNK, len(t)))
-                here = slice(offset + part.start, offset + part.stop)
-                if rows[here].any():
-                    self._add(one, t[part], samples.tau[here], rows[here], totals, outputs, window, at)
-            offset += len(t)
-
-    def _add(
-        self,
-        one: Any,
-        t: Array,
-        tau: Array,
-        rows: Bools,
-        totals: Array,
-        outputs: Array,
-        window: float,
-        at: float,
-    ) -> None:
-        packet = one.log.command_rows(t - at)
-        keep = rows.T[:, None].astype(float)  # (J, 1, N), like all below: joint, delay, row
-        kp, kd = (one.gains[name][packet].T[:, None] * keep for name in ("kp", "kd"))
-        y = tau.T[:, None] * keep
-        c = _stack(one.command("q_des", t - d, window) for d in totals) * kp
-        q = _stack(one.state("q", t - d) for d in outputs) * kp
-        v = _stack(one.state("dq", t - d) for d in outputs) * kd
-        self.aa += _norm(c)[..., None] - 2 * _cross(c, q) + _norm(q)[:, None]
-        self.ab += np.einsum("jon,jon->jo", q, v)[:, None] - _cross(c, v)
-        self.bb += _norm(v)[:, None]
-        self.ay += _cross(c, y) - _cross(y, q)
-        self.by -= _cross(y, v)
-        self.yy += _norm(y)[..., None]
-        if not {"dq_des", "tau_ff"} & set(one.sums):
-            return
-        w = _stack(one.command("dq_des", t - d, window) for d in totals) * kd
-        f = _stack(one.command("tau_ff", t - d, window) for d in totals) * keep
-        self.ab += np.einsum("jdn,jdn->jd", c, w)[..., None] - _cross(w, q)
-        self.bb += _norm(w)[..., None] - 2 * _cross(w, v)
-        self.ay -= np.einsum("jdn,jdn->jd", c, f)[..., None] - _cross(f, q)
-        self.by += _cross(w, y) - np.einsum("jdn,jdn->jd", w, f)[..., None] + _cross(f, v)
-        self.yy += (_norm(f) - 2 * _cross(f, y)[..., 0])[..., None]
-
-    def solve(self, groups: NDArray[np.intp]) -> tuple[Array, Array, Array]:
-        """Mean squared error (G, T, O) of each group of joints and pair, and the two gains."""
-        count = int(groups.max()) + 1
-        aa, ab, bb, ay, by, yy = (
-            np.stack([term[groups == g].sum(axis=0) for g in range(count)])
-            for term in (self.aa, self.ab, self.bb, self.ay, self.by, self.yy)
-        )
-        n = np.array([self.count[groups == g].sum() for g in range(count)])[:, None, None]
-        det = aa * bb - ab * ab
-        ridge = 1e-12 * (aa + bb) ** 2 + 1e-300
-        g0 = np.where(det > ridge, (bb * ay - ab * by) / np.maximum(det, ridge), ay / np.maximum(aa, 1e-300))
-        g1 = np.where(det > ridge, (aa * by - ab * ay) / np.maximum(det, ridge), 0.0)
-        mse = (yy - g0 * ay - g1 * by) / np.maximum(n, 1)
-        return np.maximum(mse, 0.0), g0, g1
-
-
-def fit_eam(
-    samples: Samples,
-    rows: Bools,
-    groups: NDArray[np.intp] | None = None,
-    windows: Sequence[float] = WINDOWS,
-) -> Eam:
-    """Fit the EAM to `rows` (N, J); joints with the same number in `groups` (J,) share gains and delays.
-
-    All joints share them by default, as the paper has it. The drive's step is the first of `windows` (s) unless a
-    later one fits better.
-    """
-    groups = np.zeros(len(samples.joints), dtype=int) if groups is None else groups
-    thinned = np.zeros_like(rows)
+def fit_eam(samples: Samples, rows: Bools, windows: Sequence[float] = WINDOWS) -> Eam:
+    """Fit the EAM to `rows` (N, J). The drive's step is the first of `windows` (s) unless a later one fits better."""
+    few = np.zeros_like(rows)
     some = scattered(len(rows), max(1, len(rows) // _ENOUGH))
-    thinned[some] = rows[some]
-    found = []
-    for window in windows:
-        totals = np.arange(0.0, LONGEST_INPUT + LONGEST_OUTPUT + 1e-9, 0.001)
-        eam = _search(
-            samples, thinned, groups, window, totals, np.arange(0.0, LONGEST_OUTPUT + 1e-9, 0.001), 0.0
-        )
-        for reach, step in _REFINEMENTS:
-            total, output = eam.input_delay + eam.output_delay, eam.output_delay
-            totals = _around(total, reach, step, LONGEST_INPUT + LONGEST_OUTPUT)
-            outputs = _around(output, reach, step, LONGEST_OUTPUT)
-            eam = _search(samples, rows, groups, window, totals, outputs, float(np.median(total)), eam.pairs)
-        found.append(eam)
-    best = found[0]
-    for eam in found[1:]:
+    few[some] = rows[some]
+    best, *others = (_fitted(samples, few, rows, window) for window in windows)
+    for eam in others:
         best = best if best.mse <= 1.002 * eam.mse else eam
     return best
 
 
-def _around(values: Array, reach: float, step: float, longest: float) -> Array:
-    """The grid of `step` within `reach` of any of `values`."""
+def _fitted(samples: Samples, few: Bools, rows: Bools, window: float) -> Eam:
+    """The best fit with a step of the drive: on a coarse grid of delays with `few` rows, on finer ones about it with all."""
+    longest = LONGEST_INPUT + LONGEST_OUTPUT, LONGEST_OUTPUT
+    totals, outputs = (_grid(end, _COARSE) for end in longest)
+    eam = _Sums(samples, few, totals, outputs, window, 0.0).best()
+    for reach, step in _REFINEMENTS:
+        about = eam.input_delay[0] + eam.output_delay[0], eam.output_delay[0]
+        totals, outputs = (_grid(end, step, near, reach) for end, near in zip(longest, about, strict=True))
+        eam = _Sums(samples, rows, totals, outputs, window, about[0]).best()
+    return eam
+
+
+def _grid(longest: float, step: float, about: float = 0.0, reach: float = np.inf) -> Array:
+    """Delays from 0 to `longest` (s) within `reach` of `about`."""
     grid = np.round(np.arange(0.0, longest + 1e-9, step), 7)
-    chosen: Array = grid[(np.abs(grid[:, None] - values[None]) <= reach + 1e-9).any(axis=1)]
+    chosen: Array = grid[np.abs(grid - about) <= reach + 1e-9]
     return chosen
 
 
-def _search(
-    samples: Samples,
-    rows: Bools,
-    groups: NDArray[np.intp],
-    window: float,
-    totals: Array,
-    outputs: Array,
-    at: float,
-    known: tuple[DelayPair, ...] = (),
-) -> Eam:
-    """The best pair of each group among these sums of both delays and output delays."""
-    return _best(_Sums(samples, rows, totals, outputs, window, at), groups, totals, outputs, window, known)
+class _Sums:
+    """Cross products of the shifted commands and states, so that any pair's regression is a 2 by 2 system.
+
+    The torque less the feed-forward torque F is g0 (C - Q) + g1 (D - V) with C = kp q_des, D = kd dq_des and F shifted by
+    the sum of both delays, Q = kp q and V = kd dq shifted by the output delay. Rows of a sum are such `totals`, columns
+    `outputs`; gains count as they were commanded `at` s before a row.
+    """
+
+    def __init__(
+        self, samples: Samples, rows: Bools, totals: Array, outputs: Array, window: float, at: float
+    ) -> None:
+        self._totals, self._outputs, self._window, self._at = totals, outputs, window, at
+        self._joints, self._count = len(samples.joints), int(rows.sum())
+        self._aa, self._ab, self._bb, self._az, self._bz, self._zz = np.zeros((6, len(totals), len(outputs)))
+        offset = 0
+        for one in samples.logs:
+            for first in range(0, len(one.t), _CHUNK):
+                t = one.t[first : first + _CHUNK]
+                here = slice(offset + first, offset + first + len(t))
+                if rows[here].any():
+                    self._add(one, t, samples.tau[here], rows[here].astype(float))
+            offset += len(one.t)
+
+    def _add(self, one: LogSignals, t: Array, tau: Array, keep: Array) -> None:
+        packet = one.in_force(t - self._at)
+        kp, kd = (one.gains[name][packet] * keep for name in ("kp", "kd"))
+        c, d, f = (
+            _stacked(one.command(name, t - late, self._window) * by for late in self._totals)
+            for name, by in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
+        )
+        q, v = (
+            _stacked(one.state(name, t - late) * by for late in self._outputs)
+            for name, by in (("q", kp), ("dq", kd))
+        )
+        z = (tau * keep).ravel() - f
+        self._aa += _dot(c, c)[:, None] - 2.0 * c @ q.T + _dot(q, q)
+        self._ab += _dot(c, d)[:, None] - c @ v.T - d @ q.T + _dot(q, v)
+        self._bb += _dot(d, d)[:, None] - 2.0 * d @ v.T + _dot(v, v)
+        self._az += _dot(c, z)[:, None] - z @ q.T
+        self._bz += _dot(d, z)[:, None] - z @ v.T
+        self._zz += _dot(z, z)[:, None]
+
+    def best(self) -> Eam:
+        """The pair with the least mean squared error, and its gains."""
+        aa, ab, bb, az, bz = self._aa, self._ab, self._bb, self._az, self._bz
+        det, ridge = aa * bb - ab * ab, 1e-12 * (aa + bb) ** 2 + 1e-300
+        g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))
+        g1 = np.where(det > ridge, (aa * bz - ab * az) / np.maximum(det, ridge), 0.0)
+        mse = np.maximum(self._zz - g0 * az - g1 * bz, 0.0) / max(self._count, 1)
+        inputs = self._totals[:, None] - self._outputs
+        possible = (inputs >= -1e-9) & (inputs <= LONGEST_INPUT + 1e-9)
+        at = np.unravel_index(np.argmin(np.where(possible, mse, np.inf)), mse.shape)
+        gains, delays = np.array([g0[at], g1[at]]), (max(inputs[at], 0.0), self._outputs[at[1]])
+        every = np.ones(self._joints)
+        return Eam(gains[:, None] * every, delays[0] * every, delays[1] * every, self._window, float(mse[at]))
 
 
-def _best(
-    sums: _Sums,
-    groups: NDArray[np.intp],
-    totals: Array,
-    outputs: Array,
-    window: float,
-    known: tuple[DelayPair, ...],
-) -> Eam:
-    mse, g0, g1 = sums.solve(groups)
-    inputs = totals[:, None] - outputs[None]
-    allowed = (inputs >= -1e-9) & (inputs <= LONGEST_INPUT + 1e-9)
-    mse = np.where(allowed[None], mse, np.inf)
-    where = [np.unravel_index(np.argmin(one), one.shape) for one in mse]
-    gains = np.array([[g[k][where[k]] for k in groups] for g in (g0, g1)])
-    input_delay = np.array([max(inputs[where[k]], 0.0) for k in groups])
-    output_delay = np.array([outputs[where[k][1]] for k in groups])
-    share = np.array([sums.count[groups == k].sum() for k in range(len(mse))])
-    error = float(sum(s * mse[k][where[k]] for k, s in enumerate(share)) / max(share.sum(), 1))
-    tried = [
-        DelayPair(round(max(float(inputs[a, b]), 0.0), 7), round(float(outputs[b]), 7), float(mse[0, a, b]))
-        for a, b in zip(*np.nonzero(mse[0] < PROBABLE * mse[0].min()), strict=True)
-    ]
-    return Eam(gains, input_delay, output_delay, window, error, _probable([*known, *tried]))
+def _stacked(signals: Iterable[Array]) -> Array:
+    """Signals (N, J), one for each delay, as rows (D, N J)."""
+    return np.stack([one.ravel() for one in signals])
 
 
-def _probable(pairs: list[DelayPair]) -> tuple[DelayPair, ...]:
-    """Those with less than 1.5 times the least error, the best one first."""
-    latest = {(pair.input_delay_s, pair.output_delay_s): pair for pair in pairs}
-    least = min((pair.mse for pair in latest.values()), default=0.0)
-    probable = (pair for pair in latest.values() if pair.mse < PROBABLE * least or pair.mse == least)
-    return tuple(sorted(probable, key=lambda pair: pair.mse))
-
-
-def _stack(signals: Iterable[Array]) -> Array:
-    """Signals (N, J), one for each delay, as one array (J, D, N)."""
-    return np.ascontiguousarray(np.stack(list(signals)).transpose(2, 0, 1))
-
-
-def _cross(a: Array, b: Array) -> Array:
-    """(J, A, N), (J, B, N) -> (J, A, B)"""
-    return a @ b.transpose(0, 2, 1)
-
-
-def _norm(a: Array) -> Array:
-    """(J, D, N) -> (J, D)"""
-    return np.einsum("jdn,jdn->jd", a, a)
+def _dot(a: Array, b: Array) -> Array:
+    """Row by row, (D,)."""
+    return np.einsum("dn,dn->d", a, b)

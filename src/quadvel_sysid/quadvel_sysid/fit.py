@@ -6,6 +6,7 @@ quadratic problem.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from itertools import product
 
 import attrs
@@ -44,6 +45,8 @@ _OUTPUTS = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
 """s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
 _DEEPEST = 3
 """Points of the grid that a fit starts from"""
+_BESIDE = (-0.002, -0.001, 0.001, 0.002)
+"""s: a coarser grid of the sum of delays alone"""
 
 
 _PROFILES, _DEEPER = 4, 0.01
@@ -66,19 +69,34 @@ def profiled(model: Model, rows: Bools) -> Model:
     return model
 
 
+def beside(model: Model, rows: Bools) -> Model:
+    """The model, or one that leaves less, fitted from input delays that are a millisecond or two off."""
+    found = _adapted(model, rows, product(_BESIDE, (0.0,)))
+    tried = [model, *(fit(one, rows) for one in found[:1])]
+    return min(tried, key=lambda one: squared_error(one, rows))
+
+
 def _around(model: Model, rows: Bools) -> Model:
     """The best fit from the points of the grid about the model's delays."""
+    deepest = _adapted(model, rows, product(_SUMS, _OUTPUTS))[:_DEEPEST]
+    tried = [fit(_searched(one, rows), rows) for one in (model, *deepest)]
+    return min(tried, key=lambda one: squared_error(one, rows))
+
+
+def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]]) -> list[Model]:
+    """The model at other delays, everything else adapted by a step, the best one first.
+
+    shifts: changes (s) of the sum of both delays and of the output delay.
+    """
     unknowns = Unknowns.of(model, delays=False)
     found = []
-    for more, later in product(_SUMS, _OUTPUTS):
+    for more, later in shifts:
         delays = model.delays + np.array([[more - later], [later]])
         if (delays >= -1e-9).all() and (delays <= LONGEST[:, None] + 1e-9).all():
             at = model.with_delays(delays)
             error = squared_error(at, rows)
             found.append(_step(at, unknowns, rows, error) or (at, error))
-    deepest = sorted(found, key=lambda one: one[1])[:_DEEPEST]
-    tried = [fit(_searched(one, rows), rows) for one in (model, *(at for at, _ in deepest))]
-    return min(tried, key=lambda one: squared_error(one, rows))
+    return [one for one, _ in sorted(found, key=lambda one: one[1])]
 
 
 def _searched(model: Model, rows: Bools) -> Model:
@@ -159,7 +177,10 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
         count = len(one.values)
         shape = getattr(one.law, "penalty", None)
         if shape is not None:
-            for j in np.flatnonzero(one.active):
+            joints = np.flatnonzero(one.active)
+            for j in joints[
+                np.unique(one.groups[joints], return_index=True)[1]
+            ]:  # one of those that share weights
                 at = unknowns.index[first : first + count, j]
                 total[np.ix_(at, at)] += shape * float(np.mean(hessian[at, at])) * RIDGE
         first += count

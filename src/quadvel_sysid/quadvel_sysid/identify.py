@@ -1,6 +1,6 @@
 """From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
 
-`readings` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
+`preparation` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
 `selection` searches for effects; the chosen model is fitted to all rows, `confidence` says how sure its values are, and
 `outcome` makes the report.
 """
@@ -33,7 +33,8 @@ from .material import VALUES, Material, Progress, gathered
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
 from .outcome import Chosen, Outcome, identification, parameters
-from .readings import Reading, read, reference_gains
+from .preparation import SHORTEST, Reading, read, reference_gains
+from .replay import BLOCK as LEG_BLOCK
 from .replay import STRETCH as LEG_STRETCH
 from .replay import TEXT as LEG_TEXT
 from .replay import Legs
@@ -46,36 +47,20 @@ _MOVES = 0.9
 """Of the error of a replay: what a model with more in it has to leave at most"""
 
 
-@attrs.frozen
-class Options:
-    """What a user may ask for."""
-
-    gains: tuple[float, float] | None = None
-    """kp (N m/rad) and kd (N m s/rad) of logs that hold none"""
-    base: ActuatorParameters | None = None
-    """its torque limits go into the corrected model"""
-    values: int = VALUES
-    """of torque that are looked at, of all logs and joints; longer logs are cut to pieces spread over all of each"""
-    cores: int = 1
-    """that work side by side; the report is the same"""
-    robot: str | None = None
-    """whose legs the reported rows are replayed on: `aliengo`, `go2`, or an MJCF or URDF file"""
-
-
 def identify(
     train: Sequence[Log],
     heldout: Sequence[Log] = (),
-    options: Options | None = None,
-    progress: Progress = lambda share, text: None,
+    gains: tuple[float, float] | None = None,
+    values: int = VALUES,
+    **options: Any,
 ) -> Identification:
     """Fit `train`, report on `heldout`, or on blocks of `train` kept aside where there is none.
 
-    `progress(share, text)` is called now and then. Raises LogError where the logs cannot be used together.
+    gains: kp (N m/rad) and kd (N m s/rad) of logs that hold none. values: how many of torque are looked at, of all logs and
+    joints; longer logs are cut to pieces spread over all of each. options: as those of `identified`. Raises LogError where
+    the logs cannot be used together.
     """
-    options = options or Options()
-    data = Dataset.of(train, heldout, options.gains)
-    material = gathered(data, options.gains, options.values, progress)
-    return identified(material, options.base, options.cores, progress, options.robot)
+    return identified(gathered(Dataset.of(train, heldout, gains), values), **options)
 
 
 def identified(
@@ -85,17 +70,17 @@ def identified(
     progress: Progress = lambda share, text: None,
     robot: str | None = None,
 ) -> Identification:
-    """The same of `material`: who does not hold the whole of a long log has more memory for it."""
+    """The same of `material`: who does not hold the whole of a long log has more memory for it.
+
+    base: its torque limits go into the corrected model. cores: that work side by side; the report is the same. robot: whose
+    legs the reported rows are replayed on, `aliengo`, `go2`, or an MJCF or URDF file. `progress(share, text)` is called now
+    and then.
+    """
     body = material.body
-    log = material.pieces[0].log
-    if robot is not None and body is not None:
-        raise LogError(
-            f"{log.name}: tau: not in the log, expected the torque to replay the commands (--robot)"
-        )
-    legs = None if robot is None else Legs.of(robot, log.joints)
+    legs = None if robot is None else _legs(robot, material)
     progress(0.02, "gains and delays")
-    windows = WINDOWS if body is None else (log.period,)
-    reading, notes = read(material, windows)
+    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    reading, notes = read(material, windows, SHORTEST if legs is None else LEG_BLOCK)
     steps = iter(range(10**6))
 
     def tick(text: str) -> None:
@@ -130,6 +115,19 @@ def identified(
     return attrs.evolve(found, report=report)
 
 
+def _legs(robot: str, material: Material) -> Legs:
+    """The legs that the logs' commands are replayed on. Raises LogError where the logs do not hold what that takes."""
+    for log in (piece.log for piece in material.pieces):
+        known = {"tau": material.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
+        for name, there in known.items():
+            if not there:
+                what = "the torque" if name == "tau" else "the commanded gains (or --gains KP KD)"
+                raise LogError(
+                    f"{log.name}: {name}: not in the log, expected {what} to replay the commands (--robot)"
+                )
+    return Legs.of(robot, material.pieces[0].log.joints)
+
+
 def _searched(reading: Reading) -> tuple[Samples, NDArray[np.intp]]:
     """The samples that are searched, and which rows these are: none of a log that is held out, and no more than it takes."""
     samples = reading.samples.reaching(reading.parts.chosen_on)
@@ -143,7 +141,7 @@ def _plain(reading: Reading) -> Model:
     """The EAM as a model that effects can be added to."""
     eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
     delays = np.stack([eam.input_delay, eam.output_delay])
-    return Model(reading.samples, eam.window, eam.gains, np.array([one, one]), delays, one)
+    return Model(reading.samples, eam.window, eam.gains, one, delays, one)
 
 
 def _outcome(
@@ -172,12 +170,12 @@ def _outcome(
     names = {one.law.name for one in account.model.applied}
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
     asked = np.ones_like(whole.gains)
-    asked[1] = 0.0 if samples.logs[0].undamped else 1.0
+    asked[1] = 0.0 if samples.undamped else 1.0
     ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
         late[0], before_whole, late[1], whole, effects, rejected, leaning,
         intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
-        material.pieces, *reference_gains(samples), base,
+        *reference_gains(samples), base,
     )  # fmt: skip
 
 
@@ -194,7 +192,7 @@ def _moving(tries: Sequence[Outcome], body: Body | None, legs: Legs | None) -> t
     A later try has to replay clearly better than those before it on the rows that fit and select. Terms can mistake the errors
     of encoders for an effect, or foretell a torque only where the joint does what it did; a replay does not.
     """
-    logs = [piece.log for piece in tries[0].pieces]
+    logs = [one.log for one in tries[0].model.samples.logs]
 
     def replay(o: Outcome, model: Model, rows: Bools) -> Replay:
         if legs is not None:

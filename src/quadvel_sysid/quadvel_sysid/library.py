@@ -40,7 +40,7 @@ _KEPT = 4
 """Sets of a term's regressors that are kept"""
 _COMMANDED = "q_des", "error", "tau"
 _PAST_COST = 0.5
-"""In parameters: decides between laws that explain the same"""
+"""Further cost, in parameters, of a law with a memory or that resembles a delay: decides between laws that explain the same"""
 _SIGNAL_COST, _WEIGHT_COST = 5.0, 0.1
 """In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
 
@@ -163,12 +163,9 @@ class Context:
         self.residual = np.where(parts.fit, self.samples.tau - self.torque, 0.0)
 
     @cached_property
-    def _losses(self) -> list[tuple[Array, Array]]:
-        return lost_commands(self.model, self.parts, self.noise)
-
-    def lost_commands(self, most: int) -> list[tuple[Array, Array]]:
+    def lost_commands(self) -> list[tuple[Array, Array]]:
         """Odds of commands that are behind, as `lost_commands.lost_commands` finds them."""
-        return self._losses
+        return lost_commands(self.model, self.parts, self.noise)
 
     def strongest_neighbours(self) -> tuple[str, ...]:
         """For each joint another joint's q, dq or tau that its residual goes with; none of one joint.

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from . import reading
+from . import interpolation
 from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
-from .logs.log import Log
+from .logs.log import ALMOST, Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]
@@ -19,14 +19,11 @@ ALL = slice(None)
 _KEPT_SLOPES = 4
 """accelerations that a log keeps: two kinds at a few delays"""
 
-_ALMOST = 1e-9
-"""s: a command counts that is sent no later than this after an instant, which is a sum of rounded numbers"""
-
 
 class LogSignals:
-    """One log; `kp`, `kd` (J,), `origin` and `steady` (s) as those of `Samples`."""
+    """One log; `origin` and `steady` (s) as those of `Samples`. known: which of kp and kd count as logged, the others as 1."""
 
-    def __init__(self, log: Log, kp: Array | None, kd: Array | None, origin: float, steady: float) -> None:
+    def __init__(self, log: Log, origin: float, steady: float, known: Collection[str]) -> None:
         self.log, self.origin = log, origin
         self.t, self.t_cmd = double(log.t), double(log.t_cmd)
         self.states = {"q": double(log.q), "dq": double(log.dq)}
@@ -44,18 +41,9 @@ class LogSignals:
             "tau_ff": zero if log.tau_ff is None else double(log.tau_ff),
         }
         self.gains = {
-            "kp": np.broadcast_to(
-                double(log.kp) if kp is None and log.kp is not None else _or_one(kp), shape
-            ),
-            "kd": np.broadcast_to(
-                double(log.kd) if kd is None and log.kd is not None else _or_one(kd), shape
-            ),
+            name: double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
+            for name in ("kp", "kd")
         }
-        self.undamped = not self.gains["kd"].any()
-        """was kd commanded as 0 throughout? Then its deviation is the drive's own damping, in units of 1 N m s/rad"""
-        if self.undamped:
-            self.gains["kd"] = np.ones(shape)
-        self.gains_known = kp is not None or log.kp is not None
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
         self.sums = {
             name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
@@ -68,7 +56,7 @@ class LogSignals:
 
     def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
-        return reading.between(self.t, at)
+        return interpolation.between(self.t, at)
 
     def state(
         self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
@@ -76,12 +64,12 @@ class LogSignals:
         """A state signal, linear between rows; `found` is `between(at)` where that is known."""
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        return reading.read(values, *(self.between(at) if found is None else found))
+        return interpolation.read(values, *(self.between(at) if found is None else found))
 
     def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
         """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
         if name == "ddq":
-            return reading.read(self._slope_of_dq(name)[:, joints], *self.between(at))
+            return interpolation.read(self._slope_of_dq(name)[:, joints], *self.between(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
             if len(self._smooth) >= _KEPT_SLOPES:
@@ -90,7 +78,7 @@ class LogSignals:
             self._smooth[key] = smooth_part(name, self.t, double(self.log.dq), self._slope_of_dq(name), come)
         smooth, answer = self._smooth[key]
         jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
-        return reading.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
+        return interpolation.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
 
     def _slope_of_dq(self, name: str) -> Array:
         """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
@@ -111,11 +99,11 @@ class LogSignals:
 
     def shifted(self, name: str, at: Array, late: Array) -> Array:
         """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
-        return reading.read_late(self.states[name], self.t, at, late)
+        return interpolation.read_late(self.states[name], self.t, at, late)
 
     def in_force(self, at: Array) -> NDArray[np.intp]:
         """The command row that counts at the times `at` (N,), s."""
-        return reading.rows_at(self.t_cmd, at + _ALMOST)
+        return interpolation.rows_at(self.t_cmd, at + ALMOST)
 
     def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
         """A command signal: the mean over `at` to `at + window`."""
@@ -129,12 +117,8 @@ class LogSignals:
         return (late - early) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
-        return reading.integral(values, sums, self.t_cmd, at)
+        return interpolation.integral(values, sums, self.t_cmd, at)
 
 
 def double(values: NDArray[np.floating]) -> Array:
     return np.asarray(values, dtype=np.float64)
-
-
-def _or_one(values: Array | None) -> Array:
-    return np.ones(1) if values is None else values

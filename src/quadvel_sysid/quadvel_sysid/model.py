@@ -71,7 +71,7 @@ class Model:
     window: float
     """s, the step of a drive that gives means over it; 0 for none"""
     gains: Array
-    gain_groups: Groups  # (2, J)
+    gain_groups: Groups  # (J,)
     delays: Array
     """(2, J) s, input and output"""
     delay_groups: Groups  # (J,)
@@ -281,9 +281,9 @@ DELAY_STEP = 0.0003
 def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[float, float], float]]:
     """Of each slot: who shares it, where it is free, bounds, and the step of its slope."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
-    known = model.samples.commanded and not model.samples.logs[0].undamped
-    for groups in model.gain_groups:
-        yield groups, everywhere, (0.0, _MOST_GAIN if known else 1e6), SLOPE
+    known = model.samples.commanded and not model.samples.undamped
+    for _ in model.gains:
+        yield model.gain_groups, everywhere, (0.0, _MOST_GAIN if known else 1e6), SLOPE
     for one in model.applied:
         for parameter in one.law.parameters:
             yield one.groups, one.active, (parameter.low, parameter.high), SLOPE * parameter.scale

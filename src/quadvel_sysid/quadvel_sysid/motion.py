@@ -10,7 +10,6 @@ the ground are not in it: the robot hangs in the air.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import attrs
 import numpy as np
@@ -158,17 +157,17 @@ def _mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
     return mean
 
 
-def implied(log: Log, kp: Array | None, kd: Array | None, body: Body | None = None) -> tuple[Log, Body]:
+def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     """The log with the torque that its motion implies, and the body that carries it, fitted unless it is known.
 
     Raises LogError where the gains are not known: without torque the scale of everything hangs on them.
     """
-    if (log.kp is None and kp is None) or (log.kd is None and kd is None):
+    if log.kp is None or log.kd is None:
         raise LogError(
             f"{log.name}: tau, kp: both are missing, expected the torque or the gains (--gains KP KD)"
         )
     coarse, ddq = spans(log)
-    samples = Samples([coarse], kp, kd)
+    samples = Samples([coarse])
     if body is None:
         delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP)
         body = min((_fitted(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
@@ -178,12 +177,8 @@ def implied(log: Log, kp: Array | None, kd: Array | None, body: Body | None = No
                     f"{log.name}: q/{joint}: the motion implies an inertia of {inertia:.3g} kg m^2; expected a joint "
                     "that turns freely (the robot hung in the air), or a measured tau"
                 )
-    gains: dict[str, Any] = {name: np.array(samples.logs[0].gains[name]) for name in ("kp", "kd")}
-    return attrs.evolve(
-        coarse,
-        tau=body.torques(*(np.asarray(x, dtype=np.float64) for x in (coarse.q, coarse.dq, ddq))),
-        **gains,
-    ), body
+    tau = body.torques(*(np.asarray(x, dtype=np.float64) for x in (coarse.q, coarse.dq, ddq)))
+    return attrs.evolve(coarse, tau=tau), body
 
 
 def _fitted(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
@@ -234,9 +229,10 @@ def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
     errors = np.zeros((2, *log.q.shape))
     every = max(2, round(STRETCH / log.period))
+    fresh = log.fresh
     place, speed = q[0], dq[0]
     for n, commands in enumerate(packets):
-        if n % every == 0:
+        if n % every == 0 or fresh[n]:
             place, speed = q[n], dq[n]
         errors[:, n] = place - q[n], speed - dq[n]
         for row in commands:

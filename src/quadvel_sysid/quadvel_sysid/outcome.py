@@ -18,7 +18,6 @@ from .decision import decision
 from .delays import running_delays
 from .identification import Identification, Shape, Trace
 from .library import SignalTerm
-from .logs.excerpts import Piece
 from .logs.findings import Finding as LogFinding
 from .model import Applied, Model, linear_columns
 from .signals import Array, Bools
@@ -70,7 +69,6 @@ class Outcome:
     ideal: Array  # (N, J), torque of the PD law as commanded
     noise: Array  # (J,)
     parts: Parts
-    pieces: Sequence[Piece]
     kp_ref: float
     kd_ref: float
     base: ActuatorParameters
@@ -78,7 +76,7 @@ class Outcome:
     @property
     def commanded_kd(self) -> float:
         """In units of `kd_ref`: 0 where none was commanded, so that the deviation is all of the drive's damping."""
-        return 0.0 if self.before.samples.logs[0].undamped else 1.0
+        return 0.0 if self.before.samples.undamped else 1.0
 
     @property
     def after(self) -> Array:
@@ -128,7 +126,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         },
         "after": mses["after"] | _gains(o),
         "effects": sorted(_effects(o), key=lambda one: -one["heldout_gain"]),
-        "rejected": [{"name": name, "heldout_gain": gain, "reason": why} for name, gain, why in o.rejected],
+        "rejected": [{"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.rejected],
         "unexplained": _unexplained(o, mses["before"]["heldout_mse"], mses["after"]["heldout_mse"], floor),
         "warnings": [
             f"{name} sits on its bound: its value and interval are not to be trusted"
@@ -138,7 +136,6 @@ def _report(o: Outcome) -> dict[str, Any]:
         + _unlike_delays(o.whole)
         + _negative_gains(o.whole)
         + _beyond_limits(o),
-        "fitted_seconds": float(parts.chosen_on.any(axis=1).sum() * samples.period),
     }
     report["decision"] = decision(report)
     return report

@@ -31,6 +31,8 @@ from .signals import Array, Bools
 
 STRETCH = 0.2
 """s that are replayed from a measured state, whereupon the next stretch begins with another one"""
+BLOCK = 0.25
+"""s in a row that hold a stretch"""
 _BEFORE = 0.04
 """s of the measured motion that the model is led along first, so that its delays and memories are filled"""
 _STEP = 0.001
@@ -39,8 +41,6 @@ TEXT = (
     "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the measured torque; "
     "what else pushes them is as measured."
 )
-_GAP = 3.0
-"""Times the usual spacing of the rows: no stretch goes over a gap so long"""
 _SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
@@ -112,8 +112,7 @@ def _loaded(robot: str) -> mujoco.MjModel:
 def stretches(log: Log, rows: Bools) -> Array:
     """The instants (S,) s at which stretches begin that hold none but `rows` (N, J), one after the other."""
     whole: Bools = np.asarray(rows.all(axis=1))
-    fresh = np.diff(log.t, prepend=log.t[0]) > _GAP * log.period
-    broken = np.flatnonzero(~whole | fresh)
+    broken = np.flatnonzero(~whole | log.fresh)
     edges = np.concatenate([[0], broken, [len(whole)]])
     begins: list[float] = []
     for first, end in pairwise(edges):

@@ -20,7 +20,7 @@ from .criterion import PER_PARAMETER
 from .fit import RIDGE
 from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
-from .signals import Array, Samples, scattered
+from .signals import Array, scattered
 
 _SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004)
 _FEW_SHIFTS = (0.0,)
@@ -66,7 +66,8 @@ class Screen:
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
         self._remembers = any(one.law.remembers for one in context.model.applied)
-        self._few = context.samples.taken(self.rows)
+        self.few = context.samples.taken(self.rows)
+        """the rows that are looked at, alone"""
         self._spots: dict[bool, list[_Spot]] = {}
 
     def grid(self, whole: bool) -> list[_Spot]:
@@ -75,15 +76,10 @@ class Screen:
         if whole not in self._spots:
             model = self.context.model
             if not whole:
-                model = attrs.evolve(model, samples=self._few)
+                model = attrs.evolve(model, samples=self.few)
             around = _around(model, _SHIFTS if not self._remembers else _FEW_SHIFTS)
             self._spots[whole] = [_Spot(self, at, whole) for at in (model, *around)]
         return self._spots[whole]
-
-    @property
-    def few(self) -> Samples:
-        """The rows that are looked at, alone."""
-        return self._few
 
     @cached_property
     def bare(self) -> Array:
@@ -141,7 +137,7 @@ class _Spot:
         self.basis = [_basis(one[np.linalg.norm(one, axis=1) > 0.0]) for one in own]  # of each joint (n, k)
         self.left = self.project(left.T[:, None])[:, 0]  # (J, n)
         self.shared = self.project(slopes[:, shared])  # (J, 4, n)
-        groups = np.concatenate([model.gain_groups, np.tile(model.delay_groups, (2, 1))])
+        groups = np.array([model.gain_groups, model.gain_groups, model.delay_groups, model.delay_groups])
         offsets = np.cumsum([0, *(int(one.max()) + 1 for one in groups)])
         self.index, self.count = groups + offsets[:4, None], int(offsets[4])
 
@@ -195,7 +191,7 @@ class _Spot:
     def best(self, law: EffectLaw, table: Array) -> Screened:
         """The law at the best of its starting values for each joint."""
         columns = self.columns(law, table)
-        columns = np.stack([self.project(one) for one in columns.transpose(0, 1, 2, 3)])
+        columns = np.stack([self.project(one) for one in columns])
         penalty = getattr(law, "penalty", None)
         error, choice, (change, weights) = self._solve(columns, law, penalty)
         bare = self.screen.bare

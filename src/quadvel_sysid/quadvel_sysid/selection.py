@@ -14,7 +14,7 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
-from .account import Account, Judge, groupings, parameters
+from .account import Account, Judge, groupings, parameter_count
 from .candidates import LAWS, TERMS, Candidates, key
 from .criterion import LEVEL, PER_PARAMETER, WORTH
 from .library import SignalTerm
@@ -70,7 +70,7 @@ class Search:
 
     def leaning(self, account: Account) -> tuple[str, ...]:
         """The signals that what is left goes with most, whether or not a term of them would pay."""
-        terms = self._pool(account).terms
+        terms, _ = self._pool(account).found(TERMS)
         best = min(terms, key=lambda one: one.criterion, default=None)
         return () if best is None else best.last.law.inputs  # type: ignore[attr-defined]
 
@@ -81,9 +81,7 @@ class Search:
             account = self.judge.narrowed(self._nested(account, k), k)
         model, one = account.model, np.zeros(len(self.judge.noise), dtype=np.intp)
         if model.gain_groups.any():
-            shared = self.judge.fitted(
-                attrs.evolve(model, gains=_shared(model.gains), gain_groups=np.array([one, one]))
-            )
+            shared = self.judge.fitted(attrs.evolve(model, gains=_shared(model.gains), gain_groups=one))
             account = min(account, shared, key=lambda each: each.criterion)
         if model.delay_groups.any():
             same = attrs.evolve(account.model, delay_groups=one).with_delays(_shared(model.delays))
@@ -93,7 +91,7 @@ class Search:
         return account
 
     def _nested(self, account: Account, index: int) -> Account:
-        """With the law that an effect's is at the end of one of its parameters, unless the rows that select tell them apart."""
+        """With the effect's law replaced by its special case, as Stribeck friction by Coulomb's, unless selecting rows need it."""
         one = account.model.applied[index]
         less = one.law.simpler(dict(zip(one.law.names, one.values, strict=True)))
         if less is None:
@@ -111,7 +109,7 @@ class Search:
             if more is None:
                 break
             best = self.judge.profiled(self._floated(more, kinds))
-            if PER_PARAMETER * parameters(best.model) > bound:
+            if PER_PARAMETER * parameter_count(best.model) > bound:
                 break
         return best
 
@@ -135,7 +133,7 @@ class Search:
             near = {
                 key(one.last.law)
                 for one, by in zip(candidates, fall, strict=True)
-                if one.model.applied and by > NEAR * fall[0]
+                if len(one.model.applied) > len(before.model.applied) and by > NEAR * fall[0]
             }
             for name in near:
                 self._near.setdefault(name, set()).update(near)
@@ -164,9 +162,8 @@ class Search:
 
     def _candidates(self, before: Account, kinds: str) -> list[Account]:
         """The most promising candidates of these kinds on top of an account, fitted."""
-        pool = self._pool(before)
-        self._tried = pool.tried(kinds)
-        return pool.laws if kinds == LAWS else pool.terms
+        found, self._tried = self._pool(before).found(kinds)
+        return found
 
     def _regrouped(self, before: Account) -> list[Account]:
         """The account with gains, or delays, for each kind of joint and for each joint."""
@@ -174,8 +171,8 @@ class Search:
         found = []
         for groups in groupings(joints):
             finer = len(np.unique(groups))
-            if finer > len(np.unique(model.gain_groups[0])):
-                found.append(attrs.evolve(model, gain_groups=np.array([groups, groups])))
+            if finer > len(np.unique(model.gain_groups)):
+                found.append(attrs.evolve(model, gain_groups=groups))
             if finer > len(np.unique(model.delay_groups)):
                 found.append(attrs.evolve(model, delay_groups=groups))
         return [self.judge.fitted(one) for one in found]
@@ -211,10 +208,12 @@ class Search:
             return account
         for k in range(len(account.model.applied) - 1):
             one = account.model.applied[k].law
-            rest = self.judge.fitted(account.model.without(k))
             names = {name for name in self._near.get(key(one), ()) if name != key(one)}
+            if not names:
+                continue
+            rest = self.judge.fitted(account.model.without(k))
             pool = Candidates(rest, self._cores, names)
-            for other in pool.laws if kinds == LAWS else pool.terms:
+            for other in pool.found(kinds)[0]:
                 if other.criterion < account.criterion - PER_PARAMETER:
                     return other
         return account
@@ -228,7 +227,7 @@ class Search:
         for signal in {one for one in signals if signals.count(one) > 1}:
             kept = tuple(one for one in account.model.applied if one.law.signal != signal)
             rest = self.judge.fitted(attrs.evolve(account.model, applied=kept))
-            every = [account, *Candidates(rest, self._cores, {(signal,)}).terms]
+            every = [account, *Candidates(rest, self._cores, {(signal,)}).found(TERMS)[0]]
             account = min(every, key=lambda one: one.criterion)
         return account
 
@@ -241,7 +240,7 @@ class Search:
         alone = len(account.model.applied) == 1
         pool = self._pool(rest) if alone else Candidates(rest, self._cores, self._near.get(key(one), set()))
         found = []
-        for other in pool.laws:
+        for other in pool.found(LAWS)[0]:
             lost = account.against(other)
             if other.last.law.name != one.name and (lost.share < TIE).all():
                 found.append(other.last.law.name)

@@ -24,9 +24,6 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Made = TypeVar("Made")
 
-GAP = 3.5
-"""A spacing above this many times the usual one begins a new stretch: memories start anew there."""
-
 SETTLING = 0.03
 """Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
 
@@ -128,24 +125,26 @@ def _constant(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
 class Samples:
     """The rows of all `logs`, one after the other: measured torque, who judges what, and the signals behind it.
 
-    `kp`, `kd` (J,) stand for logs that hold no gains; without either the gains count as 1, so that what is fitted
-    is the gain itself. `origins` (s) are the times that `Signals.t` counts from, by default each log's first row.
-    q and dq are lines through the rows at most `steady` s off. `judged` (N, J) are the rows that a model has to explain.
+    Where not every log holds its gains these count as 1, so that what is fitted is the gain itself; so does a kd that is 0 in
+    all of them (`undamped`), whose deviation is the drive's own damping, in units of 1 N m s/rad. `origins` (s) are the times
+    that `Signals.t` counts from, by default each log's first row. q and dq are lines through the rows at most `steady` s off.
+    `judged` (N, J) are the rows that a model has to explain.
     """
 
     def __init__(
         self,
         logs: Sequence[Log],
-        kp: Array | None = None,
-        kd: Array | None = None,
         origins: Sequence[float] | None = None,
         steady: float = 0.0,
     ) -> None:
         origins = [float(log.t[0]) for log in logs] if origins is None else origins
-        self.logs = [LogSignals(log, kp, kd, at, steady) for log, at in zip(logs, origins, strict=True)]
-        self.joints = logs[0].joints
-        self.commanded = all(one.gains_known for one in self.logs)
+        self.undamped = all(log.kd is not None and not log.kd.any() for log in logs)
+        known = {name for name in ("kp", "kd") if all(getattr(log, name) is not None for log in logs)}
+        self.commanded = "kp" in known
         """are the gains that were commanded known?"""
+        known -= {"kd"} if self.undamped else set()
+        self.logs = [LogSignals(log, at, steady, known) for log, at in zip(logs, origins, strict=True)]
+        self.joints = logs[0].joints
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
         self.t = np.concatenate([double(log.t) for log in logs])
@@ -164,14 +163,12 @@ class Samples:
         self._constant = _constant([one.all for one in self.logs])
         self._cache: dict[tuple[Any, ...], Signals] = {}
         self._states: dict[tuple[Any, ...], dict[str, Array]] = {}
-        self._parts: dict[int, Samples] = {}
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
         """Of each row: does a stretch begin there, the spacing to the row before, is the past known."""
-        steps = np.diff(log.t, prepend=log.t[0] - self.period)
-        start = steps > GAP * self.period
+        start = log.fresh
         start[0] = True
-        steps = np.where(start, self.period, steps)
+        steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
         known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
         return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
@@ -181,16 +178,9 @@ class Samples:
         count = int(self.log_of_row[np.flatnonzero(rows.any(axis=1))[-1]]) + 1 if rows.any() else 1
         if count == len(self.logs):
             return self
-        if count not in self._parts:
-            part = copy(self)
-            part.logs = self.logs[:count]
-            stop = int(np.searchsorted(self.log_of_row, count))
-            for name in _OF_ROWS:
-                setattr(part, name, getattr(self, name)[:stop])
-            part.sent = self.sent[: self._first_packet[count]]
-            part._cache, part._states, part._parts, part._finer = {}, {}, {}, None
-            self._parts[count] = part
-        return self._parts[count]
+        part = self.taken(np.flatnonzero(self.log_of_row < count))
+        part.logs, part.sent = self.logs[:count], self.sent[: self._first_packet[count]]
+        return part
 
     def thinned(self, step: int) -> tuple[Samples, NDArray[np.intp]]:
         """One row of `step`, and which these are; what happens to the signals between them is known as before."""
@@ -219,7 +209,7 @@ class Samples:
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._cache, part._states, part._parts, part._finer = {}, {}, {}, None
+        part._cache, part._states, part._finer = {}, {}, None
         return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:

@@ -38,7 +38,7 @@ class CommandHold(ErrorLaw):
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[CommandHold]:
-        return tuple(cls(*odds) for odds in about.lost_commands(MOST))
+        return tuple(cls(*odds) for odds in about.lost_commands)
 
     def foretold(self) -> CommandHold:
         if self.odds is None or self.usual is None:

@@ -303,11 +303,6 @@ class Term:
     at: str = DRIVE
     """where it is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
-    @property
-    def inputs(self) -> tuple[str, ...]:
-        """The signals that it depends on, as the report names them."""
-        return inputs(self.signal, self.times, self.shape)
-
     def rest(self, view: View, tau: Array, joints: Sequence[str], dt: float) -> Memory:
         """The memory of joints that have rested."""
         return self.shape.rest(read(self.signal, view, tau, joints), dt)

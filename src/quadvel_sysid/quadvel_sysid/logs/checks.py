@@ -12,9 +12,9 @@ from typing import Any
 
 import attrs
 
-from . import angles, channels, response, separability, slopes, stamps
+from . import angles, channels, response, separability, stamps
 from .findings import Finding
-from .log import Log, LogError
+from .log import GAP, Log, LogError
 from .pd_control import explainable, masked
 
 
@@ -85,7 +85,7 @@ def _refused(findings: list[Finding]) -> bool:
 OF_ROWS = (
     Check(stamps.clocks, "spacing of the rows, s; its longest step; the spans of t and t_cmd",
           f"{stamps.FASTEST:g} to {stamps.SLOWEST:g} s; a day; {stamps.LONGEST_SPAN:g} times as long", "refusal"),
-    Check(stamps.rates, "spacings, in times of the usual one", f"{slopes.GAP:g}", "note, warning of gaps"),
+    Check(stamps.rates, "spacings, in times of the usual one", f"{GAP:g}", "note, warning of gaps"),
     Check(masked, "rows of `valid` that are false", "any", "note; left out"),
     Check(channels.still, "span of q, rad", f"{channels.REACHES:g}", "warning; on all joints a refusal"),
     Check(channels.held, "share of the rows in motion that repeat the whole state before, or its torque", f"{channels.MOSTLY:.0%}",

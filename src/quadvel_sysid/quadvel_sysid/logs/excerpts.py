@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from .log import Array, Log
+from .log import Array, Log, LogError
 
 PIECE = 0.75  # s: many short pieces of a long log show more of what it does than few long ones
+LEAST = 50, 10  # rows of states, of commands, that a piece holds
 LEAD = 0.1  # s of commands before a piece
 JITTER = 0.03
 """Spacing that varies by more than this share of the usual one counts as jitter."""
@@ -35,14 +36,24 @@ class Piece:
 
 
 def pieces(log: Log, seconds: float, between: bool = False) -> list[Piece]:
-    """The log, or stretches of it of some `seconds` in all that are spread evenly; or those between these."""
+    """The log, or stretches of it of some `seconds` in all that are spread evenly; or those between these.
+
+    Raises LogError where none of these holds LEAST rows.
+    """
     if log.duration <= seconds:
         return [Piece(log, float(log.t[0]))]
-    count = max(int(seconds / PIECE), 1)
-    places = np.linspace(float(log.t[0]), float(log.t[-1]) - PIECE, max(2 * count - 1, 2))
+    usual = log.period, float(np.median(np.diff(log.t_cmd)))
+    length = max(PIECE, *(1.2 * least * period for least, period in zip(LEAST, usual, strict=True)))
+    count = max(int(seconds / length), 1)
+    places = np.linspace(float(log.t[0]), float(log.t[-1]) - length, max(2 * count - 1, 2))
     starts = places[1::2] if between else places[::2]
-    found = (_cut(log, start, start + PIECE) for start in starts)
-    return [Piece(one, float(log.t[0])) for one in found if one is not None]
+    found = [one for start in starts if (one := _cut(log, start, start + length)) is not None]
+    if not found:
+        raise LogError(
+            f"{log.name}: t, t_cmd: none of the {len(starts)} stretches of {length:.3g} s that were looked at holds "
+            f"{LEAST[0]} rows and {LEAST[1]} commands, expected a log with fewer gaps"
+        )
+    return [Piece(one, float(log.t[0])) for one in found]
 
 
 def _cut(log: Log, start: float, stop: float) -> Log | None:
@@ -55,7 +66,7 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
         if isinstance(value, np.ndarray):
             of_it = sent if field.name in _OF_COMMANDS else rows
             taken[field.name] = value[of_it].copy()  # a view would hold the whole
-    if len(taken["t"]) < 50 or len(taken["t_cmd"]) < 10:
+    if len(taken["t"]) < LEAST[0] or len(taken["t_cmd"]) < LEAST[1]:
         return None
     return attrs.evolve(log, **taken)
 

@@ -17,6 +17,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
+ALMOST = 1e-9
+"""s: a command counts that is sent no later than this after an instant, which is a sum of rounded numbers."""
+
+GAP = 3.5
+"""Times the usual spacing, beyond which rows are no neighbours: memories, slopes and replays begin anew there."""
+
 LEAST_ROWS = 10
 """Fewer samples say nothing about a joint."""
 
@@ -81,9 +87,15 @@ class Log:
         """The median spacing of the states, s."""
         return float(np.median(np.diff(self.t)))
 
+    @property
+    def fresh(self) -> Bools:
+        """Which rows (N,) follow a gap."""
+        fresh: Bools = np.diff(self.t, prepend=self.t[0]) > GAP * self.period
+        return fresh
+
     def command_rows(self, at: Array) -> NDArray[np.intp]:
         """The command row that counts at the times `at`, s, the first one before there is any; shape of `at`."""
-        return np.maximum(np.searchsorted(self.t_cmd, at, side="right") - 1, 0)
+        return np.maximum(np.searchsorted(self.t_cmd, np.asarray(at) + ALMOST, side="right") - 1, 0)
 
     def without_feed_forward(self) -> Log:
         """The log with the torque alone that answers angles and speeds: less what `tau_ff` and `dq_des` in force ask for."""

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.signal import savgol_coeffs, savgol_filter
 
-from .log import Array
+from .log import GAP, Array
 
 WIDTHS = (5, 7, 9, 13, 17, 21, 25, 33, 45, 65, 91)
 """Rows that are looked at together."""
@@ -21,8 +21,6 @@ ORDER = 3
 """Of the polynomial: its slope at the middle row is free of the second and the fourth derivative."""
 ENOUGH = 20_000
 """Rows in a row, of which the width is read."""
-GAP = 3.5
-"""Times the usual spacing, beyond which rows are no neighbours."""
 
 
 @attrs.frozen(eq=False)

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from .findings import Finding
-from .log import Log
-from .slopes import GAP
+from .log import GAP, Log
 
 PAUSE = 0.1
 """s without a command, where they come regularly, from which it is a gap."""

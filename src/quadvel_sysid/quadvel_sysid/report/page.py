@@ -209,25 +209,23 @@ def _replay(report: Mapping[str, Any]) -> str:
 
 
 def _candidates(report: Mapping[str, Any]) -> str:
-    taken, rejected = report["effects"], report["rejected"]
-    ranked = sorted([*taken, *rejected], key=lambda entry: -(entry["heldout_gain"] or 0.0))
+    taken = [
+        (one["heldout_gain"], one["p_value"], one["name"], _taken(one, report["joints"]))
+        for one in report["effects"]
+    ]
+    rejected = [(one["selecting_gain"], None, one["name"], one["reason"]) for one in report["rejected"]]
+    ranked = sorted([*taken, *rejected], key=lambda entry: -entry[0])
     if not ranked:
         return "<p>No candidate was tried.</p>"
-    picture = figures.candidate_figure(
-        [entry["name"] for entry in ranked],
-        [entry["heldout_gain"] or 0.0 for entry in ranked],
-        [any(entry is one for one in taken) for entry in ranked],
+    gains, ps, names, reasons = zip(*ranked, strict=True)
+    picture = figures.candidate_figure(names, gains, [one in taken for one in ranked])
+    rows = zip(map(escape, names), map(number, gains), map(number, ps), map(escape, reasons), strict=True)
+    note = (
+        '<p class="note">The gain of what was left out is that on the rows that select.</p>'
+        if rejected
+        else ""
     )
-    rows = [
-        (
-            escape(entry["name"]),
-            number(entry["heldout_gain"]),
-            number(entry.get("p_value")),
-            escape(entry.get("reason") or _taken(entry, report["joints"])),
-        )
-        for entry in ranked
-    ]
-    return picture + table(("candidate", "#held-out gain, N² m²", "#p", ""), rows)
+    return picture + table(("candidate", "#gain, N² m²", "#p", ""), list(rows)) + note
 
 
 def _taken(effect: Mapping[str, Any], joints: Sequence[str]) -> str:

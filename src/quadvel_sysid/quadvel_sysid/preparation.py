@@ -20,7 +20,7 @@ from .material import Material
 from .signals import Samples
 
 _BLOCKS = 20  # of a log, at least
-_SHORTEST, _LONGEST = 0.2, 2.0
+SHORTEST, _LONGEST = 0.2, 2.0
 """s, of the blocks of which some are fitted, some select and some are reported"""
 _LEAST_ROWS = 20
 _CLEARLY = 0.97
@@ -46,13 +46,15 @@ class Reading:
     eam: Eam
 
 
-def read(material: Material, windows: Sequence[float]) -> tuple[Reading, list[tuple[str, Finding]]]:
-    """The reading that explains the torque best, and what was chosen."""
+def read(
+    material: Material, windows: Sequence[float], shortest: float = SHORTEST
+) -> tuple[Reading, list[tuple[str, Finding]]]:
+    """The reading that explains the torque best, and what was chosen. shortest: s, blocks at least."""
     origins = [piece.origin for piece in material.pieces]
 
     def tried(logs: Sequence[Log], steady: float = 0.0) -> Reading:
-        samples = Samples(logs, material.kp, material.kd, origins, steady)
-        parts = divided(samples, material)
+        samples = Samples(logs, origins, steady)
+        parts = divided(samples, material, shortest)
         return Reading(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
     logs = [piece.log for piece in material.pieces]
@@ -71,10 +73,10 @@ def read(material: Material, windows: Sequence[float]) -> tuple[Reading, list[tu
     return found, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
 
 
-def divided(samples: Samples, material: Material) -> Parts:
+def divided(samples: Samples, material: Material, shortest: float) -> Parts:
     """Blocks of the logs in turn: two are fitted, two select, one is reported; a log that is held out is the only one reported."""
     spans = [one.log.duration for one in samples.logs]
-    length = float(np.clip(min(spans) / _BLOCKS, _SHORTEST, _LONGEST))
+    length = float(np.clip(min(spans) / _BLOCKS, shortest, _LONGEST))
     block = np.floor(samples.t / length).astype(int)
     if material.heldout:
         report = samples.log_of_row >= material.fitted

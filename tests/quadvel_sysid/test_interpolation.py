@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_sysid import reading
+from quadvel_sysid import interpolation
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.0005, 0.003, 400))
@@ -23,16 +23,20 @@ ORDERS = {
 @pytest.mark.parametrize("order", ORDERS)
 def test_the_row_in_force_is_the_last_one_before(order: str) -> None:
     at = ORDERS[order]
-    assert (reading.rows_at(TIMES, at) == np.maximum(np.searchsorted(TIMES, at, side="right") - 1, 0)).all()
+    assert (
+        interpolation.rows_at(TIMES, at) == np.maximum(np.searchsorted(TIMES, at, side="right") - 1, 0)
+    ).all()
 
 
 @pytest.mark.parametrize("order", ORDERS)
 def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -> None:
     at = ORDERS[order]
     expected = np.stack([np.interp(at, TIMES, one) for one in VALUES.T], axis=1)
-    np.testing.assert_allclose(reading.read(VALUES, *reading.between(TIMES, at)), expected, atol=1e-12)
+    np.testing.assert_allclose(
+        interpolation.read(VALUES, *interpolation.between(TIMES, at)), expected, atol=1e-12
+    )
     late = np.array([[0.0, 0.001, -0.002], [0.02, 0.5, 2.0]])
-    found = reading.read_late(VALUES, TIMES, at, late)
+    found = interpolation.read_late(VALUES, TIMES, at, late)
     assert found.shape == (2, len(at), 3)
     for b, j in np.ndindex(late.shape):
         np.testing.assert_allclose(
@@ -54,4 +58,4 @@ def test_an_integral_of_held_values_is_the_sum_of_values_times_how_long_they_hel
         ]
         for t in at
     ]
-    np.testing.assert_allclose(reading.integral(VALUES, sums, TIMES, at), expected, atol=1e-12)
+    np.testing.assert_allclose(interpolation.integral(VALUES, sums, TIMES, at), expected, atol=1e-12)
