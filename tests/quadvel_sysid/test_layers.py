@@ -1,7 +1,8 @@
-"""docs/sysid.md lists the modules so that imports go downwards alone, and lists them all."""
+"""docs/sysid.md lists all modules, so that imports go downwards alone, and the constants that were tuned."""
 
 import ast
 import re
+from importlib import import_module
 from pathlib import Path
 
 import quadvel_sysid
@@ -11,7 +12,8 @@ PAGE = Path(__file__).parents[2] / "docs" / "sysid.md"
 
 
 def _rows() -> list[list[str]]:
-    cells = re.findall(r"^\| (`[^|]+) \|", PAGE.read_text(), re.MULTILINE)
+    modules, _, _ = PAGE.read_text().partition("## One log")
+    cells = re.findall(r"^\| (`[^|]+) \|", modules, re.MULTILINE)
     return [
         [name.removesuffix(".py").strip("/") for name in re.findall(r"`([^`]+)`", cell)] for cell in cells
     ]
@@ -36,3 +38,10 @@ def test_imports_go_downwards_in_the_list_of_modules() -> None:
         mine = path.relative_to(PACKAGE).parts[0].removesuffix(".py")
         above = {name for name in _imported(path) if mine in place and place[name] < place[mine]}
         assert not above, f"{path.name} imports {above}, which stand above it in {PAGE.name}"
+
+
+def test_the_constants_that_were_tuned_have_the_values_that_are_told() -> None:
+    rows = re.findall(r"^\| `(\w+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
+    assert len(rows) == 30
+    for module, name, value in rows:
+        assert getattr(import_module(f"quadvel_sysid.{module}"), name) == float(value), f"{module}.{name}"
