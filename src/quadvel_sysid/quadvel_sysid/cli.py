@@ -71,7 +71,7 @@ def identify(
     holdout: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="LOG...", help="Logs to judge on.", show_default="a third of each LOG, in blocks"
+            metavar="LOG...", help="Logs to judge on.", show_default="a fifth of each LOG, in blocks"
         ),
     ] = None,
     base: Annotated[
