@@ -176,6 +176,42 @@ def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
     page.until("state.mode === 'stance'")
 
 
+@pytest.mark.realtime
+def test_the_page_opens_soon_shows_thirty_pictures_a_second_and_costs_the_robot_no_deadline(
+    browser: Any, robot: str
+) -> None:
+    seconds = 20
+
+    def opened() -> Page:
+        page = Page(browser, robot)
+        page.until("state.loop.missed !== undefined")
+        return page
+
+    def missed(page: Page) -> int:
+        return int(page.page.evaluate("state.loop.missed"))
+
+    opened().page.close()  # the first one loads the browser
+    begin = time.monotonic()
+    page = opened()
+    opening = time.monotonic() - begin
+    page.page.evaluate("words = 0; socket.addEventListener('message', () => { words += 1; })")
+    before = missed(page)
+    page.page.wait_for_timeout(1000 * seconds)
+    with_it, rate = missed(page) - before, page.page.evaluate("words") / seconds
+    before = missed(page)
+    page.page.close()
+    time.sleep(seconds)
+    page = opened()
+    without = missed(page) - before
+    page.page.close()
+    print(
+        f"open after {opening:.2f} s, {rate:.1f} pictures/s, missed deadlines in {seconds} s: {with_it}, without {without}"
+    )
+    assert opening < 3.0
+    assert rate > 28.0
+    assert with_it <= without + 2
+
+
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (390, 844)])
 def test_nothing_overlaps(browser: Any, robot: str, width: int, height: int) -> None:
     page = Page(browser, robot, width, height)
