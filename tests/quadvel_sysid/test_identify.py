@@ -85,7 +85,7 @@ def test_pieces_of_a_long_log_at_a_low_rate_hold_enough_rows():
     log = record(_truth(), 2, 30.0, 50, seed=4)
     found = pieces(log, 12.0)
     assert len(found) > 4
-    assert all(len(piece.log.t) >= 50 for piece in found)
+    assert all(len(piece.t) >= 50 for piece in found)
 
 
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
@@ -93,7 +93,7 @@ def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
     material = gathered(Dataset.of([log]), values=3000)
     del log
-    assert sum(len(piece.log.t) for piece in material.pieces) == 1500
+    assert sum(len(log.t) for log in material.logs) == 1500
     assert [array() for array in alive] == [None] * len(alive)
 
 

@@ -79,7 +79,7 @@ def identified(
     body = material.body
     legs = None if robot is None else _legs(robot, material)
     progress(0.02, "gains and delays")
-    windows = WINDOWS if body is None else (material.pieces[0].log.period,)
+    windows = WINDOWS if body is None else (material.logs[0].period,)
     reading, notes = read(material, windows, SHORTEST if legs is None else LEG_BLOCK)
     steps = iter(range(10**6))
 
@@ -117,7 +117,7 @@ def identified(
 
 def _legs(robot: str, material: Material) -> Legs:
     """The legs that the logs' commands are replayed on. Raises LogError where the logs do not hold what that takes."""
-    for log in (piece.log for piece in material.pieces):
+    for log in material.logs:
         known = {"tau": material.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
         for name, there in known.items():
             if not there:
@@ -125,7 +125,7 @@ def _legs(robot: str, material: Material) -> Legs:
                 raise LogError(
                     f"{log.name}: {name}: not in the log, expected {what} to replay the commands (--robot)"
                 )
-    return Legs.of(robot, material.pieces[0].log.joints)
+    return Legs.of(robot, material.logs[0].joints)
 
 
 def _searched(reading: Reading) -> tuple[Samples, NDArray[np.intp]]:

@@ -21,10 +21,13 @@ _KEPT_SLOPES = 4
 
 
 class LogSignals:
-    """One log; `origin` and `steady` (s) as those of `Samples`. known: which of kp and kd count as logged, the others as 1."""
+    """One log; `steady` (s) as that of `Samples`. known: which of kp and kd count as logged, the others as 1.
 
-    def __init__(self, log: Log, origin: float, steady: float, known: Collection[str]) -> None:
-        self.log, self.origin = log, origin
+    origin: when it began, s, or the log that it is a piece of.
+    """
+
+    def __init__(self, log: Log, steady: float, known: Collection[str]) -> None:
+        self.log, self.origin = log, float(log.t[0]) if log.began is None else log.began
         self.t, self.t_cmd = double(log.t), double(log.t_cmd)
         self.states = {"q": double(log.q), "dq": double(log.dq)}
         if steady > 0.0:

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import attrs
 
 from .logs.dataset import Dataset
-from .logs.excerpts import Piece, pieces
+from .logs.excerpts import pieces
 from .logs.findings import Finding
+from .logs.log import Log
 from .motion import Body, implied
 
 Progress = Callable[[float, str], None]
@@ -20,11 +21,11 @@ VALUES = 60_000
 
 @attrs.frozen(eq=False)
 class Material:
-    """Pieces that hold no more of their logs than they show: a long log can be let go of."""
+    """Logs, of long ones pieces that hold no more than they show, so that these can be let go of."""
 
-    pieces: tuple[Piece, ...]
+    logs: tuple[Log, ...]
     fitted: int
-    """of the pieces, the first ones; all where no log is there to judge on"""
+    """of them, the first ones; all where no log is there to judge on"""
     body: Body | None
     """that the joints carry, where the torque is what their motion implies"""
     findings: tuple[tuple[str, Finding], ...]
@@ -33,7 +34,7 @@ class Material:
     @property
     def heldout(self) -> bool:
         """Are there logs to judge on?"""
-        return self.fitted < len(self.pieces)
+        return self.fitted < len(self.logs)
 
 
 def gathered(
@@ -51,6 +52,6 @@ def gathered(
     rows = values // (len(logs) * len(logs[0].joints))
     # One script may have led all logs: what judges comes from other instants of it than what is fitted.
     parts = [pieces(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
-    chosen = tuple(piece for part in parts for piece in part)
+    chosen = tuple(log for part in parts for log in part)
     fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)
     return Material(chosen, fitted, body, data.findings)

@@ -255,7 +255,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     acts = np.any([one.active for _, one in ranked], axis=0)
     return {
         "name": TERMS,
-        "joints": [name for name, on in zip(joints, acts, strict=True) if on],
+        "joints": _acting(acts, joints),
         "params": {},
         "indistinguishable": [],
         "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
@@ -266,7 +266,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
                 "kind": one.law.shape.kind,  # type: ignore[attr-defined]
                 "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
                 "at": one.law.at,
-                "joints": [name for name, on in zip(joints, one.active, strict=True) if on],
+                "joints": _acting(one.active, joints),
                 "heldout_gain": o.effects[k].gain,
             }
             for k, one in ranked
@@ -274,16 +274,25 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
+def _params(one: Applied, half: Array) -> dict[str, dict[str, Any]]:
+    """The parameters of an effect on its joints, by name: value, interval and unit."""
     params = {}
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
         value, ci = _with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
         params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
+    return params
+
+
+def _acting(active: Bools, joints: Sequence[str]) -> list[str]:
+    return [name for name, acts in zip(joints, active, strict=True) if acts]
+
+
+def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
     settings = _settings(one)
     entry: dict[str, Any] = {
         "name": one.law.name,
-        "joints": [name for name, acts in zip(joints, one.active, strict=True) if acts],
-        "params": params,
+        "joints": _acting(one.active, joints),
+        "params": _params(one, half),
         "indistinguishable": list(of_it.rivals),
         "heldout_gain": of_it.gain,
         "p_value": of_it.p,
@@ -316,19 +325,16 @@ def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
     for one, half in zip(model.applied, o.widths.effects, strict=False):
         if isinstance(one.law, SignalTerm):
             continue
-        values: dict[str, Any] = {}
-        ranges = {}
-        for parameter, row, width in zip(one.law.parameters, one.values, half, strict=True):
-            value, ci = _with_interval(row[one.active], width[one.active], parameter.low, parameter.high)
-            values[parameter.name], ranges[parameter.name] = value, ci
-        values |= _settings(one)
-        units = {parameter.name: parameter.unit for parameter in one.law.parameters}
-        acts = tuple(name for name, on in zip(joints, one.active, strict=True) if on)
-        effects.append(Effect(one.law.name, acts, values, units, ranges))
+        params = _params(one, half)
+        values, units, ranges = (
+            {n: p[field] for n, p in params.items()} for field in ("value", "unit", "ci95")
+        )
+        acts = tuple(_acting(one.active, joints))
+        effects.append(Effect(one.law.name, acts, values | _settings(one), units, ranges))
     terms = [one for one in model.applied if isinstance(one.law, SignalTerm)]
     if terms:
         on = np.any([one.active for one in terms], axis=0)
-        acts = tuple(name for name, acting in zip(joints, on, strict=True) if acting)
+        acts = tuple(_acting(on, joints))
         saved = [one.law.term(one, _largest(model, one, o.parts.fit)).saved(joints) for one in terms]  # type: ignore[attr-defined]
         effects.append(Effect(TERMS, acts, {"terms": saved}))
     deviations: dict[str, Any] = {

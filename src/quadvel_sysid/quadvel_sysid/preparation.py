@@ -50,14 +50,13 @@ def read(
     material: Material, windows: Sequence[float], shortest: float = SHORTEST
 ) -> tuple[Reading, list[tuple[str, Finding]]]:
     """The reading that explains the torque best, and what was chosen. shortest: s, blocks at least."""
-    origins = [piece.origin for piece in material.pieces]
 
     def tried(logs: Sequence[Log], steady: float = 0.0) -> Reading:
-        samples = Samples(logs, origins, steady)
+        samples = Samples(logs, steady)
         parts = divided(samples, material, shortest)
         return Reading(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
-    logs = [piece.log for piece in material.pieces]
+    logs: Sequence[Log] = material.logs
     found, notes = tried(logs), []
     if any(jitters(log) for log in logs):
         even = [evened(log) for log in logs]

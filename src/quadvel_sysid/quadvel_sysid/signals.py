@@ -126,24 +126,21 @@ class Samples:
     """The rows of all `logs`, one after the other: measured torque, who judges what, and the signals behind it.
 
     Where not every log holds its gains these count as 1, so that what is fitted is the gain itself; so does a kd that is 0 in
-    all of them (`undamped`), whose deviation is the drive's own damping, in units of 1 N m s/rad. `origins` (s) are the times
-    that `Signals.t` counts from, by default each log's first row. q and dq are lines through the rows at most `steady` s off.
-    `judged` (N, J) are the rows that a model has to explain.
+    all of them (`undamped`), whose deviation is the drive's own damping, in units of 1 N m s/rad. q and dq are lines through
+    the rows at most `steady` s off. `judged` (N, J) are the rows that a model has to explain.
     """
 
     def __init__(
         self,
         logs: Sequence[Log],
-        origins: Sequence[float] | None = None,
         steady: float = 0.0,
     ) -> None:
-        origins = [float(log.t[0]) for log in logs] if origins is None else origins
         self.undamped = all(log.kd is not None and not log.kd.any() for log in logs)
         known = {name for name in ("kp", "kd") if all(getattr(log, name) is not None for log in logs)}
         self.commanded = "kp" in known
         """are the gains that were commanded known?"""
         known -= {"kd"} if self.undamped else set()
-        self.logs = [LogSignals(log, at, steady, known) for log, at in zip(logs, origins, strict=True)]
+        self.logs = [LogSignals(log, steady, known) for log in logs]
         self.joints = logs[0].joints
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)

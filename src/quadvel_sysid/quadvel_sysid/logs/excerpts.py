@@ -27,21 +27,13 @@ _WINDOW = 101, 31  # rows of states, of commands, over which lateness is a drift
 _REACH = 200  # rows from which the true period is read
 
 
-@attrs.frozen(eq=False)
-class Piece:
-    """A stretch of a log, and when that log began (s)."""
-
-    log: Log
-    origin: float
-
-
-def pieces(log: Log, seconds: float, between: bool = False) -> list[Piece]:
+def pieces(log: Log, seconds: float, between: bool = False) -> list[Log]:
     """The log, or stretches of it of some `seconds` in all that are spread evenly; or those between these.
 
     Raises LogError where none of these holds LEAST rows.
     """
     if log.duration <= seconds:
-        return [Piece(log, float(log.t[0]))]
+        return [log]
     usual = log.period, float(np.median(np.diff(log.t_cmd)))
     length = max(PIECE, *(1.2 * least * period for least, period in zip(LEAST, usual, strict=True)))
     count = max(int(seconds / length), 1)
@@ -53,7 +45,7 @@ def pieces(log: Log, seconds: float, between: bool = False) -> list[Piece]:
             f"{log.name}: t, t_cmd: none of the {len(starts)} stretches of {length:.3g} s that were looked at holds "
             f"{LEAST[0]} rows and {LEAST[1]} commands, expected a log with fewer gaps"
         )
-    return [Piece(one, float(log.t[0])) for one in found]
+    return found
 
 
 def _cut(log: Log, start: float, stop: float) -> Log | None:
@@ -68,7 +60,7 @@ def _cut(log: Log, start: float, stop: float) -> Log | None:
             taken[field.name] = value[of_it].copy()  # a view would hold the whole
     if len(taken["t"]) < LEAST[0] or len(taken["t_cmd"]) < LEAST[1]:
         return None
-    return attrs.evolve(log, **taken)
+    return attrs.evolve(log, began=float(log.t[0]), **taken)
 
 
 def jitters(log: Log) -> bool:

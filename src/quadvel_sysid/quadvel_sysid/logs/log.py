@@ -60,6 +60,7 @@ class Log:
     tau_ff: Array | None = None  # (M, J) N m
     kp: Array | None = None  # (M, J) N m/rad
     kd: Array | None = None  # (M, J) N m s/rad
+    began: float | None = None  # s, of a piece: when the whole log began
     remarks: tuple[str, ...] = ()  # what the reader had to assume
     made: tuple[str, ...] = ()  # fields that the file did not hold, such as a dq that is made from q
 
