@@ -43,6 +43,8 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
 _SUMS = np.arange(-0.003, 0.0031, 0.0005)
 _OUTPUTS = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
 """s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
+_FAR = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
+"""s: changes of the sum alone, as far as what a model lacked may have led its delays astray"""
 _DEEPEST = 3
 """Points of the grid that a fit starts from"""
 _BESIDE = (-0.002, -0.001, 0.001, 0.002)
@@ -78,7 +80,8 @@ def beside(model: Model, rows: Bools) -> Model:
 
 def _around(model: Model, rows: Bools) -> Model:
     """The best fit from the points of the grid about the model's delays."""
-    deepest = _adapted(model, rows, product(_SUMS, _OUTPUTS))[:_DEEPEST]
+    shifts = (*product(_SUMS, _OUTPUTS), *product(_FAR, (0.0,)))
+    deepest = _adapted(model, rows, shifts)[:_DEEPEST]
     tried = [fit(_searched(one, rows), rows) for one in (model, *deepest)]
     return min(tried, key=lambda one: squared_error(one, rows))
 

@@ -22,7 +22,7 @@ from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
 from .signals import Array, scattered
 
-_SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004)
+_SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
 _FEW_SHIFTS = (0.0,)
 _OUTPUTS = (0.0005, 0.0025, 0.0045)
 """s: the grid of delays, as changes of their sum and as output delays"""
@@ -251,9 +251,16 @@ class _Spot:
             at = self.index[:, j]
             total[np.ix_(at, at)] += hessian[j]
             right[at] += gradient[j]
-        change: Array = _solved(total, right)[self.index]
-        change[2:] = change[2:].clip(-_FARTHEST, _FARTHEST)
-        return change
+        change = _solved(total, right)
+        far = (np.arange(self.count) >= self.index[2].min()) & (
+            np.abs(change) > _FARTHEST
+        )  # delays come last
+        if far.any():
+            change[far] = change[far].clip(-_FARTHEST, _FARTHEST)
+            rest = right[~far] - total[np.ix_(~far, far)] @ change[far]
+            change[~far] = _solved(total[np.ix_(~far, ~far)], rest)
+        shared: Array = change[self.index]
+        return shared
 
     def _started(self, law: EffectLaw, table: Array, choice: Array, change: Array, weights: Array) -> Model:
         """The model with the law at the chosen starts, gains and delays changed."""
