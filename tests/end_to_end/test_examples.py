@@ -83,6 +83,7 @@ NODES = [
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
     Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
     Step("quadvel people --out out/people", more="--runs 1"),
+    Step("quadvel demo follow --tour --out out/tour", more="--world corridor --metres 3 --no-video"),
     Step("quadvel doctor"),
     Step("python -m quadvel_training --help"),
 ]
