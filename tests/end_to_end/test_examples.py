@@ -141,7 +141,7 @@ LEFT_OUT_KINDS = {
     r"\.venv/bin/pytest .*": "these are the tests",
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
-    r"mkdir -p out/training/.*": "copies a checkpoint that a training goes on from",
+    r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"(description|dds|recordings|driver's|view|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"(driver|controller|command_mux):.*": "a part of a parameter file",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
