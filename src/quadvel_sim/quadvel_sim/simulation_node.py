@@ -224,9 +224,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if level == DiagnosticStatus.WARN:
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
         if report.fallen and not self._has_fallen:
-            self.get_logger().warning(
-                "the trunk is on the ground or tilted; after a fall, ~/reset puts the robot back"
-            )
+            self.get_logger().warning("the robot has fallen, or lies down: ~/reset puts it back")
         self._has_fallen = report.fallen
 
     def _in_world(self, report: LoopReport) -> dict[str, object]:
