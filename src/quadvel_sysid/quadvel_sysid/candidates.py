@@ -13,7 +13,7 @@ from quadvel_actuator.effects import EffectLaw
 
 from . import library
 from .account import Account
-from .fit import beside, fit
+from .fit import fit, from_nearby_delays
 from .library import Context, SignalTerm
 from .model import Model
 from .parallel import side_by_side
@@ -87,7 +87,7 @@ class Candidates:
         """The account, from other delays where that is better: a term is screened at one pair of delays alone."""
         if not isinstance(account.last.law, SignalTerm):
             return account
-        other = Account(beside(account.model, self._judge.parts.fit), self._judge)
+        other = Account(from_nearby_delays(account.model, self._judge.parts.fit), self._judge)
         return min(account, other, key=lambda one: one.criterion)
 
     def _side_by_side(self, work: Callable[[int], Model], count: int) -> list[Account]:

@@ -47,7 +47,7 @@ _FAR = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.
 """s: changes of the sum alone, as far as what a model lacked may have led its delays astray"""
 _DEEPEST = 3
 """Points of the grid that a fit starts from"""
-_BESIDE = (-0.002, -0.001, 0.001, 0.002)
+_NEARBY = (-0.002, -0.001, 0.001, 0.002)
 """s: a coarser grid of the sum of delays alone"""
 
 
@@ -71,9 +71,9 @@ def profiled(model: Model, rows: Bools) -> Model:
     return model
 
 
-def beside(model: Model, rows: Bools) -> Model:
+def from_nearby_delays(model: Model, rows: Bools) -> Model:
     """The model, or one that leaves less, fitted from input delays that are a millisecond or two off."""
-    found = _adapted(model, rows, product(_BESIDE, (0.0,)))
+    found = _adapted(model, rows, product(_NEARBY, (0.0,)))
     tried = [model, *(fit(one, rows) for one in found[:1])]
     return min(tried, key=lambda one: squared_error(one, rows))
 
@@ -181,9 +181,8 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
         shape = getattr(one.law, "penalty", None)
         if shape is not None:
             joints = np.flatnonzero(one.active)
-            for j in joints[
-                np.unique(one.groups[joints], return_index=True)[1]
-            ]:  # one of those that share weights
+            _, first_of_group = np.unique(one.groups[joints], return_index=True)
+            for j in joints[first_of_group]:
                 at = unknowns.index[first : first + count, j]
                 total[np.ix_(at, at)] += shape * float(np.mean(hessian[at, at])) * RIDGE
         first += count

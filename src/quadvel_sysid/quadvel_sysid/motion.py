@@ -229,10 +229,10 @@ def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
     errors = np.zeros((2, *log.q.shape))
     every = max(2, round(STRETCH / log.period))
-    fresh = log.fresh
+    after_gap = log.after_gap
     place, speed = q[0], dq[0]
     for n, commands in enumerate(packets):
-        if n % every == 0 or fresh[n]:
+        if n % every == 0 or after_gap[n]:
             place, speed = q[n], dq[n]
         errors[:, n] = place - q[n], speed - dq[n]
         for row in commands:

@@ -112,7 +112,7 @@ def _loaded(robot: str) -> mujoco.MjModel:
 def stretches(log: Log, rows: Bools) -> Array:
     """The instants (S,) s at which stretches begin that hold none but `rows` (N, J), one after the other."""
     whole: Bools = np.asarray(rows.all(axis=1))
-    broken = np.flatnonzero(~whole | log.fresh)
+    broken = np.flatnonzero(~whole | log.after_gap)
     edges = np.concatenate([[0], broken, [len(whole)]])
     begins: list[float] = []
     for first, end in pairwise(edges):

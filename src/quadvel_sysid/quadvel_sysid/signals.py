@@ -163,7 +163,7 @@ class Samples:
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
         """Of each row: does a stretch begin there, the spacing to the row before, is the past known."""
-        start = log.fresh
+        start = log.after_gap
         start[0] = True
         steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))

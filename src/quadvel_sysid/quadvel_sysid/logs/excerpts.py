@@ -17,6 +17,7 @@ from .log import Array, Log, LogError
 
 PIECE = 0.75  # s: many short pieces of a long log show more of what it does than few long ones
 LEAST = 50, 10  # rows of states, of commands, that a piece holds
+SPARE = 1.2  # times these at the usual rate: a few rows may be lost
 LEAD = 0.1  # s of commands before a piece
 JITTER = 0.03
 """Spacing that varies by more than this share of the usual one counts as jitter."""
@@ -35,7 +36,7 @@ def pieces(log: Log, seconds: float, between: bool = False) -> list[Log]:
     if log.duration <= seconds:
         return [log]
     usual = log.period, float(np.median(np.diff(log.t_cmd)))
-    length = max(PIECE, *(1.2 * least * period for least, period in zip(LEAST, usual, strict=True)))
+    length = max(PIECE, *(SPARE * least * period for least, period in zip(LEAST, usual, strict=True)))
     count = max(int(seconds / length), 1)
     places = np.linspace(float(log.t[0]), float(log.t[-1]) - length, max(2 * count - 1, 2))
     starts = places[1::2] if between else places[::2]

@@ -89,10 +89,10 @@ class Log:
         return float(np.median(np.diff(self.t)))
 
     @property
-    def fresh(self) -> Bools:
+    def after_gap(self) -> Bools:
         """Which rows (N,) follow a gap."""
-        fresh: Bools = np.diff(self.t, prepend=self.t[0]) > GAP * self.period
-        return fresh
+        after: Bools = np.diff(self.t, prepend=self.t[0]) > GAP * self.period
+        return after
 
     def command_rows(self, at: Array) -> NDArray[np.intp]:
         """The command row that counts at the times `at`, s, the first one before there is any; shape of `at`."""
