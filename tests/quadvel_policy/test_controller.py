@@ -455,5 +455,5 @@ def test_ctrl_c_twice_ends_the_process_with_exit_code_0(write_policy: Callable[.
         child.send_signal(signal.SIGINT)
         child.send_signal(signal.SIGINT)
         _, errors = child.communicate(timeout=60)
-    assert child.returncode == 0
+    assert child.returncode == 0, errors
     assert "Traceback" not in errors
