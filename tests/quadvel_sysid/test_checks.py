@@ -148,6 +148,16 @@ def test_a_log_that_would_mislead_is_refused(changes: dict[str, Any], sentence: 
         inspection.raise_refusal()
 
 
+@pytest.mark.parametrize("share", [0.02, 0.1])
+def test_a_strong_spring_at_one_joint_is_no_other_unit(share: float) -> None:
+    """It lets the torque answer the position error with a `share` of kp, and the command with all of it."""
+    given = fields()
+    error, angle = (given["q_des"] - given["q"])[:, 1], given["q"][:, 1] - given["q"][:, 1].mean()
+    spring = (1.0 - share) * KP * (error @ (error - error.mean())) / (error @ angle) * angle
+    tau = given["tau"] - np.outer(spring, np.arange(12) == 1)
+    assert said(inspect(log(tau=tau)), "refusal") == []
+
+
 def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
     t = fields()["t"]
     keep = ((t < 1.0) | (t > 1.3)) & (np.arange(2000) % 50 != 7)

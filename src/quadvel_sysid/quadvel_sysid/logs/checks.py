@@ -123,7 +123,8 @@ OF_RESPONSE = (
           f"in standard errors over pieces of {response.PIECE:g} s", f"0; {response.EARLY:g}", "refusal"),
     Check(response.deaf, "share of the torque, beside speed and friction, that the position error explains",
           f"{response.UNANSWERED:.0%}", "warning; on all joints a refusal"),
-    Check(response.scale, "gain that the torque shows over the one commanded", f"a factor of {response.FAR_OFF:g}",
+    Check(response.scale, "gain that the torque shows over the one commanded, of the position error and of the command alone",
+          f"a factor of {response.FAR_OFF:g}",
           "refusal where a unit or one joint explains it; else the gains are in a servo's own unit and are fitted, with a warning"),
 )  # fmt: skip
 """What is asked of logs with torque, in the rows under PD control."""

@@ -59,6 +59,7 @@ class Response:
     command: Array  # (J,), partial correlation with the own command at the best lag
     angle: Array  # (J,), partial correlation with the own angle beside it
     gain: Array  # (J,) N m/rad, of the position error
+    command_gain: Array  # (J,) N m/rad, of the command beside the angle: springs leave it as it is
     answer: Array  # (J,), share that the position error explains of what speed and friction leave
     errors: Array  # (L, R), squared errors over each joint's variance, summed over the joints
 
@@ -84,19 +85,19 @@ def measured(log: Log, reach: float = REACH) -> Response | None:
     at = [log.command_rows(log.t[row] - lag + ROUNDING) for lag in lags]
     near, joints = np.abs(lags) <= REACH + 1e-9, len(log.joints)
     left, errors = np.empty((len(lags), joints)), np.zeros((len(lags), len(row)))
-    found = np.empty((4, joints))
+    found = np.empty((5, joints))
     for j in range(joints):
         misses, found[:, j] = _of_joint(log, row, at, j, near)
         left[:, j] = misses.mean(axis=1)
         errors += misses
-    command, angle, gain, answer = found
-    return Response(log, row, lags, left, command, angle, gain, answer, errors)
+    command, angle, gain, command_gain, answer = found
+    return Response(log, row, lags, left, command, angle, gain, command_gain, answer, errors)
 
 
 def _of_joint(
     log: Log, row: NDArray[np.intp], at: Sequence[NDArray[np.intp]], j: int, near: Bools
-) -> tuple[Array, tuple[float, float, float, float]]:
-    """Squared errors (L, R) of joint `j`, and `command`, `angle`, `gain`, `answer` of `Response`.
+) -> tuple[Array, tuple[float, float, float, float, float]]:
+    """Squared errors (L, R) of joint `j`, and `command`, `angle`, `gain`, `command_gain`, `answer` of `Response`.
 
     `at` are the command rows of each lag, `near` the lags within REACH.
     """
@@ -116,9 +117,10 @@ def _of_joint(
     angle = float(other @ _residual(y, c[:, k]) / (np.linalg.norm(other) * np.linalg.norm(y) + 1e-12))
     error = c[:, k] - p
     gain = float(error @ y / (error @ error + 1e-12))
+    command_gain = float(beside @ of_c[:, k] / size[k] ** 2)
     answer = float((error @ y) ** 2 / ((error @ error) * (y @ y) + 1e-12))
     misses = (beside[:, None] - of_c * (beside @ of_c / size**2)) ** 2 / variance
-    return misses.T, (float(r[k]), angle, gain, answer if gain > 0.0 else 0.0)
+    return misses.T, (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
 
 
 def _motion(dq: Array) -> Array:
@@ -268,7 +270,7 @@ def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
     if not clear.any():
         return
     ratio = found.gain / np.where(asked > 0.0, asked, 1.0)
-    off = clear & (np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(FAR_OFF))
+    off = clear & _far(ratio) & _far(found.command_gain / np.where(asked > 0.0, asked, 1.0))
     if not off.any():
         return
     number, joints = float(np.median(ratio[off])), names(log, off)
@@ -284,6 +286,10 @@ def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
     )
     yield Finding("warning", "kp", joints, text)
     yield attrs.evolve(log, kp=None, kd=None)
+
+
+def _far(ratio: Array) -> Bools:
+    return np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(FAR_OFF)
 
 
 _UNITS_OF_TORQUE = (
