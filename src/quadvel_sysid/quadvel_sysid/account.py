@@ -12,6 +12,7 @@ from .criterion import LEVEL, PER_PARAMETER, WHITE_LEVEL, Comparison, Parts, nor
 from .fit import fit, profiled
 from .library import complexity
 from .model import Applied, Groups, Model
+from .parallel import side_by_side
 from .signals import Array
 
 _TINY = 1e-12  # N^2 m^2, of a log without noise
@@ -76,15 +77,28 @@ class Judge:
     parts: Parts
     noise: Array
     """variance of the torque's noise (J,), N^2 m^2"""
+    cores: int = 1
+    """that work side by side"""
 
     def fitted(self, model: Model) -> Account:
         """The model fitted to the rows for that."""
         return Account(fit(model, self.parts.fit), self)
 
+    def each_fitted(self, models: Sequence[Model]) -> list[Account]:
+        """Several models of the same samples, each fitted."""
+        if not models:
+            return []
+        found = side_by_side(
+            lambda k: fit(models[k], self.parts.fit), len(models), self.cores, models[0].samples
+        )
+        return [Account(one, self) for one in found]
+
     def profiled(self, account: Account) -> Account:
         """With its delays sought on a grid once more: what was added may have hidden the right ones."""
         return min(
-            account, Account(profiled(account.model, self.parts.fit), self), key=lambda one: one.criterion
+            account,
+            Account(profiled(account.model, self.parts.fit, self.cores), self),
+            key=lambda one: one.criterion,
         )
 
     def narrowed(self, every: Account, index: int) -> Account:

@@ -25,17 +25,18 @@ FITTED, FITTED_TERMS = 6, 4
 SIMPLIFIED = 3
 """Of these, the best, of which it is tried what their joints share"""
 LAWS, TERMS = "laws", "terms"
+_PORTION = 8
+"""Candidates that one core screens before it asks for more"""
 L = TypeVar("L", bound=EffectLaw)
+R = TypeVar("R")
 
 
 class Candidates:
     """The candidates on top of an account, fitted, the most promising first."""
 
-    def __init__(
-        self, before: Account, cores: int = 1, among: Collection[tuple[str, ...]] | None = None
-    ) -> None:
+    def __init__(self, before: Account, among: Collection[tuple[str, ...]] | None = None) -> None:
         """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
-        self._before, self._judge, self._cores, self._among = before, before.judge, cores, among
+        self._before, self._judge, self._among = before, before.judge, among
         self._context = Context(before.model, before.judge.parts, before.judge.noise)
         self._screen = Screen(self._context)
 
@@ -49,18 +50,28 @@ class Candidates:
     @cached_property
     def _laws(self) -> tuple[list[Account], int]:
         several = len(self._context.samples.joints) > 1
-        asked = (one for one in self._asked(library.laws(self._context)) if several or not one.gainlike)
-        found = list(self._screen.laws(asked))
+        asked = [one for one in self._asked(library.laws(self._context)) if several or not one.gainlike]
+        self._screen.prepare(any(one.remembers for one in asked))
+        found = self._screened(self._screen.laws, asked)
         count = len({one.law.name for one in found}) or 1
         return self._fitted(_distinct(best_first(found), FITTED)), count
 
     @cached_property
     def _terms(self) -> tuple[list[Account], int]:
-        found = list(self._screen.terms(self._asked(library.terms(self._context))))
+        asked = list(self._asked(library.terms(self._context)))
+        self._screen.prepare(any(one.remembers for one in asked))
+        found = self._screened(self._screen.terms, asked)
         best = _distinct(best_first(found), FITTED_TERMS)
-        finer = [self._refined(one) for one in best]
+        finer = self._side_by_side(lambda k: self._refined(best[k]), len(best))
         best += [one for one in finer if one not in best]
         return self._fitted(best), len({key(one.law) for one in found})
+
+    def _screened(
+        self, screen: Callable[[Sequence[L]], Iterable[Screened]], asked: Sequence[L]
+    ) -> list[Screened]:
+        parts = [asked[k : k + _PORTION] for k in range(0, len(asked), _PORTION)]
+        found = self._side_by_side(lambda k: list(screen(parts[k])), len(parts))
+        return [one for part in found for one in part]
 
     def _refined(self, one: Screened) -> Screened:
         """A term with its place and time constants where it promises most."""
@@ -74,13 +85,12 @@ class Candidates:
         return one
 
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
-        first = self._side_by_side(lambda k: self._fit(chosen[k]), len(chosen))
+        first = self._accounts(lambda k: self._fit(chosen[k]), len(chosen))
         first.sort(key=lambda one: one.criterion)
         best, others = first[:SIMPLIFIED], first[SIMPLIFIED:]
         last = len(self._context.model.applied)
         return (
-            self._side_by_side(lambda k: self._judge.tied(self._deeper(best[k]), last).model, len(best))
-            + others
+            self._accounts(lambda k: self._judge.tied(self._deeper(best[k]), last).model, len(best)) + others
         )
 
     def _deeper(self, account: Account) -> Account:
@@ -90,9 +100,11 @@ class Candidates:
         other = Account(from_nearby_delays(account.model, self._judge.parts.fit), self._judge)
         return min(account, other, key=lambda one: one.criterion)
 
-    def _side_by_side(self, work: Callable[[int], Model], count: int) -> list[Account]:
-        models = side_by_side(work, count, self._cores, self._context.samples)
-        return [Account(one, self._judge) for one in models]
+    def _accounts(self, work: Callable[[int], Model], count: int) -> list[Account]:
+        return [Account(one, self._judge) for one in self._side_by_side(work, count)]
+
+    def _side_by_side(self, work: Callable[[int], R], count: int) -> list[R]:
+        return side_by_side(work, count, self._judge.cores, self._context.samples)
 
     def _fit(self, one: Screened) -> Model:
         """The candidate fitted on all joints, or on those that it acts on, whichever is better."""

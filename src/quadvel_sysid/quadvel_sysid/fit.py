@@ -14,6 +14,7 @@ import numpy as np
 from scipy.linalg import solve
 
 from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
+from .parallel import side_by_side
 from .signals import Array, Bools
 
 _SETTLED = 2e-5
@@ -28,6 +29,7 @@ RIDGE = 1e-4
 
 def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) -> Model:
     """The model with its parameters fitted to `rows` (N, J)."""
+    samples, (model, rows) = model.samples, _alone(model, rows)
     unknowns = Unknowns.of(model, delays)
     error = squared_error(model, rows)
     for _ in range(iterations):
@@ -37,7 +39,15 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
         before, (model, error) = error, better
         if error > before * (1.0 - _SETTLED):
             break
-    return tidied(model)
+    return attrs.evolve(tidied(model), samples=samples)
+
+
+def _alone(model: Model, rows: Bools) -> tuple[Model, Bools]:
+    """The model on `rows` (N, J) alone, and which of these each joint has; on all rows where a law of it remembers some before."""
+    some: Bools = np.asarray(rows.any(axis=1))
+    if some.all() or any(one.law.remembers for one in model.applied):
+        return model, rows
+    return attrs.evolve(model, samples=model.samples.held(some)), rows[some]
 
 
 _SUMS = np.arange(-0.003, 0.0031, 0.0005)
@@ -59,46 +69,50 @@ _FACTORS = np.array([1.0, 0.8, 0.9, 0.95, 0.98, 0.99, 1.01, 1.02, 1.05, 1.1, 1.2
 """Times a parameter: the values around it that are tried"""
 
 
-def profiled(model: Model, rows: Bools) -> Model:
+def profiled(model: Model, rows: Bools, cores: int = 1) -> Model:
     """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
+    samples, (model, rows) = model.samples, _alone(model, rows)
     error = squared_error(model, rows)
     for _ in range(_PROFILES):
-        found = _around(model, rows)
+        found = _around(model, rows, cores)
         before, error = error, squared_error(found, rows)
         model = found if error < before else model
         if error > (1.0 - _DEEPER) * before:
             break
-    return model
+    return attrs.evolve(model, samples=samples)
 
 
 def from_nearby_delays(model: Model, rows: Bools) -> Model:
     """The model, or one that leaves less, fitted from input delays that are a millisecond or two off."""
+    samples, (model, rows) = model.samples, _alone(model, rows)
     found = _adapted(model, rows, product(_NEARBY, (0.0,)))
     tried = [model, *(fit(one, rows) for one in found[:1])]
-    return min(tried, key=lambda one: squared_error(one, rows))
+    return attrs.evolve(min(tried, key=lambda one: squared_error(one, rows)), samples=samples)
 
 
-def _around(model: Model, rows: Bools) -> Model:
+def _around(model: Model, rows: Bools, cores: int) -> Model:
     """The best fit from the points of the grid about the model's delays."""
     shifts = (*product(_SUMS, _OUTPUTS), *product(_FAR, (0.0,)))
-    deepest = _adapted(model, rows, shifts)[:_DEEPEST]
-    tried = [fit(_searched(one, rows), rows) for one in (model, *deepest)]
+    starts = [model, *_adapted(model, rows, shifts, cores)[:_DEEPEST]]
+    tried = side_by_side(lambda k: fit(_searched(starts[k], rows), rows), len(starts), cores, model.samples)
     return min(tried, key=lambda one: squared_error(one, rows))
 
 
-def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]]) -> list[Model]:
+def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], cores: int = 1) -> list[Model]:
     """The model at other delays, everything else adapted by a step, the best one first.
 
     shifts: changes (s) of the sum of both delays and of the output delay.
     """
     unknowns = Unknowns.of(model, delays=False)
-    found = []
-    for more, later in shifts:
-        delays = model.delays + np.array([[more - later], [later]])
-        if (delays >= -1e-9).all() and (delays <= LONGEST[:, None] + 1e-9).all():
-            at = model.with_delays(delays)
-            error = squared_error(at, rows)
-            found.append(_step(at, unknowns, rows, error) or (at, error))
+    every = [model.delays + np.array([[more - later], [later]]) for more, later in shifts]
+    within = [one for one in every if (one >= -1e-9).all() and (one <= LONGEST[:, None] + 1e-9).all()]
+
+    def adapted(k: int) -> tuple[Model, float]:
+        at = model.with_delays(within[k])
+        error = squared_error(at, rows)
+        return _step(at, unknowns, rows, error) or (at, error)
+
+    found = side_by_side(adapted, len(within), cores, model.samples)
     return [one for one, _ in sorted(found, key=lambda one: one[1])]
 
 

@@ -89,9 +89,9 @@ def identified(
     plain = _plain(reading)
     noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
     samples, rows = _searched(reading)
-    judge = Judge(reading.parts.taken(rows), noise)
+    judge = Judge(reading.parts.taken(rows), noise, cores)
     plain = attrs.evolve(plain, samples=samples)
-    search, before = Search(judge, tick, cores), judge.fitted(plain)
+    search, before = Search(judge, tick), judge.fitted(plain)
     best, of_laws = search.best(plain)
     progress(0.88, "intervals")
 

@@ -8,7 +8,7 @@ times the direction of motion, the speed or the torque. Terms stand for what no 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import attrs
@@ -45,6 +45,16 @@ _SIGNAL_COST, _WEIGHT_COST = 5.0, 0.1
 """In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
 
 
+@cache
+def _weights(count: int) -> tuple[Parameter, ...]:
+    return tuple(Parameter(name, "N m", -1e6, 1e6, 1.0) for name in _names(count))
+
+
+@cache
+def _names(count: int) -> tuple[str, ...]:
+    return tuple(f"w{k}" for k in range(count))
+
+
 @attrs.frozen(eq=False)
 class SignalTerm(AddedLaw):
     """A shape of a signal, times something, as a law that is linear in its weights."""
@@ -56,13 +66,22 @@ class SignalTerm(AddedLaw):
     joints: tuple[str, ...]
     _kept: dict[tuple[int, ...], tuple[Any, Array]] = attrs.field(factory=dict, init=False, repr=False)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """As it was made: the regressors that are kept are known by what lies in the memory of this process."""
+        made = {one.name: getattr(self, one.name) for one in attrs.fields(type(self)) if one.init}
+        return partial(type(self), **made), ()
+
     @property
     def settings(self) -> dict[str, Any]:
         return {"of": self.of, "times": self.times, "shape": repr(self.shape), "at": self.at}
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
-        return tuple(Parameter(f"w{k}", "N m", -1e6, 1e6, 1.0) for k in range(self.shape.count))
+        return _weights(self.shape.count)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return _names(self.shape.count)
 
     @property
     def linear(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -123,10 +142,14 @@ class SignalTerm(AddedLaw):
         return np.broadcast_to(found, (len(found), *s.q.shape))
 
     def torque(self, x: Array, s: Any, p: Params) -> Array:
-        weights = np.stack(
-            np.broadcast_arrays(*(p[name] for name in self.names)), axis=-2
-        )  # (K, J), or (B, 1, K, J)
-        columns = self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(one, s) for one in x])
+        each = [p[name] for name in self.names]
+        if any(one.ndim > 1 for one in each):
+            each = list(np.broadcast_arrays(*each))
+        weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
+        if x.ndim == 2 or not self.reads_total:
+            columns = self.regressors(x, s)
+        else:
+            columns = np.stack([self.regressors(one, s) for one in x])
         if columns.ndim == 3 and weights.ndim == 2:
             return np.einsum("kj,knj->nj", weights, columns)
         batch: Array = np.einsum("...kj,...knj->...nj", weights.reshape(-1, *weights.shape[-2:]), columns)

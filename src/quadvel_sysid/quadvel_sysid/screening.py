@@ -81,6 +81,11 @@ class Screen:
             self._spots[whole] = [_Spot(self, at, whole) for at in (model, *around)]
         return self._spots[whole]
 
+    def prepare(self, whole: bool) -> None:
+        """Do now what all candidates need, those that are followed over all rows among them if `whole`."""
+        self.grid(whole)
+        self.bare  # noqa: B018
+
     @cached_property
     def bare(self) -> Array:
         """Squared error (J,) of the model without a candidate, at its best delays."""

@@ -34,8 +34,8 @@ Tick = Callable[[str], None]
 class Search:
     """Searches on one set of data."""
 
-    def __init__(self, judge: Judge, tick: Tick = lambda text: None, cores: int = 1) -> None:
-        self.judge, self._tick, self._cores = judge, tick, cores
+    def __init__(self, judge: Judge, tick: Tick = lambda text: None) -> None:
+        self.judge, self._tick = judge, tick
         self.rejected: dict[str, tuple[float, str]] = {}
         self._tried = 1
         self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
@@ -157,7 +157,7 @@ class Search:
         """The candidates on top of an account; kept, as several searches come by."""
         model = _described(before.model)
         if model not in self._known:
-            self._known[model] = Candidates(before, self._cores)
+            self._known[model] = Candidates(before)
         return self._known[model]
 
     def _candidates(self, before: Account, kinds: str) -> list[Account]:
@@ -175,7 +175,7 @@ class Search:
                 found.append(attrs.evolve(model, gain_groups=groups))
             if finer > len(np.unique(model.delay_groups)):
                 found.append(attrs.evolve(model, delay_groups=groups))
-        return [self.judge.fitted(one) for one in found]
+        return self.judge.each_fitted(found)
 
     def _floated(self, account: Account, kinds: str) -> Account:
         """The account after drops, and swaps while its residual is not white, that lessen the criterion."""
@@ -190,7 +190,8 @@ class Search:
     def dropped(self, account: Account) -> Account:
         """Without the effects that the others made needless (backward elimination)."""
         while len(account.model.applied) > 1:
-            every = [self.judge.fitted(account.model.without(k)) for k in range(len(account.model.applied))]
+            model = account.model
+            every = self.judge.each_fitted([model.without(k) for k in range(len(model.applied))])
             least = min(every, key=lambda one: one.criterion)
             if self._needed(least, account):
                 return account
@@ -212,7 +213,7 @@ class Search:
             if not names:
                 continue
             rest = self.judge.fitted(account.model.without(k))
-            pool = Candidates(rest, self._cores, names)
+            pool = Candidates(rest, names)
             for other in pool.found(kinds)[0]:
                 if other.criterion < account.criterion - PER_PARAMETER:
                     return other
@@ -227,7 +228,7 @@ class Search:
         for signal in {one for one in signals if signals.count(one) > 1}:
             kept = tuple(one for one in account.model.applied if one.law.signal != signal)
             rest = self.judge.fitted(attrs.evolve(account.model, applied=kept))
-            every = [account, *Candidates(rest, self._cores, {(signal,)}).found(TERMS)[0]]
+            every = [account, *Candidates(rest, {(signal,)}).found(TERMS)[0]]
             account = min(every, key=lambda one: one.criterion)
         return account
 
@@ -238,7 +239,7 @@ class Search:
             return ()
         rest = self.judge.fitted(account.model.without(index))
         alone = len(account.model.applied) == 1
-        pool = self._pool(rest) if alone else Candidates(rest, self._cores, self._near.get(key(one), set()))
+        pool = self._pool(rest) if alone else Candidates(rest, self._near.get(key(one), set()))
         found = []
         for other in pool.found(LAWS)[0]:
             lost = account.against(other)

@@ -155,6 +155,7 @@ class Samples:
         self.row = np.arange(len(self.t))
         self.early = np.zeros(len(self.t))  # s, how much before the row of the log
         self._finer: Samples | None = None
+        self._held: dict[bytes, Samples] = {}
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._first_row = np.cumsum([0, *lengths])
         self._constant = _constant([one.all for one in self.logs])
@@ -201,18 +202,26 @@ class Samples:
             self._finer = part
         return self._finer
 
+    def held(self, rows: Bools) -> Samples:
+        """The rows (N,) that are true, alone; made but once, as fits come by again and again."""
+        key = rows.tobytes()
+        if key not in self._held:
+            self._held[key] = self.taken(np.flatnonzero(rows))
+        return self._held[key]
+
     def taken(self, rows: NDArray[np.intp]) -> Samples:
         """These rows alone; `dt` and `start` are those they had."""
         part = copy(self)
         for name in _OF_ROWS:
             setattr(part, name, getattr(self, name)[rows])
-        part._cache, part._states, part._finer = {}, {}, None
+        part._cache, part._states, part._finer, part._held = {}, {}, None, {}
         return part
 
     def at(self, input_delay: Array | float, output_delay: Array | float, window: float) -> Signals:
         """The signals (N, J) with delays (s) of all joints, or of each, (J,)."""
         delays = np.broadcast_arrays(np.atleast_1d(input_delay), np.atleast_1d(output_delay))
-        pairs = [(round(float(a), 7), round(float(b), 7)) for a, b in zip(*delays, strict=True)]
+        early, late = np.round(delays, 7).tolist()
+        pairs = list(zip(early, late, strict=True))
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
         return self._kept(
