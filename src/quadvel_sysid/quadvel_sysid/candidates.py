@@ -38,7 +38,6 @@ class Candidates:
         """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
         self._before, self._judge, self._among = before, before.judge, among
         self._context = Context(before.model, before.judge.parts, before.judge.noise)
-        self._screen = Screen(self._context)
 
     def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
         return (one for one in candidates if self._among is None or key(one) in self._among)
@@ -51,18 +50,20 @@ class Candidates:
     def _laws(self) -> tuple[list[Account], int]:
         several = len(self._context.samples.joints) > 1
         asked = [one for one in self._asked(library.laws(self._context)) if several or not one.gainlike]
-        self._screen.prepare(any(one.remembers for one in asked))
-        found = self._screened(self._screen.laws, asked)
+        screen = Screen(self._context)
+        screen.prepare(any(one.remembers for one in asked))
+        found = self._screened(screen.laws, asked)
         count = len({one.law.name for one in found}) or 1
         return self._fitted(_distinct(best_first(found), FITTED)), count
 
     @cached_property
     def _terms(self) -> tuple[list[Account], int]:
         asked = list(self._asked(library.terms(self._context)))
-        self._screen.prepare(any(one.remembers for one in asked))
-        found = self._screened(self._screen.terms, asked)
+        screen = Screen(self._context)
+        screen.prepare(any(one.remembers for one in asked))
+        found = self._screened(screen.terms, asked)
         best = _distinct(best_first(found), FITTED_TERMS)
-        finer = self._side_by_side(lambda k: self._refined(best[k]), len(best))
+        finer = self._side_by_side(lambda k: _refined(best[k], screen), len(best))
         best += [one for one in finer if one not in best]
         return self._fitted(best), len({key(one.law) for one in found})
 
@@ -72,17 +73,6 @@ class Candidates:
         parts = [asked[k : k + _PORTION] for k in range(0, len(asked), _PORTION)]
         found = self._side_by_side(lambda k: list(screen(parts[k])), len(parts))
         return [one for part in found for one in part]
-
-    def _refined(self, one: Screened) -> Screened:
-        """A term with its place and time constants where it promises most."""
-        for _ in range(3):
-            assert isinstance(one.law, SignalTerm)
-            near = self._screen.terms(library.refined(one.law))
-            better = max(near, key=lambda other: other.promise, default=one)
-            if better.promise <= one.promise:
-                break
-            one = better
-        return one
 
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
         first = self._accounts(lambda k: self._fit(chosen[k]), len(chosen))
@@ -117,6 +107,18 @@ class Candidates:
         starts = [model, near] if law.shifts or law.gainlike else [model]
         every = min((judge.fitted(start) for start in starts), key=lambda one: one.criterion)
         return judge.narrowed(every, len(every.model.applied) - 1).model
+
+
+def _refined(one: Screened, screen: Screen) -> Screened:
+    """A term with its place and time constants where it promises most."""
+    for _ in range(3):
+        assert isinstance(one.law, SignalTerm)
+        near = screen.terms(library.refined(one.law))
+        better = max(near, key=lambda other: other.promise, default=one)
+        if better.promise <= one.promise:
+            break
+        one = better
+    return one
 
 
 def key(law: EffectLaw) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ times the direction of motion, the speed or the torque. Terms stand for what no 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from functools import cache, cached_property, partial
+from functools import cache, cached_property
 from typing import Any
 
 import attrs
@@ -36,8 +36,10 @@ from .lost_commands import lost_commands
 from .model import Applied, Model
 from .signals import Array, Bools, Signals
 
-_KEPT = 4
-"""Sets of a term's regressors that are kept"""
+_KEPT = 12
+"""Sets of regressors of terms that are kept"""
+_kept: dict[tuple[Any, ...], tuple[Shape, Signals, Array]] = {}
+"""Such sets, the latest used last; what a key names by where it lies in memory is held beside them."""
 _COMMANDED = "q_des", "error", "tau"
 _PAST_COST = 0.5
 """Further cost, in parameters, of a law with a memory or that resembles a delay: decides between laws that explain the same"""
@@ -64,12 +66,6 @@ class SignalTerm(AddedLaw):
     times: str
     shape: Shape
     joints: tuple[str, ...]
-    _kept: dict[tuple[int, ...], tuple[Any, Array]] = attrs.field(factory=dict, init=False, repr=False)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """As it was made: the regressors that are kept are known by what lies in the memory of this process."""
-        made = {one.name: getattr(self, one.name) for one in attrs.fields(type(self)) if one.init}
-        return partial(type(self), **made), ()
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -126,12 +122,12 @@ class SignalTerm(AddedLaw):
         """What its weights are factors of, (K, N, J); the latest are kept where they hang on signals alone."""
         if self.reads_total or self.of.endswith("ddq"):
             return self._regressors(x, s)
-        key = id(s.q), id(s.dq), id(s.q_des)
-        if key not in self._kept:
-            if len(self._kept) >= _KEPT:
-                self._kept.pop(next(iter(self._kept)))
-            self._kept[key] = (s, self._regressors(x, s))
-        return self._kept[key][1]
+        key = self.of, self.times, id(self.shape), id(s.q), id(s.dq), id(s.q_des)
+        found = _kept.pop(key, None) or (self.shape, s, self._regressors(x, s))
+        _kept[key] = found
+        if len(_kept) > _KEPT:
+            del _kept[next(iter(_kept))]
+        return found[2]
 
     def _regressors(self, x: Array, s: Signals) -> Array:
         view = _past_only(s) if self.of.endswith("ddq") else s
