@@ -3,7 +3,7 @@
 import json
 import os
 import signal
-from concurrent.futures.process import BrokenProcessPool
+import time
 
 import attrs
 import pytest
@@ -11,7 +11,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
-from quadvel_sysid.parallel import side_by_side
+from quadvel_sysid.parallel import HelperError, side_by_side
 from quadvel_sysid.signals import Samples
 
 
@@ -27,11 +27,32 @@ def test_answers_are_those_of_one_core_and_name_the_samples_that_are_here(sample
         assert all(one is samples for _, one in found)
 
 
-def test_an_error_of_the_work_and_the_end_of_a_worker_come_out(samples):
-    with pytest.raises(ZeroDivisionError):
-        side_by_side(lambda k: 1 // k, 2, 2, samples)
-    with pytest.raises(BrokenProcessPool):
-        side_by_side(lambda k: os.kill(os.getpid(), signal.SIGKILL), 2, 2, samples)
+def of_the_helper(act):
+    """Work that only waits in this process, until the helper has acted."""
+    here = os.getpid()
+    return lambda k: time.sleep(0.5) if os.getpid() == here else act(k)
+
+
+def test_an_error_of_the_work_and_the_end_of_a_helper_come_out(samples):
+    for work in (lambda k: 1 // 0, of_the_helper(lambda k: 1 // 0)):
+        with pytest.raises(ZeroDivisionError):
+            side_by_side(work, 4, 2, samples)
+    with pytest.raises(HelperError, match="killed"):
+        side_by_side(of_the_helper(lambda k: os.kill(os.getpid(), signal.SIGKILL)), 4, 2, samples)
+
+
+def test_a_helper_ends_with_the_work_that_was_broken_off(samples):
+    def work(k):
+        if os.getpid() == here:
+            raise KeyboardInterrupt
+        time.sleep(60.0)
+
+    here, begun = os.getpid(), time.monotonic()
+    with pytest.raises(KeyboardInterrupt):
+        side_by_side(work, 4, 2, samples)
+    assert time.monotonic() - begun < 5.0
+    with pytest.raises(ChildProcessError):
+        os.waitpid(-1, os.WNOHANG)
 
 
 def test_the_report_of_two_cores_is_that_of_one():
