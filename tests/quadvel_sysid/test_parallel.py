@@ -11,7 +11,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
-from quadvel_sysid.parallel import HelperError, side_by_side
+from quadvel_sysid.parallel import side_by_side
 from quadvel_sysid.signals import Samples
 
 
@@ -37,7 +37,7 @@ def test_an_error_of_the_work_and_the_end_of_a_helper_come_out(samples):
     for work in (lambda k: 1 // 0, of_the_helper(lambda k: 1 // 0)):
         with pytest.raises(ZeroDivisionError):
             side_by_side(work, 4, 2, samples)
-    with pytest.raises(HelperError, match="killed"):
+    with pytest.raises(ChildProcessError, match="killed"):
         side_by_side(of_the_helper(lambda k: os.kill(os.getpid(), signal.SIGKILL)), 4, 2, samples)
 
 

@@ -25,14 +25,10 @@ _MOST = 2048
 """Pieces of work: as many numbers of two bytes as a pipe of one page holds"""
 
 
-class HelperError(RuntimeError):
-    """A helper ended without a word: killed, or out of memory."""
-
-
 def side_by_side(work: Callable[[int], R], count: int, cores: int, samples: Samples) -> list[R]:
     """What the work gives for each of the numbers below `count`; it may hold `samples`, and no others.
 
-    This process works as well. Raises what the work raises, and HelperError.
+    This process works as well. Raises what the work raises, and ChildProcessError where a helper was killed.
     """
     if cores < 2 or count < 2:
         return [work(k) for k in range(count)]
@@ -86,7 +82,7 @@ class _Helper:
         """Its answers by number. Waits for them."""
         answer = self._answer.read()
         if not answer:
-            raise HelperError("a process that helps to identify was killed; is memory short?")
+            raise ChildProcessError("a process that helps to identify was killed; is memory short?")
         found = _Unpickler(io.BytesIO(answer), self._samples).load()
         if isinstance(found, Exception):
             raise found
