@@ -14,7 +14,7 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
-from .account import Account, Judge, groupings, parameter_count
+from .account import Account, Judge, groupings
 from .candidates import LAWS, TERMS, Candidates, key
 from .criterion import LEVEL, PER_PARAMETER, WORTH
 from .library import SignalTerm
@@ -63,7 +63,7 @@ class Search:
         if laws.white or not terms.white or laws.criterion < terms.criterion:
             laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
             accounts += [laws, self.merged(laws)]
-            accounts += [] if laws.white else [self.run(laws, TERMS)]
+            accounts += [] if laws.white else [self.run(laws, TERMS, bound=terms.criterion)]
         least = min(one.criterion for one in accounts)
         alike = [one for one in accounts if one.criterion < least + TIE * len(self.judge.noise)]
         return self.simplified(min(alike, key=_terms)), laws
@@ -102,14 +102,18 @@ class Search:
         return account if self._needed(other, account) else other
 
     def run(self, best: Account, kinds: str, most: int = MOST, bound: float = np.inf) -> Account:
-        """The account with candidates of these kinds added while it pays and might come below `bound`."""
+        """The account with candidates of these kinds added while it pays and may come below `bound`.
+
+        Effects are taken to gain less one by one, so that what the last one gained tells how far the others may get.
+        """
         while len(best.model.applied) < most and not best.white:
             self._tick(f"effect {len(best.model.applied) + 1}")
-            more = self._added(best, kinds)
+            before, more = best, self._added(best, kinds)
             if more is None:
                 break
             best = self.judge.profiled(self._floated(more, kinds))
-            if PER_PARAMETER * parameter_count(best.model) > bound:
+            gained, left = before.criterion - best.criterion, most - len(best.model.applied)
+            if best.criterion - left * gained > bound:
                 break
         return best
 
