@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from quadvel_nodes.scheduling import Scheduling
+from quadvel_nodes.scheduling import SLICE, Scheduling, slice_of
 
 APPLY = """
 import os, threading, time
@@ -69,6 +69,18 @@ def test_a_thread_that_pauses_keeps_its_priority() -> None:
 def test_without_being_asked_nothing_has_a_priority() -> None:
     assert Scheduling().realtime_priority == 0
     assert all(line.startswith(f"{os.SCHED_OTHER} 0 ") for line in lines(0))
+
+
+def test_threads_ask_for_a_short_slice_and_those_that_they_start_do_so_too() -> None:
+    if not slice_of(0):
+        pytest.skip("the kernel gives all threads the same slice, as before Linux 6.12")
+    code = APPLY.format(priority=0, cpus="", spin=0.0, pause=0.0)
+    code = code.replace(
+        "def scheduled(thread):", "from quadvel_nodes.scheduling import slice_of\ndef scheduled(thread):"
+    )
+    code = code.replace("return policy,", "return slice_of(thread), policy,")
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert [line.split()[0] for line in result.stdout.splitlines()] == [str(SLICE)] * 4
 
 
 def test_every_thread_stays_on_the_cores_that_were_chosen() -> None:
