@@ -1,8 +1,8 @@
-"""One floating forward search for the effects that a log shows: add, swap, drop.
+"""One floating forward search for the effects that a log shows: add, drop, tie.
 
 Candidates are screened on top of the model so far, the most promising are fitted with everything else, and the one with
-the least criterion on the rows that select is added if it passes the test. After each step every earlier effect is held
-against the alternatives beside the others (swap), and left out (drop), as long as the criterion falls.
+the least criterion on the rows that select is added if it passes the test. After each step effects that the others made
+needless are left out. In the end it is tried what joints share.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from quadvel_actuator.effects import EffectLaw
 
 from .account import Account, Judge, groupings
 from .candidates import LAWS, TERMS, Candidates, key
-from .criterion import LEVEL, PER_PARAMETER, WORTH
+from .criterion import LEVEL, WORTH
 from .library import SignalTerm
 from .model import Applied, Model
 from .signals import Array
@@ -24,7 +24,7 @@ from .signals import Array
 MOST = 5
 """Effects of one log at most"""
 NEAR = 0.5
-"""Of the best candidate's worth: what is worth so much is its rival, and tried in its place once more is known"""
+"""Of the best candidate's worth: what is worth so much is its rival, which may say the same"""
 TIE = 0.02
 """Of a joint's error: laws whose errors differ by less cannot be told apart"""
 
@@ -111,7 +111,7 @@ class Search:
             before, more = best, self._added(best, kinds)
             if more is None:
                 break
-            best = self.judge.profiled(self._floated(more, kinds))
+            best = self.judge.profiled(self.dropped(more))
             gained, left = before.criterion - best.criterion, most - len(best.model.applied)
             if best.criterion - left * gained > bound:
                 break
@@ -131,7 +131,7 @@ class Search:
         return None
 
     def _note_rivals(self, before: Account, candidates: Sequence[Account]) -> None:
-        """Keep in mind what is worth nearly as much as the best candidate: it may be right beside what comes later."""
+        """Keep in mind what is worth nearly as much as the best candidate: it may say the same."""
         fall = [before.criterion - one.criterion for one in candidates]
         if fall:
             near = {
@@ -181,16 +181,6 @@ class Search:
                 found.append(attrs.evolve(model, delay_groups=groups))
         return self.judge.each_fitted(found)
 
-    def _floated(self, account: Account, kinds: str) -> Account:
-        """The account after drops, and swaps while its residual is not white, that lessen the criterion."""
-        for _ in range(MOST):
-            before = account
-            account = self.dropped(account)
-            account = account if account.white else self._swapped(account, kinds)
-            if account is before:
-                return account
-        return account
-
     def dropped(self, account: Account) -> Account:
         """Without the effects that the others made needless (backward elimination)."""
         while len(account.model.applied) > 1:
@@ -206,22 +196,6 @@ class Search:
         found = account.against(without)
         worth = float(np.max(found.share))
         return account.criterion < without.criterion and worth > WORTH and found.p < LEVEL
-
-    def _swapped(self, account: Account, kinds: str) -> Account:
-        """With one effect in another's place, if that lessens the criterion."""
-        if len(account.model.applied) < 2:
-            return account
-        for k in range(len(account.model.applied) - 1):
-            one = account.model.applied[k].law
-            names = {name for name in self._near.get(key(one), ()) if name != key(one)}
-            if not names:
-                continue
-            rest = self.judge.fitted(account.model.without(k))
-            pool = Candidates(rest, names)
-            for other in pool.found(kinds)[0]:
-                if other.criterion < account.criterion - PER_PARAMETER:
-                    return other
-        return account
 
     def merged(self, account: Account) -> Account:
         """With a curve over a signal in the place of several laws of that signal, if that lessens the criterion.
