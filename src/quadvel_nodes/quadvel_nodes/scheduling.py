@@ -21,7 +21,7 @@ BUSY = 0.9
 """share of LOOK that a thread computed, from which on it counts as one that does not pause"""
 SLICE = 100_000
 """ns, the shortest that there is: a thread that asks for so little of a core at once is let in before those that ask for
-more. Where two programs compute without a pause beside it, one wake-up in a hundred is then 0.2 ms late instead of 4."""
+more, such as programs that compute without a pause beside it."""
 LAST_RESORT = 1_000_000
 """us of computing without a pause after which the kernel ends the process: the watchdog could not run"""
 
