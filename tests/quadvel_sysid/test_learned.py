@@ -4,6 +4,7 @@ import attrs
 import numpy as np
 import odd_joints
 import pytest
+from simulated_joints import parameters, record
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_sysid.identify import identify
@@ -34,6 +35,19 @@ def test_the_signal_behind_an_odd_effect_is_named_and_most_of_its_error_goes(nam
     before, after = (report[word]["heldout_mse"] for word in ("before", "after"))
     assert before - after > 0.8 * (before - VARIANCE)
     assert set(report["unexplained"]["joints"]) >= {odd_joints.NAMES[j] for j in odd.joints}
+
+
+def test_rare_blows_that_no_signal_foretells_are_not_passed_over_as_noise():
+    log = record(parameters(joints=2), 2, 4.0, 500, seed=4)
+    rng = np.random.default_rng(0)
+    tau = log.tau.copy()
+    tau[rng.choice(len(tau), 12, replace=False), 1] += rng.choice([-8.0, 8.0], 12)
+    report = identify([attrs.evolve(log, tau=tau)]).report
+    assert report["effects"] == []
+    assert report["unexplained"]["verdict"] == "structured"
+    assert report["unexplained"]["depends_on"] == []
+    assert report["unexplained"]["joints"] == [log.joints[1]]
+    assert "goes with no signal of the log" in report["decision"]
 
 
 def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):

@@ -7,6 +7,8 @@ from typing import Any
 
 from quadvel_actuator.effects.terms import NAME as TERMS
 
+UNTRACED = "it goes with no signal of the log, whose cause may be too rare in what is fitted"
+"""Of what a model leaves that is not white"""
 _LESS = 0.9
 """Of the error before, from which gains and delays of each joint are worth a word."""
 
@@ -25,7 +27,8 @@ def _nothing_added(report: Mapping[str, Any]) -> str:
     rest = report["unexplained"]
     if rest["verdict"] != "white":
         signals = ", ".join(rest["depends_on"])
-        return f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: it depends on {signals}."
+        why = f"it depends on {signals}" if signals else UNTRACED
+        return f"No effect is added, but what the EAM leaves ({before:.3g} N^2 m^2) is not white: {why}."
     floor = f"(noise floor {report['noise_floor']:.3g}), and no effect is added."
     if after < _LESS * before:
         return (

@@ -173,7 +173,7 @@ def _outcome(
     asked[1] = 0.0 if samples.undamped else 1.0
     ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
-        late[0], before_whole, late[1], whole, effects, rejected, leaning,
+        late[0], before_whole, late[1], whole, effects, rejected, account.white, leaning,
         intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
         *reference_gains(samples), base,
     )  # fmt: skip

@@ -13,7 +13,7 @@ from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
 from .confidence import Intervals
-from .criterion import LEVEL, WHITE_LEVEL, Parts, whiteness
+from .criterion import LEVEL, WHITE_LEVEL, Parts, normality, whiteness
 from .decision import decision
 from .delays import running_delays
 from .identification import Identification, Shape, Trace
@@ -63,6 +63,8 @@ class Outcome:
     effects: tuple[Chosen, ...]
     rejected: tuple[tuple[str, float, str], ...]
     """law, gain on the rows that select, reason"""
+    white: bool
+    """is what is left nothing but noise?"""
     leaning: tuple[str, ...]
     """the signals that what is left goes with most, where it is not white and no term says more of it"""
     widths: Intervals
@@ -145,11 +147,12 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
     """What no law explains: terms of named signals, or a residual that is not white."""
     parts, samples = o.parts, o.model.samples
     left = samples.tau - o.model.predict()
-    coloured = whiteness(left, parts.every, samples.start, parts.overlap) < WHITE_LEVEL
+    p = np.minimum(whiteness(left, parts.every, samples.start, parts.overlap), normality(left, parts.every))
+    coloured = p < WHITE_LEVEL
     names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
     joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
     removable = before - floor
-    structured = bool(names) or bool(o.leaning)
+    structured = bool(names) or not o.white
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))

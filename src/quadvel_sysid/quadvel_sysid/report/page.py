@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..decision import UNTRACED
 from ..excitation import propose
 from ..identification import Identification
 from . import figures
@@ -320,6 +321,8 @@ def _unexplained(report: Mapping[str, Any]) -> str:
         text += (
             f" Beyond the effects of the registry it depends on {signals}{f' at {where}' if where else ''}."
         )
+    elif rest["verdict"] != "white":
+        text += f" {UNTRACED.capitalize()}."
     text += "</p>"
     learned = next((e for e in report["effects"] if e["name"] == "learned_residual"), None)
     if learned:
