@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -69,6 +70,7 @@ def no_node_outlives_its_context(monkeypatch: pytest.MonkeyPatch) -> Iterator[No
     if kind is not None:
         begin = kind.__init__
 
+        @wraps(begin)
         def remember(node: Any, *args: Any, **named: Any) -> None:
             begin(node, *args, **named)
             made.append(node)
