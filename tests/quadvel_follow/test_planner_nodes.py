@@ -19,6 +19,7 @@ from std_msgs.msg import String
 
 from quadvel_follow.follow_planner_node import FollowPlannerNode
 from quadvel_follow.trajectory_planner import TrajectoryPlanner
+from quadvel_msgs.msg import ControllerState
 
 RECEIVED = {
     "cmd_vel_follow": Twist,
@@ -116,6 +117,24 @@ def test_a_person_ahead_is_approached_and_without_scans_the_robot_stops(begin: C
     assert 0.2 < way.poses[-1].pose.position.x < 2.0
     peer.wait(lambda: peer.speeds("cmd_vel_follow")[-1] == 0.0, lambda: peer.send_all(scan=False))
     assert peer.heard["follow_planner/state"][-1].data == "blind: the scan is silent"
+
+
+def test_a_robot_that_does_not_walk_yet_is_commanded_zero_and_followed_once_it_does(
+    begin: Callable[..., Peer],
+) -> None:
+    peer = begin(FollowPlannerNode)
+    controller = peer.node.create_publisher(ControllerState, "controller/state", 1)
+    refusal = "a zero velocity has to be commanded first"
+
+    def send() -> None:
+        controller.publish(ControllerState(walk_refusal=refusal, walk_allowed=not refusal))
+        peer.send_all()
+
+    state = peer.heard["follow_planner/state"]
+    peer.wait(lambda: state[-1:] and state[-1].data == f"waiting: the robot does not walk: {refusal}", send)
+    assert set(peer.speeds("cmd_vel_follow")) == {0.0}
+    refusal = ""
+    peer.wait(lambda: peer.speeds("cmd_vel_follow")[-1] > 0.5, send)
 
 
 def test_before_anything_is_heard_the_follower_commands_zero_and_says_why(begin: Callable[..., Peer]) -> None:

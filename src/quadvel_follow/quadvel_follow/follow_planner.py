@@ -106,6 +106,9 @@ class FollowConfig:
     scan_timeout: float = _described(0.2, "silence of the scan after which the robot stops, s")
     odom_timeout: float = _described(0.2, "silence of the odometry after which the robot stops, s")
     person_timeout: float = _described(0.2, "silence about the person after which it is lost, s")
+    robot_timeout: float = _described(
+        0.5, "silence of the controller after which what it last refused no longer counts, s"
+    )
 
 
 @attrs.frozen
@@ -148,6 +151,7 @@ class FollowPlanner:
         self._odometry: _Heard | None = None
         self._person: _Heard | None = None
         self._deviation = 0.0  # m, of its position
+        self._refusal: _Heard | None = None
         self._others: _Heard | None = None
         self._command = np.zeros(3)
         self._rate = np.zeros(3)  # of the command
@@ -202,6 +206,10 @@ class FollowPlanner:
         if deviation < SURE:
             self._trail.add(found[:2])
 
+    def on_robot(self, now: float, refusal: str) -> None:
+        """Why the robot follows no velocity, a sentence; empty where it does. Who never hears of it takes it to follow."""
+        self._refusal = _Heard(now, now, refusal)
+
     def on_others(self, now: float, stamp: float, persons: ArrayLike) -> None:
         """Everybody else, (n, 4) as in `on_person`; the person to follow may be among them. Raises ValueError if not finite."""
         self._others = _Heard(now, stamp, _persons(persons))
@@ -232,6 +240,10 @@ class FollowPlanner:
         ):
             if heard is None or not 0.0 <= now - heard.now <= timeout:
                 return State.BLIND, f"the {what} is silent" if heard else f"there was no {what} yet"
+        refusal = self._refusal
+        if refusal and refusal.value and 0.0 <= now - refusal.now <= config.robot_timeout:
+            self._lost, self._turned = np.inf, None
+            return State.WAITING, f"the robot does not walk: {refusal.value}"
         if self._person is None:
             return State.WAITING, "nobody is meant"
         if 0.0 <= now - self._person.now <= config.person_timeout:

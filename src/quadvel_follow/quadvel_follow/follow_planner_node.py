@@ -13,7 +13,7 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import String
 
-from quadvel_msgs.msg import Persons
+from quadvel_msgs.msg import ControllerState, Persons
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, seconds
 from quadvel_nodes.node import read_parameters, run
@@ -42,6 +42,7 @@ class FollowPlannerNode(Node):
         self.create_subscription(Odometry, "odom", self._on_odom, qos_profile_sensor_data)
         self.create_subscription(Odometry, "person/odometry", self._on_person, 10)
         self.create_subscription(Persons, "persons", self._on_persons, 10)
+        self.create_subscription(ControllerState, "controller/state", self._on_robot, 1)
         self.create_timer(PERIOD, self._step)
         self.create_timer(1.0, self._report)
 
@@ -87,6 +88,9 @@ class FollowPlannerNode(Node):
             self._planner.on_others(self._now(), seconds(message.header.stamp), persons)
         except ValueError as error:
             self._refusals.add("persons", MessageError(str(error)))
+
+    def _on_robot(self, message: Any) -> None:
+        self._planner.on_robot(self._now(), message.walk_refusal)
 
     def _step(self) -> None:
         self._plan = plan = self._planner.step(self._now())
