@@ -94,12 +94,12 @@ _CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
 """The numbers of the system calls sched_setattr and sched_getattr, for which the C library has no name yet"""
 
 
-def ask_for_slice(thread: int, nanoseconds: int = SLICE) -> None:
-    """Ask that `thread` gets a core for so long at once, and the sooner for it, where it has no real-time priority."""
+def ask_for_slice(thread: int) -> None:
+    """Ask that `thread` gets a core for no more than SLICE at once, and the sooner for it, where it has no real-time priority."""
     write, _ = _CALLS.get(platform.machine(), (0, 0))
     attributes = _attributes(thread)
     if attributes is not None and attributes.policy in (os.SCHED_OTHER, os.SCHED_BATCH):
-        attributes.runtime = nanoseconds
+        attributes.runtime = SLICE
         ctypes.CDLL(None).syscall(write, thread, ctypes.byref(attributes), 0)
 
 
