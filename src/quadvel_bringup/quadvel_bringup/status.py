@@ -24,7 +24,9 @@ from .orders import WAY_OUT
 from .session import PATIENCE, Session
 
 LISTEN = 2.2
-"""s, since another node was found: each reports once a second"""
+"""s at least: each node reports once a second"""
+LOOP = {"command_mux", "controller", "estimator"}
+"""The nodes without which no robot walks; they are waited for, as a middleware may find some of them seconds after others"""
 HEARD = {
     "/diagnostics": DiagnosticArray,
     "controller/state": ControllerState,
@@ -79,13 +81,16 @@ def look() -> dict[str, Node]:
 
 
 def _hear_all(session: Session, heard: deque[Any]) -> None:
-    """Listen until each node that publishes /diagnostics has reported; on a busy machine some are found late."""
-    session.spin_until(lambda: heard, PATIENCE)
-    known = 0
-    while known < (now := session.node.count_publishers("/diagnostics")):
-        known = now
-        session.spin(LISTEN)
-    session.spin_until(lambda: len(reported(heard)) >= known, LISTEN)
+    """Listen until the control loop's nodes and all others that publish /diagnostics have reported, or are waited for in vain."""
+    if not session.spin_until(lambda: heard, PATIENCE):
+        return
+
+    def complete() -> bool:
+        nodes = reported(heard)
+        return nodes.keys() >= LOOP and len(nodes) >= session.node.count_publishers("/diagnostics")
+
+    session.spin(LISTEN)
+    session.spin_until(complete, PATIENCE)
 
 
 def reported(arrays: deque[Any]) -> dict[str, Node]:
