@@ -40,7 +40,8 @@ def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_wa
     with subprocess.Popen(
         [sys.executable, "-c", ROBOT], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as robot:
-        assert robot.stdin is not None and robot.stdout is not None
+        assert robot.stdin is not None
+        assert robot.stdout is not None
         robot.stdout.readline()
         nodes = look()
         robot.stdin.close()
