@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
-from quadvel_sysid import lost_commands
+from quadvel_sysid import library, lost_commands
 from quadvel_sysid.identify import identify
 
 JOINTS = NAMES[:2]
@@ -42,3 +42,21 @@ def test_lost_commands_are_named_with_the_share_of_samples_that_they_hit():
     (effect,) = report["effects"]
     assert effect["name"] == "command_hold"
     assert effect["samples_hit"] == pytest.approx(0.1, abs=0.03)
+
+
+@pytest.mark.parametrize("lag", [0.008, 0.012, 0.02])
+def test_a_drive_that_lags_after_each_command_alike_loses_none(monkeypatch, lag):
+    """It is behind, too; but that follows from how long ago the command arrived, so that no loss at random is told."""
+    found = []
+    looked_for = lost_commands.lost_commands
+
+    def remembered(*given):
+        found.append(looked_for(*given))
+        return found[-1]
+
+    monkeypatch.setattr(library, "lost_commands", remembered)
+    truth = parameters([Effect("first_order_lag", NAMES[:4], {"T": lag})], noise=0.01)
+    log = record(attrs.evolve(truth, joints=NAMES[:4]), 4, 3.0, 500, motion="chirp", seed=1)
+    assert [one["name"] for one in identify([log]).report["effects"]] == ["first_order_lag"]
+    assert found
+    assert not any(found)

@@ -80,7 +80,8 @@ def identified(
     legs = None if robot is None else _legs(robot, material)
     progress(0.02, "gains and delays")
     windows = WINDOWS if body is None else (material.logs[0].period,)
-    reading, notes = read(material, windows, SHORTEST if legs is None else LEG_BLOCK)
+    shortest = SHORTEST if legs is None or material.heldout else LEG_BLOCK
+    reading, notes = read(material, windows, shortest)
     steps = iter(range(10**6))
 
     def tick(text: str) -> None:
@@ -102,7 +103,8 @@ def identified(
         outcome, sections = told(best), dict[str, Any]()
     else:
         progress(0.93, "replays")
-        accounts = dict.fromkeys((before, of_laws if of_laws is best else search.simplified(of_laws), best))
+        laws = of_laws if of_laws is best else search.simplified(of_laws)
+        accounts = dict.fromkeys((before, laws, best, *search.shorter(laws)))
         outcome, sections = _moving([told(one) for one in accounts], body, legs)
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
@@ -189,8 +191,9 @@ def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
 def _moving(tries: Sequence[Outcome], body: Body | None, legs: Legs | None) -> tuple[Outcome, dict[str, Any]]:
     """The outcome with which the commands replay the motion best, and the sections of the report about that.
 
-    A later try has to replay clearly better than those before it on the rows that fit and select. Terms can mistake the errors
-    of encoders for an effect, or foretell a torque only where the joint does what it did; a replay does not.
+    A later try has to replay clearly better than those before it on the rows that fit and select: the laws than the plain model,
+    terms than laws, and fewer laws than all. Terms can mistake the errors of encoders for an effect, or foretell a torque only
+    where the joint does what it did, and a law can stand for how the log was written; a replay does not take that for motion.
     """
     logs = [one.log for one in tries[0].model.samples.logs]
 

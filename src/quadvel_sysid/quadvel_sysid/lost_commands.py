@@ -7,6 +7,8 @@ row stands in for the torque of a joint where that is not to be looked at.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import attrs
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +26,9 @@ _LEAST_SHARE = 0.003
 """Of the commands: they are not looked at as lost where fewer lag behind"""
 _TURNS = 5
 """Earlier delays that are looked at, over one time between two commands"""
-_FORETOLD = 1.25
-"""Times the error of the model without: losses at random leave, all alike, about what a longer delay left in their place.
-Where much more is left than that, what was read off the torque as losses was something else."""
+_AT_RANDOM = 0.5
+"""Of what the reading takes off the error: what has to come of its telling one command from another. A lag answers late, too,
+but after each command alike; losses at random cannot be foretold."""
 
 _PIECE, _AROUND = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
@@ -89,26 +91,46 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
     noise = _usual_error(model, parts, noise)
     if len(noise) < 2 or not _suspicious(model, noise):
         return []
+    tried = _readings(model, parts, noise)
+    best = min(tried, key=lambda one: squared_error(one[0], parts.select), default=None)
+    if best is None or not _at_random(model, *best, parts):
+        return []
+    _, odds, usual = best
+    return [(_of_every_row(odds, model.samples.row), usual)]
+
+
+def _readings(model: Model, parts: Parts, noise: Array) -> Iterator[tuple[Model, Array, Array]]:
+    """The model with losses, their odds at the rows of its samples (N, J, MOST + 1), and at any; for several delays."""
     period = float(np.median(np.concatenate([np.diff(log.t_cmd) for log in model.samples.logs])))
-    best: tuple[Array, Array] | None = None
-    least = np.inf
     for turn in range(_TURNS):
         at = model.with_delays(model.delays - np.array([[turn * period / _TURNS], [0.0]]))
         odds = backlog(at, noise, MOST, ~parts.fit)
         usual = odds[parts.fit].mean(axis=0)
         if 1.0 - usual[0] < _LEAST_SHARE:
             break
-        every = np.ones(len(noise), dtype=bool)
-        law = CommandHold(_of_every_row(odds, model.samples.row), usual)
-        losing = fit(
-            at.plus(Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))), parts.fit, 3
-        )
-        error = squared_error(losing, parts.select)
-        if error < least:
-            best, least, foretold = (odds, usual), error, squared_error(losing.foretold(), parts.fit)
-    if best is None or foretold > _FORETOLD * squared_error(model, parts.fit):
-        return []
-    return [(_of_every_row(best[0], model.samples.row), best[1])]
+        yield _losing(at, odds, usual, parts), odds, usual
+
+
+def _losing(model: Model, odds: Array, usual: Array, parts: Parts) -> Model:
+    """The model with losses of these odds, fitted."""
+    every = np.ones(odds.shape[1], dtype=bool)
+    law = CommandHold(_of_every_row(odds, model.samples.row), usual)
+    one = Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))
+    return fit(model.plus(one), parts.fit, 3)
+
+
+def _at_random(model: Model, losing: Model, odds: Array, usual: Array, parts: Parts) -> bool:
+    """Does the `losing` model tell much more than one whose losses follow from the time since the command arrived?"""
+    fitted = parts.fit.any(axis=1)
+    since = np.rint(losing.signals.age[:, 0] / losing.samples.period).astype(int)
+    since = np.minimum(since, since[fitted].max())
+    total = np.zeros((since.max() + 1, *odds.shape[1:]))
+    np.add.at(total, since[fitted], odds[fitted])
+    mean = total / np.maximum(total.sum(axis=-1, keepdims=True), 1.0)
+    bare = losing.without(len(model.applied))
+    tried = (model, fit(bare, parts.fit, 3), losing, _losing(bare, mean[since], usual, parts))
+    *without, read, foreseen = (squared_error(one, parts.chosen_on) for one in tried)
+    return foreseen - read > _AT_RANDOM * (min(without) - read) > 0.0
 
 
 def _of_every_row(odds: Array, rows: NDArray[np.intp]) -> Array:

@@ -90,6 +90,13 @@ class Search:
             account = self.judge.tied(account, k)
         return account
 
+    def shorter(self, account: Account) -> list[Account]:
+        """The account with fewer of its effects, those that were found first, the most of them first."""
+        model = account.model
+        return self.judge.each_fitted(
+            [attrs.evolve(model, applied=model.applied[:k]) for k in range(len(model.applied) - 1, 0, -1)]
+        )
+
     def _nested(self, account: Account, index: int) -> Account:
         """With the effect's law replaced by its special case, as Stribeck friction by Coulomb's, unless selecting rows need it."""
         one = account.model.applied[index]
@@ -111,7 +118,7 @@ class Search:
             before, more = best, self._added(best, kinds)
             if more is None:
                 break
-            best = self.judge.profiled(self.dropped(more))
+            best = self.judge.profiled(self.dropped(more, kept=1))
             gained, left = before.criterion - best.criterion, most - len(best.model.applied)
             if best.criterion - left * gained > bound:
                 break
@@ -181,12 +188,14 @@ class Search:
                 found.append(attrs.evolve(model, delay_groups=groups))
         return self.judge.each_fitted(found)
 
-    def dropped(self, account: Account) -> Account:
-        """Without the effects that the others made needless (backward elimination)."""
-        while len(account.model.applied) > 1:
+    def dropped(self, account: Account, kept: int = 0) -> Account:
+        """Without the effects that the others made needless (backward elimination), but with the last `kept` ones."""
+        while len(account.model.applied) > max(kept, 1):
             model = account.model
-            every = self.judge.each_fitted([model.without(k) for k in range(len(model.applied))])
-            least = min(every, key=lambda one: one.criterion)
+            among = range(len(model.applied) - kept)
+            least = min(
+                self.judge.each_fitted([model.without(k) for k in among]), key=lambda one: one.criterion
+            )
             if self._needed(least, account):
                 return account
             account = least
