@@ -47,7 +47,7 @@ class Bench:
     """A planner that is told where the robot is, what it sees, and where the person is, all at once."""
 
     def __init__(self, **config: object) -> None:
-        self.planner = FollowPlanner(FollowConfig(**config))  # type: ignore[arg-type]
+        self.planner = FollowPlanner(FollowConfig(**{"laser_x": 0.0, **config}))  # type: ignore[arg-type]
         self.now = 0.0
         self.pose = np.zeros(3)
 

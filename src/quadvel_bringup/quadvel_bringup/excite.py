@@ -28,7 +28,7 @@ from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, w
 
 from .alone import ensure_alone
 from .node_output import PrefixedOutput
-from .nodes import command, enclave
+from .nodes import Parameters, arguments, command, enclave
 from .processes import ProcessGroup, StopSignals
 from .stack import PARAMETERS
 
@@ -209,11 +209,13 @@ def _propose(report: Path, console: Console) -> None:
 
 def sim_arguments(**parameters: Any) -> list[str]:
     """Arguments of a simulator that stands, in lockstep, at 1 kHz."""
-    lockstep = {"mode": "lockstep", "state_rate": 1000, "keyframe": "stand", "answer_timeout": ANSWER_TIMEOUT}
-    words = ["--ros-args", *enclave("sim_node"), "--params-file", str(PARAMETERS.resolve())]
-    for name, value in {**lockstep, **parameters}.items():
-        words += ["-p", f"{name}:={json.dumps(value)}"]
-    return words
+    lockstep: Parameters = {
+        "mode": "lockstep",
+        "state_rate": 1000,
+        "keyframe": "stand",
+        "answer_timeout": ANSWER_TIMEOUT,
+    }
+    return arguments("sim_node", {**lockstep, **parameters}, PARAMETERS)
 
 
 def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]], console: Console) -> None:

@@ -47,9 +47,8 @@ class FollowedWalk(RecordedRun):
     ) -> None:
         """laser: where it is on the robot, x and y, m. view: with the operator's page."""
         place = dict(zip(("laser_x", "laser_y"), laser, strict=True))
-        file = ["--params-file", str(stack.parameters.resolve())]
         names = ("person_tracker", "follow_planner")
-        followers = {name: command(name, [*arguments(name, place), *file]) for name in names}
+        followers = {name: command(name, arguments(name, place, stack.parameters)) for name in names}
         super().__init__(recording, {**stack.commands(view), **followers}, FOLLOWED, False, console, seconds)
         self._seconds, self._began = seconds, float("inf")
 

@@ -9,8 +9,11 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
+from pathlib import Path
 
 import attrs
+
+Parameters = Mapping[str, bool | str | int | float]
 
 
 @attrs.frozen
@@ -71,11 +74,15 @@ def enclave(name: str) -> list[str]:
     return ["--enclave", f"/quadvel/{name}"]
 
 
-def arguments(name: str, parameters: Mapping[str, bool | str | int | float]) -> list[str]:
-    """A node's arguments of ROS 2: its enclave and its parameters."""
-    # JSON is YAML with quotes, and without them a file named "1" would be a number.
-    pairs = [("-p", f"{parameter}:={json.dumps(value)}") for parameter, value in parameters.items()]
-    return ["--ros-args", *enclave(name), *(word for pair in pairs for word in pair)]
+def arguments(name: str, parameters: Parameters, file: Path | None = None) -> list[str]:
+    """A node's arguments of ROS 2: its enclave and its parameters, which stand above those of the parameter file."""
+    words = ["--ros-args", *enclave(name)]
+    if file is not None:
+        words += ["--params-file", str(file.resolve())]  # before the parameters: what comes later counts
+    for parameter, value in parameters.items():
+        # JSON is YAML with quotes, and without them a file named "1" would be a number.
+        words += ["-p", f"{parameter}:={json.dumps(value)}"]
+    return words
 
 
 def command(name: str, arguments: Sequence[str] = ()) -> list[str]:

@@ -8,12 +8,10 @@ from pathlib import Path
 
 import attrs
 
-from .nodes import arguments, command
+from .nodes import Parameters, arguments, command
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
 """The shipped values of all nodes' parameters."""
-
-Parameters = Mapping[str, bool | str | int | float]
 
 VIEW = "view"
 """The node that serves the operator's page: where it ends, the robot goes on"""
@@ -123,15 +121,11 @@ class Stack:
         view: with the node `view`, which is no part of the robot and stays in the time of who looks at it.
         """
         nodes = self.overrides() | ({VIEW: {}} if view else {})
-        return {name: self._arguments(name, values) for name, values in nodes.items()}
+        return {name: arguments(name, values, self.parameters) for name, values in nodes.items()}
 
     def commands(self, view: bool = False) -> dict[str, list[str]]:
         """The same as command lines, which run each node as a process of its own."""
-        return {name: command(name, arguments) for name, arguments in self.arguments(view).items()}
-
-    def _arguments(self, name: str, values: Parameters) -> list[str]:
-        first, *rest = arguments(name, values)
-        return [first, "--params-file", str(self.parameters.resolve()), *rest]  # what comes later counts
+        return {name: command(name, words) for name, words in self.arguments(view).items()}
 
 
 def _found(world: str | None) -> str | None:

@@ -100,7 +100,9 @@ class FollowConfig:
     )
     length: float = _described(0.65, "length of the robot's outline, legs included, m")
     width: float = _described(0.35, "its width, m")
-    laser_x: float = _described(0.0, "where the laser is on the robot: forward, m", positive=False)
+    laser_x: float = _described(
+        0.25, "where the laser is on the robot: forward, m; as in the shipped worlds", positive=False
+    )
     laser_y: float = _described(0.0, "where the laser is on the robot: to the left, m", positive=False)
     laser_yaw: float = _described(0.0, "where the laser looks on the robot: to the left, rad", positive=False)
     scan_timeout: float = _described(0.2, "silence of the scan after which the robot stops, s")

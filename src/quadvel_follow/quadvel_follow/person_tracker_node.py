@@ -49,7 +49,7 @@ class PersonTrackerParameters:
     use_odom: bool = _parameter(
         True, "whether the robot's pose comes on odom; else tracks are in the frame of the scans"
     )
-    laser_x: float = _parameter(0.0, "where the laser is on the robot: forward, m")
+    laser_x: float = _parameter(0.25, "where the laser is on the robot: forward, m; as in the shipped worlds")
     laser_y: float = _parameter(0.0, "where the laser is on the robot: to the left, m")
     laser_yaw: float = _parameter(0.0, "where the laser looks on the robot: to the left, rad")
     select_nearest: bool = _parameter(
