@@ -20,7 +20,8 @@ TURNS = 0.7  # m, from its place beside the person, up to which the robot turns 
 CHANGES = np.array([3.0, 10.0, 15.0])  # cost of the squared change of vx, vy, wz from one step to the next
 USE = np.array([0.0, 2.0, 0.3])  # of their squares
 COLLISION = 1000.0
-CLOSE = 100.0  # 1/m^2, cost of the least distance to a person, as far as it is below 0.5 m
+CLOSE = 100.0  # 1/m^2, cost of the least distance to a person, as far as it is below what is kept
+KEPT, BERTH = 0.5, 0.7  # m, of the person who is followed, and of others, of whom one knows less
 GUARD = 0.05  # m, below which a clearance counts as a collision
 
 
@@ -127,10 +128,12 @@ class FollowCost:
     def _persons(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
         """Nobody is met; past others, of whom one does not know where they go, the robot is slow."""
         gaps = self.gaps(situation, rollouts.poses)
-        least = gaps.min(axis=(0, 2))
+        least = gaps.min(2)  # (persons, K)
+        kept = np.full((len(least), 1), BERTH)
+        kept[0] = KEPT
+        short = (kept - least).max(0).clip(min=0.0)
         near = np.maximum(1.0 - gaps[1:].min(0, initial=np.inf), 0.0)
-        met = COLLISION * (least < GUARD) + CLOSE * np.maximum(0.5 - least, 0.0) ** 2
-        return met + (speed**2 * near).mean(1)
+        return COLLISION * (least.min(0) < GUARD) + CLOSE * short**2 + (speed**2 * near).mean(1)
 
     def _unseen(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:
         """Fast into what the scan does not show."""
