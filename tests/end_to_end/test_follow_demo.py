@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from quadvel_follow.planar import planar_pose
+from quadvel_nodes.messages import seconds
 from quadvel_recordings.reading import read_messages
 
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
@@ -37,10 +38,8 @@ def test_the_robot_follows_and_touches_nothing(out: Path) -> None:
 
 def test_the_person_is_told_where_it_is(out: Path) -> None:
     """As the robot sees it: what the tracker says, against the odometry, beside the truth of the same instants."""
-    person, robot = (
-        places(out, "/person/odometry", lambda m: m.pose.pose),
-        places(out, "/odom", lambda m: m.pose.pose),
-    )
+    person = places(out, "/person/odometry", lambda m: m.pose.pose)
+    robot = places(out, "/odom", lambda m: m.pose.pose)
     true_person = places(out, "/ground_truth/persons", lambda m: m.poses[0])
     true_robot = places(out, "/ground_truth/odom", lambda m: m.pose.pose)
     time = person[:, 0]
@@ -53,9 +52,7 @@ def test_the_person_is_told_where_it_is(out: Path) -> None:
 def places(out: Path, topic: str, pose: Callable[[Any], Any]) -> Array:
     """Of a topic: time (s), x, y (m), yaw (rad), (n, 4)."""
     messages = [m for _, _, m in read_messages(out / "follow.mcap", lambda name, _: name == topic)]
-    return np.array(
-        [[m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec, *planar_pose(pose(m))] for m in messages]
-    )
+    return np.array([[seconds(m.header.stamp), *planar_pose(pose(m))] for m in messages])
 
 
 def at(time: Array, known: Array) -> Array:
