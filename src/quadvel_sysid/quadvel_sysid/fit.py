@@ -11,7 +11,6 @@ from itertools import product
 
 import attrs
 import numpy as np
-from scipy.linalg import solve
 
 from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
 from .parallel import side_by_side
@@ -215,7 +214,7 @@ def _bounded(matrix: Array, gradient: Array, low: Array, high: Array, scale: Arr
     for pivot in range(_PIVOTS[1]):
         free = ~held
         right = gradient[free] - matrix[np.ix_(free, held)] @ x[held]
-        x[free] = solve(matrix[np.ix_(free, free)], right, assume_a="sym")
+        x[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
         beyond = free & ((x < low) | (x > high))
         x = x.clip(low, high)
         slope = matrix @ x - gradient

@@ -20,6 +20,7 @@ from .account import Account, Judge
 from .baselines import baselines
 from .confidence import intervals
 from .contradictions import contradictions
+from .corrected import parameters
 from .criterion import Parts, noise_variance
 from .delays import in_steps, latest
 from .eam import WINDOWS, pd_torque
@@ -32,14 +33,14 @@ from .lost_commands import read_again
 from .material import VALUES, Material, Progress, gathered
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
-from .outcome import Chosen, Outcome, identification, parameters
-from .preparation import SHORTEST, Reading, read, reference_gains
+from .outcome import Chosen, Outcome, identification
+from .preparation import SHORTEST, Reading, read
 from .replay import BLOCK as LEG_BLOCK
 from .replay import STRETCH as LEG_STRETCH
 from .replay import TEXT as LEG_TEXT
 from .replay import Legs
 from .selection import Search
-from .signals import Bools, Samples
+from .signals import Array, Bools, Samples
 
 _SEARCHED, _COARSEST = 30_000, 0.002
 """Values of torque that are searched, as long as their rows are not farther apart (s); what is found is fitted to all"""
@@ -94,22 +95,23 @@ def identified(
     plain = attrs.evolve(plain, samples=samples)
     search, before = Search(judge, tick), judge.fitted(plain)
     best, of_laws = search.best(plain)
-    progress(0.88, "intervals")
-
-    def told(account: Account) -> Outcome:
-        return _outcome(account, before, search, reading, material, base or ActuatorParameters.default())
-
-    if body is None and legs is None:
-        outcome, sections = told(best), dict[str, Any]()
-    else:
-        progress(0.93, "replays")
+    corrected = base or ActuatorParameters.default()
+    moving = None if body is None and legs is None else _Moving(body, legs, reading, corrected)
+    progress(0.88, "replays" if moving else "intervals")
+    tries = [best]
+    if moving:
         laws = of_laws if of_laws is best else search.simplified(of_laws)
-        accounts = dict.fromkeys((before, laws, best, *search.shorter(laws)))
-        outcome, sections = _moving([told(one) for one in accounts], body, legs)
+        tries = list(dict.fromkeys((before, laws, best, *search.shorter(laws))))
+    refitted = [_refitted(one, reading, noise) for one in tries]
+    k = moving.choose(refitted) if moving else 0
+    progress(0.93, "intervals")
+    outcome = _outcome(tries[k], before, refitted[k], search, reading, material, corrected)
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
-    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report), **sections}
+    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
+    if moving:
+        report |= moving.section(outcome)
     if body is not None:
         report |= _told_of_motion(report)
     report["warnings"] = [*report["warnings"], *contradictions(report)]
@@ -146,38 +148,42 @@ def _plain(reading: Reading) -> Model:
     return Model(reading.samples, eam.window, eam.gains, one, delays, one)
 
 
+def _refitted(account: Account, reading: Reading, noise: Array) -> Model:
+    """The model of an account with values of all rows that fit and select."""
+    parts, samples = reading.parts, reading.samples
+    model = attrs.evolve(account.model, samples=samples)
+    if len(samples.t) > len(account.model.samples.t):
+        model = read_again(model, parts, noise)
+    return latest(fit(model, parts.chosen_on), parts.chosen_on)
+
+
 def _outcome(
     account: Account,
     before: Account,
+    model: Model,
     search: Search,
     reading: Reading,
     material: Material,
     base: ActuatorParameters,
 ) -> Outcome:
-    """The chosen model with values of all rows, and errors of the rows that chose nothing."""
+    """The chosen model, refitted, with values of every row, and errors of the rows that chose nothing."""
     parts, samples = reading.parts, reading.samples
     every = parts.chosen_on if material.heldout else parts.every
-    chosen = parts.chosen_on
-    models = [attrs.evolve(one.model, samples=samples) for one in (before, account)]
-    if len(samples.t) > len(account.model.samples.t):
-        models[1] = read_again(models[1], parts, search.judge.noise)
-    late = [latest(fit(one, chosen), chosen) for one in models]
+    late = _refitted(before, reading, search.judge.noise), model
     before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
     effects = tuple(
-        Chosen(*_worth(late[1], k, parts), search.rivals(account, k))
-        for k in range(len(account.model.applied))
+        Chosen(*_worth(model, k, parts), search.rivals(account, k)) for k in range(len(model.applied))
     )
-    has_terms = any(isinstance(one.law, SignalTerm) for one in account.model.applied)
+    has_terms = any(isinstance(one.law, SignalTerm) for one in model.applied)
     leaning = () if account.white or has_terms else search.leaning(account)
-    names = {one.law.name for one in account.model.applied}
+    names = {one.law.name for one in model.applied}
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
     asked = np.ones_like(whole.gains)
     asked[1] = 0.0 if samples.undamped else 1.0
     ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
-        late[0], before_whole, late[1], whole, effects, rejected, account.white, leaning,
-        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts,
-        *reference_gains(samples), base,
+        late[0], before_whole, model, whole, effects, rejected, account.white, leaning,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts, base,
     )  # fmt: skip
 
 
@@ -188,40 +194,53 @@ def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
     return worth.gain, worth.p
 
 
-def _moving(tries: Sequence[Outcome], body: Body | None, legs: Legs | None) -> tuple[Outcome, dict[str, Any]]:
-    """The outcome with which the commands replay the motion best, and the sections of the report about that.
+@attrs.frozen(eq=False)
+class _Moving:
+    """Commands replayed on what the joints carry: of several models the one that moves it as it moved is chosen."""
 
-    A later try has to replay clearly better than those before it on the rows that fit and select: the laws than the plain model,
-    terms than laws, and fewer laws than all. Terms can mistake the errors of encoders for an effect, or foretell a torque only
-    where the joint does what it did, and a law can stand for how the log was written; a replay does not take that for motion.
-    """
-    logs = [one.log for one in tries[0].model.samples.logs]
+    body: Body | None
+    legs: Legs | None
+    reading: Reading
+    base: ActuatorParameters
 
-    def replay(o: Outcome, model: Model, rows: Bools) -> Replay:
-        if legs is not None:
-            return legs.replayed(logs, parameters(o, model), rows)
-        assert body is not None
-        return replayed(logs, parameters(o, model), body, rows)
+    def choose(self, tries: Sequence[Model]) -> int:
+        """The number of the model with which the commands replay the motion best.
 
-    best, least = tries[0], np.inf
-    for one in tries:
-        error = replay(one, one.model, one.parts.chosen_on)["dq_rms_rad_s"]
-        if error < _MOVES * least:
-            best, least = one, error
-    sizes = {
-        name: replay(best, model, best.parts.report)
-        for name, model in (("before", best.before), ("after", best.model))
-    }
-    if legs is not None:
-        return best, {"replay": {"stretch_s": LEG_STRETCH, **sizes, "text": LEG_TEXT}}
-    assert body is not None
-    motion = {
-        "inertia": {"value": body.inertia.tolist(), "unit": "kg m^2"},
-        "replayed_s": STRETCH,
-        "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
-        "the inertia and an encoder bias part of the torque offset.",
-    }
-    return best, {"motion": motion | sizes}
+        A later one has to replay clearly better than those before it on the rows that fit and select: the laws than the plain
+        model, terms than laws, and fewer laws than all. Terms can mistake the errors of encoders for an effect, or foretell a
+        torque only where the joint does what it did, and a law can stand for how the log was written; a replay does not take
+        that for motion.
+        """
+        best, least = 0, np.inf
+        for k, model in enumerate(tries):
+            error = self._replay(model, self.reading.parts.chosen_on)["dq_rms_rad_s"]
+            if error < _MOVES * least:
+                best, least = k, error
+        return best
+
+    def section(self, outcome: Outcome) -> dict[str, Any]:
+        """The section of the report about the replay of the rows that chose nothing."""
+        rows = self.reading.parts.report
+        sizes = {"before": self._replay(outcome.before, rows), "after": self._replay(outcome.model, rows)}
+        if self.body is None:
+            return {"replay": {"stretch_s": LEG_STRETCH, **sizes, "text": LEG_TEXT}}
+        return {
+            "motion": {
+                "inertia": {"value": self.body.inertia.tolist(), "unit": "kg m^2"},
+                "replayed_s": STRETCH,
+                "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
+                "the inertia and an encoder bias part of the torque offset.",
+                **sizes,
+            }
+        }
+
+    def _replay(self, model: Model, rows: Bools) -> Replay:
+        logs = [one.log for one in self.reading.samples.logs]
+        corrected = parameters(model, self.reading.parts, self.base)
+        if self.legs is not None:
+            return self.legs.replayed(logs, corrected, rows)
+        assert self.body is not None
+        return replayed(logs, corrected, self.body, rows)
 
 
 def _told_of_motion(report: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Everything that was found, as the report, the corrected parameters, and the series for the pictures."""
+"""Everything that was found, as the report and the series for the pictures."""
 
 from __future__ import annotations
 
@@ -9,20 +9,21 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.effects.terms import NAME as TERMS
-from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_actuator.parameters import ActuatorParameters
 
 from .confidence import Intervals
+from .corrected import acting, form, gain_deviations, limits, mean_square, parameters, told, with_interval
 from .criterion import LEVEL, WHITE_LEVEL, Parts, normality, whiteness
 from .decision import decision
-from .delays import running_delays
 from .identification import Identification, Shape, Trace
 from .library import SignalTerm
 from .logs.findings import Finding as LogFinding
-from .model import Applied, Model, linear_columns
-from .signals import Array, Bools
+from .model import Applied, Model
+from .preparation import reference_gains
+from .signals import Array
 
 SCHEMA = 1
+_DELTAS = "delta_kp", "delta_kd"
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
 _REMOVABLE = 0.05
 """Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
@@ -71,14 +72,7 @@ class Outcome:
     ideal: Array  # (N, J), torque of the PD law as commanded
     noise: Array  # (J,)
     parts: Parts
-    kp_ref: float
-    kd_ref: float
     base: ActuatorParameters
-
-    @property
-    def commanded_kd(self) -> float:
-        """In units of `kd_ref`: 0 where none was commanded, so that the deviation is all of the drive's damping."""
-        return 0.0 if self.before.samples.undamped else 1.0
 
     @property
     def after(self) -> Array:
@@ -92,10 +86,11 @@ class Outcome:
 
 
 def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
-    """The report, the parameters and the series; `findings` are (log, finding)."""
+    """The report, the corrected model and the series; `findings` are (log, finding)."""
     report = _report(outcome)
     report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
-    return Identification(report, parameters(outcome), _traces(outcome), _shapes(outcome))
+    corrected = parameters(outcome.whole, outcome.parts, outcome.base, outcome.widths.effects)
+    return Identification(report, corrected, _traces(outcome), _shapes(outcome))
 
 
 def _report(o: Outcome) -> dict[str, Any]:
@@ -105,12 +100,15 @@ def _report(o: Outcome) -> dict[str, Any]:
         for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.after))
     }
     mses: dict[str, dict[str, Any]] = {
-        name: {"train_mse": _mse(error, parts.chosen_on), "heldout_mse": _mse(error, parts.report)}
+        name: {
+            "train_mse": mean_square(error, parts.chosen_on),
+            "heldout_mse": mean_square(error, parts.report),
+        }
         for name, error in errors.items()
     }
     for name in ("before", "after"):
         mses[name]["per_joint"] = [
-            _mse(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
+            mean_square(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
         ]
     floor = float(np.average(o.noise, weights=np.maximum(parts.report.sum(axis=0), 1)))
     report = {
@@ -121,8 +119,10 @@ def _report(o: Outcome) -> dict[str, Any]:
         "pd": mses["pd"],
         "before": mses["before"]
         | {
-            "delta_kp": float((o.before_whole.gains[0, 0] - 1.0) * o.kp_ref),
-            "delta_kd": float((o.before_whole.gains[1, 0] - o.commanded_kd) * o.kd_ref),
+            **{
+                name: float(each[0])
+                for name, each in zip(_DELTAS, gain_deviations(o.before_whole), strict=True)
+            },
             "input_delay_ms": 1e3 * float(o.before_whole.delays[0, 0]),
             "output_delay_ms": 1e3 * float(o.before_whole.delays[1, 0]),
         },
@@ -199,45 +199,30 @@ def _negative_gains(model: Model) -> list[str]:
 def _beyond_limits(o: Outcome) -> list[str]:
     """Torques that were measured and that the corrected model can not give."""
     joints, most = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
-    limits = np.broadcast_to(_limits(o.base, joints), most.shape)
+    allowed = np.broadcast_to(limits(o.base, joints), most.shape)
     return [
         f"{joint}: up to {torque:.1f} N m were measured, and torque_limit in actuator.yaml, which is the base's, is "
         f"{limit:.1f} N m"
-        for joint, torque, limit in zip(joints, most, limits, strict=True)
+        for joint, torque, limit in zip(joints, most, allowed, strict=True)
         if torque > _OVER * limit
     ]
-
-
-def _mse(error: Array, rows: Any) -> float:
-    count = int(rows.sum())
-    return float(np.sum(np.where(rows, error, 0.0) ** 2) / count) if count else 0.0
 
 
 def _gains(o: Outcome) -> dict[str, Any]:
     """Gain deviations and delays of the corrected model, a number, or one for each joint, with intervals."""
     model, widths = o.whole, o.widths
     found: dict[str, Any] = {}
+    halves = widths.gains * np.array(reference_gains(model.samples))[:, None]
     rows = {
-        "delta_kp": ((model.gains[0] - 1.0) * o.kp_ref, widths.gains[0] * o.kp_ref),
-        "delta_kd": ((model.gains[1] - o.commanded_kd) * o.kd_ref, widths.gains[1] * o.kd_ref),
+        **dict(zip(_DELTAS, zip(gain_deviations(model), halves, strict=True), strict=True)),
         "input_delay_ms": (1e3 * model.delays[0], 1e3 * widths.delays[0]),
         "output_delay_ms": (1e3 * model.delays[1], 1e3 * widths.delays[1]),
     }
     for name, (values, half) in rows.items():
         least = -np.inf if name.startswith("delta") else 0.0
-        value, ci = _with_interval(values, half, least)
+        value, ci = with_interval(values, half, least)
         found[name], found[f"{name}_ci95"] = value, ci
     return found
-
-
-def _with_interval(
-    values: Array, half: Array, least: float = -np.inf, most: float = np.inf
-) -> tuple[Any, Any]:
-    """Value and interval, within what is possible: numbers if all joints share them, else lists."""
-    low, high = np.maximum(values - half, least), np.minimum(values + half, most)
-    if np.all(values == values[0]):
-        return float(values[0]), [float(low[0]), float(high[0])]
-    return values.tolist(), np.stack([low, high], axis=1).tolist()
 
 
 def _effects(o: Outcome) -> list[dict[str, Any]]:
@@ -258,7 +243,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     acts = np.any([one.active for _, one in ranked], axis=0)
     return {
         "name": TERMS,
-        "joints": _acting(acts, joints),
+        "joints": acting(acts, joints),
         "params": {},
         "indistinguishable": [],
         "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
@@ -269,7 +254,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
                 "kind": one.law.shape.kind,  # type: ignore[attr-defined]
                 "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
                 "at": one.law.at,
-                "joints": _acting(one.active, joints),
+                "joints": acting(one.active, joints),
                 "heldout_gain": o.effects[k].gain,
             }
             for k, one in ranked
@@ -277,25 +262,12 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _params(one: Applied, half: Array) -> dict[str, dict[str, Any]]:
-    """The parameters of an effect on its joints, by name: value, interval and unit."""
-    params = {}
-    for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
-        value, ci = _with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
-        params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
-    return params
-
-
-def _acting(active: Bools, joints: Sequence[str]) -> list[str]:
-    return [name for name, acts in zip(joints, active, strict=True) if acts]
-
-
 def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
-    settings = _settings(one)
+    settings = form(one)
     entry: dict[str, Any] = {
         "name": one.law.name,
-        "joints": _acting(one.active, joints),
-        "params": _params(one, half),
+        "joints": acting(one.active, joints),
+        "params": told(one, half),
         "indistinguishable": list(of_it.rivals),
         "heldout_gain": of_it.gain,
         "p_value": of_it.p,
@@ -306,79 +278,6 @@ def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> 
     if of_it.rivals:
         entry["separated_by"] = one.law.motion
     return entry
-
-
-def _settings(one: Applied) -> dict[str, Any]:
-    """The form of a law; what it has for each joint, for those that it acts on."""
-    return {
-        name: [v for v, acts in zip(value, one.active, strict=True) if acts]
-        if isinstance(value, list)
-        else value
-        for name, value in one.law.settings.items()
-    }
-
-
-def parameters(o: Outcome, model: Model | None = None) -> ActuatorParameters:
-    """The corrected model as the stack loads it, or another one of the outcome's."""
-    model = o.whole if model is None else model
-    joints = model.samples.joints
-    mse = _mse(model.foretold().residual(), o.parts.chosen_on)
-    pair = DelayPair(*running_delays(model, o.parts.chosen_on), mse)
-    effects = []
-    for one, half in zip(model.applied, o.widths.effects, strict=False):
-        if isinstance(one.law, SignalTerm):
-            continue
-        params = _params(one, half)
-        values, units, ranges = (
-            {n: p[field] for n, p in params.items()} for field in ("value", "unit", "ci95")
-        )
-        acts = tuple(_acting(one.active, joints))
-        effects.append(Effect(one.law.name, acts, values | _settings(one), units, ranges))
-    terms = [one for one in model.applied if isinstance(one.law, SignalTerm)]
-    if terms:
-        on = np.any([one.active for one in terms], axis=0)
-        acts = tuple(_acting(on, joints))
-        saved = [one.law.term(one, _largest(model, one, o.parts.fit)).saved(joints) for one in terms]  # type: ignore[attr-defined]
-        effects.append(Effect(TERMS, acts, {"terms": saved}))
-    deviations: dict[str, Any] = {
-        "delta_kp": (model.gains[0] - 1.0) * o.kp_ref,
-        "delta_kd": (model.gains[1] - o.commanded_kd) * o.kd_ref,
-    }
-    if o.commanded_kd == 0.0:  # a deviation is relative to what is commanded: of nothing it would be nothing
-        own = {"b": np.maximum(deviations.pop("delta_kd"), 0.0).tolist()}
-        effects.append(Effect("viscous_friction", joints, own, {"b": "N m s/rad"}))
-        deviations["delta_kd"] = np.zeros(len(joints))
-    deviations = {
-        name: float(v[0]) if np.all(v == v[0]) else tuple(v.tolist()) for name, v in deviations.items()
-    }
-    return attrs.evolve(
-        o.base,
-        name="identified",
-        joints=joints,
-        torque_limit=_limits(o.base, joints),
-        kp_ref=o.kp_ref,
-        kd_ref=o.kd_ref,
-        pairs=(pair,),
-        torque_noise=mse,
-        effects=tuple(effects),
-        **deviations,
-    )
-
-
-def _largest(model: Model, one: Applied, rows: Bools) -> Array:
-    """The largest torque (J,) that a term had on `rows` (N, J): a running model's stays within it."""
-    torque = np.einsum("kj,knj->nj", one.values, linear_columns(model, one))
-    return np.max(np.abs(torque) * rows, axis=0)
-
-
-def _limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
-    """The base's torque limits for these joints: each its own where the base knows it, else the largest."""
-    limit = base.torque_limit
-    if not isinstance(limit, tuple):
-        return limit
-    names = list(base.joints or JOINT_NAMES)
-    every = limit if len(limit) == len(names) else limit * (len(names) // len(limit))
-    return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
 
 
 def _traces(o: Outcome) -> dict[str, Trace]:

@@ -78,7 +78,7 @@ class Search:
         """Without what costs more than it is worth: effects, joints of effects, values and gains of each joint."""
         account = self.dropped(account)
         for k in range(len(account.model.applied)):
-            account = self.judge.narrowed(self._nested(account, k), k)
+            account = self._nested(self.judge.narrowed(self._nested(account, k), k), k)
         model, one = account.model, np.zeros(len(self.judge.noise), dtype=np.intp)
         if model.gain_groups.any():
             shared = self.judge.fitted(attrs.evolve(model, gains=_shared(model.gains), gain_groups=one))
