@@ -63,7 +63,7 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
         )
     engines = Counter(row.get("engine", "unknown") for row in rows)
     lines.append(
-        "\nCommits of src/quadvel_actuator that they were scored on: "
+        "\nCommits of the identification that they were scored on: "
         + ", ".join(f"{name} ({count} logs)" for name, count in engines.most_common())
         + "."
     )

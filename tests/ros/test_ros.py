@@ -89,6 +89,29 @@ def test_the_launch_file_starts_the_robot_and_ctrl_c_ends_it(ros: Any, times: in
 
 
 @with_cyclone
+@pytest.mark.parametrize(
+    ("file", "names"),
+    [
+        (("sim.launch.py", "use_sim_time:=true"), STACK),
+        (("robot.launch.py", "low_level:=board"), ("board", "driver", *STACK[1:])),
+        (("follow.launch.py", "use_sim_time:=true"), ("person_tracker", "follow_planner")),
+    ],
+    ids=["sim", "board", "follow"],
+)
+def test_every_other_launch_starts_its_nodes_and_ctrl_c_ends_them(ros: Any, file: Any, names: Any) -> None:
+    launch = ros.start("ros2", "launch", "quadvel_bringup", *file)
+    assert_ends_cleanly(ros, launch, 1, *(f"/{name}" for name in names))
+    assert launch.text.count("process has finished cleanly") == len(names), launch.text
+
+
+@with_cyclone
+def test_a_launched_simulator_takes_the_actuator_file_that_is_named(ros: Any, tmp_path: Path) -> None:
+    launch = ros.start(*LAUNCH, f"actuator:={tmp_path}/none.yaml")
+    launch.wait(60.0)
+    assert f"actuator_file: cannot read {tmp_path}/none.yaml" in launch.text, launch.text
+
+
+@with_cyclone
 def test_the_launch_file_ends_all_where_one_node_cannot_start(ros: Any) -> None:
     launch = ros.start(*LAUNCH, "policy:=/nowhere.onnx")
     launch.wait(60.0)  # its end; the processes that it leaves behind fail the test

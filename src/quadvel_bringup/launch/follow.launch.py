@@ -4,26 +4,34 @@ ros2 launch quadvel_bringup follow.launch.py params:=my.yaml
 """
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, EmitEvent
+from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+from launch_ros.parameter_descriptions import ParameterValue
 
-from quadvel_bringup.nodes import NODES
+from quadvel_bringup.nodes import launched
 from quadvel_bringup.stack import PARAMETERS
+
+ARGUMENTS = [
+    DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
+    DeclareLaunchArgument(
+        "use_sim_time",
+        default_value="false",
+        choices=["true", "false"],
+        description="true: by the simulator's clock, as robot.launch.py with it; false: in real time",
+    ),
+]
 
 
 def generate_launch_description() -> LaunchDescription:
-    parameters = DeclareLaunchArgument(
-        "params", default_value=str(PARAMETERS), description="YAML file of parameters"
-    )
+    sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     nodes = [
         Node(
-            package=NODES[name].package,
-            executable=name,
-            name=name,
-            output="screen",
-            parameters=[LaunchConfiguration("params")],
+            **launched(name),
+            parameters=[LaunchConfiguration("params"), {"use_sim_time": sim_time}],
+            on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )
         for name in ("person_tracker", "follow_planner")
     ]
-    return LaunchDescription([parameters, *nodes])
+    return LaunchDescription([*ARGUMENTS, *nodes])

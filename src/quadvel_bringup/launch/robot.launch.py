@@ -13,7 +13,7 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from quadvel_bringup.nodes import NODES, enclave
+from quadvel_bringup.nodes import launched
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 ARGUMENTS = [
@@ -21,6 +21,11 @@ ARGUMENTS = [
         "low_level", default_value="sim", choices=list(LOW_LEVELS), description="the robot"
     ),
     DeclareLaunchArgument("policy", default_value="", description="ONNX file; empty: the shipped one"),
+    DeclareLaunchArgument(
+        "actuator",
+        default_value="",
+        description="YAML file of an actuator model, as identify writes it; empty: the shipped one",
+    ),
     DeclareLaunchArgument("terrain", default_value="", description="flat, slope or rough; empty: flat"),
     DeclareLaunchArgument(
         "world", default_value="", description="corridor, park, campus or a file; empty: none"
@@ -42,6 +47,7 @@ def start(context: LaunchContext) -> list[Action]:
     stack = Stack(
         low_level=chosen["low_level"],
         policy=Path(chosen["policy"]) if chosen["policy"] else None,
+        actuator=Path(chosen["actuator"]) if chosen["actuator"] else None,
         terrain=chosen["terrain"] or None,
         world=chosen["world"] or None,
         parameters=Path(chosen["params"]),
@@ -49,11 +55,7 @@ def start(context: LaunchContext) -> list[Action]:
     )
     actions: list[Action] = [
         Node(
-            package=NODES[name].package,
-            executable=name,
-            name=name,
-            output="screen",
-            ros_arguments=enclave(name),
+            **launched(name),
             parameters=[str(stack.parameters), *([overrides] if overrides else [])],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )

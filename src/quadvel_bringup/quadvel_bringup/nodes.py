@@ -10,6 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import attrs
 
@@ -72,6 +73,14 @@ def run(name: str, arguments: Sequence[str]) -> None:
 def enclave(name: str) -> list[str]:
     """The arguments of ROS 2 that name a process's rights under SROS 2 (docs/security.md); without it they change nothing."""
     return ["--enclave", f"/quadvel/{name}"]
+
+
+def launched(name: str) -> dict[str, Any]:
+    """What `launch_ros.actions.Node` wants to know of a node, but for its parameters."""
+    package = entry(name).package
+    return {
+        "package": package, "executable": name, "name": name, "output": "screen", "ros_arguments": enclave(name)
+    }  # fmt: skip
 
 
 def arguments(name: str, parameters: Parameters, file: Path | None = None) -> list[str]:
