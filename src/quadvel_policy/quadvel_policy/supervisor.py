@@ -37,7 +37,7 @@ FOLLOWING = ("stance", "walk")
 """In which modes a velocity is followed"""
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
-PATIENCE_IN_BRAKING = 2.0  # times `brake_time`, after which a robot that still moves is put into its posture
+PATIENCE_IN_BRAKING = 1.8  # times `brake_time`, after which a robot that still moves is put into its posture
 
 SPOIL_THE_ESTIMATE = {guard.name() for guard in (EstimateStale, EstimateWrong, AccelerometerImplausible)}
 """With any of these the backup's velocity is followed"""
@@ -86,7 +86,7 @@ class SupervisorConfig(GuardConfig, CommandLimitsConfig):
     blend_time: float = setting(0.15, "over which the policy's torques fade in, s")
     reset_gap: float = setting(0.02, "time without a state after which the policy's memory is reset, s")
     max_posture_error: float = setting(0.35, "largest joint error at which the robot counts as standing, rad")
-    max_standing_speed: float = setting(0.3, "largest speed at which walking may end in a posture, m/s")
+    max_standing_speed: float = setting(0.1, "largest speed at which walking may end in a posture, m/s")
     brake_time: float = setting(0.6, "in which the policy brings the robot to a stand after a fault, s")
 
 
