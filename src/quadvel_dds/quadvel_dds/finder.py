@@ -52,10 +52,9 @@ class EmbeddedFinder(MetaPathFinder):
                 raise UnsupportedModuleError(f"module {fullname}")
             return None
         package, _, kind = fullname.partition(".")
-        if kind not in ("", "msg", "srv"):
-            return None
         # Only names that look like an interface package make us read the definitions.
-        if not package.endswith(("_msgs", "_interfaces", "_srvs", "_dds_common")):
+        looks_like_one = package.endswith(("_msgs", "_interfaces", "_srvs", "_dds_common"))
+        if kind not in ("", "msg", "srv") or not looks_like_one:
             return None
         from quadvel_dds import messages
 

@@ -34,6 +34,8 @@ from .segments import rounded
 Array = NDArray[np.float64]
 
 SLOWEST = 0.005  # s, from one state to the next
+MEMORY = 0.5
+"""s from the beginning of a recording in which an estimator still lacks what it would remember of the time before"""
 
 
 @attrs.frozen(eq=False)
@@ -88,9 +90,11 @@ def estimated(path: Path, estimator: Estimator) -> tuple[Array, Array]:
 
 def velocity_errors(run: Run, times: Array, found: Array) -> Mapping[str, Array]:
     """RMS (2,) of vx and vy, m/s: of the velocities found minus what the robot's own estimator said, and minus the true ones, where
-    these were recorded.
+    these were recorded. The first MEMORY of a longer recording is left out.
     """
     errors = {}
+    whole = np.searchsorted(times, times[0] + MEMORY) % len(times)  # 0: all of a short one
+    times, found = times[whole:], found[whole:]
     for name, topic in (("recorded estimate", "/velocity_estimate"), ("truth", "/ground_truth/odom")):
         if topic in run.lines:
             time, value = run.lines[topic]

@@ -29,10 +29,9 @@ class GraphAnnouncer:
 def _node_info(node: Any) -> Any:
     calls = [entity._endpoint for entity in (*node._clients, *node._services)]
     readers = [*(one._reader for one in node._subscriptions), *(call.reader for call in calls)]
-    writers = [*(one._writer for one in node._publishers), *(call.writer for call in calls)]
+    writers = [one._writer for one in node._publishers if one._writer is not None]  # None: destroyed
+    writers += [call.writer for call in calls]
     info = NodeEntitiesInfo(node_namespace=node.get_namespace(), node_name=node.get_name())
     info.reader_gid_seq = [Gid(data=list(reader.gid)) for reader in readers]
-    info.writer_gid_seq = [
-        Gid(data=list(writer.gid)) for writer in writers if writer is not None
-    ]  # None: destroyed
+    info.writer_gid_seq = [Gid(data=list(writer.gid)) for writer in writers]
     return info

@@ -36,9 +36,6 @@ class RcutilsLogger(Partial):
         self._places: dict[tuple[Any, int], float] = {}  # when each spoke last, where that counts
         self._severities: dict[tuple[Any, int], int] = {}
 
-    def set_level(self, level: int) -> None:
-        levels[self.name] = int(level)
-
     def get_effective_level(self) -> int:
         name = self.name
         while name and not levels.get(name):

@@ -89,9 +89,8 @@ class Node(ParameterMixin):
     def _publish_log(self, level: int, name: str, message: str, stamp_ns: int, frame: Any) -> None:
         if self.context.ok():
             stamp = Time(nanoseconds=stamp_ns).to_msg()
-            code = frame.f_code
-            log = Log(stamp=stamp, level=level, name=name, msg=message, file=code.co_filename)
-            log.function, log.line = code.co_name, frame.f_lineno
+            log = Log(stamp=stamp, level=level, name=name, msg=message, file=frame.f_code.co_filename)
+            log.function, log.line = frame.f_code.co_name, frame.f_lineno
             self._rosout.publish(log)
 
     # Who the node is.

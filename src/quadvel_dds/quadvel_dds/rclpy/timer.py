@@ -45,19 +45,15 @@ class Timer(Partial):
     def is_ready(self) -> bool:
         return not self._canceled and self._remaining_ns() <= 0
 
-    def is_canceled(self) -> bool:
-        return self._canceled
-
     def cancel(self) -> None:
         self._canceled = True
+
+    destroy = cancel
 
     def reset(self) -> None:
         self._canceled = False
         self._restart()
         self._on_change()
-
-    def destroy(self) -> None:
-        self._canceled = True
 
     def _remaining_ns(self) -> int:
         changed = self._simulated != (self.clock._simulated_ns is not None)
