@@ -233,6 +233,8 @@ def early(log: Log, found: Response) -> Iterator[Finding]:
     leads = log.dq_des is not None and log.kd is None  # by as much as nobody knows
     if leads or found.lags[best] >= -1e-9 or np.median(found.left[best]) > CLEAR:
         return
+    if (found.left[best] > BETTER * found.left[nearest]).all():
+        return  # play, for one, goes with commands to come nearly as well as with those that it answers
     _, piece = np.unique((found.log.t[found.row] / PIECE).astype(np.intp), return_inverse=True)
     gain = np.bincount(piece, found.errors[nearest] - found.errors[best])
     if gain.sum() < EARLY * np.sqrt(np.sum((gain - gain.mean()) ** 2) + 1e-12):
