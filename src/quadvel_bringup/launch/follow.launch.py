@@ -10,7 +10,7 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
-from quadvel_bringup.nodes import launched
+from quadvel_bringup.nodes import launch_arguments
 from quadvel_bringup.stack import PARAMETERS
 
 ARGUMENTS = [
@@ -28,7 +28,7 @@ def generate_launch_description() -> LaunchDescription:
     sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     nodes = [
         Node(
-            **launched(name),
+            **launch_arguments(name),
             parameters=[LaunchConfiguration("params"), {"use_sim_time": sim_time}],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )

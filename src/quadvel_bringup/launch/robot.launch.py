@@ -13,7 +13,7 @@ from launch.events import Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-from quadvel_bringup.nodes import launched
+from quadvel_bringup.nodes import launch_arguments
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 ARGUMENTS = [
@@ -55,7 +55,7 @@ def start(context: LaunchContext) -> list[Action]:
     )
     actions: list[Action] = [
         Node(
-            **launched(name),
+            **launch_arguments(name),
             parameters=[str(stack.parameters), *([overrides] if overrides else [])],
             on_exit=EmitEvent(event=Shutdown(reason=f"{name} ended")),
         )

@@ -75,7 +75,7 @@ def enclave(name: str) -> list[str]:
     return ["--enclave", f"/quadvel/{name}"]
 
 
-def launched(name: str) -> dict[str, Any]:
+def launch_arguments(name: str) -> dict[str, Any]:
     """What `launch_ros.actions.Node` wants to know of a node, but for its parameters."""
     package = entry(name).package
     return {

@@ -54,12 +54,12 @@ def _laws(model: Model, widths: Sequence[Array]) -> list[Effect]:
     for k, one in enumerate(model.applied):
         if isinstance(one.law, SignalTerm):
             continue
-        params = told(one, widths[k] if widths else np.zeros_like(one.values))
+        params = parameter_entries(one, widths[k] if widths else np.zeros_like(one.values))
         values, units, ranges = (
             {name: each[field] for name, each in params.items()} for field in ("value", "unit", "ci95")
         )
-        acts = tuple(acting(one.active, model.samples.joints))
-        found.append(Effect(one.law.name, acts, values | form(one), units, ranges if widths else {}))
+        acts = tuple(acting_joints(one.active, model.samples.joints))
+        found.append(Effect(one.law.name, acts, values | law_settings(one), units, ranges if widths else {}))
     return found
 
 
@@ -70,7 +70,7 @@ def _terms(model: Model, rows: Bools) -> list[Effect]:
     if not terms:
         return []
     saved = [one.law.term(one, _largest(model, one, rows)).saved(joints) for one in terms]  # type: ignore[attr-defined]
-    acts = acting(np.any([one.active for one in terms], axis=0), joints)
+    acts = acting_joints(np.any([one.active for one in terms], axis=0), joints)
     return [Effect(TERMS, tuple(acts), {"terms": saved})]
 
 
@@ -111,7 +111,7 @@ def limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[flo
     return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
 
 
-def told(one: Applied, half: Array) -> dict[str, dict[str, Any]]:
+def parameter_entries(one: Applied, half: Array) -> dict[str, dict[str, Any]]:
     """The parameters of an effect on its joints, by name: value, interval and unit."""
     params = {}
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
@@ -130,12 +130,12 @@ def with_interval(
     return values.tolist(), np.stack([low, high], axis=1).tolist()
 
 
-def acting(active: Bools, joints: Sequence[str]) -> list[str]:
+def acting_joints(active: Bools, joints: Sequence[str]) -> list[str]:
     """The names of the joints that an effect acts on."""
     return [name for name, acts in zip(joints, active, strict=True) if acts]
 
 
-def form(one: Applied) -> dict[str, Any]:
+def law_settings(one: Applied) -> dict[str, Any]:
     """The settings of a law; what it has for each joint, for those that it acts on."""
     return {
         name: [v for v, acts in zip(value, one.active, strict=True) if acts]

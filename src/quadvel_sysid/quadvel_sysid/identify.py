@@ -96,22 +96,22 @@ def identified(
     search, before = Search(judge, tick), judge.fitted(plain)
     best, of_laws = search.best(plain)
     corrected = base or ActuatorParameters.default()
-    moving = None if body is None and legs is None else _Moving(body, legs, reading, corrected)
-    progress(0.88, "replays" if moving else "intervals")
-    tries = [best]
-    if moving:
+    replayer = None if body is None and legs is None else _Replayer(body, legs, reading, corrected)
+    progress(0.88, "replays" if replayer else "intervals")
+    tries = [before, best]
+    if replayer:
         laws = of_laws if of_laws is best else search.simplified(of_laws)
-        tries = list(dict.fromkeys((before, laws, best, *search.shorter(laws))))
-    refitted = [_refitted(one, reading, noise) for one in tries]
-    k = moving.choose(refitted) if moving else 0
+        tries = [before, laws, best, *search.shorter(laws)]
+    refitted = {one: _refitted(one, reading, noise) for one in dict.fromkeys(tries)}
+    chosen = replayer.choose(refitted) if replayer else best
     progress(0.93, "intervals")
-    outcome = _outcome(tries[k], before, refitted[k], search, reading, material, corrected)
+    outcome = _outcome(chosen, refitted[before], refitted[chosen], search, reading, material, corrected)
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
     report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
-    if moving:
-        report |= moving.section(outcome)
+    if replayer:
+        report |= replayer.section(outcome)
     if body is not None:
         report |= _told_of_motion(report)
     report["warnings"] = [*report["warnings"], *contradictions(report)]
@@ -159,18 +159,17 @@ def _refitted(account: Account, reading: Reading, noise: Array) -> Model:
 
 def _outcome(
     account: Account,
-    before: Account,
+    before: Model,
     model: Model,
     search: Search,
     reading: Reading,
     material: Material,
     base: ActuatorParameters,
 ) -> Outcome:
-    """The chosen model, refitted, with values of every row, and errors of the rows that chose nothing."""
+    """The chosen model and the plain one, both refitted, with values of every row, and errors of the rows that chose nothing."""
     parts, samples = reading.parts, reading.samples
     every = parts.chosen_on if material.heldout else parts.every
-    late = _refitted(before, reading, search.judge.noise), model
-    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in late)
+    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in (before, model))
     effects = tuple(
         Chosen(*_worth(model, k, parts), search.rivals(account, k)) for k in range(len(model.applied))
     )
@@ -182,7 +181,7 @@ def _outcome(
     asked[1] = 0.0 if samples.undamped else 1.0
     ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
-        late[0], before_whole, model, whole, effects, rejected, account.white, leaning,
+        before, before_whole, model, whole, effects, rejected, account.white, leaning,
         intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts, base,
     )  # fmt: skip
 
@@ -195,7 +194,7 @@ def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
 
 
 @attrs.frozen(eq=False)
-class _Moving:
+class _Replayer:
     """Commands replayed on what the joints carry: of several models the one that moves it as it moved is chosen."""
 
     body: Body | None
@@ -203,19 +202,19 @@ class _Moving:
     reading: Reading
     base: ActuatorParameters
 
-    def choose(self, tries: Sequence[Model]) -> int:
-        """The number of the model with which the commands replay the motion best.
+    def choose(self, tries: Mapping[Account, Model]) -> Account:
+        """The account with whose model the commands replay the motion best.
 
         A later one has to replay clearly better than those before it on the rows that fit and select: the laws than the plain
         model, terms than laws, and fewer laws than all. Terms can mistake the errors of encoders for an effect, or foretell a
         torque only where the joint does what it did, and a law can stand for how the log was written; a replay does not take
         that for motion.
         """
-        best, least = 0, np.inf
-        for k, model in enumerate(tries):
+        best, least = next(iter(tries)), np.inf
+        for account, model in tries.items():
             error = self._replay(model, self.reading.parts.chosen_on)["dq_rms_rad_s"]
             if error < _MOVES * least:
-                best, least = k, error
+                best, least = account, error
         return best
 
     def section(self, outcome: Outcome) -> dict[str, Any]:

@@ -12,7 +12,16 @@ from quadvel_actuator.effects.terms import NAME as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
 
 from .confidence import Intervals
-from .corrected import acting, form, gain_deviations, limits, mean_square, parameters, told, with_interval
+from .corrected import (
+    acting_joints,
+    gain_deviations,
+    law_settings,
+    limits,
+    mean_square,
+    parameter_entries,
+    parameters,
+    with_interval,
+)
 from .criterion import LEVEL, WHITE_LEVEL, Parts, normality, whiteness
 from .decision import decision
 from .identification import Identification, Shape, Trace
@@ -243,7 +252,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     acts = np.any([one.active for _, one in ranked], axis=0)
     return {
         "name": TERMS,
-        "joints": acting(acts, joints),
+        "joints": acting_joints(acts, joints),
         "params": {},
         "indistinguishable": [],
         "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
@@ -254,7 +263,7 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
                 "kind": one.law.shape.kind,  # type: ignore[attr-defined]
                 "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
                 "at": one.law.at,
-                "joints": acting(one.active, joints),
+                "joints": acting_joints(one.active, joints),
                 "heldout_gain": o.effects[k].gain,
             }
             for k, one in ranked
@@ -263,11 +272,11 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
 
 
 def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
-    settings = form(one)
+    settings = law_settings(one)
     entry: dict[str, Any] = {
         "name": one.law.name,
-        "joints": acting(one.active, joints),
-        "params": told(one, half),
+        "joints": acting_joints(one.active, joints),
+        "params": parameter_entries(one, half),
         "indistinguishable": list(of_it.rivals),
         "heldout_gain": of_it.gain,
         "p_value": of_it.p,
