@@ -144,6 +144,15 @@ def test_a_stance_command_keeps_the_policy_in_charge(rig: Rig) -> None:
     np.testing.assert_array_equal(rig.policy.seen[-1][:4], STILL)
 
 
+@pytest.mark.parametrize(("speed", "stance"), [(1.0, 0.0), (0.25, 0.0), (0.15, 1.0), (0.0, 1.0)])
+def test_a_robot_that_is_to_stand_steps_on_until_it_is_slow(rig: Rig, speed: float, stance: float) -> None:
+    rig.walk()
+    rig.velocity = np.array([0.0, speed, 0.0])
+    rig.tick(STILL)
+    assert rig.mode == "walk"
+    np.testing.assert_array_equal(rig.supervisor.command, [0.0, 0.0, 0.0, stance])
+
+
 def test_a_command_that_is_not_finite_means_standing_still(rig: Rig) -> None:
     rig.walk()
     rig.tick((math.nan, 0.0, 0.0, 0.0))

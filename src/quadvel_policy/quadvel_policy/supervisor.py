@@ -37,6 +37,9 @@ FOLLOWING = ("stance", "walk")
 """In which modes a velocity is followed"""
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
+STEPPING_SPEED = (
+    0.2  # m/s, above which a robot that is to stand steps on: feet that stay behind a moving trunk trip it
+)
 PATIENCE_IN_BRAKING = 1.8  # times `brake_time`, after which a robot that still moves is put into its posture
 
 SPOIL_THE_ESTIMATE = {guard.name() for guard in (EstimateStale, EstimateWrong, AccelerometerImplausible)}
@@ -225,7 +228,10 @@ class Supervisor:
         if unfit and self.mode == "walk":
             self.findings.append(Finding(unfit, *OTHER_FAULTS[unfit]))
         self._act_on(self.findings, state.time)
-        seen = self._seen(state, self._velocity_in_effect(sight))
+        velocity = self._velocity_in_effect(sight)
+        if self.mode == "walk" and self._speed > STEPPING_SPEED:
+            self.command[3] = 0.0
+        seen = self._seen(state, velocity)
         if self.config.reset_gap < sight.gap <= self.config.max_state_age:
             self._walk.forget()
         if self.mode in self._after and (following := self._after[self.mode](seen)):
@@ -313,6 +319,11 @@ class Supervisor:
         self._limiter.apply(answer, self._previous, seen.state)
         return answer
 
+    @property
+    def _speed(self) -> float:
+        """The last that was known, m/s."""
+        return float(np.linalg.norm(self._velocity))
+
     def _seen(self, state: RobotState, velocity: Array | None) -> Tick:
         elapsed = 0.0 if self._entered is None else state.time - self._entered
         return Tick(elapsed, state, velocity, self.command, self._previous)
@@ -384,10 +395,8 @@ class Supervisor:
                 return "there is no fresh velocity estimate"
         if self.mode == "passive" and mode == "stance":
             return self._posture_error(last)
-        if self.mode == "walk":
-            speed = float(np.linalg.norm(self._velocity))
-            if not last.command[3] or speed > self.config.max_standing_speed:
-                return f"the robot walks ({speed:.2f} m/s), command stance first"
+        if self.mode == "walk" and (not last.command[3] or self._speed > self.config.max_standing_speed):
+            return f"the robot walks ({self._speed:.2f} m/s), command stance first"
         return None
 
     def _posture_error(self, seen: Tick) -> str | None:
@@ -425,7 +434,7 @@ class Supervisor:
         if self._held is None:
             return None
         braked, c = seen.state.time - self._held_since, self.config
-        still = float(np.linalg.norm(self._velocity)) <= c.max_standing_speed
+        still = self._speed <= c.max_standing_speed
         if braked < c.brake_time or not (still or braked >= PATIENCE_IN_BRAKING * c.brake_time):
             return None
         return "stance", self._held.sentence
