@@ -60,25 +60,13 @@ _NEARBY = (-0.002, -0.001, 0.001, 0.002)
 """s: a coarser grid of the sum of delays alone"""
 
 
-_PROFILES, _DEEPER = 4, 0.01
-"""Grids at most, one about what the other found, while each takes so much of the error off"""
-
-
-_FACTORS = np.array([1.0, 0.8, 0.9, 0.95, 0.98, 0.99, 1.01, 1.02, 1.05, 1.1, 1.25])
-"""Times a parameter: the values around it that are tried"""
-
-
 def profiled(model: Model, rows: Bools, cores: int = 1) -> Model:
     """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
     samples, (model, rows) = model.samples, _alone(model, rows)
-    error = squared_error(model, rows)
-    for _ in range(_PROFILES):
-        found = _around(model, rows, cores)
-        before, error = error, squared_error(found, rows)
-        model = found if error < before else model
-        if error > (1.0 - _DEEPER) * before:
-            break
-    return attrs.evolve(model, samples=samples)
+    shifts = (*product(_SUMS, _OUTPUTS), *product(_FAR, (0.0,)))
+    starts = [model, *_adapted(model, rows, shifts, cores)[:_DEEPEST]]
+    tried = side_by_side(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
+    return attrs.evolve(min([model, *tried], key=lambda one: squared_error(one, rows)), samples=samples)
 
 
 def from_nearby_delays(model: Model, rows: Bools) -> Model:
@@ -87,14 +75,6 @@ def from_nearby_delays(model: Model, rows: Bools) -> Model:
     found = _adapted(model, rows, product(_NEARBY, (0.0,)))
     tried = [model, *(fit(one, rows) for one in found[:1])]
     return attrs.evolve(min(tried, key=lambda one: squared_error(one, rows)), samples=samples)
-
-
-def _around(model: Model, rows: Bools, cores: int) -> Model:
-    """The best fit from the points of the grid about the model's delays."""
-    shifts = (*product(_SUMS, _OUTPUTS), *product(_FAR, (0.0,)))
-    starts = [model, *_adapted(model, rows, shifts, cores)[:_DEEPEST]]
-    tried = side_by_side(lambda k: fit(_searched(starts[k], rows), rows), len(starts), cores, model.samples)
-    return min(tried, key=lambda one: squared_error(one, rows))
 
 
 def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], cores: int = 1) -> list[Model]:
@@ -113,35 +93,6 @@ def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], c
 
     found = side_by_side(adapted, len(within), cores, model.samples)
     return [one for one, _ in sorted(found, key=lambda one: one[1])]
-
-
-def _searched(model: Model, rows: Bools) -> Model:
-    """The model with every parameter that is not linear at the best of some values around it, one after the other.
-
-    Where a torque jumps with a parameter, as at the edge of a deadband, slopes say little of what a step does.
-    """
-    for k, one in enumerate(model.applied):
-        linear = getattr(one.law, "linear", ())
-        for p, parameter in enumerate(one.law.parameters):
-            if parameter.name not in linear:
-                values = np.repeat(one.values[None], len(_FACTORS), axis=0)
-                values[:, p] = np.clip(values[:, p] * _FACTORS[:, None], parameter.low, parameter.high)
-                one = attrs.evolve(one, values=_best_of(model, k, values, rows))
-                model = model.replacing(k, one)
-    return model
-
-
-def _best_of(model: Model, index: int, values: Array, rows: Bools) -> Array:
-    """Of a batch of values (B, P, J) of an effect the one with the least error, for each group of joints: (P, J)."""
-    every = [np.repeat(one.values[None], len(values), axis=0) for one in model.applied]
-    every[index] = values
-    torque = model.evaluate(np.repeat(model.gains[None], len(values), axis=0), every)
-    error = np.einsum("bnj->bj", np.where(rows, model.samples.tau - torque, 0.0) ** 2)
-    groups = model.applied[index].groups
-    for g in np.unique(groups):
-        error[:, groups == g] = error[:, groups == g].sum(axis=1, keepdims=True)
-    best: Array = values[np.argmin(error, axis=0), :, np.arange(len(groups))].T
-    return best
 
 
 def tidied(model: Model) -> Model:

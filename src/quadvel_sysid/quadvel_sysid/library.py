@@ -43,8 +43,8 @@ _kept: dict[tuple[Any, ...], tuple[Shape, Signals, Array]] = {}
 _COMMANDED = "q_des", "error", "tau"
 _PAST_COST = 0.5
 """Further cost, in parameters, of a law with a memory or that resembles a delay: decides between laws that explain the same"""
-_SIGNAL_COST, _WEIGHT_COST = 5.0, 0.1
-"""In parameters: what a signal that a term names costs, and what each of its weights does, which a penalty keeps smooth"""
+_SIGNAL_COST = 5.0
+"""In parameters: what a signal that a term names costs; its weights, which a penalty keeps smooth, cost nothing"""
 
 
 @cache
@@ -113,7 +113,7 @@ class SignalTerm(AddedLaw):
     @property
     def complexity(self) -> float:
         """What it says, in parameters."""
-        return _SIGNAL_COST * len(self.inputs) + _WEIGHT_COST * self.shape.count
+        return _SIGNAL_COST * len(self.inputs)
 
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{}]

@@ -7,8 +7,6 @@ row stands in for the torque of a joint where that is not to be looked at.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import attrs
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +22,6 @@ LOST = 6.0
 """nats by which a command has to look lost or late on its own"""
 _LEAST_SHARE = 0.003
 """Of the commands: they are not looked at as lost where fewer lag behind"""
-_TURNS = 5
-"""Earlier delays that are looked at, over one time between two commands"""
 _AT_RANDOM = 0.5
 """Of what the reading takes off the error: what has to come of its telling one command from another. A lag answers late, too,
 but after each command alike; losses at random cannot be foretold."""
@@ -84,31 +80,16 @@ def _share(part: float, whole: float) -> float:
 def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array, Array]]:
     """How likely the drive lags by 0 to MOST commands: at each row, (N, J, MOST + 1), and at any; none if it rarely does.
 
-    For each joint without a look at its torque where that selects or is reported. Losses at random delay the commands by
-    what they do so on average, which is in the delay of a model without them: earlier ones are looked at, in steps of a
-    part of the time between two commands, and rows that select decide.
+    For each joint without a look at its torque where that selects or is reported.
     """
     noise = _usual_error(model, parts, noise)
     if len(noise) < 2 or not _suspicious(model, noise):
         return []
-    tried = _readings(model, parts, noise)
-    best = min(tried, key=lambda one: squared_error(one[0], parts.select), default=None)
-    if best is None or not _at_random(model, *best, parts):
+    odds = backlog(model, noise, MOST, ~parts.fit)
+    usual = odds[parts.fit].mean(axis=0)
+    if 1.0 - usual[0] < _LEAST_SHARE or not _at_random(model, odds, usual, parts):
         return []
-    _, odds, usual = best
     return [(_of_every_row(odds, model.samples.row), usual)]
-
-
-def _readings(model: Model, parts: Parts, noise: Array) -> Iterator[tuple[Model, Array, Array]]:
-    """The model with losses, their odds at the rows of its samples (N, J, MOST + 1), and at any; for several delays."""
-    period = float(np.median(np.concatenate([np.diff(log.t_cmd) for log in model.samples.logs])))
-    for turn in range(_TURNS):
-        at = model.with_delays(model.delays - np.array([[turn * period / _TURNS], [0.0]]))
-        odds = backlog(at, noise, MOST, ~parts.fit)
-        usual = odds[parts.fit].mean(axis=0)
-        if 1.0 - usual[0] < _LEAST_SHARE:
-            break
-        yield _losing(at, odds, usual, parts), odds, usual
 
 
 def _losing(model: Model, odds: Array, usual: Array, parts: Parts) -> Model:
@@ -119,8 +100,9 @@ def _losing(model: Model, odds: Array, usual: Array, parts: Parts) -> Model:
     return fit(model.plus(one), parts.fit, 3)
 
 
-def _at_random(model: Model, losing: Model, odds: Array, usual: Array, parts: Parts) -> bool:
-    """Does the `losing` model tell much more than one whose losses follow from the time since the command arrived?"""
+def _at_random(model: Model, odds: Array, usual: Array, parts: Parts) -> bool:
+    """Does the model with losses tell much more than one whose losses follow from the time since the command arrived?"""
+    losing = _losing(model, odds, usual, parts)
     fitted = parts.fit.any(axis=1)
     since = np.rint(losing.signals.age[:, 0] / losing.samples.period).astype(int)
     since = np.minimum(since, since[fitted].max())
