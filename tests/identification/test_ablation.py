@@ -13,7 +13,7 @@ def test_a_switch_replaces_what_is_there_and_puts_it_back(switch: str) -> None:
     before = candidates.FITTED, fit._FAR
     with without(switch):
         pass
-    assert (candidates.FITTED, fit._FAR) == before
+    assert before == (candidates.FITTED, fit._FAR)
 
 
 def test_switches_joined_are_all_out() -> None:
