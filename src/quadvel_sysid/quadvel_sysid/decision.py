@@ -7,6 +7,8 @@ from typing import Any
 
 from quadvel_actuator.effects.terms import NAME as TERMS
 
+from .criterion import LEVEL
+
 UNTRACED = "it goes with no signal of the log, whose cause may be too rare in what is fitted"
 """Of what a model leaves that is not white"""
 _LESS = 0.9
@@ -41,7 +43,8 @@ def _nothing_added(report: Mapping[str, Any]) -> str:
 def _added(report: Mapping[str, Any]) -> str:
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
     effects, rest = report["effects"], report["unexplained"]
-    named = ", ".join(dict.fromkeys(one["name"] for one in effects))
+    shown = [one for one in effects if one["p_value"] <= LEVEL]
+    named = ", ".join(dict.fromkeys(one["name"] for one in shown or effects))
     cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
     way = f"{'falls' if cut >= 0.0 else 'rises'} by {abs(cut):.0f} %"
     text = f"Add {named}: the held-out error {way}, from {before:.3g} to {after:.3g} N^2 m^2"
@@ -49,6 +52,8 @@ def _added(report: Mapping[str, Any]) -> str:
     beyond = "what was learned beyond them" if learned else "what is left"
     more = f"; {beyond} depends on {', '.join(rest['depends_on'])}" if rest["depends_on"] else ""
     for one in effects:
+        if shown and one not in shown:
+            more += f"; {one['name']} is in the model, too, but the rows that are reported do not confirm it"
         if "samples_hit" in one:
             more += (
                 f"; {one['name']} hits {100.0 * one['samples_hit']:.2g} % of the samples at random, which the error after "
