@@ -51,7 +51,6 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "half as many fits": {"candidates.FITTED": 3, "candidates.FITTED_TERMS": 2},
     "three valleys of delays": {"fit._DEEPEST": 1},
     "far delays": {"fit._FAR": ()},
-    "merging": {"selection.Search.merged": _method_same},
     "laws before terms": {"selection._terms": lambda account: account.criterion},
     "nesting": {"selection.Search._nested": _method_same},
     "no repeats": {"selection.repeats": lambda *_: False},

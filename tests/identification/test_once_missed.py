@@ -16,6 +16,7 @@ from tests.identification.judge import judge
             0,
             606,
         ),  # it had led the plain fit's delays 10 ms astray, out of the grid's reach
+        ("soft_stop", 1, 913),  # a spring and less than a period of cogging add up to any curve
         ("backlash", 2, 912),  # play goes with commands to come nearly as well as with those it answers
         pytest.param(
             "triple", 0, 606, marks=pytest.mark.long

@@ -50,6 +50,11 @@ class Applied:
             found[name] = one[0] if len(one) == 1 or (one == one[0]).all() else one[:, None]
         return found
 
+    def shown(self, s: Signals) -> bool:
+        """Does the motion of one at least of the joints that share values show the law?"""
+        joints = self.law.shown(dict(zip(self.law.names, self.values, strict=True)), s) & self.active
+        return set(self.groups[joints]) == set(self.groups[self.active])
+
     def formed(self, law: EffectLaw) -> Applied:
         """With another form of its law; parameters that this one had not start from zero."""
         known = dict(zip(self.law.names, self.values, strict=True))

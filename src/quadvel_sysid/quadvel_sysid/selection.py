@@ -62,8 +62,7 @@ class Search:
         accounts = [terms]
         if laws.white or not terms.white or laws.criterion < terms.criterion:
             laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
-            accounts += [laws, self.merged(laws)]
-            accounts += [] if laws.white else [self.run(laws, TERMS, bound=terms.criterion)]
+            accounts += [laws] if laws.white else [laws, self.run(laws, TERMS, bound=terms.criterion)]
         least = min(one.criterion for one in accounts)
         alike = [one for one in accounts if one.criterion < least + TIE * len(self.judge.noise)]
         return self.simplified(min(alike, key=_terms)), laws
@@ -151,8 +150,11 @@ class Search:
 
     def _reason(self, before: Account, after: Account) -> str:
         """Why what was added does not count; nothing where it does."""
-        if len(after.model.applied) > len(before.model.applied) and repeats(after.last, before.model.applied):
+        grown = len(after.model.applied) > len(before.model.applied)
+        if grown and repeats(after.last, before.model.applied):
             return "a law that it contains, or that contains it, is on the same joints already"
+        if grown and not after.last.shown(after.model.signals):
+            return "the joints moved too little to tell it from other laws"
         found = after.against(before)
         p = found.p * self._tried
         worth = float(np.max(found.share))
@@ -205,19 +207,6 @@ class Search:
         found = account.against(without)
         worth = float(np.max(found.share))
         return account.criterion < without.criterion and worth > WORTH and found.p < LEVEL
-
-    def merged(self, account: Account) -> Account:
-        """With a curve over a signal in the place of several laws of that signal, if that lessens the criterion.
-
-        Laws of one signal add up to any shape of it: a spring and cogging to a stop, for one.
-        """
-        signals = [one.law.signal for one in account.model.applied if not isinstance(one.law, SignalTerm)]
-        for signal in {one for one in signals if signals.count(one) > 1}:
-            kept = tuple(one for one in account.model.applied if one.law.signal != signal)
-            rest = self.judge.fitted(attrs.evolve(account.model, applied=kept))
-            every = [account, *Candidates(rest, {(signal,)}).found(TERMS)[0]]
-            account = min(every, key=lambda one: one.criterion)
-        return account
 
     def rivals(self, account: Account, index: int) -> tuple[str, ...]:
         """The laws that say the same in the place of an effect, to what rows that select can tell."""

@@ -204,6 +204,10 @@ class EffectLaw(ABC):
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""
         return p
 
+    def shown(self, p: Params, s: View) -> Bools:
+        """Joints (J,) whose motion shows the law with these parameters (J,); on the others it passes for another one."""
+        return np.ones(s.q.shape[-1], dtype=bool)
+
     def chance(self, p: Params, s: View) -> dict[str, Array]:
         """Half widths (J,) of the 95 % intervals of parameters that count what happened at random."""
         return {}

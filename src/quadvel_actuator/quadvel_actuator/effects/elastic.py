@@ -12,6 +12,7 @@ from . import recurrence
 from .base import (
     AddedLaw,
     Array,
+    Bools,
     EffectLaw,
     ErrorLaw,
     Errors,
@@ -122,6 +123,11 @@ class Cogging(AddedLaw):
     def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
         phi = p["phi"] + np.where(p["a"] < 0.0, np.pi, 0.0)
         return p | {"a": np.abs(p["a"]), "phi": np.remainder(phi + np.pi, 2.0 * np.pi) - np.pi}
+
+    def shown(self, p: Params, s: View) -> Bools:
+        """Joints that moved through a whole period: a part of one is any curve over the angle."""
+        whole: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi
+        return whole
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return p["a"] * of_each(lambda n, phi: np.sin(n * s.q + phi), p["n"], p["phi"])
