@@ -1,6 +1,6 @@
 """What each device of the identification's search is worth: the score without it, on the same logs, one after the other.
 
-    python -m tests.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches drop,ties]
+    python -m tests.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches nesting,elimination]
 
 Each switch takes one device out. A campaign can be broken off and taken up again, as that of `tests.identification.score`.
 Logs that are told otherwise than with everything are what a device changes: the comparison is paired.
@@ -24,7 +24,7 @@ from rich.console import Console
 from rich.progress import track
 
 from tests.identification.hidden.cases import GROUP_OF
-from tests.identification.score import score_case
+from tests.identification.score import keep, score_case
 
 WHOLE = "everything"
 
@@ -84,10 +84,7 @@ def without(switches: str) -> Iterator[None]:
 
 def _work(switches: str, kind: str, index: int, seed: int, path: Path) -> None:
     with without(switches):
-        row = score_case(kind, index, seed)
-    part = path.with_suffix(f".{os.getpid()}.part")
-    part.write_text(json.dumps(row, default=float))
-    part.replace(path)
+        keep(score_case(kind, index, seed), path)
 
 
 def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
@@ -122,6 +119,11 @@ def main(
 ) -> None:
     """Score the identification without one of its devices after the other."""
     asked = [WHOLE, *(switches.split(",") if switches else [one for one in SWITCHES if one != WHOLE])]
+    unknown = {one for switch in asked for one in switch.split("+")} - SWITCHES.keys()
+    if unknown:
+        raise typer.BadParameter(
+            f"--switches: found {', '.join(sorted(unknown))}, expected some of {', '.join(SWITCHES)}"
+        )
     cases = [
         (switch, kind, index, out / switch / f"{kind}-{index:03d}.json")
         for switch in asked

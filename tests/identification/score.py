@@ -69,8 +69,12 @@ def engine() -> str:
 
 
 def _work(kind: str, index: int, seed: int, path: Path) -> None:
-    """Scores a case into its file, whole or not at all."""
-    row = score_case(kind, index, seed) | {"engine": engine()}
+    """Scores a case into its file."""
+    keep(score_case(kind, index, seed) | {"engine": engine()}, path)
+
+
+def keep(row: dict[str, Any], path: Path) -> None:
+    """Write a row of the score into its file, whole or not at all."""
     part = path.with_suffix(f".{os.getpid()}.part")
     part.write_text(json.dumps(row, indent=1, default=float))
     part.replace(path)

@@ -37,9 +37,8 @@ FOLLOWING = ("stance", "walk")
 """In which modes a velocity is followed"""
 STILL = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
-STEPPING_SPEED = (
-    0.2  # m/s, above which a robot that is to stand steps on: feet that stay behind a moving trunk trip it
-)
+STEPPING_SPEED = 0.2
+"""m/s, above which a robot that is to stand steps on: feet that stop behind a moving trunk trip it"""
 PATIENCE_IN_BRAKING = 1.8  # times `brake_time`, after which a robot that still moves is put into its posture
 
 SPOIL_THE_ESTIMATE = {guard.name() for guard in (EstimateStale, EstimateWrong, AccelerometerImplausible)}
