@@ -25,8 +25,6 @@ FITTED, FITTED_TERMS = 6, 4
 SIMPLIFIED = 3
 """Of these, the best, of which it is tried what their joints share"""
 LAWS, TERMS = "laws", "terms"
-_PORTION = 8
-"""Candidates that one core screens before it asks for more"""
 L = TypeVar("L", bound=EffectLaw)
 R = TypeVar("R")
 
@@ -47,32 +45,25 @@ class Candidates:
         return self._laws if kinds == LAWS else self._terms
 
     @cached_property
+    def _screen(self) -> Screen:
+        return Screen(self._context, self._judge.cores)
+
+    @cached_property
     def _laws(self) -> tuple[list[Account], int]:
         several = len(self._context.samples.joints) > 1
-        asked = [one for one in self._asked(library.laws(self._context)) if several or not one.gainlike]
-        screen = Screen(self._context)
-        screen.prepare(any(one.remembers for one in asked))
-        found = self._screened(screen.laws, asked)
+        found = self._screen.laws(
+            one for one in self._asked(library.laws(self._context)) if several or not one.gainlike
+        )
         count = len({one.law.name for one in found}) or 1
         return self._fitted(_distinct(best_first(found), FITTED)), count
 
     @cached_property
     def _terms(self) -> tuple[list[Account], int]:
-        asked = list(self._asked(library.terms(self._context)))
-        screen = Screen(self._context)
-        screen.prepare(any(one.remembers for one in asked))
-        found = self._screened(screen.terms, asked)
+        found = self._screen.terms(list(self._asked(library.terms(self._context))))
         best = _distinct(best_first(found), FITTED_TERMS)
-        finer = self._side_by_side(lambda k: _refined(best[k], screen), len(best))
+        finer = self._side_by_side(lambda k: _refined(best[k], self._screen), len(best))
         best += [one for one in finer if one not in best]
         return self._fitted(best), len({key(one.law) for one in found})
-
-    def _screened(
-        self, screen: Callable[[Sequence[L]], Iterable[Screened]], asked: Sequence[L]
-    ) -> list[Screened]:
-        parts = [asked[k : k + _PORTION] for k in range(0, len(asked), _PORTION)]
-        found = self._side_by_side(lambda k: list(screen(parts[k])), len(parts))
-        return [one for part in found for one in part]
 
     def _fitted(self, chosen: Sequence[Screened]) -> list[Account]:
         first = self._accounts(lambda k: self._fit(chosen[k]), len(chosen))
@@ -113,8 +104,8 @@ def _refined(one: Screened, screen: Screen) -> Screened:
     """A term with its place and time constants where it promises most."""
     for _ in range(3):
         assert isinstance(one.law, SignalTerm)
-        near = screen.terms(library.refined(one.law))
-        better = max(near, key=lambda other: other.promise, default=one)
+        near = library.refined(one.law)
+        better = max(map(screen.term, near), key=lambda other: other.promise, default=one)
         if better.promise <= one.promise:
             break
         one = better

@@ -11,6 +11,8 @@ from itertools import product
 
 import attrs
 import numpy as np
+from scipy.sparse import csc_array
+from scipy.sparse.linalg import splu
 
 from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
 from .parallel import side_by_side
@@ -165,7 +167,7 @@ def _bounded(matrix: Array, gradient: Array, low: Array, high: Array, scale: Arr
     for pivot in range(_PIVOTS[1]):
         free = ~held
         right = gradient[free] - matrix[np.ix_(free, held)] @ x[held]
-        x[free] = np.linalg.solve(matrix[np.ix_(free, free)], right)
+        x[free] = splu(csc_array(matrix[np.ix_(free, free)])).solve(right)  # joints share few unknowns
         beyond = free & ((x < low) | (x > high))
         x = x.clip(low, high)
         slope = matrix @ x - gradient

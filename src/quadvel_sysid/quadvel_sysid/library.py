@@ -130,22 +130,25 @@ class SignalTerm(AddedLaw):
         return found[2]
 
     def _regressors(self, x: Array, s: Signals) -> Array:
-        view = _past_only(s) if self.of.endswith("ddq") else s
-        u = read(self.of, view, x, self.joints)
-        columns = self.shape.columns(u, s.start[:, 0], float(np.median(s.dt)))  # (N, K, C)
-        by = factor(self.times, s, x)
-        found = np.moveaxis(columns, 1, 0) * by
+        columns = self.shape.columns(self._read(x, s), s.start[:, 0], float(np.median(s.dt)))  # (N, K, C)
+        found = np.moveaxis(columns, 1, 0) * factor(self.times, s, x)
         return np.broadcast_to(found, (len(found), *s.q.shape))
+
+    def _read(self, x: Array, s: Signals) -> Array:
+        """The signal that it is a shape of, (N, C)."""
+        return read(self.of, _past_only(s) if self.of.endswith("ddq") else s, x, self.joints)
 
     def torque(self, x: Array, s: Any, p: Params) -> Array:
         each = [p[name] for name in self.names]
         if any(one.ndim > 1 for one in each):
             each = list(np.broadcast_arrays(*each))
+        if x.ndim > 2 and (len(x) == 1 or not self.reads_total):
+            x = x[0]
+        if x.ndim == 2 and each[0].ndim == 1 and not self.remembers:
+            total, _ = self.shape.advance(self._read(x, s), 0.0, np.array(each), ())
+            return np.broadcast_to(total * factor(self.times, s, x), s.q.shape)
         weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
-        if x.ndim == 2 or not self.reads_total:
-            columns = self.regressors(x, s)
-        else:
-            columns = np.stack([self.regressors(one, s) for one in x])
+        columns = self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(one, s) for one in x])
         if columns.ndim == 3 and weights.ndim == 2:
             return np.einsum("kj,knj->nj", weights, columns)
         batch: Array = np.einsum("...kj,...knj->...nj", weights.reshape(-1, *weights.shape[-2:]), columns)

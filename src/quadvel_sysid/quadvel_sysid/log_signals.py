@@ -108,13 +108,20 @@ class LogSignals:
         """The command row that counts at the times `at` (N,), s."""
         return interpolation.rows_at(self.t_cmd, at + ALMOST)
 
-    def command(self, name: str, at: Array, window: float, joints: Joints = ALL) -> Array:
-        """A command signal: the mean over `at` to `at + window`."""
+    def command(
+        self,
+        name: str,
+        at: Array,
+        window: float,
+        joints: Joints = ALL,
+        row: NDArray[np.intp] | None = None,
+    ) -> Array:
+        """A command signal: the mean over `at` to `at + window`; `row` is `in_force(at)` where that is known."""
         values = self.commands[name][:, joints]
         if name not in self.sums:
             return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
-            return values[self.in_force(at)]
+            return values[self.in_force(at) if row is None else row]
         sums = self.sums[name][:, joints]
         late, early = (self._integral(values, sums, end) for end in (at + window, at))
         return (late - early) / window

@@ -20,6 +20,7 @@ from .criterion import PER_PARAMETER
 from .fit import RIDGE
 from .library import Context, SignalTerm, complexity, may_act
 from .model import LONGEST, Applied, Model, Unknowns, jacobian, linear_columns
+from .parallel import side_by_side
 from .signals import Array, scattered
 
 _SHIFTS = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
@@ -58,52 +59,80 @@ class Screen:
     Laws that remember are followed over all rows; for others these rows are enough.
     """
 
-    def __init__(self, context: Context) -> None:
-        self.context = context
+    def __init__(self, context: Context, cores: int = 1) -> None:
+        """`cores` that share the work."""
+        self.context, self._cores = context, cores
         self.joints = context.samples.joints
         fitted = np.flatnonzero(context.parts.fit.any(axis=1))
         self.rows = fitted[scattered(len(fitted), max(1, len(fitted) // _ROWS))]
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
-        self._remembers = any(one.law.remembers for one in context.model.applied)
         self.few = context.samples.taken(self.rows)
         """the rows that are looked at, alone"""
-        self._spots: dict[bool, list[_Spot]] = {}
+        self._remembers = any(one.law.remembers for one in context.model.applied)
+        shifts = _FEW_SHIFTS if self._remembers else _SHIFTS
+        self._grid = [context.model, *_around(context.model, shifts)]
+        """the model as it is, and at the points of the grid of delays"""
+        self._here: dict[bool, _Spot] = {}
 
-    def grid(self, whole: bool) -> list[_Spot]:
-        """The model as it is, and at the points of the grid of delays; on all rows, or on those that are looked at."""
-        whole = whole or self._remembers
-        if whole not in self._spots:
-            model = self.context.model
-            if not whole:
-                model = attrs.evolve(model, samples=self.few)
-            around = _around(model, _SHIFTS if not self._remembers else _FEW_SHIFTS)
-            self._spots[whole] = [_Spot(self, at, whole) for at in (model, *around)]
-        return self._spots[whole]
+    def laws(self, candidates: Iterable[EffectLaw]) -> list[Screened]:
+        """Laws, each at the point of the grid where it promises most."""
+        asked = [(law, table) for law in candidates if (table := self._table(law)) is not None]
 
-    def prepare(self, whole: bool) -> None:
-        """Do now what all candidates need, those that are followed over all rows among them if `whole`."""
-        self.grid(whole)
+        def at(k: int) -> tuple[Array, list[tuple[Model, Array]]]:
+            spots = self._spots(k, (law for law, _ in asked))
+            return spots[False].bare, [spots[law.remembers].best(law, table) for law, table in asked]
+
+        found = side_by_side(at, len(self._grid), self._cores, self.context.samples)
+        self.bare = np.min([bare for bare, _ in found], axis=0)
+        return [
+            max((self._promised(*one) for one in points), key=lambda one: one.promise)
+            for points in zip(*(each for _, each in found), strict=True)
+        ]
+
+    def terms(self, candidates: Sequence[SignalTerm]) -> list[Screened]:
+        """Terms, at the delays of the model."""
+        self.prepare(candidates)
+        return side_by_side(
+            lambda k: self.term(candidates[k]), len(candidates), self._cores, self.context.samples
+        )
+
+    def prepare(self, candidates: Iterable[SignalTerm]) -> None:
+        """Do now what `term` needs for all of these."""
+        self._here = self._spots(0, candidates)
         self.bare  # noqa: B018
+
+    def term(self, law: SignalTerm) -> Screened:
+        """One of the terms that were prepared for."""
+        table = np.zeros((1, law.shape.count, len(self.joints)))
+        return self._promised(*self._here[law.remembers].best(law, table))
 
     @cached_property
     def bare(self) -> Array:
         """Squared error (J,) of the model without a candidate, at its best delays."""
-        least: Array = np.min([spot.bare for spot in self.grid(False)], axis=0)
+        bare = side_by_side(
+            lambda k: self._spots(k)[False].bare, len(self._grid), self._cores, self.context.samples
+        )
+        least: Array = np.min(bare, axis=0)
         return least
 
-    def laws(self, candidates: Iterable[EffectLaw]) -> Iterator[Screened]:
-        """Laws, each on every spot of the grid."""
-        for law in candidates:
-            table = self._table(law)
-            if table is not None:
-                found = (spot.best(law, table) for spot in self.grid(law.remembers))
-                yield max(found, key=lambda one: one.promise)
+    def _spots(self, k: int, candidates: Iterable[EffectLaw] = ()) -> dict[bool, _Spot]:
+        """A point of the grid, for laws that remember and for others, where these are asked for."""
+        model, few = self._grid[k], attrs.evolve(self._grid[k], samples=self.few)
+        if self._remembers:
+            return dict.fromkeys((False, True), _Spot(self, model, whole=True))
+        spots = {False: _Spot(self, few, whole=False)}
+        if any(law.remembers for law in candidates):
+            spots[True] = _Spot(self, model, whole=True)
+        return spots
 
-    def terms(self, candidates: Iterable[SignalTerm]) -> Iterator[Screened]:
-        """Terms, at the delays of the model."""
-        for law in candidates:
-            yield self.grid(law.remembers)[0].best(law, np.zeros((1, law.shape.count, len(self.joints))))
+    def _promised(self, model: Model, error: Array) -> Screened:
+        """A candidate at its best start, and the squared error (J,) that it leaves."""
+        law = model.applied[-1].law
+        fall = np.maximum(self.bare - error, 0.0) * may_act(law, self.joints)
+        gain = -np.log(np.maximum(1.0 - fall / np.maximum(self.bare, 1e-300), _LEAST))
+        promise = float(np.sum(np.maximum(gain - PER_PARAMETER * complexity(law), 0.0)))
+        return Screened(model, promise)
 
     def _table(self, law: EffectLaw) -> Array | None:
         """The starting values (S, P, J) of a law; None where there are none."""
@@ -193,17 +222,12 @@ class _Spot:
                 found += list((torque - base)[:, self.rows].transpose(0, 2, 1)[:, :, None])
         return np.stack(found) * self.screen.weight.T[None, :, None]
 
-    def best(self, law: EffectLaw, table: Array) -> Screened:
-        """The law at the best of its starting values for each joint."""
+    def best(self, law: EffectLaw, table: Array) -> tuple[Model, Array]:
+        """The model with the law at the best of its starting values for each joint, and the squared error (J,) there."""
         columns = self.columns(law, table)
         columns = np.stack([self.project(one) for one in columns])
-        penalty = getattr(law, "penalty", None)
-        error, choice, (change, weights) = self._solve(columns, law, penalty)
-        bare = self.screen.bare
-        fall = np.maximum(bare - error, 0.0) * may_act(law, self.screen.joints)
-        gain = -np.log(np.maximum(1.0 - fall / np.maximum(bare, 1e-300), _LEAST))
-        promise = float(np.sum(np.maximum(gain - PER_PARAMETER * complexity(law), 0.0)))
-        return Screened(self._started(law, table, choice, change, weights), promise)
+        error, choice, (change, weights) = self._solve(columns, law, getattr(law, "penalty", None))
+        return self._started(law, table, choice, change, weights), error
 
     def _solve(
         self, columns: Array, law: EffectLaw | None, penalty: Array | None = None

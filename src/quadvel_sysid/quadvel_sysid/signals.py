@@ -302,13 +302,14 @@ class Samples:
         if delays is None:
             delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
         for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
+            sent = at - input_delay
+            row = one.in_force(sent)
             for name in one.commands.keys() - constant:
-                parts.setdefault(name, []).append(one.command(name, at - input_delay, window, chosen))
-            row = one.in_force(at - input_delay)
+                parts.setdefault(name, []).append(one.command(name, sent, window, chosen, row))
             for name in one.gains.keys() - constant:
                 parts.setdefault(name, []).append(one.gains[name][:, chosen][row])
             packets.append((row + first)[:, None])
-            ages.append((at - input_delay - one.t_cmd[row] + (1.0 if window else 0.0))[:, None])
+            ages.append((sent - one.t_cmd[row] + (1.0 if window else 0.0))[:, None])
         signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
         signals |= self._state(output_delay, joints)
         for name, value in constant.items():
