@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import redirect_stdout
-from io import StringIO
 from typing import Any
-
-import viser
 
 from .operator import Operator
 from .panel import panel
 from .picture import RobotPicture
 from .scene import Scene
+from .scene_server import SceneServer
 from .server import PageServer
 
 FRAME = 1.0 / 30.0
@@ -31,13 +28,12 @@ class Viewer:
         on_word: Callable[[int, dict[str, Any]], None],
         on_leave: Callable[[int], None],
     ) -> None:
-        with redirect_stdout(StringIO()):  # viser tells of its own address, which is nobody's business
-            self._scene_server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+        self._scene_server = SceneServer()
         try:
-            self._scene = Scene(self._scene_server)
-            self._page = PageServer(host, port, self._scene_server.get_port(), on_word, on_leave)
+            self._scene = Scene(self._scene_server.viser)
+            self._page = PageServer(host, port, self._scene_server.path, on_word, on_leave)
         except BaseException:
-            self._end_scene()
+            self._scene_server.close()
             raise
         self.url = self._page.url
 
@@ -54,8 +50,4 @@ class Viewer:
     def close(self) -> None:
         """End both servers."""
         self._page.close()
-        self._end_scene()
-
-    def _end_scene(self) -> None:
-        with redirect_stdout(StringIO()):
-            self._scene_server.stop()
+        self._scene_server.close()
