@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import stat
+import tempfile
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,8 @@ from websockets.typing import Subprotocol
 
 from quadvel_view.guard import is_loopback
 from quadvel_view.scene_server import SceneServer, SceneServerError, page
+from quadvel_view.server import AddressError
+from quadvel_view.viewer import Viewer
 
 VISER = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -84,6 +87,17 @@ def test_a_viser_that_opens_a_port_of_its_own_draws_nothing(monkeypatch: pytest.
         SceneServer()
     assert ports
     assert websockets_server.serve is by_another_way
+
+
+def test_a_folder_for_temporary_files_whose_name_is_too_long_for_a_socket_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tmp_path / ("x" * 100)
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    with pytest.raises(AddressError, match=r"x{100}.*TMPDIR"):
+        Viewer("127.0.0.1", 0, lambda *_: None, lambda _: None)
+    assert list(folder.iterdir()) == []
 
 
 def test_the_page_of_viser_is_one_file() -> None:

@@ -39,8 +39,7 @@ class SceneServer:
         path: The Unix socket that viser listens on.
 
     Raises:
-        SceneServerError: Where viser listens elsewhere.
-        OSError: Where the socket cannot be made.
+        SceneServerError: Where the socket cannot be made, or viser listens elsewhere.
     """
 
     def __init__(self) -> None:
@@ -61,7 +60,13 @@ class SceneServer:
 
     def _start(self) -> viser.ViserServer:
         listener = socket.socket(socket.AF_UNIX)  # viser closes it
-        listener.bind(str(self.path))
+        try:
+            listener.bind(str(self.path))
+        except OSError as error:
+            listener.close()
+            raise SceneServerError(
+                f"{self.path}: no socket can be made there: {error}; TMPDIR names the folder"
+            ) from None
         with (
             _starting,
             _serving_on(listener) as calls,

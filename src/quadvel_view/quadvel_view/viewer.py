@@ -9,8 +9,8 @@ from .operator import Operator
 from .panel import panel
 from .picture import RobotPicture
 from .scene import Scene
-from .scene_server import SceneServer
-from .server import PageServer
+from .scene_server import SceneServer, SceneServerError
+from .server import AddressError, PageServer
 
 FRAME = 1.0 / 30.0
 """s, between two pictures"""
@@ -28,7 +28,10 @@ class Viewer:
         on_word: Callable[[int, dict[str, Any]], None],
         on_leave: Callable[[int], None],
     ) -> None:
-        self._scene_server = SceneServer()
+        try:
+            self._scene_server = SceneServer()
+        except SceneServerError as error:
+            raise AddressError(f"the scene can't be drawn: {error}") from None
         try:
             self._scene = Scene(self._scene_server.viser)
             self._page = PageServer(host, port, self._scene_server.path, on_word, on_leave)
