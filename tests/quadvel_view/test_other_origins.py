@@ -32,7 +32,7 @@ from sockets import family_of, sockets_of, unix_listeners
 QUADVEL = (sys.executable, "-m", "quadvel_bringup")
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 VISER = f"viser-v{viser.__version__}"
-PATHS = ("/", "/words", "/scene", "/scene/")
+SOCKETS, FILES = ("/words", "/scene"), ("/", "/scene/")
 EVIL = "evil.example"  # the browser is made to take it for this host
 PATIENCE = 60.0  # s
 
@@ -124,7 +124,7 @@ def test_a_handshake_of_another_origin_is_refused_on_every_port(running: Running
             "http://127.0.0.1:1",
             "http://localhost",
         ]
-        for path, host, origin in product(PATHS, others, origins):
+        for path, host, origin in product(SOCKETS + FILES, others, origins):
             assert handshake(port, path, host, origin) in (400, 403), (path, host, origin)
         answers = [
             handshake(port, path, name, f"http://{name}") for path in ("/words", "/scene") for name in own
@@ -133,7 +133,7 @@ def test_a_handshake_of_another_origin_is_refused_on_every_port(running: Running
 
 
 ATTACK = """
-async ([ports, paths, protocol]) => {
+async ([ports, sockets, files, protocol]) => {
   const got = [];
   const soon = (work) => Promise.race([work, new Promise((over) => setTimeout(over, 5000))]);
   const connects = (url) => new Promise((over) => {
@@ -156,9 +156,9 @@ async ([ports, paths, protocol]) => {
     document.body.append(frame);
   });
   for (const port of ports) for (const host of ["127.0.0.1", "localhost", location.hostname]) {
-    const all = paths.flatMap((path) => [connects(`ws://${host}:${port}${path}`), reads(`http://${host}:${port}${path}`)]);
-    const files = ["/", "/scene/"].map((path) => shows(`http://${host}:${port}${path}`));
-    await soon(Promise.all([...all, ...files, runs(`http://${host}:${port}/app.js`)]));
+    const [ws, http] = [`ws://${host}:${port}`, `http://${host}:${port}`];
+    const tried = [...sockets.map((path) => connects(ws + path)), runs(http + "/app.js")];
+    await soon(Promise.all([...tried, ...files.flatMap((path) => [reads(http + path), shows(http + path)])]));
   }
   return got;
 }
@@ -201,7 +201,7 @@ def test_a_page_of_another_origin_gets_nothing_in_a_browser(running: Running, at
         for origin in (f"http://{EVIL}:{attackers_port}/", f"http://127.0.0.1:{attackers_port}/"):
             page = browser.new_page()
             page.goto(origin)
-            assert page.evaluate(ATTACK, [ports, PATHS, VISER]) == []
+            assert page.evaluate(ATTACK, [ports, SOCKETS, FILES, VISER]) == []
             shown = [frame.url for frame in page.frames if frame is not page.main_frame]
             assert len(shown) == 2 * 3 * len(ports)
             assert {url for url in shown if not url.startswith("chrome-error:")} == set()
@@ -212,5 +212,5 @@ def test_a_page_of_another_origin_gets_nothing_in_a_browser(running: Running, at
             answer = page.goto(f"http://{EVIL}:{port}/")
             assert answer is not None
             assert answer.status == 403
-            assert page.evaluate(ATTACK, [[port], PATHS, VISER]) == []
+            assert page.evaluate(ATTACK, [[port], SOCKETS, FILES, VISER]) == []
         browser.close()
