@@ -106,7 +106,9 @@ def handshake(port: int, path: str, host: str | None, origin: str | None) -> int
 def test_the_page_is_the_only_port_and_viser_has_none(running: Running) -> None:
     process, ports = running
     assert len(ports) == 1
-    for address in [address for pid in family_of(process) for address in unix_listeners(pid)]:
+    addresses = {address for pid in family_of(process) for address in unix_listeners(pid)}
+    assert "viser" in {Path(address).name for address in addresses}
+    for address in addresses:
         folder = Path(address).parent
         assert not address.startswith("@")
         assert stat.S_IMODE(folder.stat().st_mode) == 0o700
