@@ -2,83 +2,21 @@
 
 from __future__ import annotations
 
-import ipaddress
 import os
 import signal
-import socket
-import struct
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
-import attrs
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from sockets import Bound, family_of, sockets_of
+
 PROGRAM = [sys.executable, "-m", "quadvel_bringup"]
-FAMILIES, PROTOCOLS = (socket.AF_INET, socket.AF_INET6), (socket.IPPROTO_TCP, socket.IPPROTO_UDP)
-SOCK_DIAG, SOCK_DIAG_BY_FAMILY, REQUEST_ALL, DONE = 4, 20, 0x301, 3  # of linux/netlink.h, sock_diag.h
 SOCKETS_OF_DDS = 3  # discovery, data, and the one that sends
-
-
-@attrs.frozen
-class Bound:
-    """A socket: its address, and the interface that it is held to, if it is."""
-
-    address: str
-    port: int
-    interface: str | None
-
-    @property
-    def of_this_host(self) -> bool:
-        return ipaddress.ip_address(self.address).is_loopback or self.interface == "lo"
-
-
-def all_sockets() -> dict[str, Bound]:
-    """Those of IPv4 and IPv6 on this machine, by their inodes, as the kernel tells who asks by netlink."""
-    found = {}
-    for family in FAMILIES:
-        for protocol in PROTOCOLS:
-            with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, SOCK_DIAG) as kernel:
-                query = struct.pack("=BBBxI48x", family, protocol, 0, 0xFFFFFFFF)
-                kernel.send(
-                    struct.pack("=IHHII", 16 + len(query), SOCK_DIAG_BY_FAMILY, REQUEST_ALL, 1, 0) + query
-                )
-                found.update(answers(kernel))
-    return found
-
-
-def answers(kernel: socket.socket) -> Iterator[tuple[str, Bound]]:
-    """Inode and socket out of each inet_diag_msg, up to the end of the answer."""
-    while True:
-        data = kernel.recv(1 << 20)
-        while data:
-            length, kind = struct.unpack_from("=IH", data)
-            if kind == DONE:
-                return
-            family = data[16]
-            address = socket.inet_ntop(family, data[24 : 24 + (4 if family == socket.AF_INET else 16)])
-            (port,), (interface,) = struct.unpack_from(">H", data, 20), struct.unpack_from("=I", data, 56)
-            (inode,) = struct.unpack_from("=I", data, 84)
-            name = socket.if_indextoname(interface) if interface else None
-            yield f"socket:[{inode}]", Bound(address, port, name)
-            data = data[length:]
-
-
-def sockets_of(process: int) -> list[Bound]:
-    """Those of one process that reach the network."""
-    names = set()
-    for descriptor in Path(f"/proc/{process}/fd").glob("*"):
-        try:
-            names.add(os.readlink(descriptor))
-        except FileNotFoundError:
-            continue  # closed meanwhile
-    return [bound for name, bound in all_sockets().items() if name in names]
-
-
-def children(process: int) -> list[int]:
-    return [int(pid) for pid in Path(f"/proc/{process}/task/{process}/children").read_text().split()]
 
 
 def wait_for(condition, seconds: float = 60.0):
@@ -104,7 +42,7 @@ def test_nothing_of_a_running_robot_can_be_reached_from_another_host(environment
 
     def everything() -> dict[int, list[Bound]]:
         """The sockets of all six processes, once there are all of them: board and driver have one more."""
-        found = {pid: sockets_of(pid) for pid in (up.pid, *children(up.pid))}
+        found = {pid: sockets_of(pid) for pid in family_of(up.pid)}
         counts = sorted(len(sockets) for sockets in found.values())
         return found if counts == [SOCKETS_OF_DDS] * 4 + [SOCKETS_OF_DDS + 1] * 2 else {}
 

@@ -1,38 +1,131 @@
-"""What a package imports of the others, and of ROS 2, its package.xml asks for: so it can be built and run by itself."""
+"""What a package uses is what it declares: for ROS in its package.xml, for pip in pyproject.toml, both ways."""
 
 from __future__ import annotations
 
 import ast
+import re
+import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
 
-SRC = Path(__file__).parents[2] / "src"
+ROOT = Path(__file__).parents[2]
+SRC = ROOT / "src"
 PACKAGES = sorted(file.parent.name for file in SRC.glob("*/package.xml"))
-OF_ROS = ("_msgs", "_srvs", "_interfaces")
-EMBEDDED = "quadvel_dds"
-"""Takes the place of ROS 2: what it imports of it is its own."""
+MESSAGES = "quadvel_msgs"
+ROSDEP = {
+    "attrs": "python3-attr",
+    "evdev": "python3-evdev",
+    "google": "python3-protobuf",
+    "matplotlib": "python3-matplotlib",
+    "numba": "python3-numba",
+    "numpy": "python3-numpy",
+    "rich": "python3-rich",
+    "scipy": "python3-scipy",
+    "typer": "python3-typer",
+    "websockets": "python3-websockets",
+    "yaml": "python3-yaml",
+}
+"""Names that rosdep has for modules"""
+PIP = {
+    **dict.fromkeys(
+        ("atheris", "cattrs", "cyclonedds", "distributed", "mcap", "mujoco", "onnx", "onnxruntime"), ""
+    ),
+    **dict.fromkeys(
+        ("matplotlib", "numba", "numpy", "onnxscript", "rich", "rosbags", "scipy", "tensorboard"), ""
+    ),
+    **dict.fromkeys(
+        ("attrs", "evdev", "threadpoolctl", "torch", "trimesh", "typer", "viser", "websockets"), ""
+    ),
+    "foxglove": "foxglove-sdk",
+    "google": "protobuf",
+    "imageio_ffmpeg": "imageio-ffmpeg",
+    "yaml": "pyyaml",
+}
+"""Distributions that bring modules; of the module's name unless given"""
+BESIDE = {"setuptools", "quadvel_training"}
+"""Of every setup.py; and what `quadvel bench` measures where it is installed, which no package needs"""
+OF_TOOLS = ("test", "ros", "lint")
+"""Extras whose packages no source imports"""
+BY_TORCH = {"onnxscript", "tensorboard"}
+"""What torch imports where a training asks it to export and to log"""
+OURS = re.compile(rf"({'|'.join(PACKAGES)})\.[\w.:]+|({MESSAGES})")
+TYPE_NAME = re.compile(r"/?([a-z0-9_]+)/(?:msg|srv)/\w+")
 
 
-def imported(package: str) -> Iterator[str]:
-    """The first names of all modules that the package's sources import."""
-    for file in (SRC / package).rglob("*.py"):
-        for node in ast.walk(ast.parse(file.read_text())):
-            if isinstance(node, ast.Import):
-                yield from (one.name.partition(".")[0] for one in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-                yield node.module.partition(".")[0]
+def trees(folder: Path) -> Iterator[ast.AST]:
+    for file in folder.rglob("*.py"):
+        yield from ast.walk(ast.parse(file.read_text()))
 
 
-@pytest.mark.parametrize("package", [one for one in PACKAGES if one != EMBEDDED])
-def test_a_package_asks_for_the_packages_that_it_imports(package: str) -> None:
+def imported(folder: Path) -> set[str]:
+    """The first names of all modules that the sources in a folder import, by a statement or by a text.
+
+    A text that is the name of one of our modules, or of the package of our messages, means it; and so does the type of a message
+    where modules are imported by a name that is put together.
+    """
+    names, types, computes = set(), set(), False
+    for node in trees(folder):
+        match node:
+            case ast.Import(names=modules):
+                names |= {one.name for one in modules}
+            case ast.ImportFrom(module=str(module), level=0):
+                names.add(module)
+            case ast.Call(func=ast.Name("import_module"), args=[ast.Constant(str(module)), *_]):
+                names.add(module)
+            case ast.Call(func=ast.Name("import_module"), args=[ast.JoinedStr(), *_]):
+                computes = True
+            case ast.Constant(str(text)) if found := OURS.fullmatch(text):
+                names.add(found[1] or found[2])
+            case ast.Constant(str(text)) if found := TYPE_NAME.fullmatch(text):
+                types.add(found[1])
+    return {name.partition(".")[0] for name in names | (types if computes else set())}
+
+
+def used(package: str) -> set[str]:
+    """What a package needs of others: modules, or the packages of the fields of its messages."""
+    if package == MESSAGES:
+        definitions = [*(SRC / package).glob("msg/*.msg"), *(SRC / package).glob("srv/*.srv")]
+        lines = "\n".join(file.read_text() for file in definitions)
+        return set(re.findall(r"^([a-z0-9_]+)/\w+", lines, re.MULTILINE))
+    return imported(SRC / package) - set(sys.stdlib_module_names) - BESIDE - {package}
+
+
+def declared(package: str) -> set[str]:
     root = ElementTree.parse(SRC / package / "package.xml").getroot()
-    asked = {one.text for kind in ("depend", "exec_depend") for one in root.iter(kind)}
-    used = {
-        name
-        for name in imported(package)
-        if name in PACKAGES or name in ("rclpy", "launch", "launch_ros") or name.endswith(OF_ROS)
-    }
-    assert used - {package} - asked == set()
+    runtime = {"rosidl_default_runtime"} if package == MESSAGES else set()
+    return {one.text or "" for kind in ("depend", "exec_depend") for one in root.iter(kind)} - runtime
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_package_xml_declares_what_the_sources_import_and_nothing_else(package: str) -> None:
+    for_ros = {ROSDEP.get(name, name) for name in used(package) if name in ROSDEP or name not in PIP}
+    assert declared(package) == for_ros
+
+
+def requirements(*extras: str) -> set[str]:
+    """Names of the distributions that pyproject.toml asks for, with these extras."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    listed = [
+        *project["dependencies"],
+        *(one for extra in extras for one in project["optional-dependencies"][extra]),
+    ]
+    return {re.split(r"[\[<>=;]", one)[0] for one in listed}
+
+
+def test_pip_brings_what_the_sources_import_and_nothing_else() -> None:
+    modules = set.union(
+        *(used(package) for package in PACKAGES if package != MESSAGES), imported(ROOT / "training")
+    )
+    from_pip = {PIP[name] or name for name in modules if name in PIP}
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"].keys()
+    assert requirements(*(extras - set(OF_TOOLS))) - BY_TORCH == from_pip
+
+
+def test_viser_is_held_at_the_minor_version_whose_start_is_known() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (viser,) = (one for one in project["optional-dependencies"]["view"] if one.startswith("viser"))
+    assert re.fullmatch(r"viser>=(\d+)\.(\d+)(\.\d+)?,<\1\.\d+", viser)

@@ -52,6 +52,17 @@ def test_a_topic_comes_with_its_definition_and_its_bytes(server, latched: bool) 
         assert client.recv(timeout=10.0)[13:] == data  # behind operation, subscription, and time
 
 
+def test_a_page_of_another_origin_sees_topics_and_publishes_nothing(server) -> None:
+    """The one exception: Foxglove's own page is of another origin."""
+    server.offer("/odom", ODOMETRY)
+    with connect(server.url, origin="https://app.foxglove.dev", subprotocols=SUBPROTOCOLS) as client:
+        assert json.loads(client.recv(timeout=10.0))["capabilities"] == []
+        assert advertised(client)["topic"] == "/odom"
+        channel = {"id": 1, "topic": "/cmd_vel", "encoding": "json", "schemaName": "geometry_msgs/msg/Twist"}
+        client.send(json.dumps({"op": "advertise", "channels": [channel]}))
+        assert "clientPublish" in json.loads(client.recv(timeout=10.0))["message"]
+
+
 def test_other_hosts_are_refused_as_nobody_shows_a_token_here() -> None:
     with pytest.raises(AddressError, match=r"this host alone.*ssh -L"):
         foxglove_live.FoxgloveServer("0.0.0.0", 0)

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import http.client
+import struct
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from websockets.exceptions import InvalidStatus
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
-from quadvel_view.server import AddressError, PageServer
+from quadvel_view.server import LARGEST_WORD, MOST_FRAGMENTS, AddressError, PageServer
+
+NOWHERE = Path("/nowhere")
+TEXT, CONTINUED, END, MASKED = 1, 0, 0x80, 0x80  # of RFC 6455, 5.2
 
 
 @pytest.fixture
@@ -21,7 +27,9 @@ def heard() -> list[Any]:
 
 
 def serve(host: str, heard: list[Any]) -> Iterator[PageServer]:
-    server = PageServer(host, 0, 9, lambda page, word: heard.append(word), lambda page: heard.append("left"))
+    server = PageServer(
+        host, 0, NOWHERE, lambda page, word: heard.append(word), lambda page: heard.append("left")
+    )
     yield server
     server.close()
 
@@ -82,11 +90,41 @@ def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
 
 
 def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:
-    for nonsense in ("[1]", "{", '"' + "x" * 5000 + '"'):
+    for nonsense in ("[1]", "{", "[" * 4000, '{"do":' * 600, b"\xff\xfe"):
         with socket(here, f"http://127.0.0.1:{urlsplit(here.url).port}") as page:
             page.send(nonsense)
             with pytest.raises(Exception, match="not understood"):
                 page.recv(timeout=10.0)
+    assert [word for word in heard if word != "left"] == []
+
+
+def frame(opcode: int, data: bytes, length: int | None = None, last: bool = False) -> bytes:
+    """One as a browser sends it, with a mask of zeros. length: what it says of itself, where it is not what it has."""
+    head = struct.pack(
+        ">BBQ", opcode | (END if last else 0), MASKED | 127, len(data) if length is None else length
+    )
+    return head + bytes(4) + data
+
+
+@pytest.mark.parametrize(
+    "frames",
+    [
+        frame(TEXT, b"", length=400_000_000, last=True),
+        frame(TEXT, b"x" * 1000) + frame(CONTINUED, b"x" * 1000) * (LARGEST_WORD // 1000),
+        frame(TEXT, b"") + frame(CONTINUED, b"") * MOST_FRAGMENTS,
+        frame(TEXT, b"x" * 4000) + frame(CONTINUED, b"", length=2**62),
+    ],
+    ids=["whole", "in fragments", "in empty fragments", "in a huge last fragment"],
+)
+def test_a_long_message_is_refused_while_it_arrives(
+    here: PageServer, heard: list[Any], frames: bytes
+) -> None:
+    with socket(here, f"http://127.0.0.1:{urlsplit(here.url).port}") as page:
+        page.socket.sendall(frames)
+        with pytest.raises(ConnectionClosed) as closed:
+            page.recv(timeout=10.0)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == CloseCode.MESSAGE_TOO_BIG
     assert [word for word in heard if word != "left"] == []
 
 
@@ -110,4 +148,4 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
     port = urlsplit(here.url).port
     assert port is not None
     with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: the page can't be served there"):
-        PageServer("127.0.0.1", port, 9, lambda page, word: None, lambda page: None)
+        PageServer("127.0.0.1", port, NOWHERE, lambda page, word: None, lambda page: None)

@@ -13,7 +13,8 @@ from foxglove.websocket import ServerListener
 
 from quadvel_recordings.definitions import STORE
 
-from .server import AddressError, is_loopback
+from .guard import is_loopback
+from .server import AddressError
 
 PORT = 8765
 """TCP port at which Foxglove looks first"""

@@ -1,8 +1,6 @@
-"""The web server of the page: its files, its words both ways, and viser's scene behind the same port and the same token.
+"""The web server of the page: its files, its words both ways, and viser's scene behind the same port and the same guard.
 
-viser itself asks nobody who he is, so it listens on this host's loopback interface, and what reaches it from a browser has
-passed here: the token where there is one, a Host that is ours where there is none (against names that somebody lets point
-at this host), and for WebSockets an Origin that is our own page (against other pages in the operator's browser).
+The scene goes one way: what viser draws is passed on to the browser, and what the browser says to viser ends here.
 
 Where the page is called 127.0.0.1 its scene is called localhost, and the other way round: to the browser these are two sites,
 each with a process of its own, so that drawing never keeps pad and STOP waiting.
@@ -11,39 +9,38 @@ each with a process of its own, so that drawing never keeps pad and STOP waiting
 from __future__ import annotations
 
 import asyncio
-import hmac
-import ipaddress
 import json
+import logging
 import secrets
-import urllib.request
 from collections.abc import Callable
 from functools import cached_property
 from http import HTTPStatus
-from http.cookies import SimpleCookie
 from importlib.resources import files
+from pathlib import Path
 from threading import Event, Thread
 from typing import Any
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import urlsplit
 
-import attrs
-from websockets.asyncio.client import connect
+from websockets.asyncio.client import ClientConnection, unix_connect
 from websockets.asyncio.server import ServerConnection, broadcast, serve
 from websockets.datastructures import Headers
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.frames import CloseCode
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from . import scene_server
+from .guard import Guard, RequestError, Visitor, is_loopback
+
 COOKIE = "quadvel_view"
+"""start of the name of the cookie with the token; the port follows, as cookies are sent to all ports of a host"""
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE, WORDS = "/scene", "/words"
-LARGEST_WORD = 4096  # bytes that a page says at once
-LOOPBACK = "http://127.0.0.1:* http://localhost:*"
-# What a browser may load for our pages: nothing from any other host. viser's page is one file that unpacks itself.
-POLICY = (
-    "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; "
-    f"form-action 'none'; frame-src 'self' {LOOPBACK}; frame-ancestors 'self' {LOOPBACK}"
-)
+LARGEST_WORD = 4096
+"""bytes of one message of a browser; a longer one ends its connection while it arrives"""
+MOST_FRAGMENTS = 16
+"""of one message: browsers send one of this size whole, and an empty fragment costs memory, too"""
 # viser's own panel and notes have no place beside ours: of its page there is the picture alone. It looks for its server while
 # it has the focus, which stays with our page.
 PICTURE_ALONE = (
@@ -56,55 +53,27 @@ class AddressError(ValueError):
     """The page cannot be served there; one sentence."""
 
 
-@attrs.define
-class Guard:
-    """Who may come in. token: what every page must show; empty on the loopback interface, where nobody else comes."""
-
-    token: str
-
-    def refusal(self, request: Request) -> str:
-        """Why a request is turned away, or ""."""
-        host = request.headers.get("Host", "")
-        if self.token:
-            if not hmac.compare_digest(self._shown(request).encode(), self.token.encode()):
-                return "this page needs the token that `quadvel view` printed: open the whole address"
-        elif not is_loopback(urlsplit(f"//{host}").hostname or ""):
-            return f"this page is for this host alone, and not for '{host}'"
-        origin = request.headers.get("Origin")
-        if (
-            request.headers.get("Upgrade", "").lower() == "websocket"
-            and urlsplit(origin or "").netloc != host
-        ):
-            return f"a page of '{origin}' has no business here"
-        return ""
-
-    @staticmethod
-    def _shown(request: Request) -> str:
-        query = parse_qs(urlsplit(request.path).query).get("token", [""])[0]
-        cookie = SimpleCookie(request.headers.get("Cookie", "")).get(COOKIE)
-        return query or (cookie.value if cookie else "")
+def _is_own_fault(record: logging.LogRecord) -> bool:
+    """Whether a line of the log is about more than a request that is no HTTP or no handshake, which anybody may send."""
+    return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake))
 
 
-def is_loopback(host: str) -> bool:
-    """Whether a name or address means this host, by its loopback interface."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+LOG = logging.getLogger("quadvel_view.page")
+LOG.addFilter(_is_own_fault)
 
 
 class PageServer:
     """Serves from the time it is made until `close`, in a thread of its own.
 
     on_word: called there with the number of a page and what it said (an object of JSON); on_leave: with that of one that left.
-    scene: the port of viser on the loopback interface. Raises AddressError where address and port can't be listened on.
+    scene: the Unix socket of viser. Raises AddressError where address and port can't be listened on.
     """
 
     def __init__(
         self,
         host: str,
         port: int,
-        scene: int,
+        scene: Path,
         on_word: Callable[[int, dict[str, Any]], None],
         on_leave: Callable[[int], None],
     ) -> None:
@@ -157,7 +126,8 @@ class PageServer:
                 process_request=self._answer,
                 select_subprotocol=lambda connection, offered: offered[0] if offered else None,
                 compression=None,
-                max_size=None,
+                max_size=LARGEST_WORD,
+                logger=LOG,
             ) as server:
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
@@ -170,31 +140,30 @@ class PageServer:
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
         """The answer to a request for a file, or None for a WebSocket that may come in."""
-        path = urlsplit(request.path).path
-        if why := self._guard.refusal(request):
-            return _response(HTTPStatus.FORBIDDEN, "text/plain", why.encode() + b"\n")
-        if request.headers.get("Upgrade", "").lower() == "websocket":
-            known = path in (SCENE, WORDS)
-            return (
-                None if known else _response(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such socket\n")
-            )
-        if path == f"{SCENE}/":
-            return _response(HTTPStatus.OK, "text/html", self._scene_page)
-        if path not in PAGE:
-            return _response(HTTPStatus.NOT_FOUND, "text/plain", b"there is no such page\n")
-        name = PAGE[path]
+        try:
+            visitor = self._guard.admit(request)
+        except RequestError as error:
+            return _sentence(error.status, str(error))
+        if visitor.wants_socket:
+            known = visitor.path in (SCENE, WORDS)
+            return None if known else _sentence(HTTPStatus.NOT_FOUND, "there is no such socket")
+        if visitor.path == f"{SCENE}/":
+            return _page("text/html", self._scene_page, visitor)
+        if visitor.path not in PAGE:
+            return _sentence(HTTPStatus.NOT_FOUND, "there is no such page")
+        return self._file(PAGE[visitor.path], visitor)
+
+    def _file(self, name: str, visitor: Visitor) -> Response:
         body = files("quadvel_view").joinpath("page", name).read_bytes()
-        response = _response(HTTPStatus.OK, KINDS[name.rpartition(".")[2]], body)
-        if path == "/" and self._guard.token:
-            keep = f"{COOKIE}={self._guard.token}; Path=/; HttpOnly; SameSite=Strict"
+        response = _page(KINDS[name.rpartition(".")[2]], body, visitor)
+        if visitor.path == "/" and self._guard.token:
+            keep = f"{COOKIE}_{self._port}={self._guard.token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers["Set-Cookie"] = keep
         return response
 
     @cached_property
     def _scene_page(self) -> bytes:
-        with urllib.request.urlopen(f"http://127.0.0.1:{self._scene}/", timeout=10.0) as page:
-            text: bytes = page.read()
-        return text.replace(b"</head>", PICTURE_ALONE + b"</head>", 1)
+        return scene_server.page().replace(b"</head>", PICTURE_ALONE + b"</head>", 1)
 
     async def _serve_socket(self, connection: ServerConnection) -> None:
         assert connection.request is not None
@@ -209,7 +178,7 @@ class PageServer:
         page = self._count
         self._pages.add(connection)
         try:
-            async for text in connection:
+            while (text := await _message(connection)) is not None:
                 word = _word(text)
                 if word is None:
                     await connection.close(1008, "not understood")
@@ -222,42 +191,87 @@ class PageServer:
             self._on_leave(page)
 
     async def _relay(self, browser: ServerConnection) -> None:
-        """Hand on what a browser and viser say to each other, until one of them leaves."""
+        """Show a browser what viser draws, until one of them leaves. What the browser says is not passed on."""
         spoken = [Subprotocol(browser.subprotocol)] if browser.subprotocol else None
-        address = f"ws://127.0.0.1:{self._scene}"
-        async with connect(address, subprotocols=spoken, compression=None, max_size=None) as scene:
-            ways = [asyncio.create_task(_hand_on(*way)) for way in ((browser, scene), (scene, browser))]
+        path = str(self._scene)
+        async with unix_connect(
+            path, "ws://viser/", subprotocols=spoken, compression=None, max_size=None
+        ) as scene:
+            ways = [asyncio.create_task(way) for way in (_show(scene, browser), _ignore(browser))]
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
             for way in ways:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
 
 
-async def _hand_on(source: Any, sink: Any) -> None:
+async def _show(scene: ClientConnection, browser: ServerConnection) -> None:
     try:
-        async for message in source:
-            await sink.send(message)
+        async for message in scene:
+            await browser.send(message)
     except ConnectionClosed:
         return
 
 
-def _word(text: str | bytes) -> dict[str, Any] | None:
+async def _ignore(browser: ServerConnection) -> None:
+    """Read a browser's messages, fragment by fragment, so that pings are answered and its leaving is seen."""
+    try:
+        while True:
+            async for _ in browser.recv_streaming(decode=False):
+                pass
+    except ConnectionClosed:
+        return
+
+
+async def _message(connection: ServerConnection) -> bytes | None:
+    """The next message of a page, or None where it has too many fragments. Raises ConnectionClosed when the page left."""
+    fragments = []
+    async for fragment in connection.recv_streaming(decode=False):
+        fragments.append(fragment)
+        if len(fragments) > MOST_FRAGMENTS:
+            await connection.close(CloseCode.MESSAGE_TOO_BIG, f"more than {MOST_FRAGMENTS} fragments")
+            return None
+    return b"".join(fragments)
+
+
+def _word(text: bytes) -> dict[str, Any] | None:
     """What a page said, or None where it makes no sense."""
-    if len(text) > LARGEST_WORD:
-        return None
     try:
         word = json.loads(text)
-    except ValueError:
+    except (ValueError, RecursionError):
         return None
     return word if isinstance(word, dict) else None
 
 
-def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:
+def _sentence(status: HTTPStatus, sentence: str) -> Response:
+    return _response(
+        status, "text/plain", f"{sentence}\n".encode(), "default-src 'none'; frame-ancestors 'none'"
+    )
+
+
+def _page(kind: str, body: bytes, visitor: Visitor) -> Response:
+    """A file of the page or of the scene, and what the browser may do with it.
+
+    It loads nothing from any other host. Only our page may show the scene in a frame, and no page may show ours in one, where a
+    press of a button would be taken for the operator's. viser's page is one file that unpacks itself, hence 'unsafe-eval'.
+    """
+    ours = "'self'"
+    if is_loopback(visitor.name.strip("[]")):  # the page and its scene under the two names of this host
+        ours += "".join(f" http://{name}{visitor.port}" for name in ("127.0.0.1", "localhost"))
+    ancestors = ours if visitor.path == f"{SCENE}/" else "'none'"
+    policy = (
+        "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; form-action 'none'; "
+        f"frame-src {ours}; frame-ancestors {ancestors}"
+    )
+    return _response(HTTPStatus.OK, kind, body, policy)
+
+
+def _response(status: HTTPStatus, kind: str, body: bytes, policy: str) -> Response:
     headers = Headers(
         {
             "Content-Type": f"{kind}; charset=utf-8",
             "Content-Length": str(len(body)),
-            "Content-Security-Policy": POLICY,
+            "Content-Security-Policy": policy,
+            "Cross-Origin-Resource-Policy": "same-origin",
             "Cache-Control": "no-store",
             "Referrer-Policy": "no-referrer",
             "X-Content-Type-Options": "nosniff",

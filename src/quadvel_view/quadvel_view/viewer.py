@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import redirect_stdout
-from io import StringIO
 from typing import Any
-
-import viser
 
 from .operator import Operator
 from .panel import panel
 from .picture import RobotPicture
 from .scene import Scene
-from .server import PageServer
+from .scene_server import SceneServer, SceneServerError
+from .server import AddressError, PageServer
 
 FRAME = 1.0 / 30.0
 """s, between two pictures"""
@@ -31,13 +28,15 @@ class Viewer:
         on_word: Callable[[int, dict[str, Any]], None],
         on_leave: Callable[[int], None],
     ) -> None:
-        with redirect_stdout(StringIO()):  # viser tells of its own address, which is nobody's business
-            self._scene_server = viser.ViserServer("127.0.0.1", 0, verbose=False)
         try:
-            self._scene = Scene(self._scene_server)
-            self._page = PageServer(host, port, self._scene_server.get_port(), on_word, on_leave)
+            self._scene_server = SceneServer()
+        except SceneServerError as error:
+            raise AddressError(f"the scene can't be drawn: {error}") from None
+        try:
+            self._scene = Scene(self._scene_server.viser)
+            self._page = PageServer(host, port, self._scene_server.path, on_word, on_leave)
         except BaseException:
-            self._end_scene()
+            self._scene_server.close()
             raise
         self.url = self._page.url
 
@@ -54,8 +53,4 @@ class Viewer:
     def close(self) -> None:
         """End both servers."""
         self._page.close()
-        self._end_scene()
-
-    def _end_scene(self) -> None:
-        with redirect_stdout(StringIO()):
-            self._scene_server.stop()
+        self._scene_server.close()
