@@ -8,6 +8,9 @@ passed. A command takes effect at the simulated millisecond that follows its arr
 the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted: a stall of
 the machine stops the controller, too, and is no event in the robot's world. Nor is a controller that gets no time on a
 loaded machine: the simulation runs at most LEAD ahead of what its commands answer, and waits for it before that.
+
+While its time stands still, be it paused or waiting for an answer, it publishes its state again and again, marked as `waiting`: so
+a robot that waits differs from one that has died.
 """
 
 from __future__ import annotations
@@ -28,6 +31,8 @@ REALTIME, LOCKSTEP, FAST = MODES = ("realtime", "lockstep", "fast")
 MAX_LAG = 0.01  # s
 LEAD = 10
 """ms that real time runs ahead of the newest state that was answered: half of the time after which the drives brake"""
+WAITING_PERIOD = 0.02  # s, less than half of the silence after which a controller gives a robot up
+LOCKSTEP_WAITING_PERIOD = 0.2  # s, the same in lockstep, where a controller measures silence in simulated time
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
@@ -54,8 +59,9 @@ class SimulationLoop:
 
     `publish(state, instant)` is called with the lock held, so that samples leave in order. `state.tick` and
     `state.time` go on over resets. `instant` (s) is when the sample holds: on `clock` in real time, else in
-    simulated time. answer_timeout: s that simulated time stands still for an answer; then lockstep publishes the state again,
-    and real time goes on without a controller until the next command.
+    simulated time. A sample whose state is `waiting` is the last one again, while time stands still. answer_timeout: s that
+    simulated time stands still for an answer; then lockstep counts it as missing and waits on, and real time goes on without
+    a controller until the next command.
     """
 
     def __init__(
@@ -81,6 +87,8 @@ class SimulationLoop:
             None  # the newest that a command answered; None: nobody controls the robot
         )
         self._waits_since: float | None = None  # on the clock, for an answer, in real time
+        self._stood_still = 0.0  # s, for an answer, in lockstep
+        self._sampled: RobotState  # the last one that was published
         self._owed = 0  # ms that a paused simulation was asked for and has not simulated yet
         self._given_up = 0.0
         self._unanswered = 0
@@ -211,15 +219,14 @@ class SimulationLoop:
     def _ready(self) -> bool:
         """Whether the next period may be simulated; if not, waits a while or until something happens."""
         if self._halted:
-            self._condition.wait()
+            self._stand_still(WAITING_PERIOD)
             return False
         if self.mode == FAST:
             self._condition.wait(_BREATH)
             return not (self._halted or self._stopped)
         if self.mode == LOCKSTEP:
-            if not self._answered and not self._condition.wait(self._answer_timeout):
-                self._unanswered += 1
-                self._sample()  # for a controller that has come late
+            if not self._answered:
+                self._wait_for_answer()
             return self._answered and not (self._halted or self._stopped)
         lateness = self._clock() - self._real_time(self.tick + self._ahead)
         if lateness < 0.0:
@@ -243,11 +250,26 @@ class SimulationLoop:
             self._waits_since = now
         left = self._waits_since + self._answer_timeout - now
         if left > 0.0:
-            self._condition.wait(left)
+            self._stand_still(min(left, WAITING_PERIOD))
             return True
         self._unanswered += 1
         self._answered_tick = self._waits_since = None
         return False
+
+    def _wait_for_answer(self) -> None:
+        """Wait a while in lockstep, and count an answer that has been missing for `answer_timeout`."""
+        seconds = min(LOCKSTEP_WAITING_PERIOD, self._answer_timeout)
+        self._stood_still = self._stood_still + seconds if self._stand_still(seconds) else 0.0
+        if self._stood_still >= self._answer_timeout:
+            self._unanswered, self._stood_still = self._unanswered + 1, 0.0
+
+    def _stand_still(self, seconds: float) -> bool:
+        """Wait for something to happen; whether nothing did within `seconds`, which it says in a sample then."""
+        if self._condition.wait(seconds):
+            return False
+        now = self._clock() if self.mode == REALTIME else self._sampled.time
+        self._publish(attrs.evolve(self._sampled, waiting=True), now)
+        return True
 
     def _step(self, steps: int) -> None:
         """Simulate `steps` ms; each command takes effect when it is due."""
@@ -268,7 +290,7 @@ class SimulationLoop:
         return steps
 
     def _sample(self) -> None:
-        state = self.simulator.state()
+        self._sampled = state = self.simulator.state()
         state.tick = self.tick % _WRAP
         state.time = self.tick * DT
         self._publish(state, self._real_time(self.tick) if self.mode == REALTIME else state.time)

@@ -136,6 +136,9 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         if not self.context.ok():
             self._loop.stop()
             return
+        if state.waiting:  # nothing new, for nobody but who waits for states
+            self.publish_sample(state, instant, view=False)
+            return
         view = self._samples % max(1, VIEW_PERIOD // self._settings.period) == 0
         self.publish_sample(state, instant, view)
         if self._world_view is not None:
