@@ -32,7 +32,9 @@ MAX_LAG = 0.01  # s
 LEAD = 10
 """ms that real time runs ahead of the newest state that was answered: half of the time after which the drives brake"""
 WAITING_PERIOD = 0.02  # s, less than half of the silence after which a controller gives a robot up
-LOCKSTEP_WAITING_PERIOD = 0.2  # s, the same in lockstep, where a controller measures silence in simulated time
+LOCKSTEP_WAITING_PERIOD = (
+    0.2  # s, the same in lockstep, where a controller measures silence in simulated time
+)
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
@@ -135,6 +137,8 @@ class SimulationLoop:
         arrival = self._clock()
         with self._condition:
             self._check(command)
+            if self._halted:  # all that comes now takes effect at the same instant: the newest counts
+                self._inbox.clear()
             self._inbox.append((arrival, command))
             self._answered_tick = max(self._answered_tick or 0, self.tick - self._age(command))
             if self.mode == LOCKSTEP:
