@@ -24,7 +24,6 @@ class RobotState:
     angular_velocity: np.ndarray  # (3,) rad/s, body frame
     linear_acceleration: np.ndarray  # (3,) m/s^2, body frame, +9.81 in z at rest
     foot_force: np.ndarray  # (4,) N
-    waiting: bool = False  # whether the robot's time stands still at this state, as a simulator's may
 
 
 @attrs.define

@@ -106,7 +106,7 @@ class EstimatorNode(Node):
         start = perf_counter()
         try:
             state = read_low_state(message)
-            state.time = self._robot_time.follow(state.time, state.tick, waiting=state.waiting)
+            state.time = self._robot_time.follow(state.time, state.tick)
             estimate = self._tracker.take(state)
         except (MessageError, FloatingPointError) as error:
             self._refusals.add("low_state", error)

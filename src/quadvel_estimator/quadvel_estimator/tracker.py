@@ -68,14 +68,11 @@ class VelocityTracker:
         self._previous_action = previous_action
 
     def take(self, state: RobotState) -> Estimate | None:
-        """The estimate at this state, or None where the state comes between two samples of the estimator, or was taken before
-        and comes again as its robot waits.
+        """The estimate at this state, or None where the state comes between two samples of the estimator.
 
         Raises MessageError for a state that is older than one seen before, and FloatingPointError where the
         estimate is not finite; the estimator is reset then.
         """
-        if state.waiting and state.time == self._newest:
-            return None
         self._follow(state.time)
         if not self._grid.periods(state.time):
             return None

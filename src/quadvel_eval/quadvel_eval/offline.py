@@ -76,7 +76,7 @@ def estimated(path: Path, estimator: Estimator) -> tuple[Array, Array]:
             continue
         try:
             state = read_low_state(message)
-            stamp, state.time = state.time, clock.follow(state.time, state.tick, waiting=state.waiting)
+            stamp, state.time = state.time, clock.follow(state.time, state.tick)
             estimate = tracker.take(state)
         except (MessageError, FloatingPointError):
             continue

@@ -99,14 +99,12 @@ def read_low_state(message: Any) -> RobotState:
         angular_velocity=angular_velocity,
         linear_acceleration=linear_acceleration,
         foot_force=foot_force,
-        waiting=getattr(message, "waiting", False),  # recordings of earlier versions have no such field
     )
 
 
 def write_low_state(state: RobotState, message: Any) -> None:
     """Fill a LowState; its stamp is the caller's matter."""
     message.tick = state.tick
-    message.waiting = state.waiting
     message.orientation_wxyz = np.asarray(state.quaternion, np.float32)
     for field in ("q", "dq", "tau", "angular_velocity", "linear_acceleration", "foot_force"):
         setattr(message, field, np.asarray(getattr(state, field), np.float32))

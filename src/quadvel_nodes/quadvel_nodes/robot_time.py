@@ -25,6 +25,11 @@ class RobotTime:
         # Of the last standstill: what had been left out before it, and the robot's time at which it began, s.
         self._stalled_before, self._began = 0.0, math.inf
 
+    @property
+    def tick(self) -> int | None:
+        """Of the last state, ms; None before the first one."""
+        return None if self._last is None else self._last[1]
+
     def follow(self, stamp: float, tick: int, longest: float = math.inf, waiting: bool = False) -> float:
         """The robot's time of the next state.
 

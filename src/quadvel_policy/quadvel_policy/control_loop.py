@@ -124,6 +124,7 @@ class ControlLoop:
         self._command: Stamped | None = None
         self._checks = {
             "low_state": StampCheck(config.max_silence),
+            "waiting": StampCheck(config.max_silence),
             "velocity_estimate": StampCheck(config.max_velocity_age + self._patience),
             "command": StampCheck(config.command_timeout),
         }
@@ -138,14 +139,26 @@ class ControlLoop:
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
         self.pauses.look(now)
-        longest = max(self._config.max_standstill if self.pauses.since_heard else 0.0, self._config.max_silence)
-        state.time = self._robot_time.follow(state.time, state.tick, longest, state.waiting)
+        longest = max(
+            self._config.max_standstill if self.pauses.since_heard else 0.0, self._config.max_silence
+        )
+        state.time = self._robot_time.follow(state.time, state.tick, longest)
         self.supervisor.stopped = self.pauses.lost
         self.pauses.heard()
         if self._outruns_others(state):
             self._waiting = state
         else:
             self._take(state, now, start)
+
+    def on_waiting(self, stamp: float, tick: int) -> None:
+        """The robot says at `stamp` (s) that its time stands still at `tick`; an unknown tick excuses nothing.
+
+        Raises MessageError where the stamp is not fit.
+        """
+        now = self._accept("waiting", stamp)
+        if self.state is not None and tick == self._robot_time.tick:
+            self._robot_time.follow(stamp, tick, waiting=True)
+        self._resume(now)
 
     def on_velocity(self, stamp: float, velocity: Array) -> None:
         """A velocity estimate, (3,) m/s, body frame. Raises MessageError where its stamp is not fit."""

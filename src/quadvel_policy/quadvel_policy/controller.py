@@ -20,7 +20,7 @@ from std_srvs.srv import SetBool
 
 from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
@@ -83,6 +83,7 @@ class Controller(Node):
             NEWEST if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
+        self.create_subscription(Waiting, "waiting", self._on_waiting, NEWEST)
         self.create_subscription(TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, NEWEST)
         self.create_subscription(VelocityCommand, "command", self._on_command, NEWEST)
         self.create_subscription(MotorStatus, "motor_status", self._on_motors, 1)
@@ -101,6 +102,13 @@ class Controller(Node):
             self._loop.on_state(read_low_state(message))
         except MessageError as error:
             self._refuse("low_state", error)
+
+    def _on_waiting(self, message: Any) -> None:
+        self._silent_reports = 0
+        try:
+            self._loop.on_waiting(seconds(message.stamp), message.tick)
+        except MessageError as error:
+            self._refuse("waiting", error)
 
     def _on_velocity(self, message: Any) -> None:
         try:
@@ -224,7 +232,11 @@ class Controller(Node):
 
     def _no_state(self) -> str:
         refusal = self._supervisor.refused.get("low_state")
-        return f"no message on low_state that is fit to use ({refusal})" if refusal else "no message on low_state"
+        return (
+            f"no message on low_state that is fit to use ({refusal})"
+            if refusal
+            else "no message on low_state"
+        )
 
     def _judge(self) -> tuple[bytes, str]:
         """Level and summary of the last second."""

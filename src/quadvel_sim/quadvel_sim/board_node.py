@@ -43,9 +43,8 @@ class BoardNode(SimulationNode[BoardParameters]):
         super().destroy_node()
 
     def publish_sample(self, state: RobotState, instant: float, view: bool) -> None:
-        """The state to the client; a board has no words for time that stands still."""
-        if not state.waiting:
-            self._board.publish(state, instant)
+        """The state to the client."""
+        self._board.publish(state, instant)
 
     def figures(self) -> dict[str, object]:
         """What came over the network."""

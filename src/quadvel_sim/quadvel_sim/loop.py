@@ -9,8 +9,8 @@ the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is
 the machine stops the controller, too, and is no event in the robot's world. Nor is a controller that gets no time on a
 loaded machine: the simulation runs at most LEAD ahead of what its commands answer, and waits for it before that.
 
-While its time stands still, be it paused or waiting for an answer, it publishes its state again and again, marked as `waiting`: so
-a robot that waits differs from one that has died.
+While its time stands still, be it paused or waiting for an answer, it says so every WAITING_PERIOD: so a robot that waits
+differs from one that has died.
 """
 
 from __future__ import annotations
@@ -32,15 +32,14 @@ MAX_LAG = 0.01  # s
 LEAD = 10
 """ms that real time runs ahead of the newest state that was answered: half of the time after which the drives brake"""
 WAITING_PERIOD = 0.02  # s, less than half of the silence after which a controller gives a robot up
-LOCKSTEP_WAITING_PERIOD = (
-    0.2  # s, the same in lockstep, where a controller measures silence in simulated time
-)
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
 
 Publish = Callable[[RobotState, float], None]
 """Takes a sample, and the instant (s) at which it held."""
+SayWaiting = Callable[[int, float], None]
+"""Takes the tick at which time stands still, and the instant (s) at which it does"""
 
 
 @attrs.frozen
@@ -61,9 +60,8 @@ class SimulationLoop:
 
     `publish(state, instant)` is called with the lock held, so that samples leave in order. `state.tick` and
     `state.time` go on over resets. `instant` (s) is when the sample holds: on `clock` in real time, else in
-    simulated time. A sample whose state is `waiting` is the last one again, while time stands still. answer_timeout: s that
-    simulated time stands still for an answer; then lockstep counts it as missing and waits on, and real time goes on without
-    a controller until the next command.
+    simulated time. answer_timeout: s that simulated time stands still for an answer; then lockstep publishes the state again,
+    and real time goes on without a controller until the next command. `say_waiting` is called while time stands still.
     """
 
     def __init__(
@@ -74,11 +72,12 @@ class SimulationLoop:
         period: int = 5,
         answer_timeout: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
+        say_waiting: SayWaiting = lambda tick, instant: None,
     ) -> None:
         self.simulator = simulator
         self.mode = mode
         self.period = period
-        self._publish = publish
+        self._publish, self._say_waiting = publish, say_waiting
         self._answer_timeout = answer_timeout
         self._clock = clock
         self._condition = threading.Condition()
@@ -90,7 +89,6 @@ class SimulationLoop:
         )
         self._waits_since: float | None = None  # on the clock, for an answer, in real time
         self._stood_still = 0.0  # s, for an answer, in lockstep
-        self._sampled: RobotState  # the last one that was published
         self._owed = 0  # ms that a paused simulation was asked for and has not simulated yet
         self._given_up = 0.0
         self._unanswered = 0
@@ -261,18 +259,18 @@ class SimulationLoop:
         return False
 
     def _wait_for_answer(self) -> None:
-        """Wait a while in lockstep, and count an answer that has been missing for `answer_timeout`."""
-        seconds = min(LOCKSTEP_WAITING_PERIOD, self._answer_timeout)
+        """Wait a while in lockstep, and publish the state again where its answer has been missing for `answer_timeout`."""
+        seconds = min(WAITING_PERIOD, self._answer_timeout)
         self._stood_still = self._stood_still + seconds if self._stand_still(seconds) else 0.0
         if self._stood_still >= self._answer_timeout:
             self._unanswered, self._stood_still = self._unanswered + 1, 0.0
+            self._sample()  # for a controller that has come late
 
     def _stand_still(self, seconds: float) -> bool:
-        """Wait for something to happen; whether nothing did within `seconds`, which it says in a sample then."""
+        """Wait for something to happen; whether nothing did within `seconds`."""
         if self._condition.wait(seconds):
             return False
-        now = self._clock() if self.mode == REALTIME else self._sampled.time
-        self._publish(attrs.evolve(self._sampled, waiting=True), now)
+        self._say_waiting(self.tick % _WRAP, self._clock() if self.mode == REALTIME else self.tick * DT)
         return True
 
     def _step(self, steps: int) -> None:
@@ -294,7 +292,7 @@ class SimulationLoop:
         return steps
 
     def _sample(self) -> None:
-        self._sampled = state = self.simulator.state()
+        state = self.simulator.state()
         state.tick = self.tick % _WRAP
         state.time = self.tick * DT
         self._publish(state, self._real_time(self.tick) if self.mode == REALTIME else state.time)

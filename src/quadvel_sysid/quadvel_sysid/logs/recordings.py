@@ -68,8 +68,6 @@ def read(path: Path) -> Log:
             kind = types[topic]
             if topics.setdefault(kind, topic) != topic:
                 raise LogError(f"{path}: {kind}: found on {topics[kind]} and on {topic}, expected one topic")
-            if getattr(message, "waiting", False):  # the state before again, of a simulator whose time stood still
-                continue
             rows[kind].add(message, STATE_FIELDS if kind == STATE else COMMAND_FIELDS)
     except RecordingError as error:
         raise LogError(str(error)) from None
