@@ -94,6 +94,10 @@ class Relay:
         """All is well again."""
         self._fault = None
 
+    def send(self, topic: str, message: Message) -> None:
+        """Send a message as it is."""
+        self._senders[topic].publish(message)
+
     def _hear(self, message: Message) -> None:
         self.asked = message
 
@@ -107,7 +111,7 @@ class Relay:
             fault, began = self._fault
             message = fault.change(self, message, time.monotonic() - began)
         if message is not None:
-            self._senders[topic].publish(message)
+            self.send(topic, message)
 
 
 class TopicRobot:
@@ -243,6 +247,24 @@ def _lost(relay: Relay, message: Message, age: float) -> None:
     return None
 
 
+def _kept(relay: Relay, message: Message, age: float) -> None:
+    relay.memory.setdefault("state", message)
+
+
+def _repeat(robot: TopicRobot) -> None:
+    """A simulator that hangs sends one state again and again, as if it was new."""
+    relay = robot.relay
+
+    def send() -> None:
+        if (state := relay.memory.get("state")) is not None:
+            state.stamp = relay.node.get_clock().now().to_msg()
+            relay.send("low_state", state)
+
+    timer = relay.node.create_timer(0.005, send)
+    robot.until(lambda state: bool(state.fault), "a simulator that hangs is not noticed")
+    relay.node.destroy_timer(timer)
+
+
 def _stuck(*fields: str, joint: int | None = None) -> Change:
     """Fields, or one joint of them, that repeat what they held first."""
 
@@ -338,7 +360,7 @@ FAULTS = (
     TopicFault("state_back_in_time", change=_earlier(0.1)),
     TopicFault("state_stale", change=_lost),
     TopicFault("controller_stopped", begin=lambda robot: robot.stop("controller", 2.0)),
-    TopicFault("state_frozen", change=_stuck("tick", "q", "dq", "tau")),
+    TopicFault("state_frozen", change=_kept, begin=_repeat),
     TopicFault("tilted", change=_set(orientation_wxyz=TILTED)),
     TopicFault("joint_out_of_range", change=_set(q=_at(JOINT, float(UPPER[JOINT]) + 0.5))),
     TopicFault("joint_too_fast", change=_set(dq=_at(JOINT, 50.0))),

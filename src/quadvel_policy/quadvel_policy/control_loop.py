@@ -39,6 +39,9 @@ Array = NDArray[np.float64]
 PERIOD = 1.0 / RATE_HZ
 WATCH_PERIOD = 0.02
 """s from one `watch` to the next"""
+LONGEST = 0.5
+"""s that a robot may have stood still, with all of the machine, before its next state, and that a simulated robot waits for a
+node that is behind: half of the time for which a simulator waits for its answer"""
 LOCKSTEP_PATIENCE = 2.0
 """s of real time that a robot in lockstep waits for a node that is behind"""
 
@@ -116,7 +119,7 @@ class ControlLoop:
         )  # s by which a velocity may be late as nobody ran
         self._robot_time, self._grid = RobotTime(), TickGrid(PERIOD)
         self._waiting: RobotState | None = None  # for the estimator or the mux
-        patience = LOCKSTEP_PATIENCE if sim_time else config.max_standstill
+        patience = LOCKSTEP_PATIENCE if sim_time else LONGEST
         self._estimator = _Companion(1.5 * PERIOD, patience)
         self._mux = _Companion(0.5 * config.command_timeout if sim_time else math.inf, patience)
         self._answer = JointCommand.damping()
@@ -139,9 +142,7 @@ class ControlLoop:
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
         self.pauses.look(now)
-        longest = max(
-            self._config.max_standstill if self.pauses.since_heard else 0.0, self._config.max_silence
-        )
+        longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_silence)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
         self.supervisor.stopped = self.pauses.lost
         self.pauses.heard()

@@ -46,7 +46,7 @@ class GuardConfig:
         0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME
     )
     max_standstill: float = setting(
-        0.5,
+        1.0,
         "the same for a simulated robot, whose time stands still while its process does, s",
         at_most=FALL_TIME,
     )
