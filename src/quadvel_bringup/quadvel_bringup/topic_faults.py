@@ -371,7 +371,7 @@ FAULTS = (
     ),
     TopicFault("drive_does_not_answer", change=_set(tau=_plus(JOINT, 25.0))),
     TopicFault("joint_stuck", change=_yields(JOINT, -0.29, after=0.0, within=0.3)),
-    TopicFault("stand_up_failed", change=_yields(JOINT, -0.6, after=1.5, within=0.6), mode="stand_up"),
+    TopicFault("stand_up_failed", change=_yields(JOINT, -0.3, after=1.5, within=0.6), mode="stand_up"),
     TopicFault("imu_frozen", change=_stuck("orientation_wxyz", "angular_velocity"), mode="walk"),
     TopicFault("accelerometer_implausible", change=_set(linear_acceleration=lambda before: before + 15.0)),
     TopicFault("estimate_stale", "velocity_estimate", _lost, mode="walk", says="no fresh velocity estimate"),

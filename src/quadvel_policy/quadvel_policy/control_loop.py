@@ -144,7 +144,7 @@ class ControlLoop:
         self.pauses.look(now)
         longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_silence)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
-        self.supervisor.stopped = self.pauses.lost
+        self.supervisor.stopped += self.pauses.lost
         self.pauses.heard()
         if self._outruns_others(state):
             self._waiting = state
@@ -176,8 +176,12 @@ class ControlLoop:
         self._resume(now)
 
     def refuse(self, topic: str, why: MessageError) -> None:
-        """A message of one of these topics was refused: the guards learn why, until a fit one comes."""
-        self.supervisor.refused[topic] = why
+        """A message of one of these topics was refused: the guards learn why, until a fit one comes.
+
+        What refused messages have in common in the end, that they are old, does not hide what was wrong with the first of them.
+        """
+        if type(why) is not MessageError or topic not in self.supervisor.refused:
+            self.supervisor.refused[topic] = why
 
     def watch(self) -> None:
         """Every WATCH_PERIOD: let the supervisor learn when states stop, or when none is fit to use any more."""
@@ -235,6 +239,7 @@ class ControlLoop:
         velocity = _fresh(self._velocity, state.time, self._config.max_velocity_age, self._patience)
         command = _fresh(self._command, now, self._config.command_timeout)
         self._answer = self.supervisor.tick(now, state, velocity, command)
+        self.supervisor.stopped = 0.0
         self._publish(self._answer)
 
     def _resume(self, now: float) -> None:
