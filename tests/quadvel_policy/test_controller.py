@@ -362,7 +362,9 @@ def test_states_that_go_back_in_time_become_that_fault(robot: Robot) -> None:
     robot.stand()
     for k in range(8):
         robot.graph.pass_time(0.01)
-        robot.send(robot.message(-0.01 * (k + 3)))  # all of them held at one instant, before the last good one
+        robot.send(
+            robot.message(-0.01 * (k + 3))
+        )  # all of them held at one instant, before the last good one
     assert robot.report("fault").fault == "state_back_in_time"
 
 

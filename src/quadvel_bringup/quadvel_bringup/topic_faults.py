@@ -16,6 +16,12 @@ from typing import Any
 
 import attrs
 import numpy as np
+
+import quadvel_dds
+
+quadvel_dds.install()  # before anything imports rclpy
+
+# ruff: noqa: E402
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
@@ -156,7 +162,7 @@ class TopicRobot:
         self.relay.velocity = 0.0
         self._ask_for("passive")
         self._call(ResetSim, f"{self._simulator}/reset", keyframe="lie")
-        self.spin(0.3)
+        self.spin(1.5)  # until what the guards remember of the fault before has faded
         self._ask_for("stand_up")
         if mode != "stand_up":
             self.until(lambda state: state.mode_name == "stance", "it does not stand up")
