@@ -112,9 +112,9 @@ class Relay:
         twist.linear.x = self.velocity
         self._drive.publish(twist)
 
-    def _pass_on(self, topic: str, message: Message) -> None:
-        if self._fault is not None and self._fault[0].topic == topic and self._fault[0].change is not None:
-            fault, began = self._fault
+    def _pass_on(self, topic: str, message: Message | None) -> None:
+        fault, began = self._fault or (None, 0.0)
+        if fault is not None and fault.topic == topic and fault.change is not None:
             message = fault.change(self, message, time.monotonic() - began)
         if message is not None:
             self.send(topic, message)
