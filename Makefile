@@ -55,6 +55,7 @@ format: $(VENV)/.lint  ## let ruff repair what it can
 
 faults: setup  ## let things go wrong in a simulated robot and measure what it does; results in out/faults
 	$(VENV)/bin/quadvel faults --out out/faults
+	$(VENV)/bin/python -m quadvel_bringup.topic_faults
 
 bench: setup  ## measure this machine; results in out/bench.json
 	$(VENV)/bin/quadvel bench --out out/bench.json

@@ -42,7 +42,7 @@ PATIENT = {
     "controller": {
         "max_state_age": 3.0,
         "max_velocity_age": 3.0,
-        "max_overruns": 100_000,
+        "max_overruns": 1000,
         "require_operator": True,
     },
 }

@@ -143,7 +143,8 @@ LEFT_OUT_KINDS = {
     r"torchrun .*": "the same",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
     r"(description|dds|recordings|driver's|view|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
-    r"(driver|controller|command_mux):.*": "a part of a parameter file",
+    r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity): .*)": "a part of a parameter "
+    "file; test_yaml_examples.py loads it",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
 }
 

@@ -334,10 +334,36 @@ def test_a_command_for_the_high_level_is_refused() -> None:
         wire.decode_command(sealed(packet))
 
 
+def test_motors_may_be_asked_for_different_modes() -> None:
+    packet = bytearray(COMMAND_PACKET)
+    packet[10 + 27 * 4] = MODE_DAMPING
+    data = sealed(packet)
+    command, whole = wire.decode_command(data), wire.decode_command(COMMAND_PACKET)
+    there = np.arange(12) == 4
+    assert command.mode == MODE_SERVO
+    assert (command.kp[there], command.tau[there], command.dq[there]) == (0.0, 0.0, 0.0)
+    assert command.kd[there] == whole.kd[there]
+    for field in ("q", "tau", "kp", "kd"):
+        np.testing.assert_array_equal(getattr(command, field)[~there], getattr(whole, field)[~there])
+    np.testing.assert_array_equal(wire.commanded_modes(data), np.where(there, MODE_DAMPING, MODE_SERVO))
+
+
+def test_what_a_state_says_twice_agrees() -> None:
+    state = some_state()
+    state.robot.quaternion = np.array([np.cos(0.3), 0.0, np.sin(0.3), 0.0])
+    body = struct.unpack(STATE, wire.encode_state(state)[:-4])
+    motors = np.array(body[19 : 19 + 12 * 11], float).reshape(12, 11)
+    assert body[0] == 0xFF
+    assert body[15:18] == pytest.approx((0.0, 0.6, 0.0), abs=1e-6)
+    np.testing.assert_allclose(motors[:, 5], state.robot.q, rtol=1e-6)
+    np.testing.assert_allclose(motors[:, 6], state.robot.dq, rtol=1e-6)
+    np.testing.assert_array_equal(body[-7:-3], state.robot.foot_force)
+
+
 def test_a_command_of_an_unknown_mode_is_refused() -> None:
     packet = bytearray(COMMAND_PACKET)
     packet[10 + 27 * 4] = 3
-    with pytest.raises(WireError, match="command: mode of FL_thigh_joint is 3, expected 10, as the first"):
+    with pytest.raises(WireError, match="command: mode of FL_thigh_joint is 3, expected 0 or 10"):
         wire.decode_command(sealed(packet))
     with pytest.raises(WireError, match="command: mode is 3, expected 0 or 10"):
         wire.encode_command(JointCommand(mode=3))

@@ -23,7 +23,7 @@ from std_srvs.srv import SetBool
 from quadvel_description.network_file import NetworkFileError
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
-from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
@@ -338,6 +338,75 @@ def test_an_unfit_state_is_refused_counted_and_named_and_the_node_goes_on(robot:
     assert "1 messages refused in the last second" in status.message
     robot.graph.pass_time(0.02)
     robot.graph.wait(lambda: robot.reports[-1].refused == 1)
+
+
+UNFIT: dict[str, dict[str, Any]] = {
+    "state_not_finite": {"q": np.full(12, np.nan)},
+    "attitude_not_unit": {"quaternion": np.array([1.2, 0.0, 0.0, 0.0])},
+}
+
+
+@pytest.mark.parametrize("fault", UNFIT)
+def test_states_that_are_refused_become_the_fault_that_is_wrong_with_them(robot: Robot, fault: str) -> None:
+    robot.stand()
+    for _ in range(8):
+        robot.graph.pass_time(0.01)
+        robot.state.tick += 10
+        robot.send(robot.message(**UNFIT[fault]))
+    report = robot.report("fault")
+    assert report.fault == fault
+    assert report.reason.startswith("low_state is refused: ")
+
+
+def test_states_that_go_back_in_time_become_that_fault(robot: Robot) -> None:
+    robot.stand()
+    for k in range(8):
+        robot.graph.pass_time(0.01)
+        robot.send(
+            robot.message(-0.01 * (k + 3))
+        )  # all of them held at one instant, before the last good one
+    assert robot.report("fault").fault == "state_back_in_time"
+
+
+def test_a_controller_that_did_not_run_is_the_cause_of_what_follows(robot: Robot) -> None:
+    walk(robot)
+    robot.graph.pass_time(2.0)
+    robot.state.tick += 2000
+    robot.step(2)
+    assert robot.report("fault").fault == "controller_stopped"
+
+
+def test_a_robot_whose_time_stands_still_is_not_silent(robot: Robot) -> None:
+    walk(robot)
+    waiting = robot.graph.speak(Waiting, "waiting")
+    robot.graph.wait(lambda: waiting.get_subscription_count())
+    for _ in range(20):
+        robot.graph.pass_time(0.02)
+        waiting.publish(Waiting(stamp=robot.graph.stamp(0.0), tick=robot.state.tick))
+        robot.graph.holds(lambda: False, 0.02)
+    robot.step(2)
+    assert robot.report("walk").mode_name == "walk"
+
+
+def test_a_robot_that_waits_at_a_tick_that_nobody_heard_of_is_silent(robot: Robot) -> None:
+    """Its states are withheld."""
+    walk(robot)
+    waiting = robot.graph.speak(Waiting, "waiting")
+    robot.graph.wait(lambda: waiting.get_subscription_count())
+    for _ in range(8):
+        robot.graph.pass_time(0.02)
+        waiting.publish(Waiting(stamp=robot.graph.stamp(0.0), tick=robot.state.tick + 10))
+    assert robot.report("fault").fault == "state_stale"
+
+
+def test_a_command_that_is_refused_is_named_once_the_last_fit_one_is_old(robot: Robot) -> None:
+    walk(robot)
+    for _ in range(105):
+        robot.order(math.nan)
+        robot.step()
+    report = robot.report("walk")
+    assert report.stance
+    assert "command is refused: linear is [nan" in report.findings[0]
 
 
 def test_unfit_velocities_and_commands_are_refused_and_the_last_fit_ones_stay(robot: Robot) -> None:

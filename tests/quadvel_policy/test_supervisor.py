@@ -8,14 +8,19 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 import pytest
 from rig import FORWARD, STILL, Rig, assert_damping
 
 from quadvel_description.robot import COMMAND_UPPER, LIE_Q, NOMINAL_Q, TORQUE_LIMIT, UPPER
 from quadvel_description.state import MODE_SERVO
+from quadvel_policy.control_loop import ControlConfig
+from quadvel_policy.guards import GUARDS, EncoderInconsistent
 from quadvel_policy.observation import PolicyMetadata
 from quadvel_policy.supervisor import MODES, SupervisorConfig
+
+WITHOUT_ENCODERS = [guard for guard in GUARDS if guard is not EncoderInconsistent]
 
 
 @pytest.fixture
@@ -381,7 +386,7 @@ def test_the_policy_forgets_on_entry_on_a_fault_and_after_a_gap(rig: Rig) -> Non
 
 
 def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) -> None:
-    rig = Rig(make_policy(nominal_q=tuple(UPPER)), max_posture_error=9.0, max_encoder_error=9.0)
+    rig = Rig(make_policy(nominal_q=tuple(UPPER)), WITHOUT_ENCODERS, max_posture_error=1.5)
     rig.tick()
     rig.supervisor.request("stand_up")
     for _ in range(500):
@@ -390,7 +395,7 @@ def test_targets_stay_in_the_range_of_commands(make_policy: Callable[..., Any]) 
 
 
 def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(policy: Any) -> None:
-    rig = Rig(policy, max_encoder_error=9.0).walk()
+    rig = Rig(policy, WITHOUT_ENCODERS).walk()
     rig.run(0.2)
     rig.policy.action = np.full(12, 4.0, np.float32)
     wanted = rig.policy.metadata.action.targets(rig.policy.action)
@@ -404,10 +409,27 @@ def test_what_a_policy_asks_for_beyond_the_range_goes_as_torque(policy: Any) -> 
     np.testing.assert_array_less(rig.asked.tau, TORQUE_LIMIT + 1e-9)
 
 
-@pytest.mark.parametrize("field", ["stand_kp", "rise_time", "max_state_age"])
-def test_settings_that_make_no_sense_are_refused_by_name(field: str) -> None:
+LIMITS = [name for name, value in attrs.asdict(SupervisorConfig()).items() if not isinstance(value, bool)]
+LIMITS += ["max_velocity_age", "command_timeout"]
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1.0e300, math.inf, math.nan])
+@pytest.mark.parametrize("field", LIMITS)
+def test_a_limit_that_protects_nothing_is_refused_with_the_value_and_the_bound(
+    field: str, value: float
+) -> None:
+    found = re.escape(f"{field} is {value}")
+    with pytest.raises(ValueError, match=f"^{found}, expected above 0 and at most [0-9.]+$"):
+        ControlConfig(**{field: value})
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("max_tilt", 1.6), ("max_torque_error", 45.0), ("stuck_torque", 1.01), ("max_power", 1e4)],
+)
+def test_a_limit_that_no_robot_reaches_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=field):
-        SupervisorConfig(**{field: 0.0})
+        ControlConfig(**{field: value})
 
 
 def test_limits_of_the_command_come_from_the_policy(metadata: PolicyMetadata, rig: Rig) -> None:

@@ -127,6 +127,37 @@ def test_a_network_that_does_everything_wrong_does_not_let_it_fall(serve: Serve,
     assert ticks == sorted({*ticks})
 
 
+def test_it_reports_the_mode_that_each_motor_was_asked_for(serve: Serve) -> None:
+    board = serve()
+    packet = bytearray(wire.encode_command(JointCommand(q=np.array(NOMINAL_Q), kp=np.full(12, 150.0))))
+    packet[10 + 27 * 4] = 0
+    packet[-4:] = wire.crc(bytes(packet[:604])).to_bytes(4, "little")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:
+        client.connect(board.address)
+        client.settimeout(20.0)
+        modes: list[int] = [0]
+        while not any(modes):
+            client.send(bytes(packet))
+            modes = wire.decode_state(client.recv(2048)).motor_mode.tolist()
+    assert modes == [0 if joint == 4 else 10 for joint in range(12)]
+
+
+def test_it_names_the_reason_of_the_last_datagram_that_it_could_not_use(serve: Serve) -> None:
+    board = serve()
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+    ):
+        for client in (first, second):
+            client.connect(board.address)
+        first.send(b"short")
+        wait_for(lambda: board.counts["wrong_length"], board)
+        assert "5 bytes, expected 610" in board.last_refusal
+        second.send(b"short")
+        wait_for(lambda: board.counts["from_others"], board)
+        assert f"{second.getsockname()[1]} is not served" in board.last_refusal
+
+
 def test_the_drives_brake_by_themselves_once_the_link_is_gone(serve: Serve) -> None:
     board = serve()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as client:

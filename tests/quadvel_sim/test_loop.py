@@ -31,7 +31,8 @@ class Bench:
         config = SimulatorConfig(noise=SensorNoise.none(), actuator=ActuatorParameters.ideal(), armature=1e9)
         self.clock = Clock()
         self.samples: list[tuple[RobotState, float]] = []
-        fields = {"clock": self.clock, **fields}
+        self.waiting: list[tuple[int, float]] = []
+        fields = {"clock": self.clock, "say_waiting": lambda *words: self.waiting.append(words), **fields}
         self.loop = SimulationLoop(Simulator(config), self.note, mode, period, **fields)
 
     def note(self, state: RobotState, instant: float) -> None:
@@ -183,6 +184,31 @@ def test_lockstep_without_answer_stands_still_and_sends_its_state_again() -> Non
         assert {state.tick for state, _ in bench.samples} == {0}
         bench.loop.submit(command(0.0, 0))
         wait_for(lambda: bench.samples[-1][0].tick == 5)
+
+
+def test_a_robot_whose_time_stands_still_says_so() -> None:
+    """Else nobody could tell it from one that has died."""
+    bench = Bench("realtime", clock=time.monotonic, answer_timeout=5.0)
+    with running(bench.loop):
+        bench.loop.submit(command(1.0, 0))
+        wait_for(lambda: len(bench.waiting) > 3)  # for the answer to the newest state
+        newest = bench.samples[-1][0].tick
+        bench.loop.submit(command(1.0, newest))
+        wait_for(lambda: bench.samples[-1][0].tick > newest)
+        ticks, instants = np.array(bench.waiting).T
+        np.testing.assert_array_equal(ticks, newest)
+        assert np.diff(instants).min() > 0.0
+        assert instants[-1] <= bench.samples[-1][1]  # no state that follows is older
+
+
+@pytest.mark.parametrize("mode", ["realtime", "lockstep", "fast"])
+def test_a_paused_robot_says_in_each_mode_that_its_time_stands_still(mode: str) -> None:
+    bench = Bench(mode)
+    with running(bench.loop):
+        bench.loop.pause(True)
+        bench.waiting.clear()
+        wait_for(lambda: len(bench.waiting) > 2)
+        assert {tick for tick, _ in bench.waiting} == {bench.loop.tick}
 
 
 def test_fast_goes_on_by_itself_and_takes_commands() -> None:

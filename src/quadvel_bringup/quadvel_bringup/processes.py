@@ -51,6 +51,10 @@ class ProcessGroup:
         reader.start()
         self._readers.append(reader)
 
+    def process_id(self, name: str) -> int:
+        """Of a process that was started."""
+        return self._processes[name].pid
+
     def ended(self) -> dict[str, int]:
         """Exit codes of the processes that have ended, by name; that of one ended by signal n is -n."""
         codes = {name: process.poll() for name, process in self._processes.items()}

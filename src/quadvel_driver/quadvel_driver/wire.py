@@ -9,6 +9,7 @@ the field `reserve` in front of it; these bytes have to be zero here, as the SDK
 
 from __future__ import annotations
 
+import math
 import zlib
 from enum import IntFlag
 from itertools import accumulate
@@ -186,7 +187,11 @@ def encode_command(command: JointCommand) -> bytes:
 
 
 def decode_command(data: bytes) -> JointCommand:
-    """The command in a packet. Raises WireError."""
+    """The command in a packet. Raises WireError.
+
+    Its mode is damping where all motors are asked for that; of several, one that brakes has neither stiffness nor target speed nor
+    torque. `commanded_modes` has the mode of each.
+    """
     packet = _opened(data, "command", _COMMAND)
     if packet["level_flag"] != LOW_LEVEL:
         found = f"0x{packet['level_flag']:02X}"
@@ -197,18 +202,29 @@ def decode_command(data: bytes) -> JointCommand:
         raise _not_finite("command", {"q": motors["q"], "dq": motors["dq"]})
     q, dq = numbers.astype(float).reshape(2, JOINTS)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
+    mode = _mode(motors["mode"])
+    brakes = (motors["mode"] == MODE_DAMPING) & (mode == MODE_SERVO)
     return JointCommand(
         q=np.where(no_position, 0.0, q),
-        dq=np.where(no_velocity, 0.0, dq),
-        tau=motors["tau"] / _TAU,
-        kp=np.where(no_position, 0.0, motors["kp"] / _KP),
+        dq=np.where(no_velocity | brakes, 0.0, dq),
+        tau=np.where(brakes, 0.0, motors["tau"] / _TAU),
+        kp=np.where(no_position | brakes, 0.0, motors["kp"] / _KP),
         kd=np.where(no_velocity, 0.0, motors["kd"] / _KD),
-        mode=_common_mode(motors["mode"]),
+        mode=mode,
     )
 
 
+def commanded_modes(data: bytes) -> NDArray[np.uint8]:
+    """The mode (12,) that each motor is asked for in a packet that `decode_command` took."""
+    return np.array(np.frombuffer(data, _COMMAND)[0]["motors"]["mode"][:JOINTS])
+
+
 def encode_state(state: BoardState) -> bytes:
-    """The packet of a state, clamped to what its fields hold. Raises WireError where a number is not finite."""
+    """The packet of a state, clamped to what its fields hold. Raises WireError where a number is not finite.
+
+    Fields that hold the same in other words follow from it: roll, pitch and yaw, the raw angles and speeds, the estimated foot
+    forces. Accelerations stay 0.
+    """
     robot = state.robot
     numbers = np.concatenate([getattr(robot, field) for field in _STATE_PLACES])
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
@@ -218,11 +234,14 @@ def encode_state(state: BoardState) -> bytes:
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
         packet[field] = held[field]
-    packet["foot_force"] = _counts(held["foot_force"])
+    packet["level_flag"] = LOW_LEVEL
+    packet["rpy"] = _roll_pitch_yaw(held["quaternion"])
+    packet["foot_force"] = packet["foot_force_estimate"] = _counts(held["foot_force"])
     packet["imu_temperature"] = state.imu_temperature
     packet["tick"] = robot.tick
     packet["remote"] = _remote_bytes(state.remote)
     motors = packet["motors"][0, :JOINTS]
+    motors["q_raw"], motors["dq_raw"] = held["q"], held["dq"]
     motors["q"], motors["dq"], motors["tau"] = held["q"], held["dq"], _counts(_TAU * held["tau"])
     motors["mode"], motors["error"], motors["temperature"] = (
         state.motor_mode,
@@ -294,19 +313,26 @@ def _covered(layout: np.dtype[Any]) -> int:
     return (layout.itemsize // 4 - 1) * 4
 
 
-def _common_mode(modes: NDArray[np.uint8]) -> int:
-    """The mode that all joints are asked for. Raises WireError."""
-    first = int(modes[0])
-    if first not in (MODE_DAMPING, MODE_SERVO):
+def _mode(modes: NDArray[np.uint8]) -> int:
+    """Servo where any motor is asked for it, else damping. Raises WireError where a motor is asked for anything else."""
+    unknown = (modes != MODE_DAMPING) & (modes != MODE_SERVO)
+    if unknown.any():
+        i = int(np.argmax(unknown))
         raise WireError(
-            f"command: mode of {JOINT_NAMES[0]} is {first}, expected {MODE_DAMPING} or {MODE_SERVO}"
+            f"command: mode of {JOINT_NAMES[i]} is {modes[i]}, expected {MODE_DAMPING} or {MODE_SERVO}"
         )
-    if (modes != first).any():
-        i = int(np.argmax(modes != first))
-        raise WireError(
-            f"command: mode of {JOINT_NAMES[i]} is {modes[i]}, expected {first}, as the first joint's"
-        )
-    return first
+    return MODE_SERVO if (modes == MODE_SERVO).any() else MODE_DAMPING
+
+
+def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Angles (rad) about x, y and z, of turns about z, y and x in this order; zeros where there is no direction."""
+    length = math.hypot(*quaternion.tolist())
+    w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
+    return (
+        math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
+        math.asin(max(-1.0, min(2.0 * (w * y - z * x), 1.0))),
+        math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
+    )
 
 
 def _counts(values: NDArray[np.float64]) -> NDArray[np.int16]:

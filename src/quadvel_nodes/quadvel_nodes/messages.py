@@ -35,6 +35,18 @@ class MessageError(ValueError):
     """A message that must not be used; the text names the field, the value found and what was expected."""
 
 
+class NotFiniteError(MessageError):
+    """A number of the message is not finite."""
+
+
+class NotUnitError(MessageError):
+    """The length of a quaternion is not 1."""
+
+
+class BackInTimeError(MessageError):
+    """The message is older than one before it."""
+
+
 def seconds(stamp: Any) -> float:
     """A builtin_interfaces/Time in seconds."""
     return float(stamp.sec + 1e-9 * stamp.nanosec)
@@ -46,7 +58,7 @@ def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
     if value.shape != (size,):
         raise MessageError(f"{field} has {value.size} numbers, expected {size}")
     if not np.isfinite(value).all():
-        raise MessageError(f"{field} holds {value[~np.isfinite(value)][0]}, expected finite numbers")
+        raise NotFiniteError(f"{field} holds {value[~np.isfinite(value)][0]}, expected finite numbers")
     return value
 
 
@@ -76,7 +88,7 @@ def read_low_state(message: Any) -> RobotState:
     q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _LOW_STATE.read(message)
     norm = math.hypot(*quaternion.tolist())
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
-        raise MessageError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
+        raise NotUnitError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
     return RobotState(
         time=seconds(message.stamp),
         tick=message.tick,

@@ -11,6 +11,7 @@ import math
 
 JITTER = 0.01  # s, by which stamps may be off the ticks for other reasons
 _WRAP = 2**32
+_LONGEST_LIFE = 1e-3 * _WRAP / 2  # s from state to state; a tick that is further on went back
 
 
 class RobotTime:
@@ -18,23 +19,45 @@ class RobotTime:
 
     def __init__(self) -> None:
         self.stalled = 0.0
-        self._last: tuple[float, int] | None = None
+        self._last: tuple[float, int] | None = None  # stamp, s, and tick
+        self._time = 0.0  # s, the robot's, of the last state
+        self._waited = False  # whether that state said that the robot's time stood still
         # Of the last standstill: what had been left out before it, and the robot's time at which it began, s.
         self._stalled_before, self._began = 0.0, math.inf
 
-    def follow(self, stamp: float, tick: int, longest: float = math.inf) -> float:
-        """The robot's time of the next state, s. stamp: s. tick: ms, wraps. longest: standstill to leave out, s.
+    @property
+    def tick(self) -> int | None:
+        """Of the last state, ms; None before the first one."""
+        return None if self._last is None else self._last[1]
 
-        A tick that does not move is no clock: then stamps count.
+    def follow(self, stamp: float, tick: int, longest: float = math.inf, waiting: bool = False) -> float:
+        """The robot's time of the next state.
+
+        Args:
+            stamp: When the state held, s.
+            tick: The robot's own clock, ms, which wraps at 2^32. One that does not move is no clock: then stamps count.
+            longest: The longest standstill to leave out, s.
+            waiting: Whether the robot itself says that its time stands still at this state: then any standstill is left out.
+
+        Returns:
+            The robot's time, s.
         """
+        time = stamp - self.stalled
         if self._last is not None:
             lived = 1e-3 * ((tick - self._last[1]) % _WRAP)
             standstill = stamp - self._last[0] - lived
-            if lived > 0.0 and JITTER < standstill <= longest:
-                self._stalled_before, self._began = self.stalled, self._last[0] - self.stalled
-                self.stalled += standstill
-        self._last = stamp, tick
-        return stamp - self.stalled
+            tolerance = 0.0 if waiting or self._waited else JITTER
+            if (waiting and lived < _LONGEST_LIFE) or (lived > 0.0 and tolerance < standstill <= longest):
+                time = self._time + lived
+                self._leave_out(stamp - time - self.stalled, time if waiting else self._time)
+        self._last, self._time, self._waited = (stamp, tick), time, waiting
+        return time
+
+    def _leave_out(self, standstill: float, began: float) -> None:
+        """Leave out a standstill (s) that began at the robot's time `began` (s); it may go on from the one before."""
+        if began != self._began:
+            self._stalled_before, self._began = self.stalled, began
+        self.stalled += standstill
 
     def clock_was_set(self, change: float) -> None:
         """The clock of the stamps was set by `change` (s), which is no event in the robot's life."""

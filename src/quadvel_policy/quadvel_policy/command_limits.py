@@ -34,8 +34,16 @@ LIMITS = {
 class CommandLimitsConfig:
     """What the joints may be asked for beyond the robot's own limits."""
 
-    max_torque_step: float = setting(30.0, "largest change of a joint's torque from tick to tick, N m")
-    max_power: float = setting(1800.0, "largest mechanical power of all joints together, W")
+    max_torque_step: float = setting(
+        30.0,
+        "largest change of a joint's torque from tick to tick, N m",
+        at_most=2.0 * float(TORQUE_LIMIT.max()),  # from one end of what a drive can do to the other
+    )
+    max_power: float = setting(
+        1800.0,
+        "largest mechanical power of all joints together, W",
+        at_most=float(TORQUE_LIMIT @ VELOCITY_LIMIT),  # of drives that give all they can
+    )
 
 
 class CommandLimits:

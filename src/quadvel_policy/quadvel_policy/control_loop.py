@@ -21,10 +21,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_nodes.messages import MessageError
 from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.tick_grid import TickGrid
 
+from .guard import FALL_TIME
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
 from .pauses import Pauses
@@ -38,9 +40,10 @@ PERIOD = 1.0 / RATE_HZ
 WATCH_PERIOD = 0.02
 """s from one `watch` to the next"""
 LONGEST = 0.5
-"""s that a robot may have stood still, with all of the machine, before its next state; longer is a fault"""
-HELD_UP = 10
-"""Simulated states that wait for a command, one after the other, where none comes any more"""
+"""s that a robot may have stood still, with all of the machine, before its next state, and that a simulated robot waits for a
+node that is behind: half of the time for which a simulator waits for its answer"""
+LOCKSTEP_PATIENCE = 2.0
+"""s of real time that a robot in lockstep waits for a node that is behind"""
 
 CLOCK_STEP = 0.02
 """s by which a clock has to run away from the steady one at once to have been set"""
@@ -54,14 +57,38 @@ class ControlConfig(SupervisorConfig, Scheduling):
     """The supervisor's settings and the scheduling, and how old what comes in may be."""
 
     max_velocity_age: float = setting(
-        0.05, "oldest velocity estimate that is followed; after that it is the Kalman filter's, s"
+        0.05,
+        "oldest velocity estimate that is followed; after that it is the Kalman filter's, s",
+        at_most=FALL_TIME,
     )
-    command_timeout: float = setting(0.5, "oldest command that is followed; after that the robot stands, s")
-    robot_waits: bool = setting(
-        False,
-        "whether the robot's time stands still until a late answer comes, as a simulator's does: then lateness is no fault",
-        positive=False,
+    command_timeout: float = setting(
+        0.5, "oldest command that is followed; after that the robot stands, s", at_most=FALL_TIME
     )
+
+
+@attrs.define
+class _Companion:
+    """A node whose messages a simulated robot waits for, so that it does not outrun it: not for ever, and no more then until
+    the node is heard again.
+
+    behind: s that its newest message may be behind the robot. patience: s that the robot waits.
+    """
+
+    behind: float
+    patience: float
+    _since: float | None = None
+
+    def heard(self) -> None:
+        """A message came."""
+        self._since = None
+
+    def holds_up(self, age: float, now: float) -> bool:
+        """Whether the robot is to wait. age: s, of the newest message, in the robot's time. now: s, steady."""
+        if age <= self.behind:
+            return False
+        if self._since is None:
+            self._since = now
+        return now - self._since <= self.patience
 
 
 class ControlLoop:
@@ -91,12 +118,16 @@ class ControlLoop:
             math.inf if config.robot_waits else 0.0
         )  # s by which a velocity may be late as nobody ran
         self._robot_time, self._grid = RobotTime(), TickGrid(PERIOD)
-        self._waiting: RobotState | None = None  # for the estimator or the mux, on simulated time
+        self._waiting: RobotState | None = None  # for the estimator or the mux
+        patience = LOCKSTEP_PATIENCE if sim_time else LONGEST
+        self._estimator = _Companion(1.5 * PERIOD, patience)
+        self._mux = _Companion(0.5 * config.command_timeout if sim_time else math.inf, patience)
         self._answer = JointCommand.damping()
         self._velocity: Stamped | None = None
         self._command: Stamped | None = None
         self._checks = {
-            "low_state": StampCheck(config.max_state_age),
+            "low_state": StampCheck(config.max_silence),
+            "waiting": StampCheck(config.max_silence),
             "velocity_estimate": StampCheck(config.max_velocity_age + self._patience),
             "command": StampCheck(config.command_timeout),
         }
@@ -111,33 +142,56 @@ class ControlLoop:
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
         self.pauses.look(now)
-        longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_state_age)
+        longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_silence)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
+        self.supervisor.stopped += self.pauses.lost
         self.pauses.heard()
-        sent_again = self._waiting is not None and self._waiting.time == state.time
-        if self._outruns_others(state) and not sent_again:
+        if self._outruns_others(state):
             self._waiting = state
         else:
             self._take(state, now, start)
+
+    def on_waiting(self, stamp: float, tick: int) -> None:
+        """The robot says at `stamp` (s) that its time stands still at `tick`; an unknown tick excuses nothing.
+
+        Raises MessageError where the stamp is not fit.
+        """
+        now = self._accept("waiting", stamp)
+        if self.state is not None and tick == self._robot_time.tick:
+            self._robot_time.follow(stamp, tick, waiting=True)
+        self._resume(now)
 
     def on_velocity(self, stamp: float, velocity: Array) -> None:
         """A velocity estimate, (3,) m/s, body frame. Raises MessageError where its stamp is not fit."""
         now = self._accept("velocity_estimate", stamp)
         self._velocity = self._robot_time.at(stamp), velocity
+        self._estimator.heard()
         self._resume(now)
 
     def on_command(self, stamp: float, velocity: ArrayLike, stance: bool) -> None:
         """A command, vx, vy (m/s), wz (rad/s), and whether to stand. Raises MessageError where its stamp is not fit."""
         now = self._accept("command", stamp)
         self._command = self._robot_time.at(stamp), np.append(velocity, float(stance))
+        self._mux.heard()
         self._resume(now)
 
+    def refuse(self, topic: str, why: MessageError) -> None:
+        """A message of one of these topics was refused: the guards learn why, until a fit one comes.
+
+        What refused messages have in common in the end, that they are old, does not hide what was wrong with the first of them.
+        """
+        if type(why) is not MessageError or topic not in self.supervisor.refused:
+            self.supervisor.refused[topic] = why
+
     def watch(self) -> None:
-        """Every WATCH_PERIOD: let the supervisor learn when states stop."""
+        """Every WATCH_PERIOD: let the supervisor learn when states stop, or when none is fit to use any more."""
         now = self._now()
         self.pauses.look(now)
-        silence = 0.0 if self.state is None else now - self.stalled - self.state.time
-        if self.state and silence > self._config.max_state_age and not self.pauses.excuse(now):
+        if self.state is None:
+            return
+        refused = "low_state" in self.supervisor.refused
+        limit = self._config.max_state_age if refused else self._config.max_silence
+        if now - self.stalled - self.state.time > limit and not self.pauses.excuse(now):
             self._tick(self.state, now)
 
     def _now(self, stamp: float = 0.0) -> float:
@@ -152,20 +206,16 @@ class ControlLoop:
     def _accept(self, topic: str, stamp: float) -> float:
         now = self._now(stamp)
         self._checks[topic].check(stamp, now)
+        self.supervisor.refused.pop(topic, None)
         return now
 
     def _outruns_others(self, state: RobotState) -> bool:
-        """Whether a simulator shall wait until the estimator, and in lockstep the mux, have kept up.
-
-        Not for long: it sends a state again or goes on, and states that come after a while are no longer held up.
-        """
+        """Whether a simulator shall wait until the estimator, and in lockstep the mux, have kept up."""
         if not (self._sim_time or self._config.robot_waits):
             return False
-        held_up = [(self._velocity, 1.5 * PERIOD, self._config.max_velocity_age)]
-        if self._sim_time:
-            late = 0.5 * self._config.command_timeout
-            held_up.append((self._command, late, late + HELD_UP * PERIOD))
-        return any(last is not None and least < state.time - last[0] <= most for last, least, most in held_up)
+        now = time.monotonic()
+        known = ((self._velocity, self._estimator), (self._command, self._mux))
+        return any(last is not None and node.holds_up(state.time - last[0], now) for last, node in known)
 
     def _take(self, state: RobotState, now: float, start: float) -> None:
         """Answer the state if it is due. now, start: when that began, s, on the clock and on the steady clock."""
@@ -189,6 +239,7 @@ class ControlLoop:
         velocity = _fresh(self._velocity, state.time, self._config.max_velocity_age, self._patience)
         command = _fresh(self._command, now, self._config.command_timeout)
         self._answer = self.supervisor.tick(now, state, velocity, command)
+        self.supervisor.stopped = 0.0
         self._publish(self._answer)
 
     def _resume(self, now: float) -> None:

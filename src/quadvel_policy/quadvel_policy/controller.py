@@ -6,7 +6,6 @@ When it ticks is `ControlLoop`'s matter, what a tick decides the supervisor's.
 from __future__ import annotations
 
 import gc
-import math
 import time
 from typing import Any
 
@@ -21,7 +20,7 @@ from std_srvs.srv import SetBool
 
 from quadvel_description.state import JointCommand
 from quadvel_estimator.kalman import KalmanEstimator
-from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
+from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand, Waiting
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
@@ -37,14 +36,15 @@ from .supervisor import MODES, Supervisor
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
 PATIENCE = 5
-"""s without any state after which the log says that the controller waits for one"""
+"""s without any state after which the log says that the controller waits for one, and in lockstep, whose time stands still
+then, a robot that reported before is lost"""
 
 
 @attrs.frozen(kw_only=True)
 class ControllerParameters(ControlConfig):
     """What the loop is told, and the node's own."""
 
-    policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped", positive=False)
+    policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped")
 
 
 class Controller(Node):
@@ -53,8 +53,6 @@ class Controller(Node):
     def __init__(self) -> None:
         super().__init__("controller")
         self._settings = read_parameters(self, ControllerParameters)
-        if self._settings.robot_waits:
-            self._settings = attrs.evolve(self._settings, max_state_age=math.inf)
         policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
         policy.prepare()  # now, as the first time is slow
         self._supervisor = Supervisor(policy, self._settings, KalmanEstimator())
@@ -70,7 +68,7 @@ class Controller(Node):
         self._refusals, self._message = Refusals(), LowCmd()
         self._refused_before = self._overruns_before = self._pauses_before = 0
         self._announcements = Announcements(self._supervisor)
-        self._reports = 0
+        self._reports = self._silent_reports = 0  # the latter since the last message on low_state
         self._create_interfaces()
         if not self._sim_time:  # where time waits for the node there is no hurry
             self._settings.apply(self.get_logger().warning)
@@ -85,6 +83,7 @@ class Controller(Node):
             NEWEST if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
+        self.create_subscription(Waiting, "waiting", self._on_waiting, NEWEST)
         self.create_subscription(TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, NEWEST)
         self.create_subscription(VelocityCommand, "command", self._on_command, NEWEST)
         self.create_subscription(MotorStatus, "motor_status", self._on_motors, 1)
@@ -98,22 +97,34 @@ class Controller(Node):
         return float(1e-9 * self.get_clock().now().nanoseconds)
 
     def _on_state(self, message: Any) -> None:
+        self._silent_reports = 0
         try:
             self._loop.on_state(read_low_state(message))
         except MessageError as error:
-            self._refusals.add("low_state", error)
+            self._refuse("low_state", error)
+
+    def _on_waiting(self, message: Any) -> None:
+        self._silent_reports = 0
+        try:
+            self._loop.on_waiting(seconds(message.stamp), message.tick)
+        except MessageError as error:
+            self._refuse("waiting", error)
 
     def _on_velocity(self, message: Any) -> None:
         try:
             self._loop.on_velocity(seconds(message.header.stamp), linear_velocity(message.twist.twist))
         except MessageError as error:
-            self._refusals.add("velocity_estimate", error)
+            self._refuse("velocity_estimate", error)
 
     def _on_command(self, message: Any) -> None:
         try:
             self._loop.on_command(seconds(message.stamp), planar_velocity(message.twist), message.stance)
         except MessageError as error:
-            self._refusals.add("command", error)
+            self._refuse("command", error)
+
+    def _refuse(self, topic: str, error: MessageError) -> None:
+        self._refusals.add(topic, error)
+        self._loop.refuse(topic, error)
 
     def _on_motors(self, message: Any) -> None:
         try:
@@ -177,6 +188,9 @@ class Controller(Node):
     def _report(self) -> None:
         """Once a second: /diagnostics, and a look whether the robot is alone."""
         self._supervisor.obstacle = self._rival()
+        self._silent_reports += 1
+        if self._sim_time and self._loop.state is not None and self._silent_reports > PATIENCE:
+            self._supervisor.fail(f"no state came for {PATIENCE} s: the simulator is silent", "state_stale")
         level, summary = self._judge()
         values = {
             "mode": self._supervisor.mode,
@@ -205,7 +219,7 @@ class Controller(Node):
             log.error(self._supervisor.obstacle, throttle_duration_sec=QUIET)
         elif self._loop.state is None:
             if self._reports == PATIENCE:
-                log.warning(f"no message on low_state in {PATIENCE} s: is a simulator or a driver running?")
+                log.warning(f"{self._no_state()} in {PATIENCE} s: is a simulator or a driver running?")
         elif level == DiagnosticStatus.WARN:
             log.warning(summary, throttle_duration_sec=QUIET)
 
@@ -214,6 +228,14 @@ class Controller(Node):
         count = self._states.get_publisher_count()
         return (
             f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
+        )
+
+    def _no_state(self) -> str:
+        refusal = self._supervisor.refused.get("low_state")
+        return (
+            f"no message on low_state that is fit to use ({refusal})"
+            if refusal
+            else "no message on low_state"
         )
 
     def _judge(self) -> tuple[bytes, str]:
@@ -229,7 +251,7 @@ class Controller(Node):
         if self._supervisor.obstacle:
             return DiagnosticStatus.ERROR, self._supervisor.obstacle
         if self._loop.state is None:
-            return DiagnosticStatus.WARN, "no message on low_state yet"
+            return DiagnosticStatus.WARN, f"{self._no_state()} yet"
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"
         if refused:

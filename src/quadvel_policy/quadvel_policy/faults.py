@@ -32,8 +32,13 @@ for. What it finds is told in words: in the log of `quadvel up`, by `quadvel sta
 and `reason` of `controller/state`. Every limit is a parameter of the node `controller`; its default stands in brackets. Where a
 robot is passive or in fault, its joints brake and nothing more happens to it.
 
+A state that cannot be used is refused and counted. If no fit one comes for `max_state_age`, the fault is named after what was
+wrong. A simulated robot whose time stands still, since it is paused or waits for an answer, says so on the topic `waiting`, and
+that is no fault.
+
 This page is printed by `python -m quadvel_policy.faults`; a test brings about every row, and another one sees the first fail
-without its guard. `make faults` lets sensors, links and processes fail at random instants of a simulated robot's life, and measures
+without its guard. `python -m quadvel_bringup.topic_faults` brings them about on the topics of a running robot. `make faults`
+lets sensors, links and processes fail at random instants of a simulated robot's life, and measures
 [how soon it reacts](results/faults.md).
 
 {tables}

@@ -6,7 +6,7 @@ Its `level` says what follows. All of them are in `guards`; what an operator has
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from enum import IntEnum
 from functools import cached_property
 
@@ -14,8 +14,9 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.robot import LOWER, UPPER, VELOCITY_LIMIT
+from quadvel_description.robot import LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_nodes.messages import MessageError
 
 from .settings import setting
 
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 MOVING = ("stand_up", "stance", "walk", "lie_down")
 """The modes in which the joints do more than brake"""
 WALK = ("walk",)
+FALL_TIME = 5.0
+"""s after which a robot lies that was going to fall: a limit that waits longer protects nothing"""
 
 
 class Level(IntEnum):
@@ -39,37 +42,71 @@ class Level(IntEnum):
 class GuardConfig:
     """The limits beyond which a guard finds something."""
 
-    max_state_age: float = setting(0.05, "oldest state, and longest time without one, before a fault, s")
-    max_tilt: float = setting(1.05, "largest angle between the trunk's and the world's vertical, rad")
-    max_joint_speed: float = setting(
-        1.25, "largest measured joint speed, as a share of what the drive can do"
+    max_state_age: float = setting(
+        0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME
     )
-    joint_margin: float = setting(0.2, "how far a measured angle may lie outside the mechanical range, rad")
+    max_standstill: float = setting(
+        1.0,
+        "the same for a simulated robot, whose time stands still while its process does, s",
+        at_most=FALL_TIME,
+    )
+    robot_waits: bool = setting(
+        False,
+        "whether the robot's time stands still until a late answer comes, as a simulator's does: then lateness is no fault",
+    )
+    max_tilt: float = setting(
+        1.05, "largest angle between the trunk's and the world's vertical, rad", at_most=0.5 * math.pi
+    )
+    max_joint_speed: float = setting(
+        1.25, "largest measured joint speed, as a share of what the drive can do", at_most=2.0
+    )
+    joint_margin: float = setting(
+        0.2, "how far a measured angle may lie outside the mechanical range, rad", at_most=1.0
+    )
     max_encoder_error: float = setting(
-        0.35, "by how much a joint's angle may be off what its speed adds up to over 0.1 s, rad"
+        0.35, "by how much a joint's angle may be off what its speed adds up to over 0.1 s, rad", at_most=1.5
     )
     max_attitude_error: float = setting(
-        0.15, "by how much the orientation may be off what the gyroscope adds up to over 0.2 s, rad"
+        0.15,
+        "by how much the orientation may be off what the gyroscope adds up to over 0.2 s, rad",
+        at_most=0.5 * math.pi,
     )
     max_torque_error: float = setting(
-        12.0, "by how much a drive's torque may be off the one asked for, on the mean of 0.1 s, N m"
+        12.0,
+        "by how much a drive's torque may be off the one asked for, on the mean of 0.1 s, N m",
+        at_most=float(TORQUE_LIMIT.max()),
     )
     max_acceleration_error: float = setting(
-        5.0, "largest mean acceleration of the trunk over 0.5 s, gravity left out, m/s^2"
+        5.0, "largest mean acceleration of the trunk over 0.5 s, gravity left out, m/s^2", at_most=50.0
     )
-    frozen_time: float = setting(0.1, "after which a sensor that repeats itself to the bit is at fault, s")
-    frozen_tick_time: float = setting(0.025, "after which a robot whose tick stands still is at fault, s")
-    frozen_foot_time: float = setting(1.0, "the same for a foot's force while walking, s")
-    stuck_time: float = setting(0.5, "after which a joint that pushes hard and does not move is stuck, s")
-    stuck_torque: float = setting(0.8, "what pushing hard is, as a share of the drive's largest torque")
+    frozen_time: float = setting(
+        0.1, "after which a sensor that repeats itself to the bit is at fault, s", at_most=FALL_TIME
+    )
+    frozen_tick_time: float = setting(
+        0.025, "after which a robot whose tick stands still is at fault, s", at_most=FALL_TIME
+    )
+    frozen_foot_time: float = setting(1.0, "the same for a foot's force while walking, s", at_most=60.0)
+    stuck_time: float = setting(
+        0.5, "after which a joint that pushes hard and does not move is stuck, s", at_most=FALL_TIME
+    )
+    stuck_torque: float = setting(
+        0.8, "what pushing hard is, as a share of the drive's largest torque", at_most=1.0
+    )
     max_velocity_error: float = setting(
-        0.8, "by how much the velocity estimate may be off the Kalman filter's, m/s"
+        0.8, "by how much the velocity estimate may be off the Kalman filter's, m/s", at_most=5.0
     )
     velocity_trust_time: float = setting(
-        1.0, "after which an estimate that is right again is followed again, s"
+        1.0, "after which an estimate that is right again is followed again, s", at_most=60.0
     )
-    max_temperature: float = setting(80.0, "hottest motor before the robot has to stand, deg C")
-    max_overruns: int = setting(20, "deadlines missed in a row before the robot has to stand")
+    max_temperature: float = setting(
+        80.0, "hottest motor before the robot has to stand, deg C", at_most=120.0
+    )
+    max_overruns: int = setting(20, "deadlines missed in a row before the robot has to stand", at_most=1000)
+
+    @property
+    def max_silence(self) -> float:
+        """The longest time (s) without a state, and the oldest state: longer ones for a robot whose time may stand still."""
+        return self.max_standstill if self.robot_waits else self.max_state_age
 
 
 @attrs.frozen
@@ -106,6 +143,10 @@ class Sight:
     motors: MotorStatus | None
     obstacle: str | None
     """what somebody else found that forbids moving, a sentence"""
+    refused: Mapping[str, MessageError] = attrs.field(factory=dict)
+    """by topic, why the messages that came since the last fit one were refused"""
+    stopped: float = 0.0
+    """s in which the controller did not run between the two states"""
 
     @cached_property
     def is_sound(self) -> bool:

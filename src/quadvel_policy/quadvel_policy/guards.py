@@ -14,6 +14,7 @@ import numpy as np
 from quadvel_description.kinematics import rotate
 from quadvel_description.robot import GRAVITY, JOINT_NAMES, LEGS, LOWER, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
+from quadvel_nodes.messages import QUATERNION_TOLERANCE, BackInTimeError, NotFiniteError, NotUnitError
 
 from .guard import MOVING, WALK, Array, Guard, Level, Sight
 
@@ -36,6 +37,8 @@ class StateNotFinite(Guard):
     """A number of the state is not finite."""
 
     def look(self, see: Sight) -> str | None:
+        if isinstance(refusal := see.refused.get("low_state"), NotFiniteError):
+            return f"low_state is refused: {refusal}"
         if see.is_sound:
             return None
         for name in ("q", "dq", "quaternion", "angular_velocity"):
@@ -44,23 +47,54 @@ class StateNotFinite(Guard):
         return None
 
 
-class StateStale(Guard):
-    """The state is older than `max_state_age`, or none came for so long."""
+class AttitudeNotUnit(Guard):
+    """The orientation's quaternion is not of length 1, within 5 %."""
 
     def look(self, see: Sight) -> str | None:
-        limit = see.config.max_state_age
-        if see.age > limit:
-            return f"the state is {1e3 * see.age:.0f} ms old, limit {1e3 * limit:.0f} ms"
-        if see.gap > limit:
-            return f"no state came for {1e3 * see.gap:.0f} ms, limit {1e3 * limit:.0f} ms"
-        return None
+        if isinstance(refusal := see.refused.get("low_state"), NotUnitError):
+            return f"low_state is refused: {refusal}"
+        length = math.hypot(*see.state.quaternion.tolist())
+        return (
+            f"the state's quaternion has length {length:.2f}, expected 1"
+            if abs(length - 1.0) > QUATERNION_TOLERANCE
+            else None
+        )
 
 
 class StateBackInTime(Guard):
     """The time of the states went back."""
 
     def look(self, see: Sight) -> str | None:
+        if isinstance(refusal := see.refused.get("low_state"), BackInTimeError):
+            return f"low_state is refused: {refusal}"
         return f"the state's time went back by {-1e3 * see.gap:.0f} ms" if see.gap < 0.0 else None
+
+
+class ControllerStopped(Guard):
+    """The controller itself did not run for longer than `max_state_age`, and the robot went on without it."""
+
+    def look(self, see: Sight) -> str | None:
+        limit = see.config.max_state_age
+        if min(see.stopped, see.gap) <= limit:
+            return None
+        stopped = f"the controller did not run for {1e3 * see.stopped:.0f} ms while the robot went on"
+        return f"{stopped}, limit {1e3 * limit:.0f} ms"
+
+
+class StateStale(Guard):
+    """The state is older than `max_state_age`, or none fit to use came for so long; `max_standstill` where the process of a
+    simulated robot is silent, whose time stands still then."""
+
+    def look(self, see: Sight) -> str | None:
+        if refusal := see.refused.get("low_state"):
+            return f"low_state is refused: {refusal}"
+        limit = see.config.max_silence
+        if see.age > limit:
+            return f"the state is {1e3 * see.age:.0f} ms old, limit {1e3 * limit:.0f} ms"
+        limit = see.config.max_state_age
+        if see.gap > limit:
+            return f"no state came for {1e3 * see.gap:.0f} ms, limit {1e3 * limit:.0f} ms"
+        return None
 
 
 class StateFrozen(Guard):
@@ -75,18 +109,6 @@ class StateFrozen(Guard):
         if self._time < see.config.frozen_tick_time:
             return None
         return f"the robot's tick has stood at {see.state.tick} for {1e3 * self._time:.0f} ms"
-
-
-class AttitudeNotUnit(Guard):
-    """The orientation's quaternion is not of length 1, within 5 %."""
-
-    def look(self, see: Sight) -> str | None:
-        length = math.hypot(*see.state.quaternion.tolist())
-        return (
-            f"the state's quaternion has length {length:.2f}, expected 1"
-            if abs(length - 1.0) > 0.05
-            else None
-        )
 
 
 class Tilted(Guard):
@@ -354,7 +376,7 @@ class EstimateStale(Guard):
     modes = WALK
 
     def look(self, see: Sight) -> str | None:
-        return _lost(see.velocity)
+        return _lost(see)
 
 
 class EstimateWrong(Guard):
@@ -389,17 +411,18 @@ class NoVelocity(Guard):
     modes = WALK
 
     def look(self, see: Sight) -> str | None:
-        lost = _lost(see.velocity)
+        lost = _lost(see)
         return f"{lost}, nor has the Kalman filter one" if lost and see.backup is None else None
 
 
 GUARDS: tuple[type[Guard], ...] = (
     Obstacle,
     StateNotFinite,
-    StateStale,
-    StateBackInTime,
-    StateFrozen,
     AttitudeNotUnit,
+    StateBackInTime,
+    ControllerStopped,
+    StateStale,
+    StateFrozen,
     Tilted,
     JointOutOfRange,
     JointTooFast,
@@ -418,7 +441,7 @@ GUARDS: tuple[type[Guard], ...] = (
     EstimateWrong,
     FootForceFrozen,
 )
-"""In the order in which the first of several at once is told."""
+"""In the order in which the first of several at once is told: causes before what follows from them."""
 
 
 def torque_of(command: JointCommand, state: RobotState) -> Array:
@@ -428,11 +451,14 @@ def torque_of(command: JointCommand, state: RobotState) -> Array:
     return torque
 
 
-def _lost(velocity: Array | None) -> str | None:
-    """Why a velocity estimate (3,) cannot be followed, a sentence, or None."""
-    if velocity is None:
-        return "there is no fresh velocity estimate"
-    return None if all(map(math.isfinite, velocity.tolist())) else "the velocity estimate is not finite"
+def _lost(see: Sight) -> str | None:
+    """Why the velocity estimate cannot be followed, a sentence, or None."""
+    if see.velocity is None:
+        refusal = see.refused.get("velocity_estimate")
+        return (
+            f"velocity_estimate is refused: {refusal}" if refusal else "there is no fresh velocity estimate"
+        )
+    return None if all(map(math.isfinite, see.velocity.tolist())) else "the velocity estimate is not finite"
 
 
 def _rotation_between(before: Array, after: Array) -> Array:

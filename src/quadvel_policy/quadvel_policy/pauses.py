@@ -12,12 +12,13 @@ import math
 class Pauses:
     """Notices when this process did not run, and excuses silence for a period after that, once.
 
-    count: how often it did not, since the start.
+    count: how often it did not, since the start. lost: s in which it did not, since the last message.
     """
 
     def __init__(self, period: float, tolerance: float) -> None:
         """`look` is called by a timer of this period (s) at least; later by more than `tolerance` (s) is a pause."""
         self.count = 0
+        self.lost = 0.0
         self._period = period
         self._tolerance = tolerance
         self._looked: float | None = None
@@ -27,6 +28,7 @@ class Pauses:
         """This process runs at `now` (s)."""
         if self._looked is not None and now - self._looked > self._period + self._tolerance:
             self.count += 1
+            self.lost += now - self._looked
             if self._waits_until is None:
                 self._waits_until = now + self._period
         self._looked = now
@@ -34,6 +36,7 @@ class Pauses:
     def heard(self) -> None:
         """A message fit to use came."""
         self._waits_until = None
+        self.lost = 0.0
 
     @property
     def since_heard(self) -> bool:

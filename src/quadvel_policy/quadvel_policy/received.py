@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_nodes.messages import MessageError
+from quadvel_nodes.messages import BackInTimeError, MessageError, NotFiniteError
 
 Array = NDArray[np.float64]
 
@@ -29,7 +29,7 @@ class StampCheck:
             ago = f"{now - stamp:.3f} s old" if stamp < now else f"{stamp - now:.3f} s ahead of the clock"
             raise MessageError(f"stamp is {ago}, expected at most {self._limit:.3f} s")
         if stamp < self._stamp:
-            raise MessageError(f"stamp is {self._stamp - stamp:.3f} s older than the one before")
+            raise BackInTimeError(f"stamp is {self._stamp - stamp:.3f} s older than the one before")
         self._stamp = stamp
 
 
@@ -47,5 +47,5 @@ def planar_velocity(twist: Any) -> Array:
 
 def _finite(field: str, values: list[float]) -> Array:
     if not all(map(math.isfinite, values)):
-        raise MessageError(f"{field} is {values}, expected finite numbers")
+        raise NotFiniteError(f"{field} is {values}, expected finite numbers")
     return np.array(values, float)

@@ -15,10 +15,11 @@ from numpy.typing import ArrayLike
 
 from quadvel_description.robot import JOINT_NAMES, LIE_Q
 from quadvel_description.state import JointCommand, RobotState
+from quadvel_nodes.messages import MessageError, NotFiniteError
 
 from .backup_velocity import BackupVelocity, Estimator
 from .command_limits import CommandLimits, CommandLimitsConfig
-from .guard import WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Sight, Watch
+from .guard import FALL_TIME, WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Sight, Watch
 from .guards import GUARDS, AccelerometerImplausible, EstimateStale, EstimateWrong, Obstacle
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
 from .settings import setting
@@ -39,6 +40,8 @@ STILL = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
 STEPPING_SPEED = 0.2
 """m/s, above which a robot that is to stand steps on: feet that stop behind a moving trunk trip it"""
+MAX_STIFFNESS, MAX_DAMPING = 1000.0, 50.0
+"""N m/rad and N m s/rad: more shakes the legs instead of holding them"""
 PATIENCE_IN_BRAKING = 1.8  # times `brake_time`, after which a robot that still moves is put into its posture
 
 SPOIL_THE_ESTIMATE = {guard.name() for guard in (EstimateStale, EstimateWrong, AccelerometerImplausible)}
@@ -72,24 +75,32 @@ Following = tuple[str, str] | None  # the next mode and the reason
 class SupervisorConfig(GuardConfig, CommandLimitsConfig):
     """Gains and times of the modes; the limits of guards and commands."""
 
-    auto_stand: bool = setting(
-        False, "stand up once, by itself, as soon as the robot reports", positive=False
+    auto_stand: bool = setting(False, "stand up once, by itself, as soon as the robot reports")
+    require_operator: bool = setting(False, "walk only after ~/enable_walking was called (set it on a robot)")
+    stand_kp: float = setting(
+        150.0, "gain of standing up, stance and lying down, N m/rad", at_most=MAX_STIFFNESS
     )
-    require_operator: bool = setting(
-        False, "walk only after ~/enable_walking was called (set it on a robot)", positive=False
+    stand_kd: float = setting(
+        4.0, "damping of standing up, stance and lying down, N m s/rad", at_most=MAX_DAMPING
     )
-    stand_kp: float = setting(150.0, "gain of standing up, stance and lying down, N m/rad")
-    stand_kd: float = setting(4.0, "damping of standing up, stance and lying down, N m s/rad")
-    damping_kd: float = setting(5.0, "damping when passive or in fault, N m s/rad")
-    fold_time: float = setting(0.8, "first part of standing up: to the lying posture, s")
-    rise_time: float = setting(1.2, "second part of standing up: to the nominal posture, s")
-    settle_time: float = setting(0.3, "from walking back to the nominal posture, s")
-    lie_down_time: float = setting(1.0, "from standing to the lying posture, s")
-    blend_time: float = setting(0.15, "over which the policy's torques fade in, s")
-    reset_gap: float = setting(0.02, "time without a state after which the policy's memory is reset, s")
-    max_posture_error: float = setting(0.35, "largest joint error at which the robot counts as standing, rad")
-    max_standing_speed: float = setting(0.1, "largest speed at which walking may end in a posture, m/s")
-    brake_time: float = setting(0.6, "in which the policy brings the robot to a stand after a fault, s")
+    damping_kd: float = setting(5.0, "damping when passive or in fault, N m s/rad", at_most=MAX_DAMPING)
+    fold_time: float = setting(0.8, "first part of standing up: to the lying posture, s", at_most=60.0)
+    rise_time: float = setting(1.2, "second part of standing up: to the nominal posture, s", at_most=60.0)
+    settle_time: float = setting(0.3, "from walking back to the nominal posture, s", at_most=60.0)
+    lie_down_time: float = setting(1.0, "from standing to the lying posture, s", at_most=60.0)
+    blend_time: float = setting(0.15, "over which the policy's torques fade in, s", at_most=FALL_TIME)
+    reset_gap: float = setting(
+        0.02, "time without a state after which the policy's memory is reset, s", at_most=FALL_TIME
+    )
+    max_posture_error: float = setting(
+        0.35, "largest joint error at which the robot counts as standing, rad", at_most=1.5
+    )
+    max_standing_speed: float = setting(
+        0.1, "largest speed at which walking may end in a posture, m/s", at_most=1.0
+    )
+    brake_time: float = setting(
+        0.6, "in which the policy brings the robot to a stand after a fault, s", at_most=FALL_TIME
+    )
 
 
 class Supervisor:
@@ -100,7 +111,8 @@ class Supervisor:
     `reason` (one sentence), `fault` (the name of what made the robot stop, "" where nothing did), `findings` (what is wrong
     now), `limits` (how often each limit of commands acted), `command` (4,) in effect, `walk_refusal`, `inference_seconds` (nan
     where no network ran). Set from outside: `obstacle` (what forbids moving, a sentence, or None), `overruns` (deadlines missed
-    in a row), `motors`.
+    in a row), `motors`, `refused` (by topic, why the messages since the last fit one were refused), `stopped` (s that the
+    controller did not run before the state that is to be answered).
     """
 
     def __init__(
@@ -146,6 +158,8 @@ class Supervisor:
         self.obstacle: str | None = None
         self.overruns = 0
         self.motors: MotorStatus | None = None
+        self.refused: dict[str, MessageError] = {}
+        self.stopped = 0.0
         self._auto_stand = c.auto_stand
         self._enabled = False
         self._zero_seen = False  # a command to stand still came since a velocity could have been followed
@@ -225,7 +239,10 @@ class Supervisor:
         self.command, unfit = self._limited(command)
         sight = self._look(now, state, None if velocity is None else np.asarray(velocity, float))
         if unfit and self.mode == "walk":
-            self.findings.append(Finding(unfit, *OTHER_FAULTS[unfit]))
+            level, modes, sentence = OTHER_FAULTS[unfit]
+            refusal = self.refused.get("command") if command is None else None
+            sentence = f"command is refused: {refusal}" if refusal else sentence
+            self.findings.append(Finding(unfit, level, modes, sentence))
         self._act_on(self.findings, state.time)
         velocity = self._velocity_in_effect(sight)
         if self.mode == "walk" and self._speed > STEPPING_SPEED:
@@ -274,6 +291,8 @@ class Supervisor:
             overruns=self.overruns,
             motors=self.motors,
             obstacle=self.obstacle,
+            refused=self.refused,
+            stopped=self.stopped,
         )
         self._found = self._watch.look(sight)
         self.findings = [finding for finding in self._found if self.mode in finding.modes]
@@ -333,7 +352,8 @@ class Supervisor:
         Stand still where there is none, where it says so, is not finite, or is refused.
         """
         if command is None:
-            return STILL.copy(), "command_stale"
+            not_finite = isinstance(self.refused.get("command"), NotFiniteError)
+            return STILL.copy(), "command_not_finite" if not_finite else "command_stale"
         numbers = np.asarray(command, float).tolist()
         if not _finite(numbers):
             return STILL.copy(), "command_not_finite"

@@ -15,11 +15,11 @@ from collections.abc import Callable
 
 import numpy as np
 
-from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
+from quadvel_description.state import MODE_DAMPING, RobotState
 from quadvel_driver import wire
 from quadvel_driver.calibration import Calibration
 from quadvel_driver.link import NO_CALIBRATION
-from quadvel_driver.wire import BoardState, Remote, WireError
+from quadvel_driver.wire import JOINTS, BoardState, Remote, WireError
 from quadvel_sim.bad_network import BadNetwork, NetworkConfig
 from quadvel_sim.loop import SimulationLoop
 
@@ -60,6 +60,7 @@ class Board:
         self._inward, self._outward = BadNetwork(network, 0), BadNetwork(network, 1)
         self._lock = threading.Lock()  # around the outward network and the client
         self._client: Address | None = None
+        self._modes = np.full(JOINTS, MODE_DAMPING)  # that the last command asked each motor for
         self._heard_at = 0.0
         self._ended = False
 
@@ -74,10 +75,10 @@ class Board:
         assert self.loop is not None
         if self._client is None:
             return
-        mode = MODE_DAMPING if self.loop.simulator.braking else MODE_SERVO
-        twelve = np.full(12, WARM)
+        modes = np.full(JOINTS, MODE_DAMPING) if self.loop.simulator.braking else self._modes
+        warm = np.full(JOINTS, WARM)
         packet = wire.encode_state(
-            BoardState(self._off.reported(state), np.full(12, mode), 0 * twelve, twelve, WARM, self.remote)
+            BoardState(self._off.reported(state), modes, 0 * warm, warm, WARM, self.remote)
         )
         with self._lock:
             self._outward.send(packet, self._clock())
@@ -119,7 +120,7 @@ class Board:
                 if self._client is None or now - self._heard_at > PATIENCE:
                     self._client = sender
                 if sender != self._client:
-                    self.counts["from_others"] += 1
+                    self._refuse("from_others", f"{_name(sender)} is not served, as {_name(self._client)} is")
                     continue
                 self._heard_at = now
             self._inward.send(data, now)
@@ -131,11 +132,16 @@ class Board:
             command = self._off.carried_out(wire.decode_command(packet))
             command.tick = self.loop.tick % _WRAP
             self.loop.submit(command)
+            self._modes = wire.commanded_modes(packet)
             self.counts["commands"] += 1
         except ValueError as error:
             about = error.about if isinstance(error, WireError) else wire.CONTENT
-            self.counts[f"wrong_{about.lower()}"] += 1
-            self.last_refusal = str(error)
+            self._refuse(f"wrong_{about.lower()}", str(error))
+
+    def _refuse(self, name: str, why: str) -> None:
+        """Count a datagram that could not be used, under a name, and remember why."""
+        self.counts[name] += 1
+        self.last_refusal = why
 
     def _deliver(self) -> None:
         """Hand the client the states that have arrived."""
@@ -146,8 +152,12 @@ class Board:
             for packet in self._outward.arrived(self._clock()):
                 try:
                     self._socket.sendto(packet, client)
-                except OSError:  # it is gone, or takes nothing in; the next one goes to it again
-                    self.counts["not_sent"] += 1
+                except OSError as error:  # it is gone, or takes nothing in; the next one goes to it again
+                    self._refuse("not_sent", f"nothing can be sent to {_name(client)}: {error.strerror}")
+
+
+def _name(address: Address) -> str:
+    return f"{address[0]}:{address[1]}"
 
 
 def _bound(address: Address) -> socket.socket:

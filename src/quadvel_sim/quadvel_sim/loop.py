@@ -8,6 +8,9 @@ passed. A command takes effect at the simulated millisecond that follows its arr
 the loop woke every millisecond. What is late is caught up; beyond MAX_LAG it is given up, and counted: a stall of
 the machine stops the controller, too, and is no event in the robot's world. Nor is a controller that gets no time on a
 loaded machine: the simulation runs at most LEAD ahead of what its commands answer, and waits for it before that.
+
+While its time stands still, be it paused or waiting for an answer, it says so every WAITING_PERIOD: so a robot that waits
+differs from one that has died.
 """
 
 from __future__ import annotations
@@ -28,12 +31,15 @@ REALTIME, LOCKSTEP, FAST = MODES = ("realtime", "lockstep", "fast")
 MAX_LAG = 0.01  # s
 LEAD = 10
 """ms that real time runs ahead of the newest state that was answered: half of the time after which the drives brake"""
+WAITING_PERIOD = 0.02  # s, less than half of the silence after which a controller gives a robot up
 MAX_AGE = 100  # ms, of the state that a command answers
 _BREATH = 1e-4  # s that the fast mode leaves to other threads each period
 _WRAP = 2**32
 
 Publish = Callable[[RobotState, float], None]
 """Takes a sample, and the instant (s) at which it held."""
+SayWaiting = Callable[[int, float], None]
+"""Takes the tick at which time stands still, and the instant (s) at which it does"""
 
 
 @attrs.frozen
@@ -55,7 +61,7 @@ class SimulationLoop:
     `publish(state, instant)` is called with the lock held, so that samples leave in order. `state.tick` and
     `state.time` go on over resets. `instant` (s) is when the sample holds: on `clock` in real time, else in
     simulated time. answer_timeout: s that simulated time stands still for an answer; then lockstep publishes the state again,
-    and real time goes on without a controller until the next command.
+    and real time goes on without a controller until the next command. `say_waiting` is called while time stands still.
     """
 
     def __init__(
@@ -66,11 +72,12 @@ class SimulationLoop:
         period: int = 5,
         answer_timeout: float = 1.0,
         clock: Callable[[], float] = time.monotonic,
+        say_waiting: SayWaiting = lambda tick, instant: None,
     ) -> None:
         self.simulator = simulator
         self.mode = mode
         self.period = period
-        self._publish = publish
+        self._publish, self._say_waiting = publish, say_waiting
         self._answer_timeout = answer_timeout
         self._clock = clock
         self._condition = threading.Condition()
@@ -81,6 +88,7 @@ class SimulationLoop:
             None  # the newest that a command answered; None: nobody controls the robot
         )
         self._waits_since: float | None = None  # on the clock, for an answer, in real time
+        self._stood_still = 0.0  # s, for an answer, in lockstep
         self._owed = 0  # ms that a paused simulation was asked for and has not simulated yet
         self._given_up = 0.0
         self._unanswered = 0
@@ -127,6 +135,8 @@ class SimulationLoop:
         arrival = self._clock()
         with self._condition:
             self._check(command)
+            if self._halted:  # all that comes now takes effect at the same instant: the newest counts
+                self._inbox.clear()
             self._inbox.append((arrival, command))
             self._answered_tick = max(self._answered_tick or 0, self.tick - self._age(command))
             if self.mode == LOCKSTEP:
@@ -211,15 +221,14 @@ class SimulationLoop:
     def _ready(self) -> bool:
         """Whether the next period may be simulated; if not, waits a while or until something happens."""
         if self._halted:
-            self._condition.wait()
+            self._stand_still(WAITING_PERIOD)
             return False
         if self.mode == FAST:
             self._condition.wait(_BREATH)
             return not (self._halted or self._stopped)
         if self.mode == LOCKSTEP:
-            if not self._answered and not self._condition.wait(self._answer_timeout):
-                self._unanswered += 1
-                self._sample()  # for a controller that has come late
+            if not self._answered:
+                self._wait_for_answer()
             return self._answered and not (self._halted or self._stopped)
         lateness = self._clock() - self._real_time(self.tick + self._ahead)
         if lateness < 0.0:
@@ -243,11 +252,26 @@ class SimulationLoop:
             self._waits_since = now
         left = self._waits_since + self._answer_timeout - now
         if left > 0.0:
-            self._condition.wait(left)
+            self._stand_still(min(left, WAITING_PERIOD))
             return True
         self._unanswered += 1
         self._answered_tick = self._waits_since = None
         return False
+
+    def _wait_for_answer(self) -> None:
+        """Wait a while in lockstep, and publish the state again where its answer has been missing for `answer_timeout`."""
+        seconds = min(WAITING_PERIOD, self._answer_timeout)
+        self._stood_still = self._stood_still + seconds if self._stand_still(seconds) else 0.0
+        if self._stood_still >= self._answer_timeout:
+            self._unanswered, self._stood_still = self._unanswered + 1, 0.0
+            self._sample()  # for a controller that has come late
+
+    def _stand_still(self, seconds: float) -> bool:
+        """Wait for something to happen; whether nothing did within `seconds`."""
+        if self._condition.wait(seconds):
+            return False
+        self._say_waiting(self.tick % _WRAP, self._clock() if self.mode == REALTIME else self.tick * DT)
+        return True
 
     def _step(self, steps: int) -> None:
         """Simulate `steps` ms; each command takes effect when it is due."""

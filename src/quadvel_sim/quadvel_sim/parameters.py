@@ -12,7 +12,7 @@ from quadvel_driver.calibration import Calibration
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_sim.bad_network import NetworkConfig
 from quadvel_sim.config import SensorNoise, SimulatorConfig
-from quadvel_sim.loop import MODES, Publish, SimulationLoop
+from quadvel_sim.loop import MODES, Publish, SayWaiting, SimulationLoop
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.terrain import KINDS, Terrain
 from quadvel_sim.world import SHIPPED, World
@@ -66,8 +66,8 @@ class PlantParameters(Scheduling):
         """Simulated ms from state to state."""
         return 1000 // self.state_rate
 
-    def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
-        """The loop that runs this robot: in real time, and it waits for nobody."""
+    def loop(self, simulator: Simulator, publish: Publish, say_waiting: SayWaiting) -> SimulationLoop:
+        """The loop that runs this robot: in real time, and it waits for nobody; nor has a board words for a pause."""
         return SimulationLoop(simulator, publish, period=self.period, answer_timeout=0.0)
 
     def config(self) -> SimulatorConfig:
@@ -121,9 +121,11 @@ class SimParameters(PlantParameters):
         if not 0.0 < self.answer_timeout < 3600.0:
             raise ValueError(f"answer_timeout is {self.answer_timeout} s, expected a time above 0")
 
-    def loop(self, simulator: Simulator, publish: Publish) -> SimulationLoop:
+    def loop(self, simulator: Simulator, publish: Publish, say_waiting: SayWaiting) -> SimulationLoop:
         """The loop that runs this robot, in the mode that was asked for."""
-        return SimulationLoop(simulator, publish, self.mode, self.period, self.answer_timeout)
+        return SimulationLoop(
+            simulator, publish, self.mode, self.period, self.answer_timeout, say_waiting=say_waiting
+        )
 
 
 @attrs.frozen(kw_only=True)

@@ -8,7 +8,7 @@ from typing import Any
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from quadvel_description.state import RobotState
-from quadvel_msgs.msg import LowCmd, LowState
+from quadvel_msgs.msg import LowCmd, LowState, Waiting
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
 from quadvel_nodes.node import run
 from quadvel_nodes.robot_view import RobotView
@@ -27,6 +27,7 @@ class SimNode(SimulationNode[SimParameters]):
         self._refusals = Refusals()
         self._refused_before = self._unanswered_before = 0
         self._low_state = self.create_publisher(LowState, "low_state", 10)
+        self._waiting = self.create_publisher(Waiting, "waiting", 1)
         self._clock_publisher = self.create_publisher(ClockMessage, "/clock", 10)
         noise = self._loop.simulator.config.noise
         self._view = RobotView(self, noise.orientation, noise.angular_velocity, noise.linear_acceleration)
@@ -43,6 +44,11 @@ class SimNode(SimulationNode[SimParameters]):
         self._low_state.publish(message)
         if view:
             self._view.publish(stamp, state)
+
+    def say_waiting(self, tick: int, instant: float) -> None:
+        """On the topic `waiting`."""
+        if self.context.ok():
+            self._waiting.publish(Waiting(stamp=self.stamp(instant), tick=tick))
 
     def figures(self) -> dict[str, object]:
         """The messages that were refused."""

@@ -64,7 +64,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._given_up_before = 0.0
         self._has_fallen = False
         self._failure = ""
-        self._loop = self._settings.loop(simulator, self._publish)
+        self._loop = self._settings.loop(simulator, self._publish, self.say_waiting)
         world = simulator.config.world
         self._world_view = None if world is None else WorldView(self, world)
         self._thread = Thread(target=self._simulate, name="simulation")
@@ -103,6 +103,9 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     @abstractmethod
     def worry(self, report: LoopReport) -> str:
         """What was wrong in the last second beyond the loop, in a few words, or ""."""
+
+    def say_waiting(self, tick: int, instant: float) -> None:
+        """Say that time stands still at `tick`, in the simulation's thread; a robot that has no words for that keeps silent."""
 
     def stamp(self, instant: float) -> Any:
         """The instant of a sample as a message; in real time in the time of the system clock."""

@@ -48,6 +48,8 @@ def _cases(
 
 WALK = ("walk",)
 STALE = ("state_stale",)
+UNFIT = ("state_not_finite", "attitude_not_unit", *STALE)
+"""What is wrong with states none of which can be used"""
 FALLS = ("tilted", "joint_out_of_range", "joint_too_fast", "drive_does_not_answer")
 """What a robot that nobody commands any more, or too late, is seen to do"""
 ENCODER = (
@@ -62,7 +64,7 @@ STOP = 1.3  # s in which the policy brakes and the robot stands
 CASES: list[Case] = [
     *_cases("low_state", "off", MODES, STALE, 0.08, "damping"),
     *_cases("low_state", "stuck", MODES, ("state_frozen",), 0.04, "damping"),
-    *_cases("low_state", "garbage", MODES, (*STALE, *ENCODER, "imu_inconsistent"), 0.1, "damping"),
+    *_cases("low_state", "garbage", MODES, (*UNFIT, *ENCODER, "imu_inconsistent"), 0.1, "damping"),
     *_cases("low_state", "wrong", MODES, ("encoder_inconsistent",), 0.02, "damping"),
     *_cases("low_state", "slow", MODES, STALE, 0.2, "damping"),
     *_cases("low_state", "delayed", MODES, STALE, 0.1, "damping"),
@@ -97,9 +99,9 @@ CASES: list[Case] = [
     *_cases("encoder", "slow", WALK, ENCODER, 0.5, "damping"),
     *_cases("encoder", "delayed", WALK, (), 0.0, "any"),
     *_cases("encoder", "intermittent", WALK, (), 0.0, "any"),  # a hip is at zero anyway
-    *_cases("imu", "off", MODES, STALE, 0.08, "damping"),
+    *_cases("imu", "off", MODES, ("attitude_not_unit",), 0.08, "damping"),
     *_cases("imu", "stuck", WALK, ("imu_frozen",), 0.15, "stopped", STOP),
-    *_cases("imu", "garbage", MODES, (*STALE, "imu_inconsistent", "tilted"), 0.1, "damping"),
+    *_cases("imu", "garbage", MODES, (*UNFIT, "imu_inconsistent", "tilted"), 0.1, "damping"),
     *_cases("imu", "slow", WALK, ("imu_frozen",), 0.25, "any"),
     *_cases("imu", "delayed", WALK, (), 0.0, "any"),
     *_cases("imu", "intermittent", WALK, (), 0.0, "any"),

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -200,24 +199,28 @@ class Stack:
         )
 
     def _state_to_controller(self, message: Message) -> None:
-        self._to_controller(lambda: self._loop.on_state(read_low_state(message)))
+        self._to_controller("low_state", lambda: self._loop.on_state(read_low_state(message)))
 
     def _velocity_to_controller(self, message: Message) -> None:
         self._to_controller(
-            lambda: self._loop.on_velocity(seconds(message.stamp), numbers(message, "velocity", 3))
+            "velocity_estimate",
+            lambda: self._loop.on_velocity(seconds(message.stamp), numbers(message, "velocity", 3)),
         )
 
     def _command_to_controller(self, message: Message) -> None:
         self._to_controller(
+            "command",
             lambda: self._loop.on_command(
                 seconds(message.stamp), numbers(message, "velocity", 3), message.stance
-            )
+            ),
         )
 
-    def _to_controller(self, work: Callable[[], None]) -> None:
+    def _to_controller(self, topic: str, work: Callable[[], None]) -> None:
         def refusing() -> None:
-            with suppress(MessageError):  # as the node does, which counts them
+            try:
                 work()
+            except MessageError as error:  # as the node does, which counts them, too
+                self._loop.refuse(topic, error)
 
         self.processes["controller"].do(refusing)
 
