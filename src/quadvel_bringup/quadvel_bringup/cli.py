@@ -155,10 +155,10 @@ def doctor() -> None:
 @app.command(help=RUN_HELP, context_settings=HANDED_ON)
 def run(
     context: typer.Context,
-    node: Annotated[str, typer.Argument(metavar="NODE")],
+    node: Annotated[str, typer.Argument()],
     actuator: Annotated[
         Path | None,
-        typer.Option(help="sim_node: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="sim_node: its actuator.yaml.", show_default="the shipped one"),
     ] = None,
 ) -> None:
     from . import nodes
@@ -179,23 +179,32 @@ def up(
         ),
     ] = "sim",
     policy: Annotated[
-        Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
+        Path | None,
+        typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one"),
     ] = None,
-    terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    terrain: Annotated[
+        str | None, typer.Option(metavar="<name>", help="flat, slope or rough.", show_default="flat")
+    ] = None,
     world: Annotated[
         str | None,
         typer.Option(
+            metavar="<name|file>",
             help="Simulated robot: what is around it, corridor, park, campus or a file.",
             show_default="nothing",
         ),
     ] = None,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="Simulated robot: its actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
-    estimator: Annotated[str | None, typer.Option(help="learned or kalman.", show_default="learned")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(metavar="<name>", help="learned or kalman.", show_default="learned")
+    ] = None,
     params: Annotated[
-        Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
+        Path,
+        typer.Option(metavar="<file>", help="YAML file with the nodes' parameters.", show_default="shipped"),
     ] = PARAMETERS,
     view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
 ) -> None:
@@ -225,11 +234,14 @@ def up(
 def view(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[FILE]", help="A recording to play: MCAP, rosbag2.", show_default=False),
+        typer.Argument(help="A recording to play: MCAP, rosbag2.", show_default=False),
     ] = None,
     host: Annotated[
         str,
-        typer.Option(help="Address to listen on; others than this host's own need the token that is shown."),
+        typer.Option(
+            metavar="<address>",
+            help="Address to listen on; others than this host's own need the token that is shown.",
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
@@ -258,7 +270,9 @@ def drive(
     vy: Annotated[float, typer.Option(help="To the left, m/s.")] = 0.0,
     wz: Annotated[float, typer.Option(help="Turn to the left, rad/s.")] = 0.0,
     seconds: Annotated[float, typer.Option(min=0.1, help="For how long.")] = 3.0,
-    topic: Annotated[str, typer.Option(help="An input of the command mux.")] = "cmd_vel_teleop",
+    topic: Annotated[
+        str, typer.Option(metavar="<topic>", help="An input of the command mux.")
+    ] = "cmd_vel_teleop",
 ) -> None:
     """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop; says what came of it.
 
@@ -289,7 +303,7 @@ def teleop(
 @app.command()
 def mode(
     wanted: Annotated[
-        Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="MODE")
+        Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="mode")
     ],
 ) -> None:
     """Ask the controller for a mode: passive, stand_up, stance, walk or lie_down.
@@ -349,7 +363,7 @@ def pause(
 
 
 @app.command()
-def step(milliseconds: Annotated[int, typer.Argument(min=1, metavar="MS")] = 5) -> None:
+def step(milliseconds: Annotated[int, typer.Argument(min=1)] = 5) -> None:
     """Let a paused simulation run on for some milliseconds."""
     raise typer.Exit(_with_middleware("orders").step(milliseconds))
 
@@ -360,7 +374,7 @@ def push(
     fy: Annotated[float, typer.Option(help="Force to its left, N.")] = 0.0,
     fz: Annotated[float, typer.Option(help="Force upwards, N.")] = 0.0,
     seconds: Annotated[float, typer.Option(min=0.001, help="For how long.")] = 0.2,
-    body: Annotated[str, typer.Option(help="Which body of the robot.")] = "trunk",
+    body: Annotated[str, typer.Option(metavar="<name>", help="Which body of the robot.")] = "trunk",
 ) -> None:
     """Push the simulated robot.
 
@@ -377,15 +391,15 @@ def record(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="The file to write; with --ring the folder.", show_default="out/record.mcap, out/faults"
+            metavar="<file>",
+            help="The file to write; with --ring the folder.",
+            show_default="out/record.mcap, out/faults",
         ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after these.")] = None,
     ring: Annotated[
         float | None,
-        typer.Option(
-            min=1.0, help="Write only faults: each with so many seconds before it.", metavar="SECONDS"
-        ),
+        typer.Option(min=1.0, help="Write only faults: each with so many seconds before it."),
     ] = None,
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.

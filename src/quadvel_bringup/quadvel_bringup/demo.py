@@ -39,7 +39,9 @@ def demo_command(
     ] = "walk",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for the results.", show_default="out/demo, out/follow, out/tour"),
+        typer.Option(
+            metavar="<folder>", help="Folder for the results.", show_default="out/demo, out/follow, out/tour"
+        ),
     ] = None,
     video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
     quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
@@ -57,14 +59,15 @@ def demo_command(
     ] = 0.0,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
     view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
     world: Annotated[
-        str, typer.Option(help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file.")
+        str,
+        typer.Option(metavar="<name|file>", help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file."),
     ] = "campus",
     seconds: Annotated[float, typer.Option(min=5.0, help="With follow: for how long, s.")] = 180.0,
     tour: Annotated[

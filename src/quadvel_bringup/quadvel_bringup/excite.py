@@ -124,7 +124,8 @@ def excite_command(
         float | None, typer.Option(min=0.5, help="For how long.", show_default="the motion's own")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="The file to write.", show_default="out/excite/MOTION.mcap")
+        Path | None,
+        typer.Option(metavar="<file>", help="The file to write.", show_default="out/excite/MOTION.mcap"),
     ] = None,
     low_level: Annotated[
         Literal["sim", "external"],
@@ -148,11 +149,16 @@ def excite_command(
     ] = None,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="Simulated robot: its actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Simulated robot: of its noise.")] = 0,
     after: Annotated[
-        Path | None, typer.Option(help="A report.json: say which motions would settle what it left open.")
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="A report.json: say which motions would settle what it left open."
+        ),
     ] = None,
 ) -> None:
     """Move the joints so that they show what they are; record state and command for `quadvel identify`.

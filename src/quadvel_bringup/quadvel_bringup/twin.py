@@ -50,7 +50,7 @@ def twin_command(
         list[str] | None,
         typer.Argument(help=f"Shipped plants ({', '.join(SHIPPED)}) or YAML files.", show_default="all"),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/twin"),
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the results.")] = Path("out/twin"),
     reuse: Annotated[
         bool, typer.Option("--reuse", help="Take up the recordings and reports that are there.")
     ] = False,

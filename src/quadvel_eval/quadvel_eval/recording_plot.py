@@ -194,7 +194,9 @@ def _shade(mode: str) -> str:
 
 def plot_command(
     recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out/plot"),
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
+        "out/plot"
+    ),
 ) -> None:
     """Draw what was recorded of a run: velocity, joints, torques, the controller's loop.
 
