@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     warnings.showwarning = _show_warning
     try:
         app(arguments, prog_name="quadvel")  # however it was started: shell completion goes by this name
-    except (OSError, ValueError, MemoryError) as error:
+    except (OSError, ValueError, MemoryError, RecursionError) as error:
         if os.environ.get("QUADVEL_TRACEBACK"):
             raise
         print(f"quadvel: {_sentence(error)}", file=sys.stderr)
@@ -39,10 +39,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
         raise
 
 
-def _sentence(error: OSError | ValueError | MemoryError) -> str:
+def _sentence(error: Exception) -> str:
     """What is wrong. Of an error of the system the file and the reason, without its number."""
     if isinstance(error, MemoryError):
         return f"this machine has too little memory for it: {error}"
+    if isinstance(error, RecursionError):
+        return f"what was given is nested too deeply: {error}"
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
     return " ".join(str(error).split())

@@ -6,7 +6,6 @@ low_cmd. The simulated one runs in lockstep at 1 kHz, so that a busy machine lea
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,6 +22,7 @@ from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.output import output_file, replacing
+from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
 
@@ -30,6 +30,7 @@ from .alone import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import Parameters, arguments, command, enclave
 from .processes import ProcessGroup, StopSignals
+from .rehearsal import rehearse_node
 from .stack import PARAMETERS
 
 RAMP = 1.5  # s, from where the robot is to where the motion begins
@@ -194,7 +195,10 @@ def excite_command(
     parameters: dict[str, Any] = {"hung": in_the_air, "seed": seed}
     if actuator is not None:
         parameters["actuator_file"] = str(actuator.resolve())
-    nodes = {"sim_node": command("sim_node", sim_arguments(**parameters))} if low_level == "sim" else {}
+    nodes = {}
+    if low_level == "sim":
+        rehearse_node("sim_node", sim_arguments(**parameters))
+        nodes["sim_node"] = command("sim_node", sim_arguments(**parameters))
     try:
         record_motion(Player(excitation, kp, kd, in_the_air), path, nodes, console)
     except MotionError as error:
@@ -204,8 +208,8 @@ def excite_command(
 
 def _propose(report: Path, console: Console) -> None:
     try:
-        proposals = propose(json.loads(report.read_text()))
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        proposals = propose(read_json(report))
+    except (KeyError, TypeError) as error:
         raise ValueError(f"{report}: no report of `quadvel identify`: {error!r}") from None
     if not proposals:
         console.print("The report leaves nothing open that another motion would settle.")

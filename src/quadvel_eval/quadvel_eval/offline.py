@@ -161,10 +161,10 @@ def replay_command(
     To see a recording in 3-D: quadvel view walk.mcap
     """
     model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
+    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
     run = read_run(recording)
     said = torques(read_joints(recording, SLOWEST), model)
-    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     times, found = estimated(recording, asked)
     errors = velocity_errors(run, times, found)
     _show(said, errors)

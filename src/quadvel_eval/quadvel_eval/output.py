@@ -65,7 +65,7 @@ def _check(folder: Path, name: Path, asked: Path, kind: str) -> None:
     try:
         nearest = next(one for one in (folder, *folder.absolute().parents) if one.exists())
         if not nearest.is_dir():
-            raise NotADirectoryError(f"{folder}: is a file or lies below one, expected a folder")
+            raise NotADirectoryError(f"{asked}: {nearest} is a file, expected a folder")
         draft = _draft(nearest / name)
         draft.touch()
         draft.unlink()

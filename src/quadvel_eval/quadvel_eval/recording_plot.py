@@ -202,8 +202,8 @@ def plot_command(
 
     Colours show the controller's mode.
     """
-    run = read_run(recording)
     output_folder(out)
+    run = read_run(recording)
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:
