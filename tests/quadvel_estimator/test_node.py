@@ -19,7 +19,8 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.kinematics import foot_positions
+from quadvel_description.robot import FOOT_RADIUS, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
@@ -135,6 +136,20 @@ def test_odometry_and_transform_agree_and_carry_the_imu_s_orientation(bench: Ben
     assert odom.pose.pose.orientation.z == pytest.approx(np.sin(0.2), abs=1e-6)
     assert odom.pose.pose.position.x == transform.transform.translation.x
     assert abs(odom.twist.twist.linear.x) < 1e-3
+
+
+def test_height_is_that_above_the_feet_and_said_to_be_unknown(bench: Bench, standing: State) -> None:
+    """Whatever the vertical velocity of the estimate adds up to."""
+    for i in range(40):
+        bench.send(0.005 * i)
+        bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
+    bench.wait(lambda: len(bench.heard["odom"]) == 10)
+    assert abs(bench.heard["velocity_estimate"][-1].twist.twist.linear.z) > 0.5  # 0.1 m in this time
+    odom = bench.heard["odom"][-1]
+    height = FOOT_RADIUS - foot_positions(standing(0.0).q)[:, 2].min()
+    assert odom.pose.pose.position.z == pytest.approx(height, abs=1e-6)
+    variances = np.reshape(odom.pose.covariance, (6, 6)).diagonal()
+    assert variances[2] > 1e5 > max(variances[:2])
 
 
 @pytest.mark.parametrize("bench", [["-p", "kind:=kalman", "-p", "publish_tf:=false"]], indirect=True)
