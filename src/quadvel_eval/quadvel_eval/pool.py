@@ -10,6 +10,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, TypeAlias
@@ -85,7 +86,7 @@ def _interrupts_held_back() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
-    except BrokenPipeError:
+    except (BrokenPipeError, BrokenProcessPool):
         if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
             raise
     finally:
