@@ -35,7 +35,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(2)
     except SystemExit as ended:
         if ended.code in STOPPED:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # what follows is the end; another one changes nothing
+            signal.signal(
+                signal.SIGINT, signal.SIG_IGN
+            )  # what follows is the end; another one changes nothing
             print("quadvel: stopped; no file was left half-written", file=sys.stderr)
         raise
 
