@@ -1,8 +1,8 @@
 from __future__ import annotations
 
-import os
 import csv
 import json
+import os
 from pathlib import Path
 
 import matplotlib.image

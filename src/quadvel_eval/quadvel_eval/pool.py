@@ -23,8 +23,7 @@ def in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterator[t
     """Number and answer of each call, as they are done.
 
     cluster: the address of a Dask scheduler, whose workers see the same files as this machine; None for the
-    cores of this one. A KeyboardInterrupt ends it; where only this process heard of it, once the calls under
-    way are through.
+    cores of this one. A KeyboardInterrupt ends it, and the calls under way on this machine.
     """
     with _cores() if cluster is None else _dask(cluster) as submit:
         with _without_windows(), _interrupts_held_back():
@@ -42,6 +41,8 @@ def _cores() -> Iterator[Callable[..., Any]]:
             yield pool.submit
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
+            for worker in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
+                worker.terminate()
             raise
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
