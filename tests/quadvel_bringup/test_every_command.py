@@ -255,11 +255,17 @@ def suffixes(place: Place) -> tuple[str, ...]:
     return (".xml", ".urdf") if place.option == "--robot" else (".yaml",)
 
 
-READ = [(place, suffix) for place in places(writes=False) for suffix in suffixes(place)]
+READ = [
+    (place, suffix, make)
+    for place in places(writes=False)
+    for suffix in suffixes(place)
+    for make in ((missing, garbage) if place.command == "run" else WRONG)  # run is a process of its own
+]
 
 
-@pytest.mark.parametrize(("place", "suffix"), READ, ids=lambda one: str(one) or "none")
-@pytest.mark.parametrize("make", WRONG, ids=lambda make: make.__name__)
+@pytest.mark.parametrize(
+    ("place", "suffix", "make"), READ, ids=lambda one: getattr(one, "__name__", str(one) or "none")
+)
 def test_a_file_that_is_not_what_it_should_be_is_refused(
     place: Place, suffix: str, make: Callable[[Path], None], quadvel: Callable[..., Ended], tmp_path: Path
 ) -> None:

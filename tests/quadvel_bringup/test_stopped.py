@@ -28,6 +28,8 @@ USUAL = ("excite", "eval")
 """Those that are run always; the others, which end in the same way, by hand"""
 
 
+STOPPED = (128 + signal.SIGINT, -signal.SIGINT)
+"""A shell reports both as 130. Python 3.11 ends itself by the signal where it came while `exec` ran a string, as in imports."""
 TOUR = "demo follow --tour"
 
 
@@ -48,7 +50,7 @@ def test_ctrl_c_is_answered_and_leaves_nothing(command: str, tmp_path: Path) -> 
     assert process.poll() is None, process.stdout and process.stdout.read()
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=90)
-    assert process.returncode == 128 + signal.SIGINT, said
+    assert process.returncode in STOPPED, said
     assert "Traceback" not in said
     assert said.count("quadvel: stopped") == 1, said
     assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")] == []
@@ -63,6 +65,6 @@ def test_a_tour_that_is_stopped_keeps_what_there_is_of_it(tmp_path: Path) -> Non
     time.sleep(1.0)
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=90)
-    assert process.returncode == 128 + signal.SIGINT, said
+    assert process.returncode in STOPPED, said
     assert json.loads((tmp_path / "out/tour/tour.json").read_text())["walked"] >= 0.0
     assert sorted(path.name for path in (tmp_path / "out/tour").iterdir()) == ["tour.json", "tour.png"]
