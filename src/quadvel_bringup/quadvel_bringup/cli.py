@@ -10,7 +10,6 @@ from typing import Annotated, Any, Literal
 
 import attrs
 import typer
-from typer.core import TyperCommand
 
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
@@ -435,8 +434,8 @@ for _name, _elsewhere in ELSEWHERE.items():
     _register(_name, _elsewhere.about)
 
 
-def command(name: str) -> TyperCommand:
-    """A command with all its arguments and options.
+def command(name: str) -> Any:
+    """A command with all its arguments and options, as click has it.
 
     Args:
         name: of the command, as after `quadvel`.
