@@ -41,7 +41,9 @@ def _cores() -> Iterator[Callable[..., Any]]:
             yield pool.submit
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
-            for worker in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
+            for (
+                worker
+            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
                 worker.terminate()
             raise
         finally:
