@@ -205,7 +205,7 @@ def test_a_file_that_is_no_plant_ends_its_process_in_one_sentence(tmp_path: Path
     file.write_text("kind: rust")
     line = [sys.executable, "-m", "quadvel_bringup.plant", str(file)]
     ended = subprocess.run(line, capture_output=True, text=True, timeout=300)
-    assert ended.returncode == 1
+    assert ended.returncode == 2
     assert ended.stderr.startswith(f"plant: {file}: kind: found 'rust'")
     assert ended.stderr.count("\n") == 1
 

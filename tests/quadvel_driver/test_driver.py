@@ -346,6 +346,6 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
 ) -> None:
     process = start(**parameters)
     _, text = process.communicate(timeout=40.0)
-    assert process.returncode == 1
+    assert process.returncode == 2
     assert sentence in text
     assert len(text.strip().splitlines()) == 1

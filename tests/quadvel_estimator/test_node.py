@@ -19,7 +19,8 @@ from nav_msgs.msg import Odometry
 from rclpy.executors import SingleThreadedExecutor
 from tf2_msgs.msg import TFMessage
 
-from quadvel_description.robot import NOMINAL_Q
+from quadvel_description.kinematics import foot_positions
+from quadvel_description.robot import FOOT_RADIUS, NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_estimator import estimator, features
 from quadvel_msgs.msg import LowCmd, LowState
@@ -137,6 +138,20 @@ def test_odometry_and_transform_agree_and_carry_the_imu_s_orientation(bench: Ben
     assert abs(odom.twist.twist.linear.x) < 1e-3
 
 
+def test_height_is_that_above_the_feet_and_said_to_be_unknown(bench: Bench, standing: State) -> None:
+    """Whatever the vertical velocity of the estimate adds up to."""
+    for i in range(40):
+        bench.send(0.005 * i)
+        bench.wait(lambda n=i: len(bench.heard["velocity_estimate"]) == n + 1)
+    bench.wait(lambda: len(bench.heard["odom"]) == 10)
+    assert abs(bench.heard["velocity_estimate"][-1].twist.twist.linear.z) > 0.5  # 0.1 m in this time
+    odom = bench.heard["odom"][-1]
+    height = FOOT_RADIUS - foot_positions(standing(0.0).q)[:, 2].min()
+    assert odom.pose.pose.position.z == pytest.approx(height, abs=1e-6)
+    variances = np.reshape(odom.pose.covariance, (6, 6)).diagonal()
+    assert variances[2] > 1e5 > max(variances[:2])
+
+
 @pytest.mark.parametrize("bench", [["-p", "kind:=kalman", "-p", "publish_tf:=false"]], indirect=True)
 def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> None:
     for at, changes in [(1.0, {}), (1.005, {"q": np.full(12, np.nan)}), (0.5, {}), (1.010, {})]:
@@ -164,10 +179,13 @@ def test_what_is_not_fit_to_use_is_refused_counted_and_named(bench: Bench) -> No
         ("speed:=3", "unknown parameter speed, expected one of realtime_priority, cpus, kind, model"),
     ],
 )
-def test_a_wrong_parameter_ends_the_start_with_one_sentence(argument: str, sentence: str) -> None:
+def test_a_wrong_parameter_ends_the_start_with_one_sentence(
+    argument: str, sentence: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit) as ended:
         estimator.main(["--ros-args", "-p", argument])
-    assert str(ended.value.code).startswith(sentence)
+    assert ended.value.code == 2
+    assert capsys.readouterr().err.startswith(sentence)
     assert not rclpy.ok()
 
 
@@ -185,7 +203,7 @@ def test_a_missing_network_ends_the_process_with_one_sentence() -> None:
     process = launch("-p", "model:=/nowhere.onnx")
     _, error = process.communicate(timeout=60)
     expected = "/nowhere.onnx: no such file, expected an ONNX network\n"
-    assert (process.returncode, error) == (1, expected)
+    assert (process.returncode, error) == (2, expected)
 
 
 def test_ctrl_c_that_arrives_twice_ends_it_with_exit_code_0() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 from pathlib import Path
 
 import matplotlib.image
@@ -74,12 +75,32 @@ def test_a_file_that_is_not_finished_leaves_the_old_one_and_no_draft(tmp_path: P
 def test_a_folder_that_is_a_file_is_refused_with_its_name(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("")
     for path in (tmp_path / "out", tmp_path / "out" / "eval"):
-        with pytest.raises(NotADirectoryError, match=rf"{path}: is a file or lies below one"):
+        with pytest.raises(
+            NotADirectoryError, match=rf"{path}: {tmp_path / 'out'} is a file, expected a folder"
+        ):
             output_folder(path)
 
 
-def test_a_missing_folder_is_made_with_its_parents(tmp_path: Path) -> None:
-    assert output_folder(tmp_path / "a" / "b").is_dir()
+def test_a_missing_folder_is_made_with_its_first_file(tmp_path: Path) -> None:
+    folder = output_folder(tmp_path / "a" / "b")
+    assert list(tmp_path.iterdir()) == []
+    write_json(folder / "eval.json", {})
+    assert [path.name for path in folder.iterdir()] == ["eval.json"]
+
+
+def test_a_folder_that_was_made_for_a_file_goes_where_the_file_fails(tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for folder in (tmp_path / "a" / "b", tmp_path / "there"):
+        with pytest.raises(KeyboardInterrupt), replacing(folder / "walk.mcap") as draft:  # noqa: PT012
+            draft.write_text("half")
+            raise KeyboardInterrupt
+    assert list(tmp_path.rglob("*")) == [tmp_path / "there"]
+
+
+def test_a_device_is_not_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="is a device or a pipe"):
+        output_file(tmp_path / "pipe")
 
 
 def test_table_tells_falls_and_the_worst_cell() -> None:
@@ -92,9 +113,9 @@ def test_table_tells_falls_and_the_worst_cell() -> None:
 
 @pytest.mark.parametrize("folder", ["/proc", "/sys"])  # where nobody can write, root neither
 def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(folder: str) -> None:
-    with pytest.raises(OSError, match=rf"^{folder}: the folder can't be written to"):
+    with pytest.raises(OSError, match=rf"^{folder}: the folder can't be written: "):
         output_folder(Path(folder))
-    with pytest.raises(OSError, match=rf"^{folder}/x: the folder can't be made"):
+    with pytest.raises(OSError, match=rf"^{folder}/x: the folder can't be written: "):
         output_folder(Path(folder) / "x")
 
 
@@ -104,4 +125,4 @@ def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path
     with pytest.raises(OSError, match="the file can't be written: File name too long"):
         output_file(tmp_path / ("x" * 300))
     assert output_file(tmp_path / "new" / "bench.json") == tmp_path / "new" / "bench.json"
-    assert list((tmp_path / "new").iterdir()) == []
+    assert list(tmp_path.iterdir()) == []

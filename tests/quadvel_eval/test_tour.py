@@ -15,6 +15,7 @@ from rich.console import Console
 from quadvel_eval.following.obstacles import BODY, Clearances, outlines
 from quadvel_eval.following.tour import Moment, Outcome, TourSetup, summary
 from quadvel_eval.following.tour_cli import run_tour
+from quadvel_eval.following.tour_report import picture
 from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
 from quadvel_sim.world import Box, Trees, Wall, World
 
@@ -81,3 +82,12 @@ def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
     assert found["least_clearance"] > 0.3
     assert found["error_xy"] < 0.15
     assert (tmp_path / "tour.png").stat().st_size > 10_000
+
+
+def test_the_picture_counts_minutes_from_its_first_moment(tmp_path: Path) -> None:
+    """Of a run in real time the moments are seconds since 1970."""
+    moments = [moment(1.8e9 + PERIOD * k, 1.5) for k in range(1200)]
+    figure = picture(World.load("corridor"), 1.5, moments)
+    below = next(axes for axes in figure.axes if axes.get_xlabel() == "min")
+    assert below.get_xlim() == pytest.approx((0.0, 1.0), abs=0.01)
+    assert all(0.0 <= x <= 1.0 for line in below.lines for x in line.get_xdata())

@@ -508,7 +508,7 @@ def process(*arguments: str) -> subprocess.Popen[str]:
 def test_a_bad_start_ends_the_process_with_one_sentence() -> None:
     with process("--ros-args", "-p", "policy:=/nowhere/policy.onnx") as child:
         _, errors = child.communicate(timeout=60)
-    assert child.returncode == 1
+    assert child.returncode == 2
     assert errors.strip() == "/nowhere/policy.onnx: no such file, expected an ONNX network"
 
 

@@ -14,7 +14,7 @@ from rich.table import Table
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_driver.find_calibration import Found, NotFound, Samples, find
-from quadvel_eval.output import output_folder, replacing
+from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import read_low_state
 from quadvel_recordings.reading import read_messages
 
@@ -26,13 +26,21 @@ UNEVEN = 0.01  # m, that the feet of a standing robot are off one plane, from wh
 
 def calibrate_command(
     hung: Annotated[
-        Path | None, typer.Option(help="Recording of the hung robot that creeps: finds the joints' zeros.")
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="Recording of the hung robot that creeps: finds the joints' zeros."
+        ),
     ] = None,
     standing: Annotated[
         Path | None,
-        typer.Option(help="Recording of the robot that stands on a level floor: finds how the IMU leans."),
+        typer.Option(
+            metavar="<file>",
+            help="Recording of the robot that stands on a level floor: finds how the IMU leans.",
+        ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="The file to write.")] = Path("calibration.yaml"),
+    out: Annotated[Path, typer.Option(metavar="<file>", help="The file to write.")] = Path(
+        "out/calibration.yaml"
+    ),
 ) -> None:
     """Find what the encoders and the IMU of a robot show at zero; the driver applies what was found.
 
@@ -47,7 +55,7 @@ def calibrate_command(
     """
     if hung is None and standing is None:
         raise ValueError("nothing to find anything from: name a recording with --hung or --standing, or both")
-    output_folder(out.parent)
+    output_file(out)
     found = find(_samples(hung), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))

@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import attrs
 import typer
 
 from .nodes import NODES
@@ -49,6 +50,71 @@ PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_excepti
 app = typer.Typer(no_args_is_help=True, **{**PLAIN, "add_completion": True})
 # Commands whose arguments belong to somebody else: handed on as they are, --help too.
 HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+
+@attrs.frozen
+class Elsewhere:
+    """A command of another module. where: "module:member", a function or a typer application; about: its line in the help."""
+
+    where: str
+    about: str
+
+
+ELSEWHERE = {
+    "demo": Elsewhere(
+        "quadvel_bringup.demo:demo_command",
+        "Walk a simulated robot through all directions, in real time, through the nodes.",
+    ),
+    "excite": Elsewhere(
+        "quadvel_bringup.excite:excite_command",
+        "Move the joints so that they show what they are, and record it for `quadvel identify`.",
+    ),
+    "identify": Elsewhere("quadvel_sysid.cli:app", "Find what the actuator model lacks, from measured logs."),
+    "calibrate": Elsewhere(
+        "quadvel_bringup.calibrate:calibrate_command",
+        "Find what the encoders and the IMU of a robot show at zero.",
+    ),
+    "twin": Elsewhere(
+        "quadvel_bringup.twin:twin_command",
+        "Close the loop on the stack itself: plants that its model does not know, identified from their walks.",
+    ),
+    "eval": Elsewhere(
+        "quadvel_eval.cli:eval_command",
+        "Measure how well a policy tracks a grid of commands, faster than real time.",
+    ),
+    "compare": Elsewhere("quadvel_eval.cli:compare_command", "Show two evaluations side by side."),
+    "faults": Elsewhere(
+        "quadvel_eval.cli:faults_command",
+        "Let things go wrong in a simulated robot, and measure what it does.",
+    ),
+    "paper": Elsewhere(
+        "quadvel_eval.paper.cli:paper_command",
+        "Measure what the paper's figures show: a page, pictures, tables.",
+    ),
+    "people": Elsewhere(
+        "quadvel_eval.people.cli:people_command",
+        "Measure how well persons are found and tracked in laser scans, real and simulated.",
+    ),
+    "world": Elsewhere(
+        "quadvel_eval.world_map:world_command", "Check a world's file, and draw the world from above."
+    ),
+    "following": Elsewhere(
+        "quadvel_eval.following.cli:following_command",
+        "Measure how well a person is followed, in simulated scenes in the plane.",
+    ),
+    "plot": Elsewhere(
+        "quadvel_eval.recording_plot:plot_command",
+        "Draw what was recorded of a run: velocity, joints, torques, the controller's loop.",
+    ),
+    "replay": Elsewhere(
+        "quadvel_eval.offline:replay_command",
+        "Ask the actuator model and the estimator offline what they say of a recording.",
+    ),
+    "bench": Elsewhere(
+        "quadvel_eval.cli:bench_command", "Measure the speed of simulator, policy and loop on this machine."
+    ),
+}
+
 # Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
 ENDED_BY_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
 
@@ -88,10 +154,10 @@ def doctor() -> None:
 @app.command(help=RUN_HELP, context_settings=HANDED_ON)
 def run(
     context: typer.Context,
-    node: Annotated[str, typer.Argument(metavar="NODE")],
+    node: Annotated[str, typer.Argument()],
     actuator: Annotated[
         Path | None,
-        typer.Option(help="sim_node: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="sim_node: its actuator.yaml.", show_default="the shipped one"),
     ] = None,
 ) -> None:
     from . import nodes
@@ -112,23 +178,32 @@ def up(
         ),
     ] = "sim",
     policy: Annotated[
-        Path | None, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
+        Path | None,
+        typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one"),
     ] = None,
-    terrain: Annotated[str | None, typer.Option(help="flat, slope or rough.", show_default="flat")] = None,
+    terrain: Annotated[
+        str | None, typer.Option(metavar="<name>", help="flat, slope or rough.", show_default="flat")
+    ] = None,
     world: Annotated[
         str | None,
         typer.Option(
+            metavar="<name|file>",
             help="Simulated robot: what is around it, corridor, park, campus or a file.",
             show_default="nothing",
         ),
     ] = None,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="Simulated robot: its actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
-    estimator: Annotated[str | None, typer.Option(help="learned or kalman.", show_default="learned")] = None,
+    estimator: Annotated[
+        str | None, typer.Option(metavar="<name>", help="learned or kalman.", show_default="learned")
+    ] = None,
     params: Annotated[
-        Path, typer.Option(help="YAML file with the nodes' parameters.", show_default="shipped")
+        Path,
+        typer.Option(metavar="<file>", help="YAML file with the nodes' parameters.", show_default="shipped"),
     ] = PARAMETERS,
     view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
 ) -> None:
@@ -158,11 +233,14 @@ def up(
 def view(
     recording: Annotated[
         Path | None,
-        typer.Argument(metavar="[FILE]", help="A recording to play: MCAP, rosbag2.", show_default=False),
+        typer.Argument(help="A recording to play: MCAP, rosbag2.", show_default=False),
     ] = None,
     host: Annotated[
         str,
-        typer.Option(help="Address to listen on; others than this host's own need the token that is shown."),
+        typer.Option(
+            metavar="<address>",
+            help="Address to listen on; others than this host's own need the token that is shown.",
+        ),
     ] = "127.0.0.1",
     port: Annotated[
         int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
@@ -191,7 +269,9 @@ def drive(
     vy: Annotated[float, typer.Option(help="To the left, m/s.")] = 0.0,
     wz: Annotated[float, typer.Option(help="Turn to the left, rad/s.")] = 0.0,
     seconds: Annotated[float, typer.Option(min=0.1, help="For how long.")] = 3.0,
-    topic: Annotated[str, typer.Option(help="An input of the command mux.")] = "cmd_vel_teleop",
+    topic: Annotated[
+        str, typer.Option(metavar="<topic>", help="An input of the command mux.")
+    ] = "cmd_vel_teleop",
 ) -> None:
     """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop; says what came of it.
 
@@ -222,7 +302,7 @@ def teleop(
 @app.command()
 def mode(
     wanted: Annotated[
-        Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="MODE")
+        Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="mode")
     ],
 ) -> None:
     """Ask the controller for a mode: passive, stand_up, stance, walk or lie_down.
@@ -282,7 +362,7 @@ def pause(
 
 
 @app.command()
-def step(milliseconds: Annotated[int, typer.Argument(min=1, metavar="MS")] = 5) -> None:
+def step(milliseconds: Annotated[int, typer.Argument(min=1)] = 5) -> None:
     """Let a paused simulation run on for some milliseconds."""
     raise typer.Exit(_with_middleware("orders").step(milliseconds))
 
@@ -293,7 +373,7 @@ def push(
     fy: Annotated[float, typer.Option(help="Force to its left, N.")] = 0.0,
     fz: Annotated[float, typer.Option(help="Force upwards, N.")] = 0.0,
     seconds: Annotated[float, typer.Option(min=0.001, help="For how long.")] = 0.2,
-    body: Annotated[str, typer.Option(help="Which body of the robot.")] = "trunk",
+    body: Annotated[str, typer.Option(metavar="<name>", help="Which body of the robot.")] = "trunk",
 ) -> None:
     """Push the simulated robot.
 
@@ -310,15 +390,15 @@ def record(
     out: Annotated[
         Path | None,
         typer.Option(
-            help="The file to write; with --ring the folder.", show_default="out/record.mcap, out/faults"
+            metavar="<file>",
+            help="The file to write; with --ring the folder.",
+            show_default="out/record.mcap, out/faults",
         ),
     ] = None,
     seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after these.")] = None,
     ring: Annotated[
         float | None,
-        typer.Option(
-            min=1.0, help="Write only faults: each with so many seconds before it.", metavar="SECONDS"
-        ),
+        typer.Option(min=1.0, help="Write only faults: each with so many seconds before it."),
     ] = None,
 ) -> None:
     """Record running topics to an MCAP file for Foxglove and ros2 bag.
@@ -342,96 +422,36 @@ def record(
         raise typer.Exit(1)
 
 
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def demo(context: typer.Context) -> None:
-    """Walk a simulated robot through all directions, in real time, through the nodes."""
-    _hand_on(context, "quadvel_bringup.demo:demo_command")
+def _register(name: str, about: str) -> None:
+    """A command of ELSEWHERE: its arguments are handed on as they are, and its module is loaded when it runs."""
+
+    @app.command(name, help=about, context_settings=HANDED_ON, add_help_option=False)
+    def hand_on(context: typer.Context) -> None:
+        command(name).main(context.args, prog_name=context.command_path)
 
 
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def excite(context: typer.Context) -> None:
-    """Move the joints so that they show what they are, and record it for `quadvel identify`."""
-    _hand_on(context, "quadvel_bringup.excite:excite_command")
+for _name, _elsewhere in ELSEWHERE.items():
+    _register(_name, _elsewhere.about)
 
 
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def identify(context: typer.Context) -> None:
-    """Find what the actuator model lacks, from measured logs."""
-    from quadvel_sysid.cli import app as command
+def command(name: str) -> Any:
+    """A command with all its arguments and options, as click has it.
 
-    command(context.args, prog_name=context.command_path)
+    Args:
+        name: of the command, as after `quadvel`.
 
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def calibrate(context: typer.Context) -> None:
-    """Find what the encoders and the IMU of a robot show at zero."""
-    _hand_on(context, "quadvel_bringup.calibrate:calibrate_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def twin(context: typer.Context) -> None:
-    """Close the loop on the stack itself: plants that its model does not know, identified from their walks."""
-    _hand_on(context, "quadvel_bringup.twin:twin_command")
-
-
-@app.command(name="eval", context_settings=HANDED_ON, add_help_option=False)
-def evaluate(context: typer.Context) -> None:
-    """Measure how well a policy tracks a grid of commands, faster than real time."""
-    _hand_on(context, "quadvel_eval.cli:eval_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def compare(context: typer.Context) -> None:
-    """Show two evaluations side by side."""
-    _hand_on(context, "quadvel_eval.cli:compare_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def faults(context: typer.Context) -> None:
-    """Let things go wrong in a simulated robot, and measure what it does."""
-    _hand_on(context, "quadvel_eval.cli:faults_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def paper(context: typer.Context) -> None:
-    """Measure what the paper's figures show: a page, pictures, tables."""
-    _hand_on(context, "quadvel_eval.paper.cli:paper_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def people(context: typer.Context) -> None:
-    """Measure how well persons are found and tracked in laser scans, real and simulated."""
-    _hand_on(context, "quadvel_eval.people.cli:people_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def world(context: typer.Context) -> None:
-    """Check a world's file, and draw the world from above."""
-    _hand_on(context, "quadvel_eval.world_map:world_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def following(context: typer.Context) -> None:
-    """Measure how well a person is followed, in simulated scenes in the plane."""
-    _hand_on(context, "quadvel_eval.following.cli:following_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def plot(context: typer.Context) -> None:
-    """Draw what was recorded of a run: velocity, joints, torques, the controller's loop."""
-    _hand_on(context, "quadvel_eval.recording_plot:plot_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def replay(context: typer.Context) -> None:
-    """Ask the actuator model and the estimator offline what they say of a recording."""
-    _hand_on(context, "quadvel_eval.offline:replay_command")
-
-
-@app.command(context_settings=HANDED_ON, add_help_option=False)
-def bench(context: typer.Context) -> None:
-    """Measure the speed of simulator, policy and loop on this machine."""
-    _hand_on(context, "quadvel_eval.cli:bench_command")
+    Raises:
+        KeyError: there is no command of this name.
+    """
+    if name not in ELSEWHERE:
+        return typer.main.get_group(app).commands[name]
+    module, _, member = ELSEWHERE[name].where.partition(":")
+    found = getattr(import_module(module), member)
+    if isinstance(found, typer.Typer):
+        return typer.main.get_command(found)
+    alone = typer.Typer(**PLAIN)
+    alone.command(name)(found)
+    return typer.main.get_command(alone)
 
 
 def _with_middleware(module: str) -> Any:
@@ -440,11 +460,3 @@ def _with_middleware(module: str) -> Any:
 
     quadvel_dds.install()
     return import_module(f".{module}", __package__)
-
-
-def _hand_on(context: typer.Context, where: str) -> None:
-    """Run a function of another package as this command, with the arguments that came."""
-    module, _, name = where.partition(":")
-    command = typer.Typer(**PLAIN)
-    command.command()(getattr(import_module(module), name))
-    command(context.args, prog_name=context.command_path)

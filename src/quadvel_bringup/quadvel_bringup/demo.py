@@ -28,21 +28,35 @@ from .rehearsal import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 
+WALK, FOLLOW, TOUR = "quadvel demo walk", "quadvel demo follow", "quadvel demo follow --tour"
+OPTIONS = {
+    **dict.fromkeys(("quick", "low_level", "loss", "jitter", "actuator", "lockstep", "video"), (WALK,)),
+    **dict.fromkeys(("world", "tour"), (FOLLOW, TOUR)),
+    **dict.fromkeys(("metres", "seed"), (TOUR,)),
+    "seconds": (FOLLOW,),
+    "view": (WALK, FOLLOW),
+}
+"""Options that not every kind of demo has, and those which have them"""
 MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 """What is made of the recording; what is left of an earlier one goes."""
 
 
 def demo_command(
+    context: typer.Context,
     what: Annotated[
         Literal["walk", "follow"],
         typer.Argument(help="A walk through all directions, or after a person through a world."),
     ] = "walk",
     out: Annotated[
         Path | None,
-        typer.Option(help="Folder for the results.", show_default="out/demo, out/follow, out/tour"),
+        typer.Option(
+            metavar="<folder>", help="Folder for the results.", show_default="out/demo, out/follow, out/tour"
+        ),
     ] = None,
-    video: Annotated[bool, typer.Option("--video/--no-video", help="Draw a video where GL is there.")] = True,
-    quick: Annotated[bool, typer.Option("--quick", help="A short walk: forward, and stop.")] = False,
+    video: Annotated[
+        bool, typer.Option("--video/--no-video", help="With walk: draw a video where GL is there.")
+    ] = True,
+    quick: Annotated[bool, typer.Option("--quick", help="With walk: a short one, forward and stop.")] = False,
     low_level: Annotated[
         Literal["sim", "board"],
         typer.Option(
@@ -57,14 +71,15 @@ def demo_command(
     ] = 0.0,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
     ] = False,
     view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
     world: Annotated[
-        str, typer.Option(help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file.")
+        str,
+        typer.Option(metavar="<name|file>", help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file."),
     ] = "campus",
     seconds: Annotated[float, typer.Option(min=5.0, help="With follow: for how long, s.")] = 180.0,
     tour: Annotated[
@@ -79,6 +94,7 @@ def demo_command(
     Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
     each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
     """
+    _check_options(context, WALK if what == "walk" else TOUR if tour else FOLLOW)
     console = Console(soft_wrap=True)
     if what == "follow":
         folder = output_folder(out or Path("out/tour" if tour else "out/follow"))
@@ -111,6 +127,19 @@ def demo_command(
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
     raise typer.Exit(1 if problem or summary["falls"] else 0)
+
+
+def _check_options(context: typer.Context, demo: str) -> None:
+    """Raises ValueError where an option was given that this kind of demo does not have."""
+    for name, demos in OPTIONS.items():
+        source = context.get_parameter_source(name)
+        if (
+            source
+            and source.name == "COMMANDLINE"
+            and context.params[name] is not False
+            and demo not in demos
+        ):
+            raise ValueError(f"--{name.replace('_', '-')} belongs to {' and '.join(demos)}, not to {demo}")
 
 
 def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:

@@ -6,7 +6,6 @@ low_cmd. The simulated one runs in lockstep at 1 kHz, so that a busy machine lea
 
 from __future__ import annotations
 
-import json
 import time
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,6 +22,7 @@ from quadvel_description import robot
 from quadvel_description.kinematics import roll_pitch
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.output import output_file, replacing
+from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
 
@@ -30,6 +30,7 @@ from .alone import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import Parameters, arguments, command, enclave
 from .processes import ProcessGroup, StopSignals
+from .rehearsal import rehearse_node
 from .stack import PARAMETERS
 
 RAMP = 1.5  # s, from where the robot is to where the motion begins
@@ -124,7 +125,8 @@ def excite_command(
         float | None, typer.Option(min=0.5, help="For how long.", show_default="the motion's own")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="The file to write.", show_default="out/excite/MOTION.mcap")
+        Path | None,
+        typer.Option(metavar="<file>", help="The file to write.", show_default="out/excite/MOTION.mcap"),
     ] = None,
     low_level: Annotated[
         Literal["sim", "external"],
@@ -148,11 +150,16 @@ def excite_command(
     ] = None,
     actuator: Annotated[
         Path | None,
-        typer.Option(help="Simulated robot: its actuator.yaml.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="Simulated robot: its actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
     seed: Annotated[int, typer.Option(help="Simulated robot: of its noise.")] = 0,
     after: Annotated[
-        Path | None, typer.Option(help="A report.json: say which motions would settle what it left open.")
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="A report.json: say which motions would settle what it left open."
+        ),
     ] = None,
 ) -> None:
     """Move the joints so that they show what they are; record state and command for `quadvel identify`.
@@ -188,7 +195,10 @@ def excite_command(
     parameters: dict[str, Any] = {"hung": in_the_air, "seed": seed}
     if actuator is not None:
         parameters["actuator_file"] = str(actuator.resolve())
-    nodes = {"sim_node": command("sim_node", sim_arguments(**parameters))} if low_level == "sim" else {}
+    nodes = {}
+    if low_level == "sim":
+        rehearse_node("sim_node", sim_arguments(**parameters))
+        nodes["sim_node"] = command("sim_node", sim_arguments(**parameters))
     try:
         record_motion(Player(excitation, kp, kd, in_the_air), path, nodes, console)
     except MotionError as error:
@@ -198,8 +208,8 @@ def excite_command(
 
 def _propose(report: Path, console: Console) -> None:
     try:
-        proposals = propose(json.loads(report.read_text()))
-    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        proposals = propose(read_json(report))
+    except (KeyError, TypeError) as error:
         raise ValueError(f"{report}: no report of `quadvel identify`: {error!r}") from None
     if not proposals:
         console.print("The report leaves nothing open that another motion would settle.")

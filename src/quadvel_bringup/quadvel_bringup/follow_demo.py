@@ -81,4 +81,5 @@ def follow(folder: Path, world: str, seconds: float, view: bool, console: Consol
     outcome, moments = read_walk(recorded, loaded)
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
+    console.print(f"no video is drawn of it; to watch it: quadvel view {recorded}", highlight=False)
     return not (problem or outcome.fell or outcome.touched)

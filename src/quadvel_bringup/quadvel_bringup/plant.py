@@ -156,7 +156,7 @@ def read_plant(path: Path) -> Callable[[], Physics]:
     """What makes the physics that the file describes. ValueError names file, field and what was expected."""
     try:
         content = yaml.safe_load(path.read_text())
-    except yaml.YAMLError as error:
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(content, Mapping) or content.get("kind") not in KINDS:
         found = content.get("kind") if isinstance(content, Mapping) else content
@@ -189,7 +189,8 @@ def main() -> None:
     try:
         physics = read_plant(Path(path))
     except ValueError as error:
-        sys.exit(f"plant: {error}")
+        print(f"plant: {error}", file=sys.stderr)
+        sys.exit(2)
     import quadvel_dds
 
     quadvel_dds.install()

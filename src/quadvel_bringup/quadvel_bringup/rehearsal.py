@@ -5,7 +5,7 @@ The nodes look for themselves once more when they start; here the same records a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -55,7 +55,12 @@ def rehearse(stack: Stack) -> None:
     _check_names(stack.parameters)
     for name, arguments in stack.arguments().items():
         if name in PARTS:
-            _check(name, PARTS[name], parse(arguments).parameters_for(f"/{name}"))
+            rehearse_node(name, arguments)
+
+
+def rehearse_node(name: str, arguments: Sequence[str]) -> None:
+    """The same for one node of PARTS with these arguments of ROS 2."""
+    _check(name, PARTS[name], parse(arguments).parameters_for(f"/{name}"))
 
 
 def _check_names(file: Path) -> None:
@@ -64,6 +69,8 @@ def _check_names(file: Path) -> None:
         overrides = read_parameter_file(file)
     except ValueError as error:
         raise ValueError(" ".join(str(error).split())) from None  # YAML tells its errors in several lines
+    if not overrides:
+        raise ValueError(f"{file}: found no section with parameters, expected one of {', '.join(NODES)}")
     for pattern in dict.fromkeys(override.pattern for override in overrides):
         of_it = next(override for override in overrides if override.pattern == pattern)
         if not any(of_it.applies_to(f"/{name}") for name in NODES):

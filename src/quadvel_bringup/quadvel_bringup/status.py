@@ -130,7 +130,7 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
         position = heard["odom"][-1].pose.pose.position
         yield (
             "position",
-            f"{position.x:.2f}, {position.y:.2f}, {position.z:.2f} m since the estimator's start",
+            f"x {position.x:.2f}, y {position.y:.2f} m since the estimator's start; height is not estimated",
         )
     yield "rates", ", ".join(f"{topic} {_rate(heard[topic]):.0f}" for topic in RATES) + " Hz"
 

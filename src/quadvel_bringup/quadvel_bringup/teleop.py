@@ -15,9 +15,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import attrs
 import numpy as np
 from geometry_msgs.msg import Twist
 from rich.console import Console
+from rich.markup import escape
 
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
@@ -33,6 +35,33 @@ from .session import PATIENCE, NobodyThere, Session
 
 ORDERS = {"u": "stand_up", "x": "lie_down"}
 HAND = "hand"
+
+
+@attrs.frozen
+class WayOut:
+    """What a hand presses: release, to release the STOP; recover, to stand up again after a fault."""
+
+    release: str
+    recover: str
+
+
+KEYS = WayOut(release="r", recover="space, r, then u")
+BUTTONS = WayOut(release="start", recover="B, start, then `quadvel mode stand_up`")
+
+
+def state_line(state: Any, stopped: bool, speed: float, way_out: WayOut) -> str:
+    """The robot in one line.
+
+    Args:
+        state: the last ControllerState.
+        stopped: whether STOP is pressed.
+        speed: m/s, straight on, of what is held.
+        way_out: of the hand that drives.
+    """
+    stop = f"STOPPED, {way_out.release} releases   " if stopped else ""
+    if state.mode_name == "fault":
+        return f"{stop}fault: {state.reason}   once the cause is gone: {way_out.recover}"
+    return f"{stop}{state.mode_name}   speed {speed:.1f} m/s   {velocity_text(planar(state.command))}"
 
 
 class Teleop:
@@ -74,11 +103,9 @@ class Teleop:
             self._ask("passive")
         self._session.spin(PERIOD)
 
-    def line(self, speed: float) -> str:
-        """How it is, in one line."""
-        state = self._states[-1]
-        stopped = "STOPPED, r releases   " if self._operator.stopped else ""
-        return f"{stopped}{state.mode_name}   speed {speed:.1f} m/s   {velocity_text(planar(state.command))}"
+    def line(self, speed: float, way_out: WayOut) -> str:
+        """`state_line` of the robot as it is now."""
+        return state_line(self._states[-1], self._operator.stopped, speed, way_out)
 
     def end(self) -> None:
         """Zero, as the last word."""
@@ -113,7 +140,7 @@ def by_keyboard() -> int:
 
     print("".join(str(keyboard.__doc__).partition("\n\n")[1:]).strip("\n"))
     with _keys_as_they_come():
-        _drive(hear, lambda: keys.speed)
+        _drive(hear, lambda: keys.speed, KEYS)
     return 0
 
 
@@ -133,11 +160,11 @@ def by_gamepad() -> int:
 
     print("".join(str(gamepad.__doc__).partition("\n\n")[1:]).strip("\n"))
     print(f"by {device.name}")
-    _drive(hear, lambda: pad.speed)
+    _drive(hear, lambda: pad.speed, BUTTONS)
     return 0
 
 
-def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float]) -> None:
+def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float], way_out: WayOut) -> None:
     """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens."""
     console = Console(soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
@@ -147,7 +174,7 @@ def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float]) -> None:
             with console.status("") as status:
                 while not signals.received:
                     teleop.serve(hear(teleop))
-                    status.update(teleop.line(speed()))
+                    status.update(escape(teleop.line(speed(), way_out)))
         finally:
             teleop.end()
 

@@ -7,7 +7,6 @@ predicts is held against what the plant did. The plant's file is read by the pla
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -26,10 +25,11 @@ from quadvel_eval import demo_summary, replay
 from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.pool import Call, in_parallel
 from quadvel_eval.recording import Recording, read_recording
-from quadvel_eval.report import write_json
+from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 
+from .plant import read_plant
 from .processes import ProcessGroup, StopSignals
 from .recorded_run import LOOK
 from .scripted_walk import ScriptedWalk
@@ -50,7 +50,7 @@ def twin_command(
         list[str] | None,
         typer.Argument(help=f"Shipped plants ({', '.join(SHIPPED)}) or YAML files.", show_default="all"),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("out/twin"),
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the results.")] = Path("out/twin"),
     reuse: Annotated[
         bool, typer.Option("--reuse", help="Take up the recordings and reports that are there.")
     ] = False,
@@ -90,6 +90,7 @@ def _plant_file(plant: str) -> Path:
     file = PLANTS / f"{plant}.yaml" if plant in SHIPPED else Path(plant)
     if not file.is_file():
         raise FileNotFoundError(f"{plant}: no such plant; expected {', '.join(SHIPPED)} or a YAML file")
+    read_plant(file)  # what is wrong with it shows here, before any walk
     return file
 
 
@@ -190,7 +191,7 @@ def judge(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]
 
 def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator[Any]) -> dict[str, Any]:
     """A plant's entry. answers: of the calls that `judge` made for it, in their order."""
-    report = json.loads((folder / "identify" / "report.json").read_text())
+    report = read_json(folder / "identify" / "report.json")
     walks = [read_walk(folder / f"{walk}.mcap").segments for walk in WALKS]
     plant = _average(walks)
     entry: dict[str, Any] = {

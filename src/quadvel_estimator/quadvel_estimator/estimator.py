@@ -21,6 +21,7 @@ from rclpy.qos import qos_profile_sensor_data
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.frames import BASE, ODOM, Placed, footprint
+from quadvel_description.kinematics import rotate
 from quadvel_description.state import RobotState
 from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import QUIET, diagnostics
@@ -39,6 +40,8 @@ KINDS = ("learned", "kalman")
 ODOM_EVERY = 4  # estimates, which makes 50 Hz
 GYRO_VARIANCE = 1e-4  # (rad/s)^2, of the angular velocity that is passed on
 ORIENTATION_VARIANCE = 1e-4  # rad^2, of the orientation that is passed on
+HEIGHT_VARIANCE = 1e6
+"""m^2, of z in `odom`: so large that a filter which fuses it leaves z alone"""
 _ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # of x, y, z and the rotations about them
 
 
@@ -127,20 +130,23 @@ class EstimatorNode(Node):
         self._velocity.publish(message)
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
-        """Position by dead reckoning, orientation as the IMU tells it."""
+        """x and y by dead reckoning, orientation from the IMU. Height is not estimated: z is the trunk's above its lowest foot."""
+        floor = footprint(state.q, state.quaternion)
+        position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
+        variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
         message = Odometry(child_frame_id=self._settings.body_frame)
         message.header.stamp = stamp
         message.header.frame_id = self._settings.odom_frame
-        fill_vector(message.pose.pose.position, estimate.position)
+        fill_vector(message.pose.pose.position, position)
         fill_quaternion(message.pose.pose.orientation, state.quaternion)
-        message.pose.covariance = _covariance(np.diag(estimate.position_deviation**2), ORIENTATION_VARIANCE)
+        message.pose.covariance = _covariance(np.diag(variances), ORIENTATION_VARIANCE)
         _fill_twist(message.twist, state, estimate)
         self._odom.publish(message)
         if self._settings.publish_tf:
             frames = self._settings
-            base = Placed(frames.odom_frame, frames.body_frame, estimate.position, state.quaternion)
-            floor = attrs.evolve(footprint(state.q, state.quaternion), parent=frames.body_frame)
-            self._tf.publish(TFMessage(transforms=transforms(stamp, [base, floor])))
+            base = Placed(frames.odom_frame, frames.body_frame, position, state.quaternion)
+            below = attrs.evolve(floor, parent=frames.body_frame)
+            self._tf.publish(TFMessage(transforms=transforms(stamp, [base, below])))
 
     def _report(self) -> None:
         """Once a second: how the last second went."""

@@ -25,27 +25,32 @@ from .walk import Setup
 Cluster = Annotated[
     str | None,
     typer.Option(
-        help="Address of a Dask scheduler to run the walks on.", show_default="the cores of this machine"
+        metavar="<address>",
+        help="Address of a Dask scheduler to run the walks on.",
+        show_default="the cores of this machine",
     ),
 ]
 
 
 def eval_command(
-    out: Annotated[Path, typer.Option(help="Folder for eval.json, eval.csv and eval.png.")],
     grid: Annotated[Literal["quick", "paper"], typer.Option(help="Which commands are tried.")],
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for eval.json, eval.csv and eval.png.")
+    ] = Path("out/eval"),
     policy: Annotated[
-        Path, typer.Option(help="ONNX file of the policy.", show_default="the shipped one")
+        Path, typer.Option(metavar="<file>", help="ONNX file of the policy.", show_default="the shipped one")
     ] = SHIPPED_POLICY,
     estimator: Annotated[
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
     estimator_file: Annotated[
-        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+        Path,
+        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
     terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
     actuator: Annotated[
         Path | None,
-        typer.Option(help="The robot's actuator.yaml.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     randomised: Annotated[
         bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")
@@ -85,16 +90,20 @@ def walks_bar() -> Progress:
 
 
 def faults_command(
-    out: Annotated[Path, typer.Option(help="Folder for faults.json, faults.md and faults.png.")] = Path(
-        "out/faults"
-    ),
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for faults.json, faults.md and faults.png.")
+    ] = Path("out/faults"),
     seeds: Annotated[
         int,
         typer.Option(min=1, help="Runs of each kind of fault, in turn in its modes, with seeds 0, 1, ..."),
     ] = 20,
     only: Annotated[
         str | None,
-        typer.Option(help="Cases whose 'component kind mode' holds this text.", show_default="all of them"),
+        typer.Option(
+            metavar="<text>",
+            help="Cases whose 'component kind mode' holds this text.",
+            show_default="all of them",
+        ),
     ] = None,
 ) -> None:
     """Let things go wrong in a simulated robot, and measure what it does and how soon.
@@ -125,7 +134,9 @@ def compare_command(
 
 
 def bench_command(
-    out: Annotated[Path, typer.Option(help="JSON file for the figures.")] = Path("out/bench.json"),
+    out: Annotated[Path, typer.Option(metavar="<file>", help="JSON file for the figures.")] = Path(
+        "out/bench.json"
+    ),
 ) -> None:
     """Measure how fast this machine simulates, infers, talks and trains; on an idle machine, some minutes."""
     output_file(out)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 from rich.table import Table
 
 from .grid import SCHEMA
+from .report import read_json
 
 EVALUATION = "eval.json"
 ON_BOTH = (
@@ -28,10 +28,7 @@ def read_evaluation(path: Path) -> dict[str, Any]:
     file = path / EVALUATION if path.is_dir() else path
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file, expected what `quadvel eval` wrote")
-    try:
-        content = json.loads(file.read_text())
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{file}: no JSON: {error}") from None
+    content = read_json(file)
     if not isinstance(content, dict) or content.get("schema") != SCHEMA or "cells" not in content:
         raise ValueError(f"{file}: no evaluation, expected schema {SCHEMA} with cells")
     return content

@@ -139,29 +139,32 @@ def velocity_figure(run: Run, times: Array, found: Array) -> Figure:
 
 def replay_command(
     recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for replay.json and pictures.")] = Path("out/replay"),
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for replay.json and pictures.")
+    ] = Path("out/replay"),
     actuator: Annotated[
-        Path | None, typer.Option(help="An actuator.yaml.", show_default="the shipped one")
+        Path | None, typer.Option(metavar="<file>", help="An actuator.yaml.", show_default="the shipped one")
     ] = None,
     estimator: Annotated[
         Literal["learned", "kalman"], typer.Option(help="Which estimator of the velocity.")
     ] = "learned",
     estimator_file: Annotated[
-        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+        Path,
+        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
 ) -> None:
     """Ask the actuator model and the estimator offline what they say of a recording of low_state and low_cmd.
 
-    \\b
+    \b
     For example, whether a corrected model says more of a walk than the shipped one:
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
     model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
+    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
     run = read_run(recording)
     said = torques(read_joints(recording, SLOWEST), model)
-    asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     times, found = estimated(recording, asked)
     errors = velocity_errors(run, times, found)
     _show(said, errors)

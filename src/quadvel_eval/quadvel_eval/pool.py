@@ -10,6 +10,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from typing import Any, TypeAlias
@@ -22,8 +23,7 @@ def in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterator[t
     """Number and answer of each call, as they are done.
 
     cluster: the address of a Dask scheduler, whose workers see the same files as this machine; None for the
-    cores of this one. A KeyboardInterrupt ends it; where only this process heard of it, once the calls under
-    way are through.
+    cores of this one. A KeyboardInterrupt ends it, and the calls under way on this machine.
     """
     with _cores() if cluster is None else _dask(cluster) as submit:
         with _without_windows(), _interrupts_held_back():
@@ -41,6 +41,10 @@ def _cores() -> Iterator[Callable[..., Any]]:
             yield pool.submit
         except KeyboardInterrupt:
             signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
+            for (
+                worker
+            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
+                worker.terminate()
             raise
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -85,7 +89,7 @@ def _interrupts_held_back() -> Iterator[None]:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
-    except BrokenPipeError:
+    except (BrokenPipeError, BrokenProcessPool):
         if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
             raise
     finally:

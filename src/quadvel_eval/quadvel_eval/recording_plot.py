@@ -194,14 +194,16 @@ def _shade(mode: str) -> str:
 
 def plot_command(
     recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
-    out: Annotated[Path, typer.Option(help="Folder for the pictures.")] = Path("out/plot"),
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
+        "out/plot"
+    ),
 ) -> None:
     """Draw what was recorded of a run: velocity, joints, torques, the controller's loop.
 
     Colours show the controller's mode.
     """
-    run = read_run(recording)
     output_folder(out)
+    run = read_run(recording)
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:

@@ -27,6 +27,19 @@ CSV_COLUMNS = (
 )
 
 
+def read_json(path: Path) -> Any:
+    """What a JSON file holds.
+
+    Raises:
+        ValueError: the file holds no JSON; the text names it.
+        OSError: it cannot be read.
+    """
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (ValueError, RecursionError) as error:  # UnicodeDecodeError is a ValueError, too
+        raise ValueError(f"{path}: is not JSON: {error}") from None
+
+
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """`content` as JSON text; NaN and infinity are refused with a ValueError."""
     with replacing(path) as draft:

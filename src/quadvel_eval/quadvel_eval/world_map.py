@@ -16,16 +16,23 @@ from rich.console import Console
 
 from quadvel_sim.world import SHIPPED, World
 
+from .output import output_file
 from .report import write_figure
 
 WIDTH = 10.0  # inches
+FORMATS = (".png", ".svg", ".pdf")
 GROUND = {"grass": "#a9c48f", "gravel": "#cfc7b8", "paved": "#d9dadc"}
 LED, OTHER = "#1a9641", "#4575b4"
 
 
 def world_command(
-    world: Annotated[str, typer.Argument(metavar="WORLD", help=f"{', '.join(SHIPPED)} or a YAML file.")],
-    out: Annotated[Path, typer.Option(help="The picture to write, PNG or SVG.")],
+    world: Annotated[str, typer.Argument(help=f"{', '.join(SHIPPED)} or a YAML file.")],
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="The picture to write, PNG, SVG or PDF.", show_default="out/WORLD.png"
+        ),
+    ] = None,
 ) -> None:
     """Check a world's file, and draw the world from above.
 
@@ -34,9 +41,11 @@ def world_command(
       quadvel world campus --out out/campus.png
     """
     loaded = World.load(world)
-    out.parent.mkdir(parents=True, exist_ok=True)
-    write_figure(out, draw(loaded))
-    Console(soft_wrap=True).print(f"written: {out}")
+    path = output_file(Path(f"out/{loaded.name}.png") if out is None else out)
+    if path.suffix not in FORMATS:
+        raise ValueError(f"{path}: found the suffix {path.suffix!r}, expected {', '.join(FORMATS)}")
+    write_figure(path, draw(loaded))
+    Console(soft_wrap=True).print(f"written: {path}")
 
 
 def draw(world: World) -> Figure:

@@ -21,6 +21,7 @@ from quadvel_nodes.node import read_parameters, run
 from .follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
 from .person_tracker import deviation
 from .planar import planar_pose, planar_twist, scan_ranges
+from .state_log import StateLog
 
 GOOD = (State.FOLLOWING, State.WAITING)
 
@@ -33,6 +34,7 @@ class FollowPlannerNode(Node):
         self._planner = FollowPlanner(read_parameters(self, FollowConfig))
         self._refusals, self._refused = Refusals(), 0
         self._frame, self._said = "", ""
+        self._log = StateLog()
         self._plan: Plan | None = None
         self._velocity = self.create_publisher(Twist, "cmd_vel_follow", 10)
         self._state = self.create_publisher(String, "follow_planner/state", 10)
@@ -98,9 +100,9 @@ class FollowPlannerNode(Node):
         twist.linear.x, twist.linear.y, twist.angular.z = plan.velocity.tolist()
         self._velocity.publish(twist)
         text = f"{plan.state.value}: {plan.words}"
-        if text != self._said:
-            self._said = text
-            self.get_logger().info(text)
+        self._said = text
+        if line := self._log.line(self._now(), text):
+            self.get_logger().info(line)
         self._state.publish(String(data=text))
         self._way.publish(self._path(plan))
 

@@ -71,7 +71,7 @@ def end(node: Node, error: str = "") -> None:
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Start a node and serve it until Ctrl-C, shutdown, or `end`. If it cannot start: one sentence, exit code 1.
+    """Start a node and serve it until Ctrl-C, shutdown, or `end`. If it cannot start: one sentence, exit code 2.
 
     For the main of a process, which ends with it. SIGINT and SIGTERM end it between two callbacks, instead of
     pulling the context away under them as rclpy's own handlers do: they may come at any moment, and again, and cut
@@ -104,7 +104,8 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         return make_node()
     except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
-        sys.exit(" ".join(str(error).split()))
+        print(" ".join(str(error).split()), file=sys.stderr)
+        sys.exit(2)
 
 
 def _serve(node: Node, signals: socket, waker: socket) -> None:

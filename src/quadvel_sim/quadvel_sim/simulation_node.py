@@ -9,6 +9,7 @@ import gc
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from threading import Thread
+from time import monotonic
 from typing import Any, Generic, TypeVar
 
 import attrs
@@ -32,6 +33,7 @@ from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport
 from quadvel_sim.parameters import PlantParameters
 from quadvel_sim.simulator import Simulator, Truth
+from quadvel_sim.slowness import SlownessLog
 from quadvel_sim.terrain import Terrain
 from quadvel_sim.world_view import WorldView
 
@@ -62,6 +64,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._system_time = SystemTime()
         self._samples = 0
         self._given_up_before = 0.0
+        self._slowness = SlownessLog()
         self._has_fallen = False
         self._failure = ""
         self._loop = self._settings.loop(simulator, self._publish, self.say_waiting)
@@ -209,7 +212,8 @@ class SimulationNode(Node, ABC, Generic[Settings]):
             end(self, f"{self.get_name()}: {self._failure}")
             return
         report = self._loop.report()
-        level, summary = self._judge(report)
+        worry = self.worry(report)
+        level, summary = self._judge(report, worry)
         values = {
             "mode": self._loop.mode,
             "actuator": self._settings.actuator_file or "the shipped AlienGo (Table 4)",
@@ -224,8 +228,10 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
-        if level == DiagnosticStatus.WARN:
-            self.get_logger().warning(summary, throttle_duration_sec=QUIET)
+        if worry:
+            self.get_logger().warning(worry, throttle_duration_sec=QUIET)
+        if slow := self._slowness.line(monotonic(), report.given_up):
+            self.get_logger().warning(slow)
         if report.fallen and not self._has_fallen:
             self.get_logger().warning("the robot has fallen, or lies down: ~/reset puts it back")
         self._has_fallen = report.fallen
@@ -237,11 +243,11 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         touched = ", ".join(f"{name} {count}" for name, count in sorted(report.touched.items()))
         return {"world": self._settings.world, "touched": touched or "nothing"}
 
-    def _judge(self, report: LoopReport) -> tuple[bytes, str]:
+    def _judge(self, report: LoopReport, worry: str) -> tuple[bytes, str]:
         """Level and summary of the last second."""
         given_up = report.given_up - self._given_up_before
         self._given_up_before = report.given_up
-        if worry := self.worry(report):
+        if worry:
             return DiagnosticStatus.WARN, worry
         if given_up:
             return DiagnosticStatus.WARN, f"this machine is too slow: {given_up:.2f} s of real time given up"

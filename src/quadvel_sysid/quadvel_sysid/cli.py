@@ -65,34 +65,38 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 def identify(
     logs: Annotated[
         list[Path],
-        typer.Argument(metavar="LOG...", help="Logs to fit: .mcap, rosbag2 folder, .npz, .csv or .json."),
+        typer.Argument(help="Logs to fit: .mcap, rosbag2 folder, .npz, .csv or .json."),
     ],
-    out: Annotated[Path, typer.Option(help="Folder for report.html, report.json and actuator.yaml.")],
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for report.html, report.json and actuator.yaml.")
+    ] = Path("out/identify"),
     holdout: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="LOG...", help="Logs to judge on.", show_default="a fifth of each LOG, in blocks"
+            metavar="<log...>", help="Logs to judge on.", show_default="a fifth of each log, in blocks"
         ),
     ] = None,
     base: Annotated[
         Path | None,
-        typer.Option(help="actuator.yaml of the model to correct.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="actuator.yaml of the model to correct.", show_default="the shipped one"
+        ),
     ] = None,
     gains: Annotated[
         tuple[float, float] | None,
         typer.Option(
-            metavar="KP KD",
+            metavar="<kp kd>",
             help="Commanded gains, N m/rad and N m s/rad, of logs that hold none.",
             show_default="fitted",
         ),
     ] = None,
     joints: Annotated[
-        list[str] | None, typer.Option(metavar="NAME...", help="Use these joints only.", show_default="all")
+        list[str] | None, typer.Option(metavar="<name...>", help="Use these joints only.", show_default="all")
     ] = None,
     columns: Annotated[
         Path | None,
         typer.Option(
-            metavar="MAPFILE",
+            metavar="<file>",
             help="YAML file that says what the logs call the fields.",
             show_default="as below, or as PACE and JointState do",
         ),
@@ -100,7 +104,7 @@ def identify(
     robot: Annotated[
         str | None,
         typer.Option(
-            metavar="ROBOT",
+            metavar="<name|file>",
             help="Replay the commands on this robot's legs before and after: aliengo, go2, or an MJCF or URDF file.",
             show_default="no replay",
         ),

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from ..output import output_folder, replacing
 from .measure import measure
 
 HEADS = {
@@ -25,15 +26,18 @@ HEADS = {
 
 
 def following_command(
-    out: Annotated[Path, typer.Option(help="Folder for following.json.")],
+    out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for following.json.")] = Path(
+        "out/following"
+    ),
     runs: Annotated[int, typer.Option(min=1, help="Scenes of each kind.")] = 10,
 ) -> None:
     """Measure how well a person is followed, in simulated scenes in the plane."""
-    out.mkdir(parents=True, exist_ok=True)
+    output_folder(out)
     found = measure(runs)
     table = Table(f"simulated, {runs} each", *HEADS.values())
     for name, row in found.items():
         table.add_row(name, *(f"{row[head]:.2f}" for head in HEADS))
     Console().print(table)
-    (out / "following.json").write_text(json.dumps(found, indent=1))
+    with replacing(out / "following.json") as draft:
+        draft.write_text(json.dumps(found, indent=1))
     print(f"written: {out}/following.json")

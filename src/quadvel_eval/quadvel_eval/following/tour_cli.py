@@ -17,7 +17,7 @@ LINES = 20  # in all, where there is no terminal that shows a bar
 def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
     """Follow through a world as `setup` has it; whether the robot neither fell nor touched anything.
 
-    Ctrl-C ends the walk early: what there is of it is judged and written.
+    Ctrl-C ends the walk early: what there is of it is judged and written. Raises KeyboardInterrupt then.
     """
     tour = Tour(setup)
     moments: list[Moment] = []
@@ -29,7 +29,7 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
     )
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("sets out", total=setup.metres)
-        told = 0.0
+        told, is_stopped = 0.0, False
         try:
             for moment in tour.moments():
                 moments.append(moment)
@@ -39,9 +39,10 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
                     console.print(f"{tour.walked:.0f} of {setup.metres:.0f} m: {moment.words}")
                     told += setup.metres / LINES
         except KeyboardInterrupt:
-            console.print("stopped")
-    if not moments:
-        return False
-    console.print(tour_table(write_tour(out, tour.world, tour.outcome, moments)))
-    console.print(f"written to {out}: tour.json, tour.png")
-    return not (tour.fell or tour.simulator.touched)
+            is_stopped = True
+    if moments:
+        console.print(tour_table(write_tour(out, tour.world, tour.outcome, moments)))
+        console.print(f"written to {out}: tour.json, tour.png; no video is drawn of a tour")
+    if is_stopped:
+        raise KeyboardInterrupt
+    return bool(moments) and not (tour.fell or tour.simulator.touched)

@@ -33,7 +33,7 @@ def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
     """The robot's way on the map of the world; below, distance to the person and speed over time."""
     figure = draw(world)
     way = np.array([one.pose[:2] for one in moments])
-    time = np.array([one.time for one in moments]) / 60.0
+    time = np.array([one.time - moments[0].time for one in moments]) / 60.0
     away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
     speed = np.array([np.hypot(*one.velocity[:2]) for one in moments])
     world_map = figure.axes[0]

@@ -19,11 +19,13 @@ from .study import SECTIONS, Progress, run
 
 
 def paper_command(
-    out: Annotated[Path, typer.Option(help="Folder for the page, pictures and tables.")],
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for the page, pictures and tables.")
+    ] = Path("out/paper"),
     policy: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="NAME=FILE",
+            metavar="<name=file>",
             help="A policy and its name; may be given several times.",
             show_default="the shipped one",
         ),
@@ -31,7 +33,7 @@ def paper_command(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SECTION",
+            metavar="<section>",
             help=f"One of {', '.join(s.name for s in SECTIONS)}; may be given several times.",
             show_default="all",
         ),
@@ -40,7 +42,8 @@ def paper_command(
         Literal["learned", "kalman", "truth"], typer.Option(help="Velocity estimator in the loop.")
     ] = "learned",
     estimator_file: Annotated[
-        Path, typer.Option(help="ONNX file of the learned one.", show_default="the shipped one")
+        Path,
+        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
     again: Annotated[bool, typer.Option("--again", help="Run sections that are done already, too.")] = False,

@@ -18,7 +18,7 @@ from matplotlib.figure import Figure
 from quadvel_policy.policy_file import PolicyFile
 
 from ..output import replacing
-from ..report import write_figure, write_json
+from ..report import read_json, write_figure, write_json
 from .section import Record, Row, Section, Study, distinct
 
 SCHEMA = 1
@@ -44,7 +44,7 @@ def _digest(path: Path) -> str:
 def is_done(folder: Path, section: Section, study: Study) -> bool:
     """Whether the folder holds this section, made with just these networks, seeds and settings."""
     path = folder / f"{section.name}.json"
-    return path.exists() and bool(json.loads(path.read_text())["made_with"] == made_with(section, study))
+    return path.exists() and bool(read_json(path)["made_with"] == made_with(section, study))
 
 
 def write_section(folder: Path, section: Section, study: Study, records: Sequence[Record]) -> None:
@@ -117,7 +117,7 @@ def write_page(folder: Path, sections: Sequence[Section]) -> None:
         "",
     ]
     for section in there:
-        lines += _chapter(section, rows[section], json.loads((folder / f"{section.name}.json").read_text()))
+        lines += _chapter(section, rows[section], read_json(folder / f"{section.name}.json"))
     with replacing(folder / PAGE) as draft:
         draft.write_text("\n".join(lines))
 

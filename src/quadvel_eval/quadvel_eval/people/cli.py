@@ -13,6 +13,7 @@ from rich.table import Table
 
 from quadvel_follow.leg_detector import SHIPPED_MODEL, LegDetector
 
+from ..output import output_folder, replacing
 from .figure import draw_tracks
 from .measure import Recording, measure_files, measure_scenes
 
@@ -31,19 +32,25 @@ HEADS = {
 
 
 def people_command(
-    out: Annotated[Path, typer.Option(help="Folder for people.json and a picture of each file.")],
+    out: Annotated[
+        Path, typer.Option(metavar="<folder>", help="Folder for people.json and a picture of each file.")
+    ] = Path("out/people"),
     scans: Annotated[
-        Path | None, typer.Option(help="Folder with files legs_*.npz of real scans.", show_default="none")
+        Path | None,
+        typer.Option(
+            metavar="<folder>", help="Folder with files legs_*.npz of real scans.", show_default="none"
+        ),
     ] = None,
     runs: Annotated[int, typer.Option(min=0, help="Simulated scenes of each kind.")] = 100,
     model: Annotated[
-        Path, typer.Option(help="ONNX file that knows legs.", show_default="the shipped one")
+        Path,
+        typer.Option(metavar="<file>", help="ONNX file that knows legs.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
 ) -> None:
     """Measure how well persons are found and tracked in laser scans, real and simulated."""
     detector, console = LegDetector(model), Console()
+    output_folder(out)
     found: dict[str, Figures] = {}
-    out.mkdir(parents=True, exist_ok=True)
     if scans is not None:
         found["scans"] = measure_files(scans, detector)
         console.print(_table("real scans", found["scans"]))
@@ -52,7 +59,8 @@ def people_command(
     if runs:
         found["scenes"] = measure_scenes(runs, detector)
         console.print(_table(f"simulated, {runs} each", found["scenes"]))
-    (out / "people.json").write_text(json.dumps(found, indent=1))
+    with replacing(out / "people.json") as draft:
+        draft.write_text(json.dumps(found, indent=1))
     console.print(f"written: {out}/people.json{', pictures' if scans is not None else ''}")
 
 

@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from quadvel_follow.leg_detector import LegDetector
 
+from ..report import write_figure
 from .measure import Recording
 
 
@@ -31,5 +32,4 @@ def draw_tracks(recording: Recording, detector: LegDetector, path: Path) -> None
     axes.plot(0.0, 0.0, "k^", markersize=9, label="laser")
     axes.set(xlabel="x, m", ylabel="y, m", title=recording.name, aspect="equal")
     axes.legend(loc="upper right")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    write_figure(path, figure)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from time import process_time
 from typing import Any
+from zipfile import BadZipFile
 
 import attrs
 import numpy as np
@@ -45,7 +46,7 @@ class Recording:
             ranges = np.where(ranges < found["range_max"], ranges, np.inf)
             angles = float(found["angle_min"]), float(found["angle_increment"])
             return cls(path.stem, ranges, *angles, found["stamp"].astype(float), found.get("legs"))
-        except (OSError, KeyError, ValueError) as error:
+        except (OSError, KeyError, ValueError, BadZipFile) as error:
             raise ValueError(
                 f"{path}: {error}; expected NPZ with ranges (N, rays), angle_min, angle_increment, range_max and stamp (N,)"
             ) from None
