@@ -21,7 +21,8 @@ LARGEST = 10_000_000  # bytes of a file
 SAME = 1e-6  # m, within which two points are one
 TURN_RATE = 1.0  # rad/s, at most, on the spot and in curves
 LONGEST = 86_400.0  # s, of a trajectory: a day
-FURTHEST = 100_000.0  # m, of a way
+FURTHEST = 100_000.0  # m, of a trajectory
+LONGEST_STEP = 10_000.0  # m, between two points
 LEAP_STEPS, LEAP_M = 20.0, 20.0
 """Usual steps and metres from which a step of a recorded path is a leap"""
 TABLE_NOISE = NoiseLimits(least=EXACT_M, few=0.1, many=0.5)
@@ -91,11 +92,14 @@ class Trajectory:
             ValueError: if there are less than two places, or too long a way.
         """
         points = np.asarray(places, float)
-        points = points[np.concatenate([[True], np.hypot(*np.diff(points, axis=0).T) > SAME])]
+        points = points[np.concatenate([[True], _lengths(points) > SAME])]
         if len(points) < 2:
             raise ValueError("has one place, expected two at least")
-        _refuse_long(float(np.hypot(*np.diff(points, axis=0).T).sum()) / speed)
         path = smooth_path(points, noise)
+        length = sum(float(_lengths(piece).sum()) for piece in path.pieces)
+        if not length <= FURTHEST:
+            raise ValueError(f"is {length:.3g} m long, expected {FURTHEST:.0f} m at most")
+        _refuse_long(length / speed)
         corners = [
             float(turns_of(np.array([before[-1] - before[-2], after[1] - after[0]]))[0])
             for before, after in itertools.pairwise(path.pieces)
@@ -216,29 +220,24 @@ def _lengths(places: Array) -> Array:
 
 
 def _refuse_leaps(points: Array, steps: Array) -> None:
-    """Raises ValueError that names the point after which a recording leaps, or a way is too long.
+    """Raises ValueError that names the points between which a path leaps.
 
     Args:
         points: (n, 2), as the file has them.
         steps: (n - 1,), m, between them.
     """
     usual = float(np.median(steps[steps > SAME])) if (steps > SAME).any() else 0.0
-    leaps = np.flatnonzero(steps > max(LEAP_STEPS * usual, LEAP_M)) if len(steps) >= FEW_POINTS else []
-    longest = int(leaps[0]) if len(leaps) else int(np.argmax(steps)) if len(steps) else 0
-
-    def step() -> str:
-        return (
-            f"{steps[longest]:.6g} m from point {longest + 1} at {_pair(points[longest])} "
-            f"to point {longest + 2} at {_pair(points[longest + 1])}"
-        )
-
-    if len(leaps):
-        more = f"; {len(leaps)} steps of the file are such leaps" if len(leaps) > 1 else ""
-        raise ValueError(
-            f"leaps {step()}, where a usual step is {usual:.2g} m{more}; remove the points that are wrong, or fill the gap"
-        )
-    if (total := float(steps.sum())) > FURTHEST:
-        raise ValueError(f"is {total:.3g} m long, expected {FURTHEST:.0f} m at most; its longest step is {step()}")
+    recorded = len(points) >= FEW_POINTS
+    most = min(max(LEAP_STEPS * usual, LEAP_M), LONGEST_STEP) if recorded else LONGEST_STEP
+    leaps = np.flatnonzero(steps > most)
+    if not len(leaps):
+        return
+    k = leaps[0]
+    more = f"; {len(leaps)} steps of the file are such leaps" if len(leaps) > 1 else ""
+    raise ValueError(
+        f"leaps {steps[k]:.6g} m from point {k + 1} at {_pair(points[k])} to point {k + 2} at {_pair(points[k + 1])}, "
+        f"expected {most:.3g} m at most, as a usual step is {usual:.2g} m{more}; remove the wrong points, or fill the gap"
+    )
 
 
 def _pair(numbers: Array) -> str:
