@@ -29,7 +29,7 @@ from quadvel_view.operator import PERIOD, Operator
 from .drive import planar, velocity_text
 from .orders import CONTROLLER
 from .processes import StopSignals
-from .session import PATIENCE, NobodyThere, Session
+from .session import PATIENCE, Session
 
 ORDERS = {"u": "stand_up", "x": "lie_down"}
 HAND = "hand"
@@ -49,7 +49,7 @@ class Teleop:
     def wait_for_robot(self) -> None:
         """Raises NobodyThere where no robot is heard."""
         if not self._session.spin_until(lambda: self._states and self._set_mode.service_is_ready(), PATIENCE):
-            raise NobodyThere(f"controller/state: nothing came; {CONTROLLER}")
+            raise self._session.nobody(f"controller/state: nothing came; {CONTROLLER}")
 
     def order(self, order: str) -> None:
         """ "stop", "release", or a mode, of which none counts while STOP is pressed."""
