@@ -33,6 +33,7 @@ from .session import PATIENCE, Session
 
 ORDERS = {"u": "stand_up", "x": "lie_down"}
 HAND = "hand"
+SILENT = f"gamepad silent for {gamepad.SILENCE:g} s: press the dead-man's button again   "
 
 
 class Teleop:
@@ -126,19 +127,28 @@ def by_gamepad() -> int:
     def hear(teleop: Teleop) -> Any:
         try:
             while (event := device.read_one()) is not None:
-                teleop.order(pad.follow(event.type, event.code, event.value))
+                order = pad.follow(event.type, event.code, event.value)
+                teleop.order(restore(pad, device) if order == "restore" else order)
         except OSError:
             raise ValueError(f"{device.name}: the gamepad is gone") from None
         return pad.velocity()
 
     print("".join(str(gamepad.__doc__).partition("\n\n")[1:]).strip("\n"))
     print(f"by {device.name}")
-    _drive(hear, lambda: pad.speed)
+    _drive(hear, lambda: pad.speed, lambda: SILENT if pad.fell_silent else "")
     return 0
 
 
-def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float]) -> None:
-    """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens."""
+def restore(pad: Gamepad, device: Any) -> str:
+    """Ask an evdev device what is held, after the kernel has lost events of it; "stop" where STOP is."""
+    axes = {code: device.absinfo(code).value for code in gamepad.STICKS}
+    return pad.restore(device.active_keys(), axes)
+
+
+def _drive(
+    hear: Callable[[Teleop], Any], speed: Callable[[], float], note: Callable[[], str] = lambda: ""
+) -> None:
+    """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens. note: shown before the robot's state."""
     console = Console(soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
         teleop = Teleop(session)
@@ -147,7 +157,7 @@ def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float]) -> None:
             with console.status("") as status:
                 while not signals.received:
                     teleop.serve(hear(teleop))
-                    status.update(teleop.line(speed()))
+                    status.update(note() + teleop.line(speed()))
         finally:
             teleop.end()
 
