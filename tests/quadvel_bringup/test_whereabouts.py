@@ -13,7 +13,7 @@ import quadvel_dds
 
 quadvel_dds.install()
 
-from quadvel_bringup import session, whereabouts
+from quadvel_bringup import session, whereabouts  # noqa: E402
 
 HERE = int(os.environ["ROS_DOMAIN_ID"])
 ELSEWHERE = HERE + 1
@@ -35,7 +35,8 @@ def elsewhere() -> Iterator[subprocess.Popen[str]]:
     environment = {**os.environ, "ROS_DOMAIN_ID": str(ELSEWHERE)}
     command = [sys.executable, "-c", ROBOT, "sim_node"]
     with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout and process.stdout.readline() == "ready\n"
+        assert process.stdout
+        assert process.stdout.readline() == "ready\n"
         yield process
         process.kill()
 
@@ -72,7 +73,9 @@ def test_without_another_domain_the_own_and_the_ways_out_are_named(monkeypatch: 
     monkeypatch.setattr(whereabouts, "domains_in_use", lambda table: {HERE})
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
     text = whereabouts.whereabouts()
-    assert f"ROS domain {HERE}" in text and "ROS_DOMAIN_ID" in text and "SUBNET" in text
+    assert f"ROS domain {HERE}" in text
+    assert "ROS_DOMAIN_ID" in text
+    assert "SUBNET" in text
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
     assert "SUBNET" not in whereabouts.whereabouts()
 

@@ -19,7 +19,10 @@ HOSTILE = {
     "mappings in mappings": ("{a: " * 10_000, "levels"),
     "blocks in blocks": ("\n".join(" " * k + "a:" for k in range(300)), "levels"),
     "keys of keys": ("? " * 10_000, "levels"),
-    "aliases": ("a: &a [1, 1]\nb: &b [*a, *a]\nc: [*b, *b]", "alias"),
+    "aliases": (
+        "a0: &a0 [1, 1]\n" + "\n".join(f"a{k}: &a{k} [*a{k - 1}, *a{k - 1}]" for k in range(1, 60)),
+        "alias",
+    ),
     "base 60": ("1:" * 50_000 + "1", "characters"),
     "many digits": ("9" * 5_000, "digits"),
     "no date": ("2001-99-99", "(month|ros__parameters)"),
@@ -44,6 +47,10 @@ def test_every_reader_refuses_hostile_yaml_and_names_the_file(tmp_path: Path, re
     with pytest.raises(ValueError, match=f"hostile.yaml.*{word}") as refused:
         READERS[reader](file)
     assert "\n" not in str(refused.value)
+
+
+def test_a_few_aliases_are_read() -> None:
+    assert load_yaml("a: &a [1, 2]\nb: *a") == {"a": [1, 2], "b": [1, 2]}
 
 
 def test_usual_depth_is_read() -> None:

@@ -166,13 +166,19 @@ def test_narrow_curves_are_walked_slower_than_the_robot_turns_fastest() -> None:
 
 
 def test_before_it_sets_off_it_says_length_duration_and_turning() -> None:
-    assert Trajectory.of_places([[0, 0], [2, 0], [2, 1]], 0.5).summary().startswith("3.0 m in 7.6 s, turning 1.6")
+    assert (
+        Trajectory.of_places([[0, 0], [2, 0], [2, 1]], 0.5)
+        .summary()
+        .startswith("3.0 m in 7.6 s, turning 1.6")
+    )
 
 
 @pytest.mark.parametrize(
     ("points", "words"),
     [
-        pytest.param([(0.0, 0.0)], r"leaps 5\.3\d+e\+06 m from point 1 at \(0, 0\) to point 2", id="no fix first"),
+        pytest.param(
+            [(0.0, 0.0)], r"leaps 5\.3\d+e\+06 m from point 1 at \(0, 0\) to point 2", id="no fix first"
+        ),
         pytest.param([(46.05, 14.6)] * 3, "leaps .* from point 3 .* to point 4", id="away first"),
     ],
 )
@@ -198,7 +204,9 @@ def test_a_leap_of_a_gpx_is_refused_by_its_points(
         ("x,y\n" + "".join(f"{0.05 * k},0\n" for k in range(99)) + "500,0\n", "leaps 495.1 m from point 99"),
     ],
 )
-def test_ways_that_are_too_long_are_refused_before_they_take_memory(tmp_path: Path, text: str, words: str) -> None:
+def test_ways_that_are_too_long_are_refused_before_they_take_memory(
+    tmp_path: Path, text: str, words: str
+) -> None:
     file = tmp_path / "way.csv"
     file.write_text(text)
     with pytest.raises(ValueError, match=rf"way\.csv: .*{words}"):

@@ -16,7 +16,6 @@ from nav_msgs.msg import Odometry
 from rich.console import Console
 
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
-
 from quadvel_nodes.topic_types import all_conflicts
 
 from .alone import ros_domain

@@ -20,8 +20,12 @@ def whereabouts() -> str:
     """One sentence for somebody whom no robot answers: the domain, what is on others, and what to set."""
     here = ros_domain()
     sentence = f"this command is on ROS domain {here}"
-    elsewhere = [f"{name} (pid {pid}) is on {domain}" for pid, (name, domain) in robots().items() if domain != here]
-    others = sorted(domain for domain in domains_in_use(Path("/proc/net/udp").read_text()) if str(domain) != here)
+    elsewhere = [
+        f"{name} (pid {pid}) is on {domain}" for pid, (name, domain) in robots().items() if domain != here
+    ]
+    others = sorted(
+        domain for domain in domains_in_use(Path("/proc/net/udp").read_text()) if str(domain) != here
+    )
     if elsewhere:
         sentence += f", {', '.join(elsewhere)}: set ROS_DOMAIN_ID to that number"
     elif others:

@@ -109,7 +109,12 @@ def parse_rule(flag: str, text: str) -> Rule:
 
 
 class _Loader(BoundedLoader):
-    """YAML as ROS 2 reads it: 1e-3 is a number, a date is not."""
+    """YAML as ROS 2 reads it: 1e-3 is a number, a date is not, and there are no aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("found an alias, expected values in full, as in ROS 2")
+        return super().compose_node(parent, index)
 
 
 _Loader.yaml_implicit_resolvers = {

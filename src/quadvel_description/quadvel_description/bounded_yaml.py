@@ -11,6 +11,8 @@ LARGEST = 200_000
 """Characters of a file; PyYAML reads some 50,000 a second"""
 LONGEST_SCALAR = 10_000
 """Characters of one value; numbers to the base of 60 take time that grows with its square"""
+MOST_NODES = 100_000
+"""Values, lists and mappings of a file, with those that aliases repeat: about what a text of LARGEST may have"""
 DEEPEST = 20
 """Lists and mappings in each other"""
 
@@ -18,20 +20,28 @@ DEEPEST = 20
 class BoundedLoader(yaml.SafeLoader):
     """Refuses what may cost much more time or memory than its text is long."""
 
-    _depth = 0
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = self._count = 0
+        self._sizes: dict[str, int] = {}  # nodes under each anchor
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
-        """A node. Raises YAMLError for one that is too deep or too long, and for an alias: a few could fill the memory."""
-        event = self.peek_event()
-        if isinstance(event, yaml.AliasEvent):
-            self._refuse("an alias, expected values in full", event)
-        if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
-            self._refuse(f"a value of {len(event.value)} characters, expected {LONGEST_SCALAR} at most", event)
+        """A node. Raises YAMLError for one that is too deep or too long, and for too many, those under an alias counted again."""
+        event, before = self.peek_event(), self._count
+        self._count += self._sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
         self._depth += 1
         if self._depth > DEEPEST:
             self._refuse(f"more than {DEEPEST} levels, expected fewer", event)
+        if self._count > MOST_NODES:
+            self._refuse(f"more than {MOST_NODES} values, those of aliases included, expected fewer", event)
+        if isinstance(event, yaml.ScalarEvent) and len(event.value) > LONGEST_SCALAR:
+            self._refuse(
+                f"a value of {len(event.value)} characters, expected {LONGEST_SCALAR} at most", event
+            )
         node = super().compose_node(parent, index)
         self._depth -= 1
+        if event.anchor is not None and not isinstance(event, yaml.AliasEvent):
+            self._sizes[event.anchor] = self._count - before
         return node
 
     @staticmethod

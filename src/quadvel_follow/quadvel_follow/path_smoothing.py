@@ -6,6 +6,8 @@ smoothing spline, as stiff as the noise permits, replaces the places. A hand-wri
 
 from __future__ import annotations
 
+import itertools
+
 import attrs
 import numpy as np
 from numpy.typing import NDArray
@@ -76,7 +78,7 @@ def smooth_path(points: Array, limits: NoiseLimits) -> SmoothPath:
     ends = [0, *corners, len(places) - 1]
     pieces = [
         _smoothed(places[first : last + 1], errors[first : last + 1])
-        for first, last in zip(ends[:-1], ends[1:], strict=True)
+        for first, last in itertools.pairwise(ends)
     ]
     return SmoothPath(pieces, noise)
 
@@ -191,8 +193,6 @@ def _densified(places: Array, errors: Array) -> tuple[Array, Array]:
     usual = max(float(np.median(lengths)), 1e-3 * float(lengths.max()))
     parts = np.where(lengths > LONG_LEG * usual, np.ceil(lengths / usual), 1.0).astype(int)
     index = np.arange(len(places), dtype=float)
-    finer = np.concatenate(
-        [np.concatenate([k + np.arange(n) / n for k, n in enumerate(parts)]), index[-1:]]
-    )
+    finer = np.concatenate([np.concatenate([k + np.arange(n) / n for k, n in enumerate(parts)]), index[-1:]])
     columns = [np.interp(finer, index, column) for column in (*places.T, errors)]
     return np.column_stack(columns[:2]), columns[2]

@@ -60,9 +60,7 @@ class Trajectory:
         length, turned = STEP * speed.sum(), STEP * turning.sum()
         on_the_spot = STEP * turning[speed == 0.0].sum()
         noise = f"; position noise of {self.noise:.2f} m is smoothed away" if self.noise > EXACT_M else ""
-        return (
-            f"{length:.1f} m in {self.seconds:.1f} s, turning {turned:.1f} rad, {on_the_spot:.1f} rad of them on the spot{noise}"
-        )
+        return f"{length:.1f} m in {self.seconds:.1f} s, turning {turned:.1f} rad, {on_the_spot:.1f} rad of them on the spot{noise}"
 
     @classmethod
     def of_commands(cls, seconds: ArrayLike, commands: ArrayLike, step: float = STEP) -> Trajectory:

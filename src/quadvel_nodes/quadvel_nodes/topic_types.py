@@ -10,8 +10,14 @@ import attrs
 PERIOD = 2.0
 """s between two looks of a node at its topics"""
 REMEDIES = {
-    ("geometry_msgs/msg/TwistStamped", "geometry_msgs/msg/Twist"): "; the command mux takes it with -p stamped:=true",
-    ("geometry_msgs/msg/Twist", "geometry_msgs/msg/TwistStamped"): "; the command mux takes it with -p stamped:=false",
+    (
+        "geometry_msgs/msg/TwistStamped",
+        "geometry_msgs/msg/Twist",
+    ): "; the command mux takes it with -p stamped:=true",
+    (
+        "geometry_msgs/msg/Twist",
+        "geometry_msgs/msg/TwistStamped",
+    ): "; the command mux takes it with -p stamped:=false",
 }
 
 
