@@ -27,7 +27,8 @@ class BoundedLoader(yaml.SafeLoader):
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """A node. Raises YAMLError for one that is too deep or too long, and for too many, those under an alias counted again."""
-        event, before = self.peek_event(), self._count
+        event: Any = self.peek_event()  # type: ignore[no-untyped-call]
+        before = self._count
         self._count += self._sizes.get(event.anchor, 1) if isinstance(event, yaml.AliasEvent) else 1
         self._depth += 1
         if self._depth > DEEPEST:
@@ -45,7 +46,7 @@ class BoundedLoader(yaml.SafeLoader):
         return node
 
     @staticmethod
-    def _refuse(found: str, event: yaml.Event) -> NoReturn:
+    def _refuse(found: str, event: Any) -> NoReturn:
         mark = event.start_mark
         raise yaml.YAMLError(f"found {found}, in line {mark.line + 1}, column {mark.column + 1}")
 
