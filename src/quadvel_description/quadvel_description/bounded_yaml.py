@@ -23,7 +23,7 @@ class BoundedLoader(yaml.SafeLoader):
     def __init__(self, stream: str) -> None:
         super().__init__(stream)
         self._depth = self._count = 0
-        self._sizes: dict[str, int] = {}  # nodes under each anchor
+        self._sizes: dict[str | None, int] = {}  # nodes under each anchor
 
     def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
         """A node. Raises YAMLError for one that is too deep or too long, and for too many, those under an alias counted again."""
