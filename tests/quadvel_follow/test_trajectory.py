@@ -7,7 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_follow.trajectory import SHIPPED, STEP, Trajectory, TrajectoryFollower, load
+from quadvel_follow.trajectory import RECEIVER_NOISE, SHIPPED, STEP, Trajectory, TrajectoryFollower, load
+
+Array = np.ndarray
 
 
 def walked(follower: TrajectoryFollower, start: np.ndarray, drift: np.ndarray) -> np.ndarray:
@@ -43,6 +45,177 @@ def test_points_of_a_gpx_are_metres_from_the_first(tmp_path: Path) -> None:
         '<trkpt lat="60.0" lon="10.0"/><trkpt lat="60.0" lon="10.0001"/></trkseg></trk></gpx>'
     )
     np.testing.assert_allclose(load(file, 0.5).pose[-1, :2], [5.56, 0.0], atol=0.02)
+
+
+def gpx(tmp_path: Path, points: Array) -> Path:
+    """A file of a track through lat, lon (n, 2), deg."""
+    file = tmp_path / "way.gpx"
+    marks = "".join(f'<trkpt lat="{lat:.7f}" lon="{lon:.7f}"/>' for lat, lon in points)
+    file.write_text(f"<gpx><trk><trkseg>{marks}</trkseg></trk></gpx>")
+    return file
+
+
+@pytest.mark.parametrize(
+    ("first", "last"), [((89.9999, 0.0), (89.9999, 180.0)), ((10.0, 179.9999), (10.0, -179.9999))]
+)
+def test_neither_a_pole_nor_the_date_line_stretches_a_gpx(
+    tmp_path: Path, first: tuple[float, float], last: tuple[float, float]
+) -> None:
+    way = load(gpx(tmp_path, np.array([first, last])), 1.0)
+    assert 20.0 < np.hypot(*way.pose[-1, :2]) < 23.0
+
+
+def arc(radius: float, turns: float, spacing: float) -> Array:
+    """Points (n, 2) on a circle to the left, from the origin on."""
+    angle = np.arange(0.0, 2.0 * np.pi * turns + 1e-9, spacing / radius)
+    return radius * np.column_stack([np.sin(angle), 1.0 - np.cos(angle)])
+
+
+def line(length: float, spacing: float) -> Array:
+    """Points (n, 2) along x."""
+    x = np.arange(0.0, length + 1e-9, spacing)
+    return np.column_stack([x, np.zeros_like(x)])
+
+
+def noisy(points: Array, noise: float, seed: int) -> Array:
+    """The same with errors of that standard deviation, m."""
+    return points + noise * np.random.default_rng(seed).standard_normal(points.shape)
+
+
+def on_the_spot(way: Trajectory) -> float:
+    """s, in which it turns without walking."""
+    return STEP * float(np.sum(way.velocity[:, 0] < 1e-9))
+
+
+def turned(way: Trajectory) -> float:
+    """Sum of all turning, rad."""
+    return STEP * float(np.abs(way.velocity[:, 2]).sum())
+
+
+EIGHT = np.vstack([arc(2.0, 1.0, 0.1), arc(2.0, 1.0, 0.1)[1:] * [1.0, -1.0]])
+SPIRAL_ANGLE = np.arange(np.pi, 6.0 * np.pi, 0.05)[:, None]
+SPIRAL = 0.3 * SPIRAL_ANGLE * np.hstack([np.cos(SPIRAL_ANGLE), np.sin(SPIRAL_ANGLE)])
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(
+    ("points", "noise", "length", "turn"),
+    [
+        pytest.param(arc(2.0, 1.0, 0.001), 0.001, 12.57, 6.28, id="circle of millimetres"),
+        pytest.param(arc(2.0, 1.0, 0.05), 0.0, 12.57, 6.28, id="circle"),
+        pytest.param(arc(2.0, 1.0, 0.05), 0.01, 12.57, 6.28, id="noisy circle"),
+        pytest.param(arc(2.0, 1.0, 0.5), 0.0, 12.57, 6.28, id="circle of half metres"),
+        pytest.param(arc(20.0, 1.0, 5.0), 0.05, 125.7, 6.28, id="circle of five metres"),
+        pytest.param(EIGHT, 0.01, 25.1, 12.57, id="figure of eight"),
+        pytest.param(SPIRAL, 0.01, 51.9, 15.9, id="spiral"),
+        pytest.param(line(10.0, 0.02), 0.01, 10.0, 0.0, id="line"),
+        pytest.param(line(10.0, 0.005), 0.1, 10.0, 0.0, id="line lost in noise"),
+    ],
+)
+def test_recorded_paths_are_walked_in_curves_and_nowhere_on_the_spot(
+    points: Array, noise: float, length: float, turn: float, seed: int
+) -> None:
+    way = Trajectory.of_places(np.round(noisy(points, noise, seed), 4), 0.9)
+    assert way.velocity[:, 0].sum() * STEP == pytest.approx(length, rel=0.06)
+    assert on_the_spot(way) == 0.0
+    assert turned(way) == pytest.approx(turn, rel=0.12, abs=0.4)
+    assert np.quantile(way.velocity[:, 0], 0.02) > 0.85
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("rate", [1, 10])
+def test_a_receiver_that_stood_for_minutes_leads_along_the_way_alone(rate: int, seed: int) -> None:
+    before, after = line(40.0, 1.0 / rate), line(40.0, 1.0 / rate) @ [[0.0, 1.0], [-1.0, 0.0]] + [40.0, 0.0]
+    stop = np.tile([40.0, 0.0], (180 * rate, 1))
+    track = noisy(np.vstack([np.zeros((100 * rate, 2)), before, stop, after]), 0.4, seed)
+    way = Trajectory.of_places(track, 1.0, RECEIVER_NOISE)
+    assert way.velocity[:, 0].sum() * STEP == pytest.approx(80.0, abs=6.0)
+    assert turned(way) < 1.57 + 1.2
+    assert way.noise == pytest.approx(0.4, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        pytest.param([[0, 0], [2, 0], [2, 2], [0, 2], [0, 0]], id="square"),
+        pytest.param([[0, 0], [1.5, 0], [0, 1.5], [1.5, 1.5]], id="letter Z"),
+        pytest.param([[x, 0.5 * y] for y in range(20) for x in ((0, 1), (1, 0))[y % 2]], id="lawn mower"),
+        pytest.param([[0, 0], [3, 0], [5, 2]], id="half a right angle"),
+        pytest.param([[0, 0], [3, 0], [0, 0]], id="back and forth"),
+    ],
+)
+def test_written_corners_are_turned_on_the_spot(corners: list[list[float]]) -> None:
+    legs = np.diff(np.array(corners, float), axis=0)
+    turns = np.abs((np.diff(np.arctan2(legs[:, 1], legs[:, 0])) + np.pi) % (2.0 * np.pi) - np.pi)
+    way = Trajectory.of_places(corners, 0.5)
+    assert on_the_spot(way) == pytest.approx(turns.sum(), abs=0.02 * len(corners))
+    assert way.seconds == pytest.approx(np.hypot(*legs.T).sum() / 0.5 + turns.sum(), rel=0.01)
+
+
+def test_dense_points_keep_a_corner() -> None:
+    side = line(2.0, 0.05)
+    way = Trajectory.of_places(np.vstack([side, side[1:] @ [[0.0, 1.0], [-1.0, 0.0]] + [2.0, 0.0]]), 0.5)
+    assert on_the_spot(way) == pytest.approx(np.pi / 2, abs=0.1)
+    assert np.hypot(*(way.pose[:, :2] - [2.0, 0.0]).T).min() < 0.02
+
+
+def test_narrow_curves_are_walked_slower_than_the_robot_turns_fastest() -> None:
+    way = Trajectory.of_places(arc(0.4, 2.0, 0.05), 1.0)
+    assert np.abs(way.velocity[:, 2]).max() <= 1.001
+    assert np.median(way.velocity[:, 0]) == pytest.approx(0.4, abs=0.05)
+
+
+def test_before_it_sets_off_it_says_length_duration_and_turning() -> None:
+    assert (
+        Trajectory.of_places([[0, 0], [2, 0], [2, 1]], 0.5)
+        .summary()
+        .startswith("3.0 m in 7.6 s, turning 1.6")
+    )
+
+
+@pytest.mark.parametrize(
+    ("points", "words"),
+    [
+        pytest.param(
+            [(0.0, 0.0)], r"leaps 5\.3\d+e\+06 m from point 1 at \(0, 0\) to point 2", id="no fix first"
+        ),
+        pytest.param([(46.05, 14.6)] * 3, "leaps .* from point 3 .* to point 4", id="away first"),
+    ],
+)
+def test_a_leap_of_a_gpx_is_refused_by_its_points(
+    tmp_path: Path, points: list[tuple[float, float]], words: str
+) -> None:
+    track = [(46.05 + 2e-5 * k, 14.5) for k in range(30)]
+    with pytest.raises(ValueError, match=rf"way\.gpx: {words}"):
+        load(gpx(tmp_path, np.array([*points, *track])), 0.5)
+    middle = gpx(tmp_path, np.array([*track[:20], (46.06, 14.5), *track[20:], (46.07, 14.5)]))
+    with pytest.raises(ValueError, match=r"from point 20 .* to point 21 .*; 3 steps of the file"):
+        load(middle, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("x,y\n0,0\n300000,0\n", "leaps 300000 m from point 1"),
+        ("x,y\n0,0\n1e308,0\n-1e308,0\n", "leaps 1e\\+308 m from point 1"),
+        ("x,y\n" + "".join(f"{9000 * k},0\n" for k in range(20)), "is 1.71e\\+05 m long, expected 100000 m"),
+        ("x,y\n" + "".join(f"{9000 * k},0\n" for k in range(9)), "lasts 1.44e\\+05 s, expected a day"),
+        ("seconds,vx,vy,wz\n1e12,0.1,0,0\n", "lasts 1e\\+12 s, expected a day"),
+        ("x,y\n" + "".join(f"{0.05 * k},0\n" for k in range(99)) + "500,0\n", "leaps 495.1 m from point 99"),
+    ],
+)
+def test_ways_that_are_too_long_are_refused_before_they_take_memory(
+    tmp_path: Path, text: str, words: str
+) -> None:
+    file = tmp_path / "way.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=rf"way\.csv: .*{words}"):
+        load(file, 0.5)
+
+
+def test_a_gpx_beyond_the_poles_is_refused_by_its_point(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"point 2 at \(91, 0\)"):
+        load(gpx(tmp_path, np.array([[90.0, 0.0], [91.0, 0.0]])), 0.5)
 
 
 @pytest.mark.parametrize(

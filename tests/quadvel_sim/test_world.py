@@ -377,6 +377,22 @@ def test_a_file_that_holds_no_world_is_refused_by_file_field_and_value(case: str
         World.load(path)
 
 
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"trees": [Trees(positions=[[float(k), 5.0] for k in range(100_000)])]}, "100000 parts"),
+        ({"walls": [Wall(points=[[float(k), 5.0] for k in range(100_000)])]}, "99999 parts"),
+        ({"boxes": [Box(position=(5.0, 0.0), size=1.0)] * 3_000}, "3000 parts"),
+        ({"tables": [Table(position=(5.0, 0.0))] * 500}, "2500 parts"),
+        ({"persons": [Person(way=[[1.0, 1.0], [2.0, 2.0]])] * 60}, "60 persons"),
+        ({"patches": [Patch(surface="grass", position=(0.0, 0.0), size=(1e5, 1e5))]}, "points of bumps"),
+    ],
+)
+def test_a_world_of_too_many_parts_is_refused_before_it_is_built(parts: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=f"found .*{words}.*, expected [0-9]+ at most"):
+        World(**parts)
+
+
 def test_a_file_that_is_none_is_refused(tmp_path: Path) -> None:
     with pytest.raises(
         ValueError, match=r"world nowhere: .* expected a YAML file or one of corridor, park, campus"

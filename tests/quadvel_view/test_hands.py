@@ -78,6 +78,66 @@ def test_buttons_stop_and_release_when_they_go_down() -> None:
     assert pad.follow(gamepad.KEY, gamepad.RELEASE, 1) == "release"
 
 
+class Clock:
+    """Seconds, as a test sets them."""
+
+    now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def held_pad(clock: Clock) -> Gamepad:
+    """A gamepad whose dead-man's button is down and whose stick is ahead."""
+    pad = Gamepad(SPANS, clock)
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 1)
+    pad.follow(gamepad.ABSOLUTE, gamepad.FORWARD, -32768)
+    assert pad.velocity() is not None
+    return pad
+
+
+@pytest.mark.parametrize(("keys", "held"), [((), False), ((gamepad.DEAD_MAN,), True)])
+def test_after_lost_events_nothing_is_held_until_the_device_was_read_again(
+    keys: tuple[int, ...], held: bool
+) -> None:
+    pad = held_pad(Clock())
+    assert pad.follow(gamepad.SYNCHRONISATION, gamepad.DROPPED, 0) == ""
+    assert pad.velocity() is None
+    assert pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 1) == ""  # the rest of the cut report
+    assert pad.velocity() is None
+    assert pad.follow(gamepad.SYNCHRONISATION, gamepad.REPORT, 0) == "restore"
+    assert pad.restore(keys, dict.fromkeys(gamepad.STICKS, 32767)) == ""
+    velocity = pad.velocity()
+    assert (velocity is not None) == held
+    if velocity is not None:
+        assert velocity == pytest.approx([-0.5, -0.3, -0.8], abs=1e-3)
+
+
+def test_a_stop_among_lost_events_counts() -> None:
+    pad = held_pad(Clock())
+    pad.follow(gamepad.SYNCHRONISATION, gamepad.DROPPED, 0)
+    assert pad.restore((gamepad.STOP, gamepad.DEAD_MAN), dict.fromkeys(gamepad.STICKS, 0)) == "stop"
+
+
+def test_a_silent_pad_counts_as_let_go_until_its_button_is_pressed_again() -> None:
+    clock = Clock()
+    pad = held_pad(clock)
+    clock.now = 0.9 * gamepad.SILENCE
+    assert pad.velocity() is not None
+    pad.follow(gamepad.ABSOLUTE, gamepad.FORWARD, -32767)  # a hand trembles
+    clock.now = 1.8 * gamepad.SILENCE
+    assert pad.velocity() is not None
+    clock.now = 2.0 * gamepad.SILENCE
+    assert pad.velocity() is None
+    assert pad.fell_silent
+    pad.follow(gamepad.ABSOLUTE, gamepad.FORWARD, -32768)  # the link is back, the hand may be elsewhere
+    assert pad.velocity() is None
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 0)
+    pad.follow(gamepad.KEY, gamepad.DEAD_MAN, 1)
+    assert pad.velocity() is not None
+    assert not pad.fell_silent
+
+
 def test_what_has_no_two_sticks_is_refused() -> None:
     with pytest.raises(ValueError, match="no axis 0x3, expected two sticks"):
         Gamepad({code: SPANS[code] for code in (gamepad.FORWARD, gamepad.SIDE)})

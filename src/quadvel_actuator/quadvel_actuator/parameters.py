@@ -14,6 +14,8 @@ import attrs
 import numpy as np
 import yaml
 
+from quadvel_description.bounded_yaml import read_yaml
+
 SCHEMA = 1
 JOINTS = 12
 PROBABLE = 1.5  # a pair whose error is below this many times the least one is probable (Section 3.1)
@@ -195,12 +197,9 @@ class ActuatorParameters:
     @classmethod
     def load(cls, path: str | Path) -> ActuatorParameters:
         """Read a parameter file; ValueError names file, field, the value found and what was expected."""
+        content = read_yaml(Path(path), "a YAML file of actuator parameters")
         try:
-            parameters: ActuatorParameters = _record(cls, yaml.safe_load(Path(path).read_text()))
-        except UnicodeDecodeError:
-            raise ValueError(f"{path}: no text, expected a YAML file of actuator parameters") from None
-        except (yaml.YAMLError, RecursionError) as error:
-            raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
+            parameters: ActuatorParameters = _record(cls, content)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return parameters

@@ -43,11 +43,17 @@ def _who() -> str:
 
 def servers() -> dict[int, str]:
     """Names, by process id, of what serves TOPIC on our ROS domain, as far as this user may look."""
+    return {pid: name for pid, (name, domain) in robots().items() if domain == ros_domain()}
+
+
+def robots() -> dict[int, tuple[str, str]]:
+    """Name and ROS domain, by process id, of what serves TOPIC on this machine, as far as this user may look."""
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         name = next((word for word in SERVERS if word in _words(folder)), None)
-        if name and int(folder.name) != os.getpid() and ros_domain(_environment(folder)) == ros_domain():
-            found[int(folder.name)] = name.rpartition(".")[2]
+        environment = _environment(folder) if name and int(folder.name) != os.getpid() else None
+        if name and environment is not None:
+            found[int(folder.name)] = name.rpartition(".")[2], ros_domain(environment)
     return found
 
 
@@ -61,11 +67,11 @@ def _words(folder: Path) -> list[str]:
         return []
 
 
-def _environment(folder: Path) -> dict[str, str]:
+def _environment(folder: Path) -> dict[str, str] | None:
     try:
         pairs = (folder / "environ").read_text(errors="replace").split("\0")
     except OSError:  # another user's
-        return {"ROS_DOMAIN_ID": "?"}
+        return None
     return dict(pair.partition("=")[::2] for pair in pairs)
 
 

@@ -50,11 +50,16 @@ def _robot() -> Finding:
     try:
         quadvel_dds.install()
         from .status import look
+        from .whereabouts import whereabouts
     except ImportError as error:
         return Finding("robot", True, f"not looked for: {error}")
     nodes = look()
     if not nodes:
-        return Finding("robot", True, "none runs; `quadvel up` takes the shipped actuator model (Table 4)")
+        return Finding(
+            "robot",
+            True,
+            f"none runs; `quadvel up` takes the shipped actuator model (Table 4); {whereabouts()}",
+        )
     told = [f"{key} {node.values[key]}" for node in nodes.values() for key in FILES if key in node.values]
     return Finding(
         "robot", True, f"{', '.join(nodes)} run; {', '.join(told) or 'with files that none tells'}"

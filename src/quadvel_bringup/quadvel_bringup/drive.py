@@ -19,7 +19,7 @@ from quadvel_msgs.msg import ControllerState, VelocityCommand
 
 from .orders import CONTROLLER, LONGEST, WAY_OUT
 from .processes import StopSignals
-from .session import PATIENCE, NobodyThere, Session
+from .session import PATIENCE, Session
 
 PERIOD = 0.05  # s, between two messages; the command mux forgets a source after 0.5 s
 SETTLING = 0.5  # s after the command is in full effect until the measured velocity counts
@@ -46,9 +46,9 @@ class Drive:
     def wait_for_robot(self) -> str:
         """Until somebody hears us and the robot stands: why it would not follow, or "". Raises NobodyThere."""
         if not self._wait(self._publisher.get_subscription_count, PATIENCE):
-            raise NobodyThere(f"{self._topic}: nobody listens; {CONTROLLER}")
+            raise self._session.nobody(f"{self._topic}: nobody listens; {CONTROLLER}")
         if not self._wait(lambda: self._states, PATIENCE):
-            raise NobodyThere(f"controller/state: nothing came; {CONTROLLER}")
+            raise self._session.nobody(f"controller/state: nothing came; {CONTROLLER}")
         if self._signals.received:
             return ""
         self._wait(lambda: self._states[-1].mode_name != "stand_up", LONGEST)

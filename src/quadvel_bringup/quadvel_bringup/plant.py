@@ -14,11 +14,11 @@ from typing import Any, Protocol
 
 import attrs
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_description import robot
+from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.state import RobotState
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator
@@ -154,10 +154,7 @@ class Plant(Simulator):
 
 def read_plant(path: Path) -> Callable[[], Physics]:
     """What makes the physics that the file describes. ValueError names file, field and what was expected."""
-    try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
+    content = read_yaml(path, "a YAML file of a plant")
     if not isinstance(content, Mapping) or content.get("kind") not in KINDS:
         found = content.get("kind") if isinstance(content, Mapping) else content
         raise ValueError(f"{path}: kind: found {found!r}, expected one of {', '.join(KINDS)}")

@@ -17,7 +17,10 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 
+from quadvel_nodes.topic_types import all_conflicts
+
 from .nodes import enclave
+from .whereabouts import whereabouts
 
 PATIENCE = 4.0
 """s to find out whether somebody is there: on a busy machine discovery takes a second, and where Fast DDS has missed the first
@@ -76,6 +79,10 @@ class Session:
         """Serve for so long (s)."""
         self.spin_until(lambda: False, seconds)
 
+    def nobody(self, text: str) -> NobodyThere:
+        """The error that says so, and why that may be: messages of another type, another ROS domain."""
+        return NobodyThere("; ".join([text, *map(str, all_conflicts(self.node)), whereabouts()]))
+
     def call(
         self,
         kind: Any,
@@ -91,7 +98,7 @@ class Session:
         """
         clients = [self.node.create_client(kind, service) for service in services]
         if not self.spin_until(lambda: any(client.service_is_ready() for client in clients), PATIENCE):
-            raise NobodyThere(f"{' or '.join(services)}: nobody answers; {absent()}")
+            raise self.nobody(f"{' or '.join(services)}: nobody answers; {absent()}")
         client = next(client for client in clients if client.service_is_ready())
         asked: list[Any] = []
         for wait in repeat(AGAIN, round(ANSWER / AGAIN)) if repeats else (ANSWER,):

@@ -16,12 +16,14 @@ from nav_msgs.msg import Odometry
 from rich.console import Console
 
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
+from quadvel_nodes.topic_types import all_conflicts
 
 from .alone import ros_domain
 from .doctor import FILES
 from .drive import planar, velocity_text
 from .orders import WAY_OUT
 from .session import PATIENCE, Session
+from .whereabouts import whereabouts
 
 LISTEN = 2.2
 """s at least: each node reports once a second"""
@@ -59,14 +61,18 @@ def status() -> int:
     with Session("status") as session:
         heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in HEARD.items()}
         _hear_all(session, heard["/diagnostics"])
+        conflicts = all_conflicts(session.node)
     nodes = reported(heard["/diagnostics"])
     if not nodes:
-        print(
-            f"no robot runs on ROS domain {ros_domain()} as far as this machine hears; start one: quadvel up"
-        )
+        print(f"no robot runs on ROS domain {ros_domain()}; start one: quadvel up; {whereabouts()}")
         return 1
     console = Console(soft_wrap=True, highlight=False)
-    for name, text in [*_nodes(nodes), *_lines(heard), *_equipment(nodes)]:
+    for name, text in [
+        *_nodes(nodes),
+        *(("topic", f"[yellow]warning[/] {conflict}") for conflict in conflicts),
+        *_lines(heard),
+        *_equipment(nodes),
+    ]:
         console.print(f"{name:13} {text}")
     states = heard["controller/state"]
     return 1 if not states or states[-1].mode_name == "fault" else 0

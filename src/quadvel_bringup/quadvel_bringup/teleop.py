@@ -31,10 +31,11 @@ from quadvel_view.operator import PERIOD, Operator
 from .drive import planar, velocity_text
 from .orders import CONTROLLER
 from .processes import StopSignals
-from .session import PATIENCE, NobodyThere, Session
+from .session import PATIENCE, Session
 
 ORDERS = {"u": "stand_up", "x": "lie_down"}
 HAND = "hand"
+SILENT = f"gamepad silent for {gamepad.SILENCE:g} s: press the dead-man's button again   "
 
 
 @attrs.frozen
@@ -78,7 +79,7 @@ class Teleop:
     def wait_for_robot(self) -> None:
         """Raises NobodyThere where no robot is heard."""
         if not self._session.spin_until(lambda: self._states and self._set_mode.service_is_ready(), PATIENCE):
-            raise NobodyThere(f"controller/state: nothing came; {CONTROLLER}")
+            raise self._session.nobody(f"controller/state: nothing came; {CONTROLLER}")
 
     def order(self, order: str) -> None:
         """ "stop", "release", or a mode, of which none counts while STOP is pressed."""
@@ -153,19 +154,31 @@ def by_gamepad() -> int:
     def hear(teleop: Teleop) -> Any:
         try:
             while (event := device.read_one()) is not None:
-                teleop.order(pad.follow(event.type, event.code, event.value))
+                order = pad.follow(event.type, event.code, event.value)
+                teleop.order(restore(pad, device) if order == "restore" else order)
         except OSError:
             raise ValueError(f"{device.name}: the gamepad is gone") from None
         return pad.velocity()
 
     print("".join(str(gamepad.__doc__).partition("\n\n")[1:]).strip("\n"))
     print(f"by {device.name}")
-    _drive(hear, lambda: pad.speed, BUTTONS)
+    _drive(hear, lambda: pad.speed, BUTTONS, lambda: SILENT if pad.fell_silent else "")
     return 0
 
 
-def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float], way_out: WayOut) -> None:
-    """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens."""
+def restore(pad: Gamepad, device: Any) -> str:
+    """Ask an evdev device what is held, after the kernel has lost events of it; "stop" where STOP is."""
+    axes = {code: device.absinfo(code).value for code in gamepad.STICKS}
+    return pad.restore(device.active_keys(), axes)
+
+
+def _drive(
+    hear: Callable[[Teleop], Any],
+    speed: Callable[[], float],
+    way_out: WayOut,
+    note: Callable[[], str] = lambda: "",
+) -> None:
+    """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens. note: shown before the robot's state."""
     console = Console(soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
         teleop = Teleop(session)
@@ -174,7 +187,7 @@ def _drive(hear: Callable[[Teleop], Any], speed: Callable[[], float], way_out: W
             with console.status("") as status:
                 while not signals.received:
                     teleop.serve(hear(teleop))
-                    status.update(escape(teleop.line(speed(), way_out)))
+                    status.update(escape(note() + teleop.line(speed(), way_out)))
         finally:
             teleop.end()
 

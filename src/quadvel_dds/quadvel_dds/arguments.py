@@ -10,6 +10,8 @@ from typing import Any
 import attrs
 import yaml
 
+from quadvel_description.bounded_yaml import BoundedLoader, bounded_text, load_yaml
+
 SCOPE_KEY = "ros__parameters"
 FLAGS = {
     "-p": "p", "--param": "p", "-r": "r", "--remap": "r", "--params-file": "file", "--log-level": "log",
@@ -106,8 +108,13 @@ def parse_rule(flag: str, text: str) -> Rule:
     return Rule(node or None, name, right)
 
 
-class _Loader(yaml.SafeLoader):
-    """YAML as ROS 2 reads it: 1e-3 is a number, a date is not."""
+class _Loader(BoundedLoader):
+    """YAML as ROS 2 reads it: 1e-3 is a number, a date is not, and there are no aliases."""
+
+    def compose_node(self, parent: yaml.Node | None, index: int) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise yaml.YAMLError("found an alias, expected values in full, as in ROS 2")
+        return super().compose_node(parent, index)
 
 
 _Loader.yaml_implicit_resolvers = {
@@ -126,11 +133,8 @@ def parse_value(where: str, text: str) -> Any:
 
 def _load(where: str, text: str) -> Any:
     try:
-        aliases = (token for token in yaml.scan(text) if isinstance(token, yaml.AliasToken))
-        if any(aliases):  # a few could fill the memory
-            raise yaml.YAMLError("found an alias, expected values in full, as in ROS 2")
-        return yaml.load(text, _Loader)
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        return load_yaml(text, _Loader)
+    except ValueError as error:
         raise InvalidROSArgsError(f"{where} is not valid YAML: {error}") from error
 
 
@@ -148,7 +152,7 @@ def read_parameter_file(path: Path) -> list[ParameterOverride]:
     """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
     where = f"parameter file '{path}'"
     try:
-        document = _load(where, path.read_text())
+        document = _load(where, bounded_text(path))
     except (OSError, UnicodeDecodeError) as error:
         fault = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is not text"
         raise InvalidROSArgsError(f"{where} {fault}") from error

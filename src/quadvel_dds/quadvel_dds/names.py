@@ -53,3 +53,8 @@ def remap_node(node: str, namespace: str, rules: Iterable[Rule]) -> tuple[str, s
             elif rule.name == "__ns":
                 namespace = rule.value
     return node, namespace
+
+
+def ros_type(dds_type: str) -> str:
+    """`pkg/msg/Name` of the type `pkg::msg::dds_::Name_` on the wire."""
+    return dds_type.replace("::dds_::", "/").replace("::", "/").rstrip("_")

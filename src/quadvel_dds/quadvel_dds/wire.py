@@ -13,7 +13,6 @@ import os
 import socket
 import struct
 import uuid
-from collections.abc import Iterator
 from functools import cache
 from typing import Any
 
@@ -93,6 +92,9 @@ class Participant:
             "publication": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsPublication),
             "subscription": builtin.BuiltinDataReader(self.dds, builtin.BuiltinTopicDcpsSubscription),
         }
+        news = core.SampleState.NotRead | core.ViewState.Any | InstanceState.Any
+        self._news = {kind: core.ReadCondition(reader, news) for kind, reader in self._builtin.items()}
+        self._endpoints: dict[str, list[Any]] = {}
 
     def writer(self, topic: str, typename: str, profile: Any, user_data: str = "") -> Writer:
         return Writer(DataWriter(self.dds, *self._as_dds(topic, typename, profile, user_data)))
@@ -106,10 +108,13 @@ class Participant:
             self._topics[key] = Topic(self.dds, topic, idl.struct(typename))
         return self._topics[key], to_dds_qos(profile, f"{user_data}typehash={messages.type_hash(typename)};")
 
-    def endpoints(self, kind: str) -> Iterator[Any]:
+    def endpoints(self, kind: str) -> list[Any]:
         """All writers ("publication") or readers ("subscription") on the domain, our own included."""
-        found = self._builtin[kind].read(N=100_000)
-        return (end for end in found if end.sample_info.instance_state == InstanceState.Alive)
+        if kind not in self._endpoints or self._news[kind].triggered:
+            found = self._builtin[kind].read(N=100_000)
+            alive = [end for end in found if end.sample_info.instance_state == InstanceState.Alive]
+            self._endpoints[kind] = alive
+        return self._endpoints[kind]
 
     def count(self, kind: str, topic: str) -> int:
         return sum(endpoint.topic_name == topic for endpoint in self.endpoints(kind))

@@ -14,6 +14,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from quadvel_description.bounded_yaml import read_yaml
 from quadvel_description.kinematics import rotate, rotate_inverse
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
@@ -46,7 +47,12 @@ class Calibration:
     def load(cls, path: str | Path) -> Calibration:
         """Read a file that `save` wrote. Raises CalibrationError."""
         try:
-            content = yaml.safe_load(Path(path).read_text())
+            content = read_yaml(Path(path), "a YAML file of a calibration")
+        except OSError as error:
+            raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
+        except ValueError as error:
+            raise CalibrationError(str(error)) from None
+        try:
             if not isinstance(content, Mapping) or content.get("schema") != SCHEMA:
                 raise CalibrationError(f"expected the fields of a calibration with schema: {SCHEMA}")
             zeros, mounting = content["joint_zeros"], content["imu_mounting"]
@@ -55,8 +61,6 @@ class Calibration:
                     "joint_zeros or imu_mounting has other names than the twelve joints, roll and pitch"
                 )
             return cls(_numbers(zeros, JOINT_NAMES), _numbers(mounting, ("roll", "pitch")))
-        except OSError as error:
-            raise CalibrationError(f"cannot read {path}: {error.strerror}") from error
         except Exception as error:  # of the file's content, whatever it may be
             raise CalibrationError(
                 f"{path}: {type(error).__name__}: {' '.join(str(error).split())}"

@@ -50,6 +50,7 @@ class TrajectoryPlanner(Node):
         super().__init__("trajectory_planner")
         settings = read_parameters(self, TrajectoryParameters)
         self._trajectory = settings.load()
+        self.get_logger().info(f"{settings.file}: {self._trajectory.summary()}")
         self._follower = TrajectoryFollower(self._trajectory, settings.closed_loop)
         self._closed = settings.closed_loop
         self._pose: np.ndarray | None = None
@@ -78,7 +79,7 @@ class TrajectoryPlanner(Node):
             return
         if self._began is None:
             self._began = now
-            self.get_logger().info(f"walks for {self._trajectory.seconds:.1f} s")
+            self.get_logger().info("sets off")
         try:
             velocity = self._follower.step(now - self._began, self._pose)
         except ValueError as error:

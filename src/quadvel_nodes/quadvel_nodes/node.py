@@ -15,10 +15,13 @@ from weakref import WeakKeyDictionary
 import attrs
 import rclpy
 from rcl_interfaces.msg import ParameterDescriptor
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
+
+from .topic_types import PERIOD, ConflictWatch
 
 Config = TypeVar("Config")
 STOPS = (signal.SIGINT, signal.SIGTERM)
@@ -102,7 +105,9 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
 def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-        return make_node()
+        node = make_node()
+        node.create_timer(PERIOD, ConflictWatch(node).look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        return node
     except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)

@@ -15,9 +15,9 @@ from typing import Any
 import attrs
 import mujoco
 import numpy as np
-import yaml
 from numpy.typing import ArrayLike, NDArray
 
+from quadvel_description.bounded_yaml import read_yaml
 from quadvel_sim.checks import number, numbers, one_of, or_none, points, truth_value, whole_number
 from quadvel_sim.laser import SEEN, Laser
 from quadvel_sim.terrain import GEOM_NAME, perlin
@@ -29,6 +29,11 @@ FOLDER = Path(__file__).parent / "worlds"
 SHIPPED = ("corridor", "park", "campus")
 LOW = 0
 """Group of what lies so low that a laser need not see it"""
+MOST_SOLIDS = 2_000
+"""Boxes, cylinders and meshes of a world; more make the simulation of contacts and rays too slow"""
+MOST_PERSONS = 50
+MOST_HEIGHTS = 4_000_000
+"""Points of the bumps of all patches: 100 m x 100 m"""
 SURFACE_PRIORITY = 2
 """Of geoms of grass, gravel and hills, above the feet's 1: the surface tells the friction"""
 STEEPEST = 15.0  # deg
@@ -191,6 +196,11 @@ class Patch:
             group=LOW,
             rgba=_COLOURS[self.surface],
         )
+
+    @property
+    def count(self) -> float:
+        """Number of points of its bumps."""
+        return float(np.prod(self.size / _STEP + 1.0))
 
     def _heights(self, seed: int) -> Array:
         """From a rim to the bumps, rows across, columns along, m."""
@@ -363,27 +373,38 @@ class World:
     """The one who is led first."""
 
     def __attrs_post_init__(self) -> None:
+        self._refuse_more("parts, pieces of walls and legs of tables counted each", self.solids, MOST_SOLIDS)
+        self._refuse_more("persons", len(self.persons), MOST_PERSONS)
+        self._refuse_more("points of bumps", sum(patch.count for patch in self.patches), MOST_HEIGHTS)
         led = [i for i, person in enumerate(self.persons) if person.led]
         if len(led) > 1 or led[1:] or (led and led[0] != 0):
             raise ValueError(f"persons: found {led} led, counted from 0, expected the first or none")
         if float(self.height(0.0, 0.0)) != 0.0:
             raise ValueError("hills: found one at the origin, expected level ground where the robot starts")
 
+    @staticmethod
+    def _refuse_more(what: str, found: float, most: int) -> None:
+        if found > most:
+            raise ValueError(f"found {found:.0f} {what}, expected {most} at most")
+
+    @property
+    def solids(self) -> int:
+        """Number of geoms of what stands on the ground, and hills."""
+        walls = sum(len(wall.points) - 1 for wall in self.walls)
+        trees = sum(len(group.positions) for group in self.trees)
+        return walls + len(self.boxes) + trees + 5 * len(self.tables) + len(self.hills)
+
     @classmethod
     def load(cls, source: str | Path) -> World:
         """Of a YAML file, or the shipped world of that name. ValueError names file, field, value found and what was expected."""
         path = FOLDER / f"{source}.yaml" if str(source) in SHIPPED else Path(source)
         try:
-            document = yaml.safe_load(path.read_text())
-        except UnicodeDecodeError:
-            raise ValueError(f"{path}: no text, expected a YAML file of a world") from None
+            document = read_yaml(path, "a YAML file of a world")
         except OSError as error:
             shipped = ", ".join(SHIPPED)
             raise ValueError(
                 f"world {source}: {error.strerror}, expected a YAML file or one of {shipped}"
             ) from None
-        except (yaml.YAMLError, RecursionError) as error:
-            raise ValueError(f"{path}: no valid YAML: {' '.join(str(error).split())}") from None
         try:
             return _world(document, path.stem)
         except ValueError as error:

@@ -24,6 +24,7 @@ from .service import Service
 from .subscription import Subscription
 from .time import Time
 from .timer import Timer
+from .topic_endpoint_info import TopicEndpointInfo
 
 CLOCK_QOS = QoSProfile(depth=1, reliability=qos.ReliabilityPolicy.BEST_EFFORT)
 
@@ -234,14 +235,34 @@ class Node(ParameterMixin):
     def count_publishers(self, topic_name: str) -> int:
         return self.context.participant.count("publication", f"rt{self._resolve(topic_name)}")
 
+    @property
+    def subscriptions(self) -> Iterator[Subscription]:
+        yield from self._subscriptions
+
+    def get_publishers_info_by_topic(
+        self, topic_name: str, no_mangle: bool = False
+    ) -> list[TopicEndpointInfo]:
+        refuse_options("get_publishers_info_by_topic", no_mangle=no_mangle)
+        return self._endpoints_of("publication", topic_name)
+
+    def get_subscriptions_info_by_topic(
+        self, topic_name: str, no_mangle: bool = False
+    ) -> list[TopicEndpointInfo]:
+        refuse_options("get_subscriptions_info_by_topic", no_mangle=no_mangle)
+        return self._endpoints_of("subscription", topic_name)
+
+    def _endpoints_of(self, kind: str, topic_name: str) -> list[TopicEndpointInfo]:
+        topic = f"rt{self._resolve(topic_name)}"
+        ends = self.context.participant.endpoints(kind)
+        return [TopicEndpointInfo(names.ros_type(end.type_name)) for end in ends if end.topic_name == topic]
+
     def get_topic_names_and_types(self, no_demangle: bool = False) -> list[tuple[str, list[str]]]:
         refuse_options("get_topic_names_and_types", no_demangle=no_demangle)
         found: dict[str, set[str]] = {}
         for kind in ("publication", "subscription"):
             for endpoint in self.context.participant.endpoints(kind):
                 if endpoint.topic_name.startswith("rt/"):
-                    typename = endpoint.type_name.replace("::dds_::", "/").replace("::", "/").rstrip("_")
-                    found.setdefault(endpoint.topic_name[2:], set()).add(typename)
+                    found.setdefault(endpoint.topic_name[2:], set()).add(names.ros_type(endpoint.type_name))
         return [(topic, sorted(types)) for topic, types in sorted(found.items())]
 
 
