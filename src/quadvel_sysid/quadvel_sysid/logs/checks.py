@@ -12,7 +12,7 @@ from typing import Any
 
 import attrs
 
-from . import angles, channels, response, separability, stamps
+from . import angles, channels, clocks, response, separability, stamps
 from .findings import Finding
 from .log import GAP, Log, LogError
 from .pd_control import explainable, masked
@@ -51,8 +51,6 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     for check in OF_ROWS:
         log = _looked(check, findings, log)
-    if not _refused(findings) and (found := response.measured(log, response.FAR)):
-        log = _looked(OF_CLOCKS, findings, log, found)
     if _refused(findings):
         return Inspection(log, tuple(findings))
     answer = log.without_feed_forward()
@@ -104,23 +102,19 @@ OF_ROWS = (
     Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
     Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
     Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
+    Check(clocks.clock, "lag from command to torque (without torque, to the motion's acceleration) that leaves least, s; what it leaves "
+          f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
+          f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; {clocks.STANDARD_ERRORS:g}",
+          "refusal"),
     Check(channels.gains, "kp and kd: there, constant, not negative", "0", "note; refusal of negative ones"),
 )  # fmt: skip
 """What is asked of all rows."""
-
-OF_CLOCKS = Check(
-    response.clock, "lag from command to torque that leaves least, s; what it leaves over what one near 0 leaves",
-    f"{response.REACH:g} s; {response.BETTER:g}", "refusal",
-)  # fmt: skip
-"""What is asked of all rows of a log with torque, whatever the drives did."""
 
 OF_RESPONSE = (
     Check(response.columns, "share of the torque left by the best order of joints, over that left by the order as it is",
           f"{response.BETTER:g} on two joints or more whose commands differ (correlation below {response.SAME:g})", "refusal"),
     Check(response.signs, "partial correlation of torque and own command, beside the joint's angle, speed and direction",
           f"below {-response.SURE:g}", "refusal: which of q, q_des and tau has the opposite sign"),
-    Check(response.early, "lag from command to torque that leaves least, s; what it explains more than the best one from 0 on, "
-          f"in standard errors over pieces of {response.PIECE:g} s", f"0; {response.EARLY:g}", "refusal"),
     Check(response.deaf, "share of the torque, beside speed and friction, that the position error explains",
           f"{response.UNANSWERED:.0%}", "warning; on all joints a refusal"),
     Check(response.scale, "gain that the torque shows over the one commanded, of the position error and of the command alone",
@@ -143,7 +137,7 @@ OF_MOTION = (
 def table() -> str:
     """All checks in their order, as Markdown."""
     lines = ["| check | measured | limit | then |", "|---|---|---|---|"]
-    for check in (*OF_ROWS, OF_CLOCKS, *OF_RESPONSE, *OF_MOTION):
+    for check in (*OF_ROWS, *OF_RESPONSE, *OF_MOTION):
         asks = str(check.look.__doc__).partition("\n")[0].rstrip(".")
         lines.append(f"| {asks} | {check.measures} | {check.limit} | {check.then} |")
     return "\n".join(lines)
