@@ -12,7 +12,7 @@ from typing import Any
 
 import attrs
 
-from . import angles, channels, clocks, response, separability, stamps
+from . import angles, channels, clocks, commands, response, separability, stamps, torque
 from .findings import Finding
 from .log import GAP, Log, LogError
 from .pd_control import explainable, masked
@@ -91,10 +91,12 @@ OF_ROWS = (
     Check(angles.wrapped, "steps of q from one row to the next, rad off a full turn", f"{angles.WRAPPED:g}",
           "unwrapped, with a warning"),
     Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
-          f"each sign in {angles.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
+          f"each sign in {torque.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
           "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(angles.sign_of_torque, "share of the rows with the rarer sign of the position error, where tau has one and reaches 0",
-          f"{angles.BOTH_WAYS:.0%}", "refusal"),
+    Check(torque.spikes, "rows of tau that stand off the rows around, and off what command and motion explain, in standard deviations",
+          f"{torque.FAR:g} in both", "left out, with a warning"),
+    Check(torque.sign, "tau of one sign that reaches 0: the error that the size of what a PD law asks for leaves, over that of the "
+          "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),
     Check(angles.units, "slope of q over dq, and their correlation",
           f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
     Check(angles.degrees, "size of q_des over that of q; size of q, rad", f"25 to 130; {angles.TURNS:g}", "refusal"),
@@ -102,6 +104,9 @@ OF_ROWS = (
     Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
     Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
     Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
+    Check(commands.constant, "where q_des never changes though q does: share of the torque (without it, of the acceleration) that a "
+          "PD law about it leaves; share of the rest that the angle explains",
+          f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints a refusal"),
     Check(clocks.clock, "lag from command to torque (without torque, to the motion's acceleration) that leaves least, s; what it leaves "
           f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
           f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; {clocks.STANDARD_ERRORS:g}",

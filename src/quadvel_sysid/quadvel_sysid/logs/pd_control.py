@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .findings import Finding, some
 from .log import Array, Bools, Log
+from .response import motion
 
 BIN = 0.02  # s
 WINDOW = 5  # bins
@@ -26,6 +27,10 @@ MARGIN = 0.1  # s, on both sides of it
 LEAST_VALID = 0.5  # s, of states that a model may be judged on
 LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
 ENOUGH = 40_000  # rows, of which the lag is read
+FITTED, LEAST_ROWS = 4000, 200
+"""Rows that a law of the joints under PD control is fitted to, at most and at least."""
+AS_ELSEWHERE = 4.0
+"""Times its mean squared error elsewhere, within which such a law holds in a stretch, too."""
 
 
 def explainable(log: Log) -> tuple[Bools, list[Finding]]:
@@ -125,9 +130,11 @@ def _unanswered(log: Log) -> Bools:
     # A window that tells nothing, as the error is small there, is taken to be like the one before.
     last = np.maximum.accumulate(np.where(tells, np.arange(len(gain)), -1))
     lost = ((last >= 0) & (gain[last] < LOST * usual))[bins]
+    left = _left_elsewhere(log, lost, lag) if lost.any() else None
     for first, stop in stretches(lost, log.t, SHORTEST):
         there = (log.t >= first) & (log.t <= stop)
-        if _follows(log, there, lag) >= LOST * usual:
+        explained = left is not None and np.mean(left[there]) < AS_ELSEWHERE
+        if explained or _follows(log, there, lag) >= LOST * usual:
             lost &= ~there
     return _widened(lost, log.t)
 
@@ -146,6 +153,31 @@ def _follows(log: Log, rows: Bools, lag: float) -> float:
         products += x @ (tau - tau @ level)
     found: Array = np.linalg.lstsq(squares, products, rcond=1e-3)[0]
     return float(found[0])
+
+
+def _left_elsewhere(log: Log, lost: Bools, lag: float) -> Array | None:
+    """Squared error (N,) of a PD law of each joint with friction and an offset, over its mean where it was fitted: not in `lost`.
+
+    None where that is too short. A law that holds within `lost` as well says that the drives were under PD control there: friction
+    and a load that turn against a small position error only look like a gain of 0.
+    """
+    fitted = np.flatnonzero(~lost)
+    fitted = fitted[:: max(1, len(fitted) // FITTED)]
+    if len(fitted) < LEAST_ROWS:
+        return None
+    assert log.tau is not None
+    row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
+    command = log.command_rows(log.t[row])
+    total = np.zeros(len(log.t))
+    for j in range(len(log.joints)):
+        kp, kd = (1.0 if gain is None else np.asarray(gain)[command, j] for gain in (log.kp, log.kd))
+        q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
+        speed = [] if log.dq_des is None else [log.dq_des[command, j]]
+        law = np.stack([kp * (log.q_des[command, j] - q), kd * -dq, q - q.mean(), *motion(dq).T, *speed], axis=1)
+        weights = np.linalg.lstsq(law[fitted], log.tau[fitted, j], rcond=1e-9)[0]
+        left = log.valid[:, j] * (log.tau[:, j] - law @ weights) ** 2
+        total += left / (left[fitted].mean() + 1e-12) / len(log.joints)
+    return total
 
 
 def _answers(log: Log, rows: NDArray[np.intp], lag: float) -> Iterator[tuple[Array, Array, Array, Array]]:

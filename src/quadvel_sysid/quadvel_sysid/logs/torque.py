@@ -8,10 +8,10 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import names, rows_of
+from .channels import TURN, names, rows_of
 from .findings import Finding, some
 from .log import Array, Bools, Log
-from .response import ROUNDING, motion
+from .response import CLEAR, ROUNDING, motion
 
 Numbers = NDArray[np.float64]
 
@@ -21,6 +21,10 @@ BULK = 0.8
 """Share of the rows whose largest deviation gives its scale: up to a tenth of the rows may be spikes, as many at rest."""
 FAR = 8.0
 """Standard deviations: normal noise exceeds them in none of 10^15 rows, and torque with ten times as heavy tails in none of 10^5."""
+FITTED = 4000
+"""Rows that a law is fitted to."""
+ROUNDS = 4
+"""Of fits without the rows that the one before left far off."""
 BOTH_WAYS = 0.05
 """Share of the rows in which a signed quantity has the rarer of its signs, where it goes both ways."""
 DOWN_TO_ZERO = 0.1
@@ -33,69 +37,92 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
     """Single rows of the torque that stand far off the rows around and off what command and motion explain."""
     if log.tau is None:
         return
-    row = np.arange(len(log.t))
     tau = np.asarray(log.tau, dtype=float)
-    level, hit = np.empty_like(tau), np.zeros(tau.shape, bool)
+    level, hit = tau.copy(), np.zeros(tau.shape, bool)
     for j in range(len(log.joints)):
-        level[:, j], hit[:, j] = _off(tau[:, j], [_asked(log, row, j, lag) for lag in LAGS])
+        level[:, j], hit[:, j] = _without_spikes(log, j)
     if hit.any():
-        shares, joints = hit.mean(axis=0), names(log, hit.any(axis=0))
-        size = np.max(np.abs(tau - level)[hit])
+        joints, size = names(log, hit.any(axis=0)), float(np.abs(tau - level).max())
         text = (
-            f"tau: spikes in {100 * shares.max():.2g} % of the rows at most, on {some(joints)}: single rows up to {size:.3g} N m "
-            "off the rows around and off what command and motion explain; left out"
+            f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {some(joints)}: single rows up to "
+            f"{size:.3g} N m off the rows around and off what command and motion explain; left out"
         )
         yield Finding("warning", "tau", joints, text)
-        yield attrs.evolve(log, tau=np.where(hit, level, tau), valid=log.valid & ~hit)
+        yield attrs.evolve(log, tau=level, valid=log.valid & ~hit)
 
 
-def _asked(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
-    """What a PD law makes torque of, (R, 5 or more): command, angle, speed, direction, 1; speed and torque fed forward."""
-    sent = log.command_rows(log.t[row] - lag + ROUNDING)
-    fed = [x[sent, j] for x in (log.dq_des, log.tau_ff) if x is not None]
-    signals = (log.q_des[sent, j], log.q[row, j], *motion(np.asarray(log.dq[row, j], dtype=float)).T, *fed)
-    return np.stack(signals, axis=1).astype(float)
-
-
-def _off(tau: Numbers, laws: list[Numbers]) -> tuple[Numbers, Bools]:
-    """The torque with its spikes replaced by the rows around (N,), and which rows these are."""
-    hit = np.zeros(len(tau), bool)
-    level = tau.copy()
-    for _ in range(3):
-        around = _around(level)
-        alone = _far(tau - around)
-        if not alone.any():
+def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
+    """The torque of a joint with its spikes replaced by the rows around (N,), and which rows these are."""
+    assert log.tau is not None
+    tau = np.asarray(log.tau[:, j], dtype=float)
+    level, hit = tau.copy(), np.zeros(len(tau), bool)
+    for _ in range(ROUNDS):
+        around, alone = _around(level)
+        found = np.abs(alone) > FAR * _scale(level - around)
+        for lag in LAGS if found.any() else ():
+            left = level - _explained(_asked(log, np.arange(len(tau)), j, lag), level, ~found)
+            found &= np.abs(left) > FAR * _scale(left)
+        if not found.any():
             break
-        use = ~(hit | alone)
-        found = alone & np.all([_far(tau - _explained(law, tau, use)) for law in laws], axis=0)
-        level[found & ~hit] = around[found & ~hit]
-        if (found & ~hit).sum() == 0:
-            break
-        hit |= found
+        level, hit = np.where(found, around, level), hit | found
     return level, hit
 
 
-def _around(x: Numbers) -> Numbers:
-    """The median of the two rows before and the two after, (N,)."""
+def _asked(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
+    """What a PD law makes torque of, (R, 5 or more): error, angle, speed, direction, 1; speed and torque fed forward."""
+    sent = log.command_rows(log.t[row] - lag + ROUNDING)
+    q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
+    fed = [x[sent, j] for x in (log.dq_des, log.tau_ff) if x is not None]
+    return np.stack([log.q_des[sent, j] - q, q - q.mean(), *motion(dq).T, *fed], axis=1).astype(float)
+
+
+def _around(x: Numbers) -> tuple[Numbers, Numbers]:
+    """The median of the two rows before and the two after, and how far a row is beyond all of these but one, (N,)."""
     padded = np.pad(x, 2, mode="edge")
-    sides = [padded[k : k + len(x)] for k in (0, 1, 3, 4)]
-    return np.asarray(np.median(sides, axis=0))
+    sides = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
+    alone = np.maximum(x - sides[2], 0.0) - np.maximum(sides[1] - x, 0.0)
+    alone[[0, 1, -2, -1]] = 0.0
+    return np.asarray(np.median(sides, axis=0)), alone
 
 
-def _far(deviation: Numbers) -> Bools:
-    """Rows further than FAR standard deviations off, which are those of a normal distribution with the bulk of the rows."""
-    size = np.abs(deviation)
-    scale = np.quantile(size, BULK) / 1.28
-    return np.asarray(size > FAR * scale + 1e-9)
+def _scale(deviation: Numbers) -> float:
+    """The standard deviation of the normal distribution that has the bulk of the deviations."""
+    return float(np.quantile(np.abs(deviation), BULK)) / 1.28 + 1e-9
 
 
 def _explained(law: Numbers, tau: Numbers, use: Bools) -> Numbers:
-    """The torque (N,) that `law` gives, fitted to the rows in `use` without those that it leaves furthest off."""
-    for _ in range(3):
-        weights = np.linalg.lstsq(law[use], tau[use], rcond=1e-9)[0]
-        left = np.abs(tau - law @ weights)
-        use = use & (left < FAR * np.quantile(left, BULK) / 1.28 + 1e-9)
+    """The torque (N,) that `law` gives, fitted to rows in `use`, in the end without those that it leaves furthest off."""
+    rows = np.flatnonzero(use)
+    rows = rows[:: max(1, len(rows) // FITTED)]
+    x, y = law[rows], tau[rows]
+    keep = np.ones(len(rows), bool)
+    for _ in range(ROUNDS):
+        weights = np.linalg.lstsq(x[keep], y[keep], rcond=1e-9)[0]
+        left = np.abs(y - x @ weights)
+        keep = left <= FAR * _scale(left)
     return np.asarray(law @ weights)
+
+
+def sign(log: Log) -> Iterator[Finding]:
+    """Torque without its sign: never negative, and the size of what a PD law asks for, not that itself with an offset."""
+    if log.tau is None:
+        return
+    row = rows_of(log)
+    row = row[:: max(1, len(row) // FITTED)]
+    tau = np.asarray(log.tau[row], dtype=float)
+    error = np.stack([_asked(log, row, j, 0.0)[:, 0] for j in range(len(log.joints))], axis=1)
+    error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURN)
+    hit = unsigned(tau, error)
+    for j in np.flatnonzero(hit):
+        hit[j] = any(is_size(tau[:, j], _asked(log, row, int(j), lag)) for lag in LAGS)
+    if hit.any():
+        joints = names(log, hit)
+        text = (
+            f"tau: has no sign on {some(joints)}: it never changes its sign, and the size of what position error and motion ask for "
+            "explains it better than that with an offset; expected a torque with its sign (leave it out if only its magnitude is "
+            "measured)"
+        )
+        yield Finding("refusal", "tau", joints, text)
 
 
 def unsigned(values: Array, twin: Array) -> Bools:
@@ -108,21 +135,27 @@ def unsigned(values: Array, twin: Array) -> Bools:
     return np.asarray(one_way & touches & both)
 
 
-def is_size(values: Numbers, signals: Numbers, start: Numbers) -> float:
-    """Squared error with which the size of a sum of `signals` (N, K) explains `values` (N,), over that of such a sum itself.
+def is_size(values: Numbers, signals: Numbers) -> bool:
+    """Are `values` (N,) the size of a sum of `signals` (N, K), rather than such a sum that happens to have one sign?
 
-    The signs of the sum are those of `start` (N,) first, then those of the sum that explains the values best.
+    The square of that size is linear in the products of the signals; the first eigenvector of their weights gives the signs.
     """
-    signed = _sse(values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0])
-    sign, least = np.where(start < 0.0, -1.0, 1.0), np.inf
-    for _ in range(20):
-        total = signals @ np.linalg.lstsq(signals, sign * np.abs(values), rcond=1e-9)[0]
-        least = min(least, _sse(np.abs(values) - np.abs(total)))
-        before, sign = sign, np.where(total < 0.0, -1.0, 1.0)
-        if (sign == before).all():
-            break
-    return least / (signed + 1e-12)
+    signed = _left(signals, values)
+    if signed < CLEAR * len(values) * np.var(values):
+        return False
+    signals = signals / (np.sqrt(np.mean(signals**2, axis=0)) + 1e-12)
+    a, b = np.triu_indices(signals.shape[1])
+    weights = np.zeros((signals.shape[1],) * 2)
+    weights[a, b] = np.linalg.lstsq(signals[:, a] * signals[:, b], values**2, rcond=1e-6)[0]
+    sizes, vectors = np.linalg.eigh(weights + weights.T)
+    total, least = signals @ vectors[:, np.argmax(sizes)], np.inf
+    for _ in range(ROUNDS):
+        signs = np.where(total < 0.0, -1.0, 1.0)
+        total = signals @ np.linalg.lstsq(signals, signs * np.abs(values), rcond=1e-9)[0]
+        least = min(least, float(np.sum((np.abs(values) - np.abs(total)) ** 2)))
+    return least < CLEARLY * signed
 
 
-def _sse(x: Numbers) -> float:
-    return float(np.sum(x**2))
+def _left(signals: Numbers, values: Numbers) -> float:
+    """Squared error of the best sum of `signals`."""
+    return float(np.sum((values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0]) ** 2))
