@@ -120,3 +120,79 @@ def as_log(fields: Fields) -> Log:
         valid=np.ones(shape, bool),
         **given,
     )
+
+
+def with_spikes(log: Log, share: float, size: float, seed: int) -> tuple[Log, np.ndarray]:
+    """A share of the torque's rows moved up or down by `size` standard deviations, and which (N, J) these are."""
+    assert log.tau is not None
+    random = np.random.default_rng(seed)
+    rows = random.random(log.tau.shape) < share
+    spike = size * log.tau.std(axis=0) * random.choice([-1.0, 1.0], log.tau.shape)
+    return attrs.evolve(log, tau=np.where(rows, log.tau + spike, log.tau)), rows
+
+
+def of_torque_commands(log: Log, rests: np.ndarray, command: float, seed: int) -> Log:
+    """The joints in `rests` (J,) driven by a torque that knows no position, their command `command` throughout."""
+    assert log.tau is not None
+    walk = np.cumsum(np.random.default_rng(seed).normal(size=log.tau.shape), axis=0)
+    torque = (walk - walk.mean(axis=0)) / walk.std(axis=0) + 0.5 * np.sign(log.dq)
+    speed = None if log.dq_des is None else np.where(rests, 0.0, log.dq_des)
+    return attrs.evolve(
+        log,
+        q_des=np.where(rests, command, log.q_des),
+        dq_des=speed,
+        tau=np.where(rests, torque, log.tau),
+        kp=None,
+        kd=None,
+    )
+
+
+# By hand
+
+
+def _of_offset(random: np.random.Generator, seed: int) -> Log:
+    log, sign = as_log(drawn(seed)), random.choice([-1.0, 1.0])
+    assert log.tau is not None
+    return attrs.evolve(log, tau=log.tau - sign * (sign * log.tau).min(axis=0))
+
+
+def _of_lead(random: np.random.Generator, seed: int) -> Log:
+    lead = np.exp(random.uniform(*np.log(LEADS))) * random.choice([-1.0, 1.0])
+    return as_log(drawn(seed, lead=float(lead)))
+
+
+def _of_spikes(random: np.random.Generator, seed: int) -> Log:
+    share, size = (float(np.exp(random.uniform(*np.log(span)))) for span in ((0.001, 0.1), (3.0, 100.0)))
+    return with_spikes(as_log(drawn(seed)), share, size, seed)[0]
+
+
+def _of_rest(random: np.random.Generator, seed: int) -> Log:
+    log = as_log(drawn(seed))
+    return of_torque_commands(log, np.arange(len(log.joints)) >= 0, float(random.choice([0.0, 0.3, -1.0])), seed)
+
+
+EXPECTED: dict[str, tuple[Callable[[np.random.Generator, int], Log], tuple[tuple[str, str], ...]]] = {
+    "healthy": (lambda random, seed: as_log(drawn(seed)), ()),
+    "offset": (_of_offset, ()),
+    "lead": (_of_lead, (("refusal", "t_cmd"),)),
+    "spikes": (_of_spikes, (("warning", "tau"),)),
+    "rest": (_of_rest, (("refusal", "q_des"),)),
+}
+"""Of each fault: how to draw it, and the kinds and fields of what has to be found."""
+
+
+def main(seeds: int = 40, first: int = 1000) -> None:
+    """Draw `seeds` logs of each fault and print those with other findings."""
+    for name, (draw, expected) in EXPECTED.items():
+        missed = 0
+        for seed in range(first, first + seeds):
+            findings = inspect(draw(np.random.default_rng([seed, 1]), seed)).findings
+            told = [one for one in findings if one.kind != "note" and "separable" not in one.text]
+            if tuple((one.kind, one.field) for one in told) != expected:
+                missed += 1
+                print(f"{name} {seed}: {[one.text for one in told]}")
+        print(f"{name}: {seeds - missed} of {seeds} as expected")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -8,9 +8,9 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import REACHES, names, rows_of, slope_of
+from .channels import REACHES, names, rows_of
 from .findings import Finding, some
-from .log import Bools, Log
+from .log import Log
 from .response import motion
 
 SWINGS = 0.1
@@ -24,6 +24,8 @@ ANSWERED = 0.5
 def constant(log: Log) -> Iterator[Finding | Log]:
     """Commands that never change on joints that move and that no drive holds there: nothing follows a position."""
     resting = (np.ptp(log.q_des, axis=0) < REACHES) & (np.ptp(log.q, axis=0) > SWINGS)
+    if log.tau is None:
+        resting &= resting.all()  # what moves a single joint, a load or a torque, the motion alone does not show
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():
         return
@@ -41,10 +43,12 @@ def constant(log: Log) -> Iterator[Finding | Log]:
 
 
 def _holds(log: Log, j: int) -> bool:
-    """Does the torque of joint `j`, or its acceleration where there is none, pull back to a command that rests?"""
+    """Does the torque of joint `j` pull back to a command that rests? Not known without torque: then no."""
+    if log.tau is None:
+        return False
     row = rows_of(log)
-    torque = slope_of(log, log.dq, row)[:, j] if log.tau is None else log.tau[row, j]
-    if log.tau is not None and log.tau_ff is not None:
+    torque = np.asarray(log.tau[row, j], dtype=float)
+    if log.tau_ff is not None:
         torque = torque - log.tau_ff[log.command_rows(log.t[row]), j]
     moved = motion(np.asarray(log.dq[row, j], dtype=float))
     rest, angle = (_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j]))

@@ -199,16 +199,19 @@ def _other_order(log: Log, field: str, what: str, told: NDArray[np.intp], order:
 
 def deaf(log: Log, found: Response) -> Iterator[Finding]:
     """Torque that has nothing to do with the position error."""
+    used = log.valid[found.row].any(axis=0)
     lost = found.answer < UNANSWERED
     moves = np.ptp(log.q[found.row], axis=0) > REACHES
-    if lost.all():
+    if (lost | ~used).all():
+        rests = np.ptp(log.q_des, axis=0) < REACHES
+        never = f"q_des never changes on {some(names(log, rests))}, and tau " if rests.any() else ""
         text = (
-            f"tau: does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it at "
+            f"tau: {never}does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it at "
             "most); expected q_des, q and tau of the same joints, with the same signs"
         )
         yield Finding("refusal", "tau", log.joints, text)
-    elif (lost & moves).any():
-        joints = names(log, lost & moves)
+    elif (lost & moves & used).any():
+        joints = names(log, lost & moves & used)
         text = f"tau: does not answer the position error on {some(joints)}: what is found there is not to be trusted"
         yield Finding("warning", "tau", joints, text)
 

@@ -59,8 +59,10 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
     for _ in range(ROUNDS):
         around, alone = _around(level)
         found = np.abs(alone) > FAR * _scale(level - around)
-        for lag in LAGS if found.any() else ():
-            left = level - _explained(_asked(log, np.arange(len(tau)), j, lag), level, ~found)
+        if found.any():
+            row = np.arange(len(tau))
+            laws = (level - _explained(_asked(log, row, j, lag), level, ~found) for lag in LAGS)
+            left = min(laws, key=_scale)
             found &= np.abs(left) > FAR * _scale(left)
         if not found.any():
             break
@@ -77,10 +79,14 @@ def _asked(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
 
 
 def _around(x: Numbers) -> tuple[Numbers, Numbers]:
-    """The median of the two rows before and the two after, and how far a row is beyond all of these but one, (N,)."""
+    """The median of the two rows before and the two after, and how far a row is beyond all of these but one, (N,).
+
+    0 where that is less than half of what these four differ by: the peak of a fast motion is no spike.
+    """
     padded = np.pad(x, 2, mode="edge")
     sides = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
     alone = np.maximum(x - sides[2], 0.0) - np.maximum(sides[1] - x, 0.0)
+    alone[np.abs(alone) < 0.5 * (sides[3] - sides[0])] = 0.0
     alone[[0, 1, -2, -1]] = 0.0
     return np.asarray(np.median(sides, axis=0)), alone
 
