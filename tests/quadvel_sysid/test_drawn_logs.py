@@ -47,7 +47,7 @@ def test_commands_of_another_time_are_refused_as_another_clock(seed: int, lead: 
 
 
 def test_commands_of_another_time_show_in_the_motion_alone() -> None:
-    log = attrs.evolve(as_log(drawn(1, stiff=True, lead=1.4)), tau=None)
+    log = attrs.evolve(as_log(drawn(3, lead=1.4)), tau=None)
     refused = [one.field for one in found(inspect(log)) if one.kind == "refusal"]
     assert "t_cmd" in refused
 

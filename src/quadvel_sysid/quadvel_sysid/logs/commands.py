@@ -13,8 +13,8 @@ from .findings import Finding, some
 from .log import Log
 from .response import motion
 
-SWINGS = 0.1
-"""rad, span of q from which a joint whose command rests is looked at: less may be what it gives way to a load."""
+SWINGS = 0.5
+"""rad, span of q from which a joint whose command rests is looked at: less may be what a drive gives way to a load."""
 HELD = 0.3
 """Share of the torque that a PD law about a resting command, with friction and an offset, leaves at most."""
 ANSWERED = 0.5

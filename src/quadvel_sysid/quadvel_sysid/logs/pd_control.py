@@ -29,7 +29,7 @@ LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its tor
 ENOUGH = 40_000  # rows, of which the lag is read
 FITTED, LEAST_ROWS = 4000, 200
 """Rows that a law of the joints under PD control is fitted to, at most and at least."""
-AS_ELSEWHERE = 4.0
+AS_ELSEWHERE = 9.0
 """Times its mean squared error elsewhere, within which such a law holds in a stretch, too."""
 
 

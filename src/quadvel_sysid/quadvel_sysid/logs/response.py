@@ -232,7 +232,8 @@ def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
     known = [unit for unit, factor in _UNITS_OF_TORQUE if abs(np.log(number / factor)) < np.log(1.5)]
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
-        text = f"tau: {number:.3g} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
+        size = f"{number:.3g}" if number < 100.0 else f"{number:.2g}"
+        text = f"tau: {size} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
         yield Finding("refusal", "tau", joints, text)
         return
     text = (

@@ -21,6 +21,8 @@ BULK = 0.8
 """Share of the rows whose largest deviation gives its scale: up to a tenth of the rows may be spikes, as many at rest."""
 FAR = 8.0
 """Standard deviations: normal noise exceeds them in none of 10^15 rows, and torque with ten times as heavy tails in none of 10^5."""
+LARGE = 2.0
+"""Standard deviations of the torque itself that a spike has at least: friction that turns its sign between two rows has less."""
 FITTED = 4000
 """Rows that a law is fitted to."""
 ROUNDS = 4
@@ -60,9 +62,9 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
         around, alone = _around(level)
         found = np.abs(alone) > FAR * _scale(level - around)
         if found.any():
-            row = np.arange(len(tau))
-            laws = (level - _explained(_asked(log, row, j, lag), level, ~found) for lag in LAGS)
-            left = min(laws, key=_scale)
+            found &= np.abs(alone) > LARGE * _scale(tau - np.median(tau))
+        for lag in LAGS if found.any() else ():
+            left = level - _explained(_asked(log, np.arange(len(tau)), j, lag), level, ~found)
             found &= np.abs(left) > FAR * _scale(left)
         if not found.any():
             break
