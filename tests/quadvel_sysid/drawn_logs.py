@@ -40,7 +40,9 @@ class Drive:
     @classmethod
     def draw(cls, random: np.random.Generator, joints: int, stiff: bool) -> Drive:
         """Well damped, at a natural frequency of 2 to 8 Hz, or 8 to 20 Hz where it is `stiff`."""
-        kp = float(np.exp(random.uniform(np.log(300.0 if stiff else 10.0), np.log(5000.0 if stiff else 300.0))))
+        kp = float(
+            np.exp(random.uniform(np.log(300.0 if stiff else 10.0), np.log(5000.0 if stiff else 300.0)))
+        )
         pulse = 2.0 * np.pi * random.uniform(*((8.0, 20.0) if stiff else (2.0, 8.0)))
         feeds_speed = bool(stiff and random.random() < 0.7)
         return cls(
@@ -85,7 +87,9 @@ def drawn(seed: int, stiff: bool | None = None, lead: float = 0.0, rate: int | N
     return log
 
 
-def _commands(random: np.random.Generator, t: np.ndarray, joints: int, period: float) -> tuple[np.ndarray, np.ndarray]:
+def _commands(
+    random: np.random.Generator, t: np.ndarray, joints: int, period: float
+) -> tuple[np.ndarray, np.ndarray]:
     """Sums of three sines (N, J) about a middle, and their slopes; new ones every `period` s."""
     held = t if period == 0.0 else np.floor(t / period + 1e-6) * period
     pulse, phase = 2.0 * np.pi * random.uniform(0.15, 1.8, (3, joints)), random.uniform(0.0, 6.3, (3, joints))
@@ -101,7 +105,11 @@ def _moved(drive: Drive, sent: np.ndarray, slope: np.ndarray) -> np.ndarray:
     q, dq, rows = sent[0].copy(), np.zeros(sent.shape[1]), np.empty((3, *sent.shape))
     for k in range(len(sent)):
         k_sent = max(k - late, 0)
-        tau = drive.kp * (sent[k_sent] - q) + drive.kd * (ahead[k_sent] - dq) - drive.friction * np.tanh(dq / 0.03)
+        tau = (
+            drive.kp * (sent[k_sent] - q)
+            + drive.kd * (ahead[k_sent] - dq)
+            - drive.friction * np.tanh(dq / 0.03)
+        )
         rows[:, k] = q, dq, tau
         dq = dq + DRIVE_STEP * (tau - drive.weight * np.sin(q)) / drive.inertia
         q = q + DRIVE_STEP * dq
@@ -111,7 +119,11 @@ def _moved(drive: Drive, sent: np.ndarray, slope: np.ndarray) -> np.ndarray:
 def as_log(fields: Fields) -> Log:
     """The log, its joints numbered."""
     shape = fields["q"].shape
-    given = {name: np.broadcast_to(fields[name], shape) for name in ("kp", "kd", "tau_ff", "dq_des", "tau") if name in fields}
+    given = {
+        name: np.broadcast_to(fields[name], shape)
+        for name in ("kp", "kd", "tau_ff", "dq_des", "tau")
+        if name in fields
+    }
     return Log(
         name="drawn.npz",
         joints=tuple(f"{j}_joint" for j in range(shape[1])),
@@ -168,7 +180,9 @@ def _of_spikes(random: np.random.Generator, seed: int) -> Log:
 
 def _of_rest(random: np.random.Generator, seed: int) -> Log:
     log = as_log(drawn(seed))
-    return of_torque_commands(log, np.arange(len(log.joints)) >= 0, float(random.choice([0.0, 0.3, -1.0])), seed)
+    return of_torque_commands(
+        log, np.arange(len(log.joints)) >= 0, float(random.choice([0.0, 0.3, -1.0])), seed
+    )
 
 
 EXPECTED: dict[str, tuple[Callable[[np.random.Generator, int], Log], tuple[tuple[str, str], ...]]] = {

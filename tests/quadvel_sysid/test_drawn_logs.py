@@ -68,7 +68,9 @@ def test_spikes_in_the_torque_are_left_out_and_named(share: float, size: float) 
 @pytest.mark.parametrize("torque", [True, False])
 def test_a_log_whose_commands_rest_while_all_joints_move_is_refused(command: float, torque: bool) -> None:
     log = of_torque_commands(as_log(drawn(1)), np.array([True, True, True]), command, seed=0)
-    (one,) = [one for one in found(inspect(log if torque else attrs.evolve(log, tau=None))) if one.kind == "refusal"]
+    (one,) = [
+        one for one in found(inspect(log if torque else attrs.evolve(log, tau=None))) if one.kind == "refusal"
+    ]
     assert one.field == "q_des"
 
 

@@ -216,16 +216,14 @@ def errors(report: Mapping[str, Any]) -> str:
         ("plain EAM", report["before"]),
         ("corrected model", report["after"]),
     )
-    each = ", ".join(f"{name} {entry['heldout_mse']:.3g} ({share(entry)})" for name, entry in entries)
-    return (
-        f"held-out error, N^2 m^2 (share of the torque's variance explained): {each}; noise {report['noise_floor']:.3g}"
-    )
+    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_share(entry)}" for name, entry in entries)
+    return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
 
 
-def share(entry: Mapping[str, Any]) -> str:
-    """How much of the torque's variance an account explains."""
-    found = entry["heldout_explained"]
-    return "-" if found is None else f"{100.0 * found:.3g} %"
+def _share(entry: Mapping[str, Any]) -> str:
+    """How much of the torque's variance an account explains; nothing where the torque does not vary."""
+    found = entry.get("heldout_explained")
+    return "" if found is None else f" (explains {100.0 * found:.3g} % of the variance)"
 
 
 def replays(replay: Mapping[str, Any]) -> str:

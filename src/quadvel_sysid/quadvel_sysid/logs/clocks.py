@@ -198,13 +198,19 @@ def clock(log: Log) -> Iterator[Finding]:
     if found.standard_errors(best, usual) < STANDARD_ERRORS:
         return
     what = "torque" if log.tau is not None else "motion"
-    shares = f"that leaves {100 * left:.2g} % of the {what}, a delay that a drive can have {100 * other:.2g} %"
+    shares = (
+        f"that leaves {100 * left:.2g} % of the {what}, a delay that a drive can have {100 * other:.2g} %"
+    )
     if -REACH <= lag < 0.0:
         text = (
             f"t_cmd: the {what} comes {-1e3 * lag:.0f} ms before its command ({shares}); expected each command at the time it "
             "was sent: is it logged a step late?"
         )
     else:
-        way = f"{lag:.2f} s after they were sent, more than a drive can be late" if lag > 0.0 else f"{-lag:.2f} s before they were sent"
+        way = (
+            f"{lag:.2f} s after they were sent, more than a drive can be late"
+            if lag > 0.0
+            else f"{-lag:.2f} s before they were sent"
+        )
         text = f"t_cmd: the {what} answers commands {way} ({shares}): t and t_cmd are not of one clock; expected one for both"
     yield Finding("refusal", "t_cmd", (), text)

@@ -25,7 +25,9 @@ def constant(log: Log) -> Iterator[Finding | Log]:
     """Commands that never change on joints that move and that no drive holds there: nothing follows a position."""
     resting = (np.ptp(log.q_des, axis=0) < REACHES) & (np.ptp(log.q, axis=0) > SWINGS)
     if log.tau is None:
-        resting &= resting.all()  # what moves a single joint, a load or a torque, the motion alone does not show
+        resting &= (
+            resting.all()
+        )  # what moves a single joint, a load or a torque, the motion alone does not show
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():
         return

@@ -206,8 +206,8 @@ def deaf(log: Log, found: Response) -> Iterator[Finding]:
         rests = np.ptp(log.q_des, axis=0) < REACHES
         never = f"q_des never changes on {some(names(log, rests))}, and tau " if rests.any() else ""
         text = (
-            f"tau: {never}does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it at "
-            "most); expected q_des, q and tau of the same joints, with the same signs"
+            f"tau: {never}does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it "
+            "at most); expected q_des, q and tau of the same joints, with the same signs"
         )
         yield Finding("refusal", "tau", log.joints, text)
     elif (lost & moves & used).any():
@@ -233,7 +233,9 @@ def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
         size = f"{number:.3g}" if number < 100.0 else f"{number:.2g}"
-        text = f"tau: {size} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
+        text = (
+            f"tau: {size} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
+        )
         yield Finding("refusal", "tau", joints, text)
         return
     text = (

@@ -20,9 +20,9 @@ LAGS = (0.0, 0.005, 0.01, 0.02, 0.04)
 BULK = 0.8
 """Share of the rows whose largest deviation gives its scale: up to a tenth of the rows may be spikes, as many at rest."""
 FAR = 8.0
-"""Standard deviations: normal noise exceeds them in none of 10^15 rows, and torque with ten times as heavy tails in none of 10^5."""
+"""Standard deviations: normal noise exceeds them in none of 10^14 rows."""
 LARGE = 2.0
-"""Standard deviations of the torque itself that a spike has at least: friction that turns its sign between two rows has less."""
+"""Standard deviations of the torque itself that a spike has at least: what friction and a coarse speed do in one row is less."""
 FITTED = 4000
 """Rows that a law is fitted to."""
 ROUNDS = 4
@@ -58,8 +58,11 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
     assert log.tau is not None
     tau = np.asarray(log.tau[:, j], dtype=float)
     level, hit = tau.copy(), np.zeros(len(tau), bool)
+    sides = np.sign(np.pad(log.dq[:, j], 1, mode="edge"))
+    turns = sides[:-2] != sides[2:]  # friction turns its sign there, which may stand in one row alone
     for _ in range(ROUNDS):
         around, alone = _around(level)
+        alone = np.where(turns, 0.0, alone)
         found = np.abs(alone) > FAR * _scale(level - around)
         if found.any():
             found &= np.abs(alone) > LARGE * _scale(tau - np.median(tau))
@@ -126,7 +129,7 @@ def sign(log: Log) -> Iterator[Finding]:
     if hit.any():
         joints = names(log, hit)
         text = (
-            f"tau: has no sign on {some(joints)}: it never changes its sign, and the size of what position error and motion ask for "
+            f"tau: has no sign on {some(joints)}: it never changes its sign, and the size of what a PD law asks for "
             "explains it better than that with an offset; expected a torque with its sign (leave it out if only its magnitude is "
             "measured)"
         )
