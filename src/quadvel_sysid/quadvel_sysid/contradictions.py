@@ -31,7 +31,7 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
     share = after.get("heldout_explained")
     if share is not None and share < HALF:
         yield (
-            f"the corrected model explains {100.0 * share:.0f} % of the torque's variance, less than half: what moves the torque here "
+            f"the corrected model explains {100.0 * share:.0f} % of the torque's variance, less than half: what moves it "
             "is not known, and what was named is not to be trusted before it is"
         )
     if after.get("heldout_q_rms_rad", 0.0) > FAR:

@@ -93,7 +93,7 @@ OF_ROWS = (
     Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
           f"each sign in {torque.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
           "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(torque.spikes, "rows of tau that stand off the rows around, and off what command and motion explain, in standard deviations",
+    Check(torque.spikes, "how far rows of tau stand off the rows around, and off what command and motion explain, standard deviations",
           f"{torque.FAR:g} in both", "left out, with a warning"),
     Check(torque.sign, "tau of one sign that reaches 0: the error that the size of what a PD law asks for leaves, over that of the "
           "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),
@@ -107,9 +107,10 @@ OF_ROWS = (
     Check(commands.constant, "where q_des never changes though q does: share of the torque that a "
           "PD law about it leaves; share of the rest that the angle explains",
           f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints, or without torque, a refusal"),
-    Check(clocks.clock, "lag from command to torque (without torque, to the motion's acceleration) that leaves least, s; what it leaves "
+    Check(clocks.clock, "lag from command to torque (without torque, to the acceleration) that leaves least, s; what it leaves "
           f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
-          f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; {clocks.STANDARD_ERRORS:g}",
+          f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; "
+          f"{clocks.STANDARD_ERRORS:g}",
           "refusal"),
     Check(channels.gains, "kp and kd: there, constant, not negative", "0", "note; refusal of negative ones"),
 )  # fmt: skip
