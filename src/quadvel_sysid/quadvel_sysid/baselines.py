@@ -21,7 +21,7 @@ RIDGE = 1e-4
 """Penalty on the weights of signals of unit variance, in times the number of rows"""
 
 
-def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float]]:
+def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
     """Held-out mean squared errors (N^2 m^2) of a PD law of each joint, and of a ridge regression over SPAN.
 
     `fitted` and `judged` (N, J) are the rows of all logs, one after the other, as wide as their joints.

@@ -93,7 +93,7 @@ OF_ROWS = (
     Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
           f"each sign in {torque.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
           "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(torque.spikes, "how far rows of tau stand off the rows around, and off what command and motion explain, standard deviations",
+    Check(torque.spikes, "how far rows of tau stand off the rows around and off what a PD law explains, standard deviations",
           f"{torque.FAR:g} in both", "left out, with a warning"),
     Check(torque.sign, "tau of one sign that reaches 0: the error that the size of what a PD law asks for leaves, over that of the "
           "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),

@@ -126,7 +126,7 @@ class Lags:
     @cached_property
     def lags(self) -> Numbers:
         """(L,), from a command to its torque, s."""
-        return self.step * np.arange(-self.most, self.most + 1)
+        return np.asarray(self.step * np.arange(-self.most, self.most + 1), dtype=np.float64)
 
     @cached_property
     def left(self) -> Numbers:
@@ -136,11 +136,12 @@ class Lags:
     @cached_property
     def total(self) -> Numbers:
         """(L,), geometric mean over the joints."""
-        return np.asarray(np.exp(np.mean(np.log(self.left + 1e-6), axis=1)))
+        return np.asarray(np.exp(np.mean(np.log(self.left + 1e-6), axis=1)), dtype=np.float64)
 
     def standard_errors(self, lag: int, other: int) -> float:
         """By how many the lag of index `lag` explains more than that of index `other`, in pieces of PIECE."""
-        gain = sum(one.errors(other - self.most) - one.errors(lag - self.most) for one in self.joints)
+        gains = [one.errors(other - self.most) - one.errors(lag - self.most) for one in self.joints]
+        gain = np.sum(gains, axis=0)
         pieces = np.add.reduceat(gain, np.arange(0, len(gain), max(1, round(PIECE / self.step))))
         return float(pieces.sum() / np.sqrt(np.sum((pieces - pieces.mean()) ** 2) + 1e-12))
 

@@ -52,12 +52,12 @@ def _holds(log: Log, j: int) -> bool:
     torque = np.asarray(log.tau[row, j], dtype=float)
     if log.tau_ff is not None:
         torque = torque - log.tau_ff[log.command_rows(log.t[row]), j]
-    moved = motion(np.asarray(log.dq[row, j], dtype=float))
+    moved = np.asarray(motion(log.dq[row, j]), dtype=np.float64)
     rest, angle = (_residual(moved, np.asarray(x, dtype=float)) for x in (torque, log.q[row, j]))
     pull = float(rest @ angle)
     answered = pull**2 / ((rest @ rest) * (angle @ angle) + 1e-12)
     left = (1.0 - answered) * float(rest @ rest) / (len(row) * float(np.var(torque)) + 1e-12)
-    return pull < 0.0 and answered > ANSWERED and left < HELD
+    return bool(pull < 0.0 and answered > ANSWERED and left < HELD)
 
 
 def _residual(signals: NDArray[np.float64], x: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -44,7 +44,7 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
     for j in range(len(log.joints)):
         level[:, j], hit[:, j] = _without_spikes(log, j)
     if hit.any():
-        joints, size = names(log, hit.any(axis=0)), float(np.abs(tau - level).max())
+        joints, size = names(log, np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
         text = (
             f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {some(joints)}: single rows up to "
             f"{size:.3g} N m off the rows around and off what command and motion explain; left out"
@@ -66,8 +66,9 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
         found = np.abs(alone) > FAR * _scale(level - around)
         if found.any():
             found &= np.abs(alone) > LARGE * _scale(tau - np.median(tau))
-        for lag in LAGS if found.any() else ():
-            left = level - _explained(_asked(log, np.arange(len(tau)), j, lag), level, ~found)
+        if found.any():
+            laws = [_asked(log, np.arange(len(tau)), j, lag) for lag in LAGS]
+            left = min((level - _explained(law, level, ~found) for law in laws), key=_scale)
             found &= np.abs(left) > FAR * _scale(left)
         if not found.any():
             break
