@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_sysid.baselines import baselines
+from quadvel_sysid.baselines import baselines, explained, torque_variance
 from quadvel_sysid.cli import errors
 from quadvel_sysid.contradictions import contradictions
 from quadvel_sysid.logs.read_log import read_log
@@ -41,6 +41,19 @@ REPORT = {
 }
 
 
+def test_each_error_has_the_share_of_the_variance_that_is_explained_next_to_it() -> None:
+    report = REPORT | {"after": {"heldout_mse": 0.3, "heldout_explained": 0.925}}
+    assert "corrected model 0.3 (explains 92.5 % of the variance)" in errors(report)
+
+
+def test_the_explained_share_is_of_the_variance_about_each_joints_mean() -> None:
+    torque = np.random.default_rng(0).normal([5.0, -40.0], [1.0, 2.0], (4000, 2))
+    variance = torque_variance(torque, np.ones(torque.shape, bool))
+    assert variance == pytest.approx(2.5, rel=0.05)
+    assert explained(0.25, variance) == pytest.approx(0.9, abs=0.01)
+    assert explained(0.0, 0.0) is None
+
+
 def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
     assert errors(REPORT) == (
         "held-out error, N^2 m^2: PD as commanded 2, a PD law of each joint 0.8, a linear filter over 16 ms 0.5, plain EAM 1, "
@@ -53,6 +66,10 @@ def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
     [
         ({"heldout_mse": 0.6}, "a ridge regression over 16 ms leaves less of the held-out torque, 0.5"),
         ({"heldout_mse": 0.9}, "a PD law of each joint leaves less"),
+        (
+            {"heldout_mse": 0.3, "heldout_explained": 0.49},
+            "the corrected model explains 49 % of the torque's variance",
+        ),
         ({"heldout_mse": 0.3, "heldout_q_rms_rad": 1.5}, "replayed, the commands lead 1.5 rad away"),
     ],
 )

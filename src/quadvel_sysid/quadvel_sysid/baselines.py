@@ -21,7 +21,7 @@ RIDGE = 1e-4
 """Penalty on the weights of signals of unit variance, in times the number of rows"""
 
 
-def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float]]:
+def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
     """Held-out mean squared errors (N^2 m^2) of a PD law of each joint, and of a ridge regression over SPAN.
 
     `fitted` and `judged` (N, J) are the rows of all logs, one after the other, as wide as their joints.
@@ -41,7 +41,31 @@ def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, di
         miss = _fitted(_together(logs, j, past, past), tau, fit, RIDGE)
         squares["ridge"] += float(np.sum(miss[judge] ** 2))
     count = max(int(judged.sum()), 1)
-    return {name: {"heldout_mse": total / count} for name, total in squares.items()}
+    variance = torque_variance(torques_of(logs), judged)
+    return {
+        name: {"heldout_mse": total / count, "heldout_explained": explained(total / count, variance)}
+        for name, total in squares.items()
+    }
+
+
+def torques_of(logs: Sequence[Log]) -> Array:
+    """Measured torque of all logs (N, J), N m, one after the other."""
+    return np.concatenate([np.asarray(log.tau, dtype=float) for log in logs])
+
+
+def torque_variance(torque: Array, rows: Bools) -> float:
+    """Variance (N^2 m^2) of the `torque` (N, J) about each joint's mean, over the `rows` (N, J)."""
+    count = np.maximum(rows.sum(axis=0), 1)
+    centred = torque - np.sum(torque, axis=0, where=rows) / count
+    return float(np.sum(centred**2, where=rows) / count.sum())
+
+
+def explained(mse: float, variance: float) -> float | None:
+    """Share of the torque's `variance` that a mean squared error of `mse` leaves nothing of, below 0 where it is larger.
+
+    None of a torque that does not vary.
+    """
+    return 1.0 - mse / variance if variance > 0.0 else None
 
 
 def _together(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:

@@ -212,7 +212,7 @@ def _material(
 
 
 def errors(report: Mapping[str, Any]) -> str:
-    """The held-out errors in a line, those of what needs no model beside them."""
+    """The held-out errors in a line with the shares that they explain, those of what needs no model among them."""
     entries = (
         ("PD as commanded", report["pd"]),
         ("a PD law of each joint", report["baselines"]["joint_pd"]),
@@ -220,8 +220,14 @@ def errors(report: Mapping[str, Any]) -> str:
         ("plain EAM", report["before"]),
         ("corrected model", report["after"]),
     )
-    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}" for name, entry in entries)
+    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_share(entry)}" for name, entry in entries)
     return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
+
+
+def _share(entry: Mapping[str, Any]) -> str:
+    """How much of the torque's variance an account explains; nothing where the torque does not vary."""
+    found = entry.get("heldout_explained")
+    return "" if found is None else f" (explains {100.0 * found:.3g} % of the variance)"
 
 
 def replays(replay: Mapping[str, Any]) -> str:

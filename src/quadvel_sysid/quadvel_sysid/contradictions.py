@@ -9,6 +9,8 @@ from .baselines import SPAN
 
 FAR = 1.0
 """rad; a replay that strays so far from the measured angles shows nothing of the model."""
+HALF = 0.5
+"""Share of the torque's variance that a model explains at least where the torque is that of the drive."""
 WORTH = 1.05
 """Times the error of what needs no model, below which a model is as good."""
 
@@ -26,6 +28,12 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
                 f"{what} leaves less of the held-out torque, {other:.3g} N^2 m^2, than the corrected model, "
                 f"{after['heldout_mse']:.3g}: what was named is not what the joints do"
             )
+    share = after.get("heldout_explained")
+    if share is not None and share < HALF:
+        yield (
+            f"the corrected model explains {100.0 * share:.0f} % of the torque's variance, less than half: what moves it "
+            "is not known, and what was named is not to be trusted before it is"
+        )
     if after.get("heldout_q_rms_rad", 0.0) > FAR:
         yield (
             f"replayed, the commands lead {after['heldout_q_rms_rad']:.3g} rad away from the measured angles: look at the signs, "

@@ -11,6 +11,7 @@ import numpy as np
 from quadvel_actuator.effects.terms import NAME as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
 
+from .baselines import explained, torque_variance
 from .confidence import Intervals
 from .corrected import (
     acting_joints,
@@ -115,6 +116,9 @@ def _report(o: Outcome) -> dict[str, Any]:
         }
         for name, error in errors.items()
     }
+    variance = torque_variance(samples.tau, parts.report)
+    for entry in mses.values():
+        entry["heldout_explained"] = explained(entry["heldout_mse"], variance)
     for name in ("before", "after"):
         mses[name]["per_joint"] = [
             mean_square(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))
@@ -125,6 +129,7 @@ def _report(o: Outcome) -> dict[str, Any]:
         "joints": list(samples.joints),
         "units": UNITS,
         "noise_floor": floor,
+        "heldout_variance": variance,
         "pd": mses["pd"],
         "before": mses["before"]
         | {

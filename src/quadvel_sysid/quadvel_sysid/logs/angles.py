@@ -12,18 +12,15 @@ import numpy as np
 
 from quadvel_description.robot import JOINT_NAMES
 
-from .channels import DEGREE, MOVING, REACHES, TURN, names, rows_of, slope_of_q
+from .channels import DEGREE, MOVING, REACHES, TURN, names, rows_of, slope_of
 from .findings import Finding, Kind, some
 from .log import Array, Bools, Log
 from .response import measured
 from .slopes import smoothed, tick
+from .torque import unsigned
 
 WRAPPED = 1.0
 """rad, how far a step from row to row may be off a full turn: 50 rad/s at 50 Hz."""
-BOTH_WAYS = 0.05
-"""Share of the rows in which a signed quantity has the rarer of its signs, where it goes both ways."""
-DOWN_TO_ZERO = 0.1
-"""Of its usual largest size: what a quantity comes below in one row of twenty where it comes down to 0."""
 ALIKE, OFF = 0.95, 1.4
 """Correlation of dq with the slope of q from which their ratio is a unit, and how far, as a factor, that may be off 1."""
 UNLIKE = 0.3
@@ -71,37 +68,10 @@ def wrapped(log: Log) -> Iterator[Finding | Log]:
         return
 
 
-def unsigned(values: Array, twin: Array) -> Bools:
-    """Joints (J,) whose `values` never change their sign although they come down to 0 and their `twin` has both signs."""
-    size = np.abs(values)
-    one_way = ((values >= 0.0).all(axis=0) | (values <= 0.0).all(axis=0)) & (np.ptp(values, axis=0) > 0.0)
-    touches = np.percentile(size, 5, axis=0) < DOWN_TO_ZERO * np.percentile(size, 95, axis=0)
-    scale = 0.1 * np.sqrt(np.mean(twin**2, axis=0))
-    both = np.minimum((twin > scale).mean(axis=0), (twin < -scale).mean(axis=0)) > BOTH_WAYS
-    return np.asarray(one_way & touches & both)
-
-
-def sign_of_torque(log: Log) -> Iterator[Finding]:
-    """Torque without its sign: never negative, although the position error has both signs."""
-    if log.tau is None:
-        return
-    row = rows_of(log)
-    error = np.asarray(log.q_des[log.command_rows(log.t[row])] - log.q[row], dtype=float)
-    error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURNS)
-    hit = unsigned(np.asarray(log.tau[row], dtype=float), error)
-    if hit.any():
-        joints = names(log, hit)
-        text = (
-            f"tau: has no sign on {some(joints)}: it never changes its sign, though it comes down to 0 and the position error "
-            "goes both ways; expected a torque with its sign (leave it out if only its magnitude is measured)"
-        )
-        yield Finding("refusal", "tau", joints, text)
-
-
 def speed(log: Log) -> Iterator[Finding | Log]:
     """Speeds that are not there, have no sign, are not the slope of q, or are the difference of coarse angles: made anew."""
     row = rows_of(log)
-    slope, dq = slope_of_q(log, row), np.asarray(log.dq[row], dtype=float)
+    slope, dq = slope_of(log, log.q, row), np.asarray(log.dq[row], dtype=float)
     moving = (np.minimum(_size(slope), _size(dq)) > MOVING) & (np.ptp(log.q, axis=0) > REACHES)
     coarse = tick(log.q)
     size = some([f"{1e3 * step:.3g}" for step in dict.fromkeys(np.round(coarse[coarse > 0.0], 7))], 2)
@@ -155,7 +125,7 @@ def _is_difference(log: Log) -> Bools:
 def units(log: Log) -> Iterator[Finding]:
     """What dq is beside the slope of q: nothing, a multiple of it, its opposite, or something else."""
     row = rows_of(log)
-    slope, dq = slope_of_q(log, row), np.asarray(log.dq[row], dtype=float)
+    slope, dq = slope_of(log, log.q, row), np.asarray(log.dq[row], dtype=float)
     turning, size, alike = _size(slope), _size(dq), _alike(slope, dq)
     moving = (size > MOVING) & (np.ptp(log.q, axis=0) > REACHES)
     ratio = alike * turning / (size + 1e-12)
@@ -191,18 +161,17 @@ def degrees(log: Log) -> Iterator[Finding]:
     row = rows_of(log)
     q = np.asarray(log.q[row], dtype=float)
     q_des = np.asarray(log.q_des[log.command_rows(log.t[row])], dtype=float)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = float(np.sqrt(np.mean(q_des**2) / np.mean(q**2)))
-        shares = (("q_des", "q", ratio), ("q", "q_des", 1.0 / ratio))
-    for field, other, share in shares:
+    size, asked = (float(np.sqrt(np.mean(x**2))) for x in (q, q_des))
+    for field, other, large, small in (("q_des", "q", asked, size), ("q", "q_des", size, asked)):
+        share = large / small if small > 0.0 else np.inf
         if 25.0 < share < 130.0:
             text = f"{field}: about {share:.0f} times as large as {other}: degrees? expected rad in both"
             yield Finding("refusal", field, (), text)
             return
-    large = np.percentile(np.abs(q), 95, axis=0)
-    if (joints := names(log, large > TURNS)) and set(log.joints) <= set(JOINT_NAMES):
-        text = f"q: up to {large.max():.0f} on {some(joints)}: degrees? expected rad"
+    most = np.percentile(np.abs(q), 95, axis=0)
+    if (joints := names(log, most > TURNS)) and set(log.joints) <= set(JOINT_NAMES):
+        text = f"q: up to {most.max():.0f} on {some(joints)}: degrees? expected rad"
         yield Finding("refusal", "q", joints, text)
     elif joints:
-        text = f"q: up to {large.max():.0f} on {some(joints)}; expected rad"
+        text = f"q: up to {most.max():.0f} on {some(joints)}; expected rad"
         yield Finding("warning", "q", joints, text)

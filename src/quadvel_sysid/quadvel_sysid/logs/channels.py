@@ -34,11 +34,11 @@ def rows_of(log: Log) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, len(log.t) - 1, min(ROWS, len(log.t))).astype(np.intp))
 
 
-def slope_of_q(log: Log, row: NDArray[np.intp]) -> Array:
-    """(rows, J) rad/s, over HALF_WIDTH to either side."""
+def slope_of(log: Log, values: Array, row: NDArray[np.intp]) -> Array:
+    """Slope of `values` (N, J) at `row`, (rows, J) a second, over HALF_WIDTH to either side."""
     reach = max(1, round(HALF_WIDTH / log.period))
     first, last = np.maximum(row - reach, 0), np.minimum(row + reach, len(log.t) - 1)
-    return np.asarray((log.q[last] - log.q[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
+    return np.asarray((values[last] - values[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
 
 
 def names(log: Log, hit: Bools) -> tuple[str, ...]:

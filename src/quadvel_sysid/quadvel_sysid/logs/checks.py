@@ -12,7 +12,7 @@ from typing import Any
 
 import attrs
 
-from . import angles, channels, response, separability, stamps
+from . import angles, channels, clocks, commands, response, separability, stamps, torque
 from .findings import Finding
 from .log import GAP, Log, LogError
 from .pd_control import explainable, masked
@@ -51,8 +51,6 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     for check in OF_ROWS:
         log = _looked(check, findings, log)
-    if not _refused(findings) and (found := response.measured(log, response.FAR)):
-        log = _looked(OF_CLOCKS, findings, log, found)
     if _refused(findings):
         return Inspection(log, tuple(findings))
     answer = log.without_feed_forward()
@@ -93,10 +91,12 @@ OF_ROWS = (
     Check(angles.wrapped, "steps of q from one row to the next, rad off a full turn", f"{angles.WRAPPED:g}",
           "unwrapped, with a warning"),
     Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
-          f"each sign in {angles.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
+          f"each sign in {torque.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
           "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(angles.sign_of_torque, "share of the rows with the rarer sign of the position error, where tau has one and reaches 0",
-          f"{angles.BOTH_WAYS:.0%}", "refusal"),
+    Check(torque.spikes, "how far rows of tau stand off the rows around and off what a PD law explains, standard deviations",
+          f"{torque.FAR:g} in both", "left out, with a warning"),
+    Check(torque.sign, "tau of one sign that reaches 0: the error that the size of what a PD law asks for leaves, over that of the "
+          "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),
     Check(angles.units, "slope of q over dq, and their correlation",
           f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
     Check(angles.degrees, "size of q_des over that of q; size of q, rad", f"25 to 130; {angles.TURNS:g}", "refusal"),
@@ -104,23 +104,23 @@ OF_ROWS = (
     Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
     Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
     Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
+    Check(commands.constant, "where q_des never changes though q does: share of the torque that a "
+          "PD law about it leaves; share of the rest that the angle explains",
+          f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints, or without torque, a refusal"),
+    Check(clocks.clock, "lag from command to torque (without torque, to the acceleration) that leaves least, s; what it leaves "
+          f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
+          f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; "
+          f"{clocks.STANDARD_ERRORS:g}",
+          "refusal"),
     Check(channels.gains, "kp and kd: there, constant, not negative", "0", "note; refusal of negative ones"),
 )  # fmt: skip
 """What is asked of all rows."""
-
-OF_CLOCKS = Check(
-    response.clock, "lag from command to torque that leaves least, s; what it leaves over what one near 0 leaves",
-    f"{response.REACH:g} s; {response.BETTER:g}", "refusal",
-)  # fmt: skip
-"""What is asked of all rows of a log with torque, whatever the drives did."""
 
 OF_RESPONSE = (
     Check(response.columns, "share of the torque left by the best order of joints, over that left by the order as it is",
           f"{response.BETTER:g} on two joints or more whose commands differ (correlation below {response.SAME:g})", "refusal"),
     Check(response.signs, "partial correlation of torque and own command, beside the joint's angle, speed and direction",
           f"below {-response.SURE:g}", "refusal: which of q, q_des and tau has the opposite sign"),
-    Check(response.early, "lag from command to torque that leaves least, s; what it explains more than the best one from 0 on, "
-          f"in standard errors over pieces of {response.PIECE:g} s", f"0; {response.EARLY:g}", "refusal"),
     Check(response.deaf, "share of the torque, beside speed and friction, that the position error explains",
           f"{response.UNANSWERED:.0%}", "warning; on all joints a refusal"),
     Check(response.scale, "gain that the torque shows over the one commanded, of the position error and of the command alone",
@@ -143,7 +143,7 @@ OF_MOTION = (
 def table() -> str:
     """All checks in their order, as Markdown."""
     lines = ["| check | measured | limit | then |", "|---|---|---|---|"]
-    for check in (*OF_ROWS, OF_CLOCKS, *OF_RESPONSE, *OF_MOTION):
+    for check in (*OF_ROWS, *OF_RESPONSE, *OF_MOTION):
         asks = str(check.look.__doc__).partition("\n")[0].rstrip(".")
         lines.append(f"| {asks} | {check.measures} | {check.limit} | {check.then} |")
     return "\n".join(lines)

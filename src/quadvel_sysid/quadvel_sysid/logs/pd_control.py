@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from .findings import Finding, some
 from .log import Array, Bools, Log
+from .response import motion
 
 BIN = 0.02  # s
 WINDOW = 5  # bins
@@ -26,6 +27,10 @@ MARGIN = 0.1  # s, on both sides of it
 LEAST_VALID = 0.5  # s, of states that a model may be judged on
 LAGS = np.arange(0.0, 0.021, 0.004)  # s, between the position error and its torque
 ENOUGH = 40_000  # rows, of which the lag is read
+FITTED, LEAST_ROWS = 4000, 200
+"""Rows that a law of the joints under PD control is fitted to, at most and at least."""
+AS_ELSEWHERE = 9.0
+"""Times its mean squared error elsewhere, within which such a law holds in a stretch, too."""
 
 
 def explainable(log: Log) -> tuple[Bools, list[Finding]]:
@@ -125,9 +130,11 @@ def _unanswered(log: Log) -> Bools:
     # A window that tells nothing, as the error is small there, is taken to be like the one before.
     last = np.maximum.accumulate(np.where(tells, np.arange(len(gain)), -1))
     lost = ((last >= 0) & (gain[last] < LOST * usual))[bins]
+    left = _left_elsewhere(log, lost) if lost.any() else None
     for first, stop in stretches(lost, log.t, SHORTEST):
         there = (log.t >= first) & (log.t <= stop)
-        if _follows(log, there, lag) >= LOST * usual:
+        explained = left is not None and np.mean(left[there]) < AS_ELSEWHERE
+        if explained or _follows(log, there, lag) >= LOST * usual:
             lost &= ~there
     return _widened(lost, log.t)
 
@@ -146,6 +153,38 @@ def _follows(log: Log, rows: Bools, lag: float) -> float:
         products += x @ (tau - tau @ level)
     found: Array = np.linalg.lstsq(squares, products, rcond=1e-3)[0]
     return float(found[0])
+
+
+def _left_elsewhere(log: Log, lost: Bools) -> Array | None:
+    """Squared error (N,) of a PD law of each joint with friction and an offset, over its mean where it was fitted: not in `lost`.
+
+    None where that is too short. Where such a law holds within `lost` as well, the drives were under PD control there: friction, or
+    a load that turns against a small position error, only looks like a gain of 0.
+    """
+    fitted = np.flatnonzero(~lost)
+    fitted = fitted[:: max(1, len(fitted) // FITTED)]
+    if len(fitted) < LEAST_ROWS:
+        return None
+    left = [
+        min((_left_by(log, j, fitted, lag) for lag in LAGS), key=lambda x: float(x[fitted].mean()))
+        for j in range(len(log.joints))
+    ]
+    return np.asarray(np.mean([one / (one[fitted].mean() + 1e-12) for one in left], axis=0))
+
+
+def _left_by(log: Log, j: int, fitted: NDArray[np.intp], lag: float) -> NDArray[np.float64]:
+    """Squared error (N,) of the law of one joint, `lag` s after its signals; 0 in rows that do not count."""
+    assert log.tau is not None
+    row = np.maximum(np.searchsorted(log.t, log.t - lag, side="right") - 1, 0)
+    command = log.command_rows(log.t[row])
+    kp, kd = (1.0 if gain is None else np.asarray(gain)[command, j] for gain in (log.kp, log.kd))
+    q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
+    speed = [] if log.dq_des is None else [log.dq_des[command, j]]
+    signals = (kp * (log.q_des[command, j] - q), kd * -dq, q - q.mean(), *motion(dq).T, *speed)
+    law, tau = np.stack(signals, axis=1), np.asarray(log.tau[:, j], dtype=float)
+    use = fitted[log.valid[fitted, j]]
+    weights = np.linalg.lstsq(law[use], tau[use], rcond=1e-9)[0]
+    return np.asarray(log.valid[:, j] * (tau - law @ weights) ** 2)
 
 
 def _answers(log: Log, rows: NDArray[np.intp], lag: float) -> Iterator[tuple[Array, Array, Array, Array]]:

@@ -22,8 +22,6 @@ ROWS = 4000
 """Rows that are looked at, spread over the log."""
 LAG_STEP, REACH = 0.002, 0.1
 """s between the lags that are looked at, a row of the log at least, and how far they go to either side."""
-FAR = 1.0
-"""s, how far clocks are looked at that differ."""
 ROUNDING = 1e-9
 """s, by which a command may be later than the instant at which it counts, a sum of rounded numbers."""
 AT_REST = 0.05
@@ -38,10 +36,6 @@ BETTER = 0.3
 """A second account must leave less than this share of what the first one leaves, to be preferred on one joint."""
 UNANSWERED = 0.1
 """Share of the torque that speed and friction leave, explained by the position error: usually 0.97, in 1 % below 0.05."""
-EARLY = 4.0
-"""Standard errors by which an answer before its command must explain more; one log in ninety is 2 ms early, by less."""
-PIECE = 0.1
-"""s of motion that count as one piece of evidence."""
 SAME = 0.95
 """Correlation from which two commands are one, and no order of columns can be told."""
 FAR_OFF = 8.0
@@ -61,57 +55,48 @@ class Response:
     gain: Array  # (J,) N m/rad, of the position error
     command_gain: Array  # (J,) N m/rad, of the command beside the angle: springs leave it as it is
     answer: Array  # (J,), share that the position error explains of what speed and friction leave
-    errors: Array  # (L, R), squared errors over each joint's variance, summed over the joints
 
     @property
     def best(self) -> Array:
-        """(J,), what each joint's best lag within REACH leaves."""
-        return np.asarray(self.left[np.abs(self.lags) <= REACH + 1e-9].min(axis=0))
+        """(J,), what each joint's best lag leaves."""
+        return np.asarray(self.left.min(axis=0))
 
 
-def measured(log: Log, reach: float = REACH) -> Response | None:
-    """The response in the valid rows of a log with torque, at lags up to `reach` (s); None where that is too short.
-
-    Where they go beyond REACH, they are looked at on fewer rows: clocks that differ show on all.
-    """
-    log, rows = log.without_feed_forward(), ROWS if reach <= REACH else ROWS // 4
-    step = max(LAG_STEP * ROWS / rows, log.period)
+def measured(log: Log) -> Response | None:
+    """The response in the valid rows of a log with torque, at lags up to REACH; None where that is too short."""
+    log = log.without_feed_forward()
+    step = max(LAG_STEP, log.period)
     known = (log.t > log.t_cmd[0] + REACH) & (log.t < log.t_cmd[-1] - REACH)
     row = np.flatnonzero(log.valid.any(axis=1) & known)
-    row = row[:: max(1, len(row) // rows)]
+    row = row[:: max(1, len(row) // ROWS)]
     if log.tau is None or len(row) < 50:
         return None
-    lags = step * np.arange(-int(reach / step + 0.5), int(reach / step + 0.5) + 1)
+    lags = step * np.arange(-int(REACH / step + 0.5), int(REACH / step + 0.5) + 1)
     at = [log.command_rows(log.t[row] - lag + ROUNDING) for lag in lags]
-    near, joints = np.abs(lags) <= REACH + 1e-9, len(log.joints)
-    left, errors = np.empty((len(lags), joints)), np.zeros((len(lags), len(row)))
-    found = np.empty((5, joints))
-    for j in range(joints):
-        misses, found[:, j] = _of_joint(log, row, at, j, near)
-        left[:, j] = misses.mean(axis=1)
-        errors += misses
-    command, angle, gain, command_gain, answer = found
-    return Response(log, row, lags, left, command, angle, gain, command_gain, answer, errors)
+    left, found = np.empty((len(lags), len(log.joints))), np.empty((5, len(log.joints)))
+    for j in range(len(log.joints)):
+        left[:, j], found[:, j] = _of_joint(log, row, at, j)
+    return Response(log, row, lags, left, *found)
 
 
 def _of_joint(
-    log: Log, row: NDArray[np.intp], at: Sequence[NDArray[np.intp]], j: int, near: Bools
+    log: Log, row: NDArray[np.intp], at: Sequence[NDArray[np.intp]], j: int
 ) -> tuple[Array, tuple[float, float, float, float, float]]:
-    """Squared errors (L, R) of joint `j`, and `command`, `angle`, `gain`, `command_gain`, `answer` of `Response`.
+    """`left` (L,) of joint `j`, and `command`, `angle`, `gain`, `command_gain`, `answer` of `Response`.
 
-    `at` are the command rows of each lag, `near` the lags within REACH.
+    `at` are the command rows of each lag.
     """
     assert log.tau is not None
     q, dq, tau = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq, log.tau))
     commands = np.stack([np.asarray(log.q_des[k, j], dtype=float) for k in at], 1)
     variance = float(np.var(tau)) + 1e-12
-    y, p, c = (_without(_motion(dq), x) for x in (tau, q, commands))
+    y, p, c = (_without(motion(dq), x) for x in (tau, q, commands))
     # With the angle taken out of torque and commands.
     beside, of_c = _residual(y, p), c - np.outer(p, p @ c) / (p @ p + 1e-12)
     size = np.sqrt(np.sum(of_c**2, axis=0)) + 1e-9 * np.sqrt(len(row))
     r = beside @ of_c / size / (np.linalg.norm(beside) + 1e-12)
     # Waves answer with either sign, half a period apart: the opposite one has to explain clearly more.
-    right, opposite = (int(np.argmax(np.where(near, sign * r, -1.0))) for sign in (1.0, -1.0))
+    right, opposite = (int(np.argmax(sign * r)) for sign in (1.0, -1.0))
     k = opposite if 1.0 - r[opposite] ** 2 < BETTER * (1.0 - max(r[right], 0.0) ** 2) else right
     other = _residual(p, c[:, k])
     angle = float(other @ _residual(y, c[:, k]) / (np.linalg.norm(other) * np.linalg.norm(y) + 1e-12))
@@ -120,10 +105,10 @@ def _of_joint(
     command_gain = float(beside @ of_c[:, k] / size[k] ** 2)
     answer = float((error @ y) ** 2 / ((error @ error) * (y @ y) + 1e-12))
     misses = (beside[:, None] - of_c * (beside @ of_c / size**2)) ** 2 / variance
-    return misses.T, (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
+    return misses.mean(axis=0), (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
 
 
-def _motion(dq: Array) -> Array:
+def motion(dq: Array) -> Array:
     """What of the torque the motion explains beside the angle: speed, friction and an offset, (R, 3)."""
     return np.stack([dq, np.tanh(dq / AT_REST), np.ones(len(dq))], 1)
 
@@ -187,7 +172,7 @@ def _left(found: Response, j: int, k: int, m: int) -> float:
     shares = []
     for lag in (0.0, 0.006, 0.012):
         q_des = np.asarray(log.q_des[log.command_rows(log.t[row] - lag + ROUNDING), k], dtype=float)
-        y, error = (_without(_motion(dq), x) for x in (tau, q_des - q))
+        y, error = (_without(motion(dq), x) for x in (tau, q_des - q))
         shares.append(float(np.var(_residual(y, error) if error @ y > 0.0 else y) / (np.var(tau) + 1e-12)))
     return min(shares)
 
@@ -212,53 +197,21 @@ def _other_order(log: Log, field: str, what: str, told: NDArray[np.intp], order:
     return Finding("refusal", field, tuple(log.joints[j] for j in told), text)
 
 
-def clock(log: Log, found: Response) -> Iterator[Finding]:
-    """Torque that answers commands of another time altogether: t and t_cmd are not of one clock."""
-    total = np.median(found.left, axis=1)
-    best = int(np.argmin(total))
-    least, lag = float(total[np.abs(found.lags) <= REACH + 1e-9].min()), float(found.lags[best])
-    if abs(lag) > REACH + 1e-9 and total[best] < min(BETTER * least, CLEAR):
-        way = f"{lag:.2f} s after" if lag > 0.0 else f"{-lag:.2f} s before"
-        text = (
-            f"t_cmd: the torque answers commands {way} they were sent (it leaves {100 * total[best]:.0f} % of the torque, near no "
-            f"lag {100 * least:.0f} %); expected t and t_cmd on one clock"
-        )
-        yield Finding("refusal", "t_cmd", (), text)
-
-
-def early(log: Log, found: Response) -> Iterator[Finding]:
-    """Torque that comes before its command: by the lag that leaves least."""
-    total = np.where(np.abs(found.lags) <= REACH + 1e-9, np.mean(np.log(found.left + 1e-6), axis=1), np.inf)
-    best, nearest = int(np.argmin(total)), int(np.argmin(np.where(found.lags >= -1e-9, total, np.inf)))
-    leads = log.dq_des is not None and log.kd is None  # by as much as nobody knows
-    if leads or found.lags[best] >= -1e-9 or np.median(found.left[best]) > CLEAR:
-        return
-    if (found.left[best] > BETTER * found.left[nearest]).all():
-        return  # play, for one, goes with commands to come nearly as well as with those that it answers
-    _, piece = np.unique((found.log.t[found.row] / PIECE).astype(np.intp), return_inverse=True)
-    gain = np.bincount(piece, found.errors[nearest] - found.errors[best])
-    if gain.sum() < EARLY * np.sqrt(np.sum((gain - gain.mean()) ** 2) + 1e-12):
-        return
-    left = [100.0 * float(np.median(found.left[k])) for k in (best, nearest)]
-    text = (
-        f"t_cmd: the torque comes {-1e3 * found.lags[best]:.0f} ms before its command (that leaves {left[0]:.2g} % of the torque, "
-        f"a lag that a drive can have {left[1]:.2g} %); expected each command at the time it was sent: is it logged a step late?"
-    )
-    yield Finding("refusal", "t_cmd", (), text)
-
-
 def deaf(log: Log, found: Response) -> Iterator[Finding]:
     """Torque that has nothing to do with the position error."""
+    used = log.valid[found.row].any(axis=0)
     lost = found.answer < UNANSWERED
     moves = np.ptp(log.q[found.row], axis=0) > REACHES
-    if lost.all():
+    if (lost | ~used).all():
+        rests = np.ptp(log.q_des, axis=0) < REACHES
+        never = f"q_des never changes on {some(names(log, rests))}, and tau " if rests.any() else ""
         text = (
-            f"tau: does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it at "
-            "most); expected q_des, q and tau of the same joints, with the same signs"
+            f"tau: {never}does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it "
+            "at most); expected q_des, q and tau of the same joints, with the same signs"
         )
         yield Finding("refusal", "tau", log.joints, text)
-    elif (lost & moves).any():
-        joints = names(log, lost & moves)
+    elif (lost & moves & used).any():
+        joints = names(log, lost & moves & used)
         text = f"tau: does not answer the position error on {some(joints)}: what is found there is not to be trusted"
         yield Finding("warning", "tau", joints, text)
 
@@ -279,7 +232,10 @@ def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
     known = [unit for unit, factor in _UNITS_OF_TORQUE if abs(np.log(number / factor)) < np.log(1.5)]
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
-        text = f"tau: {number:.3g} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
+        size = f"{number:.3g}" if number < 100.0 else f"{number:.2g}"
+        text = (
+            f"tau: {size} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
+        )
         yield Finding("refusal", "tau", joints, text)
         return
     text = (

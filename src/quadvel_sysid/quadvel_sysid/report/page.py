@@ -109,11 +109,11 @@ def _tiles(report: Mapping[str, Any]) -> str:
     unit = f"{report['units'].get('mse', 'N² m²')}, held out"
     return tiles(
         [
-            (number(report["pd"]["heldout_mse"]), f"ideal PD, {unit}"),
-            (number(before["heldout_mse"]), f"plain EAM, {unit}"),
-            (number(report["baselines"]["joint_pd"]["heldout_mse"]), "a PD law of each joint"),
-            (number(report["baselines"]["ridge"]["heldout_mse"]), "a linear filter over 16 ms"),
-            (number(after["heldout_mse"]), f"corrected model, {unit}"),
+            _error(report["pd"], f"ideal PD, {unit}"),
+            _error(before, f"plain EAM, {unit}"),
+            _error(report["baselines"]["joint_pd"], "a PD law of each joint"),
+            _error(report["baselines"]["ridge"], "a linear filter over 16 ms"),
+            _error(after, f"corrected model, {unit}"),
             (number(report["noise_floor"]), "noise floor, N² m²"),
             (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM"),
             (
@@ -122,6 +122,13 @@ def _tiles(report: Mapping[str, Any]) -> str:
             ),
         ]
     )
+
+
+def _error(entry: Mapping[str, Any], name: str) -> tuple[str, str]:
+    """A tile of a held-out error and the share of the torque's variance that it leaves explained."""
+    share = entry.get("heldout_explained")
+    explained = "" if share is None else f"; explains {number(100.0 * share)} % of the torque's variance"
+    return number(entry["heldout_mse"]), name + explained
 
 
 def _joints(identification: Identification) -> str:

@@ -1,0 +1,83 @@
+"""Drives drawn at random: a healthy log is used whole and in silence, a faulty one is named for its cause."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import attrs
+import numpy as np
+import pytest
+
+from quadvel_sysid.logs.checks import Inspection, inspect
+from quadvel_sysid.logs.findings import Finding
+
+sys.path.insert(0, str(Path(__file__).parent))
+from drawn_logs import as_log, drawn, of_torque_commands, with_spikes
+
+SEEDS = (1, 3)
+
+
+def found(inspection: Inspection) -> list[Finding]:
+    """Refusals and warnings, but those of what a motion cannot tell apart."""
+    return [one for one in inspection.findings if one.kind != "note" and "separable" not in one.text]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("stiff", [False, True])
+def test_of_a_healthy_log_every_row_is_used_and_nothing_is_said(seed: int, stiff: bool) -> None:
+    inspection = inspect(as_log(drawn(seed, stiff)))
+    assert found(inspection) == []
+    assert inspection.log.valid.all()
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_offset_that_keeps_a_torque_on_one_side_is_no_lost_sign(sign: float) -> None:
+    log = as_log(drawn(1))
+    assert log.tau is not None
+    lifted = log.tau - sign * (sign * log.tau).min(axis=0)
+    assert found(inspect(attrs.evolve(log, tau=lifted))) == []
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("lead", [0.07, 1.4, 4.0, -0.3, -2.0])
+def test_commands_of_another_time_are_refused_as_another_clock(seed: int, lead: float) -> None:
+    (one,) = found(inspect(as_log(drawn(seed, lead=lead))))
+    assert (one.kind, one.field) == ("refusal", "t_cmd")
+
+
+def test_commands_of_another_time_show_in_the_motion_alone() -> None:
+    log = attrs.evolve(as_log(drawn(3, lead=1.4)), tau=None)
+    refused = [one.field for one in found(inspect(log)) if one.kind == "refusal"]
+    assert "t_cmd" in refused
+
+
+@pytest.mark.parametrize(("share", "size"), [(0.002, 100.0), (0.02, 10.0), (0.1, 5.0)])
+def test_spikes_in_the_torque_are_left_out_and_named(share: float, size: float) -> None:
+    log = as_log(drawn(1))
+    spiky, rows = with_spikes(log, share, size, seed=0)
+    inspection = inspect(spiky)
+    (one,) = found(inspection)
+    assert (one.kind, one.field) == ("warning", "tau")
+    out = ~inspection.log.valid
+    assert out[rows].mean() > 0.8
+    assert out[~rows].mean() < 0.005
+
+
+@pytest.mark.parametrize("command", [0.0, 0.3])
+@pytest.mark.parametrize("torque", [True, False])
+def test_a_log_whose_commands_rest_while_all_joints_move_is_refused(command: float, torque: bool) -> None:
+    log = of_torque_commands(as_log(drawn(1)), np.array([True, True, True]), command, seed=0)
+    (one,) = [
+        one for one in found(inspect(log if torque else attrs.evolve(log, tau=None))) if one.kind == "refusal"
+    ]
+    assert one.field == "q_des"
+
+
+def test_joints_whose_commands_rest_while_they_move_are_left_out() -> None:
+    rests = np.array([False, True, False])
+    inspection = inspect(of_torque_commands(as_log(drawn(1)), rests, 0.0, seed=0))
+    (one,) = found(inspection)
+    assert (one.kind, one.field, one.joints) == ("warning", "q_des", ("1_joint",))
+    np.testing.assert_array_equal(inspection.log.valid.all(axis=0), ~rests)
+    np.testing.assert_array_equal(inspection.log.valid.any(axis=0), ~rests)
