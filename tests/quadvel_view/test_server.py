@@ -13,6 +13,7 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from quadvel_view.server import AddressError, PageServer
+from quadvel_view.words import LetGo, Stop
 
 
 @pytest.fixture
@@ -78,7 +79,7 @@ def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
     until = time.monotonic() + 10.0
     while "left" not in heard and time.monotonic() < until:
         time.sleep(0.01)
-    assert heard == [{"do": "stop"}, {"do": "let_go"}, "left"]
+    assert heard == [Stop(), LetGo(), "left"]
 
 
 def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:

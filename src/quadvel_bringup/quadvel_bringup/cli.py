@@ -263,9 +263,8 @@ def reset(
     """Put the simulated robot back to where it started, or on other ground.
 
     \b
-    After a fall:
+    After a fall, or from any mode:
       quadvel reset
-      quadvel mode passive
       quadvel mode stand_up
     On a slope of 10 degrees that rises ahead:
       quadvel reset --terrain slope --slope 0.175

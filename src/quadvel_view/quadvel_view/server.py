@@ -33,11 +33,12 @@ from websockets.exceptions import ConnectionClosed
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
+from .words import Word, WordError, read_word
+
 COOKIE = "quadvel_view"
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE, WORDS = "/scene", "/words"
-LARGEST_WORD = 4096  # bytes that a page says at once
 LOOPBACK = "http://127.0.0.1:* http://localhost:*"
 # What a browser may load for our pages: nothing from any other host. viser's page is one file that unpacks itself.
 POLICY = (
@@ -96,7 +97,7 @@ def is_loopback(host: str) -> bool:
 class PageServer:
     """Serves from the time it is made until `close`, in a thread of its own.
 
-    on_word: called there with the number of a page and what it said (an object of JSON); on_leave: with that of one that left.
+    on_word: called there with the number of a page and what it said; on_leave: with that of one that left.
     scene: the port of viser on the loopback interface. Raises AddressError where address and port can't be listened on.
     """
 
@@ -105,7 +106,7 @@ class PageServer:
         host: str,
         port: int,
         scene: int,
-        on_word: Callable[[int, dict[str, Any]], None],
+        on_word: Callable[[int, Word], None],
         on_leave: Callable[[int], None],
     ) -> None:
         self._host, self._port, self._scene = host, port, scene
@@ -210,11 +211,9 @@ class PageServer:
         self._pages.add(connection)
         try:
             async for text in connection:
-                word = _word(text)
-                if word is None:
-                    await connection.close(1008, "not understood")
-                else:
-                    self._on_word(page, word)
+                self._on_word(page, read_word(text))
+        except WordError as error:
+            await connection.close(1008, str(error))
         except ConnectionClosed:
             pass
         finally:
@@ -239,17 +238,6 @@ async def _hand_on(source: Any, sink: Any) -> None:
             await sink.send(message)
     except ConnectionClosed:
         return
-
-
-def _word(text: str | bytes) -> dict[str, Any] | None:
-    """What a page said, or None where it makes no sense."""
-    if len(text) > LARGEST_WORD:
-        return None
-    try:
-        word = json.loads(text)
-    except ValueError:
-        return None
-    return word if isinstance(word, dict) else None
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes) -> Response:

@@ -14,6 +14,7 @@ from .panel import panel
 from .picture import RobotPicture
 from .scene import Scene
 from .server import PageServer
+from .words import Word
 
 FRAME = 1.0 / 30.0
 """s, between two pictures"""
@@ -28,7 +29,7 @@ class Viewer:
         self,
         host: str,
         port: int,
-        on_word: Callable[[int, dict[str, Any]], None],
+        on_word: Callable[[int, Word], None],
         on_leave: Callable[[int], None],
     ) -> None:
         with redirect_stdout(StringIO()):  # viser tells of its own address, which is nobody's business

@@ -223,7 +223,8 @@ LEGS.forEach((leg) => {
 draggable("pad", true);
 draggable("strafe", false);
 $("stop").addEventListener("click", () => { letGo(); stopOrRelease(); });
-document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, to: one.dataset.to, terrain: $("ground").value })));
+const FIELDS = { reset: () => ({ terrain: $("ground").value }), push: (button) => ({ to: button.dataset.to }) };  // of the words that have some
+document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, ...FIELDS[one.dataset.do]?.(one) })));
 $("speed").addEventListener("input", () => { $("top").textContent = `${Number($("speed").value).toFixed(1)} m/s`; });
 $("speed").dispatchEvent(new Event("input"));
 $("play").addEventListener("click", () => say({ do: "play" }));
