@@ -74,15 +74,13 @@ def test_a_fault_is_the_first_lamp_and_a_silent_node_is_told() -> None:
     picture.take("/controller/state", state, 9.0)
     lamps = panel(picture, Operator(), 9.1)["lamps"]
     assert lamps[0] == {"name": "tilted", "level": "error", "text": "it fell"}
-    assert {"name": "estimator", "level": "stale", "text": "says nothing any more"} in lamps
+    assert {"name": "estimator", "level": "stale", "text": "no diagnostics for 3 s"} in lamps
     assert panel(picture, Operator(), 10.5)["mode"] == ""
 
 
 def test_feet_stand_on_the_ground_that_there_is() -> None:
     picture = RobotPicture()
-    assert picture.floor()[1] == pytest.approx(
-        0.0, abs=1e-3
-    )  # in the nominal posture at the nominal height
+    assert picture.floor()[1] == pytest.approx(0.0, abs=1e-3)  # in the nominal posture at the nominal height
     corners = [(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0)]
     points = [message("geometry_msgs/msg/Point", x=x, y=y, z=0.1) for x, y in corners]
     picture.take("/ground", message("visualization_msgs/msg/Marker", type=11, points=points), 0.0)

@@ -3,12 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from typing import Any
 
 from quadvel_description import robot
 
-from .operator import Operator
-from .picture import RobotPicture
+from .operator import BRAKING, PERIOD, Operator
+from .picture import FRESH, RobotPicture
+
+SOURCES = {"/controller/state": "controller", "/command": "command mux", "/joint_states": "robot"}
+"""Topics that come all the time, and who publishes them"""
+OWN_SOURCE = "teleop"
+"""the command mux's name for what the page commands"""
+IN_EFFECT = 0.5
+"""s after which a velocity that is held should be followed"""
 
 
 def panel(picture: RobotPicture, operator: Operator, now: float) -> dict[str, Any]:
@@ -16,8 +24,8 @@ def panel(picture: RobotPicture, operator: Operator, now: float) -> dict[str, An
     alive = picture.is_fresh("/controller/state", now) and picture.state is not None
     return {
         "mode": picture.state.mode_name if alive else "",
-        "reason": picture.state.reason if alive else "no controller is heard",
-        "refusal": picture.state.walk_refusal if alive else "",
+        **_why(picture, operator, alive),
+        "notices": list(_notices(picture, operator, now)),
         "stopped": operator.stopped,
         "source": picture.source if picture.is_fresh("/command", now) else "",
         "commanded": _rounded(picture.commanded, alive),
@@ -27,6 +35,30 @@ def panel(picture: RobotPicture, operator: Operator, now: float) -> dict[str, An
         "lamps": _lamps(picture, alive),
         "simulated": any(name in picture.nodes for name in ("sim_node", "board")),
     }
+
+
+def _why(picture: RobotPicture, operator: Operator, alive: bool) -> dict[str, str]:
+    """Why the robot is in its mode, and why it follows no velocity."""
+    if not alive:
+        return {"reason": "no controller is heard", "refusal": ""}
+    if operator.stopped:
+        braking = picture.state.mode_name in BRAKING
+        return {
+            "reason": "STOP was pressed" if braking else "STOP was pressed; the robot does not brake yet",
+            "refusal": "release it, then stand up",
+        }
+    return {"reason": picture.state.reason, "refusal": picture.state.walk_refusal}
+
+
+def _notices(picture: RobotPicture, operator: Operator, now: float) -> Iterator[str]:
+    """What keeps the operator's commands from the robot, or the robot from the page, a sentence each."""
+    for topic, name in SOURCES.items():
+        if (silence := picture.silence(topic, now)) > FRESH:
+            yield f"no message from the {name} for {silence:.0f} s"
+    if late := operator.lateness(now):
+        yield f"commands arrive {late:.1f} s apart, expected {PERIOD:g} s: the robot may stop between them"
+    if operator.held_for(now) > IN_EFFECT and picture.source != OWN_SOURCE:
+        yield f"the command mux does not follow this page; its source is '{picture.source}'"
 
 
 def _loop(state: Any) -> dict[str, float | None]:

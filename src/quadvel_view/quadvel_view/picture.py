@@ -135,6 +135,10 @@ class RobotPicture:
             floor = float(self.ground.vertices[away.argmin(), 2])
         return floor, float(z) - robot.FOOT_RADIUS - floor
 
+    def silence(self, topic: str, now: float) -> float:
+        """For how long nothing came on a topic, s; 0 where nothing ever came."""
+        return now - self._heard.get(topic, now)
+
     def forget_the_past(self) -> None:
         """As after a jump in time: nothing was heard, and there is no way behind."""
         self._heard.clear()
@@ -184,7 +188,9 @@ class RobotPicture:
             self.nodes[one.name] = NodeHealth(LEVELS[min(level, 3)], one.message, now)
         gone = [name for name, node in self.nodes.items() if now - node.heard > LONGEST_SILENCE]
         for name in gone:
-            self.nodes[name] = attrs.evolve(self.nodes[name], level="stale", text="says nothing any more")
+            self.nodes[name] = attrs.evolve(
+                self.nodes[name], level="stale", text=f"no diagnostics for {LONGEST_SILENCE:g} s"
+            )
 
     def _tf_static(self, message: Any, now: float) -> None:
         for one in message.transforms:

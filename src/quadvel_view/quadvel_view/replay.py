@@ -34,7 +34,7 @@ def replay(
             then = now
             while (word := _next(words)) is not None:
                 heed(playback, word)
-            more = {"said": "", "recording": None, "playback": playback.words()}
+            more = {"said": "", "recording": None, "playback": playback.words(), "notices": []}
             viewer.show(playback.picture, nobody, playback.time, **more)
     finally:
         viewer.close()

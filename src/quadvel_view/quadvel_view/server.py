@@ -49,7 +49,9 @@ POLICY = (
 # it has the focus, which stays with our page.
 PICTURE_ALONE = (
     b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
-    b"<script>document.hasFocus = () => true;</script>"
+    b"<script>document.hasFocus = () => true;"
+    b"new MutationObserver((_, self) => { if (document.querySelector('canvas')) { self.disconnect();"
+    b"parent.postMessage('drawn', '*'); } }).observe(document, { childList: true, subtree: true });</script>"
 )
 
 

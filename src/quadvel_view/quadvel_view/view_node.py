@@ -192,9 +192,7 @@ class View(Node):
         else:
             put_back()
 
-    def _call(
-        self, client: Any, request: Any, what: str, then: Callable[[], None] = lambda: None
-    ) -> None:
+    def _call(self, client: Any, request: Any, what: str, then: Callable[[], None] = lambda: None) -> None:
         """Call a service, show its answer, and where it was a success do what comes `then`."""
         if not client.service_is_ready():
             self._said = f"{what}: nobody is there who could"
