@@ -66,6 +66,22 @@ class Ground:
 
     vertices: Array
 
+    def height(self, x: float, y: float) -> float:
+        """Height at a place, m; beyond the edge that of the edge.
+
+        It is a + u (b - a) + v (c - a) in the triangle a, b, c for which the weights u, v and 1 - u - v are not negative.
+        """
+        low, high = self.vertices[:, :2].min(axis=0), self.vertices[:, :2].max(axis=0)
+        a, b, c = self.vertices.reshape(-1, 3, 3).transpose(1, 0, 2)
+        ab, ac, ap = b - a, c - a, np.clip((x, y), low, high) - a[:, :2]
+        area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+        area[area == 0.0] = np.nan  # a triangle that stands upright
+        u = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
+        v = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
+        outside = np.nan_to_num(np.max([-u, -v, u + v - 1.0], axis=0), nan=np.inf)
+        i = outside.argmin()
+        return float(a[i, 2] + u[i] * ab[i, 2] + v[i] * ac[i, 2]) if np.isfinite(outside[i]) else 0.0
+
 
 @attrs.define
 class RobotPicture:
@@ -129,10 +145,7 @@ class RobotPicture:
         """
         feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
         x, y, z = feet[feet[:, 2].argmin()]
-        floor = 0.0
-        if self.ground is not None:
-            away = (self.ground.vertices[:, 0] - x) ** 2 + (self.ground.vertices[:, 1] - y) ** 2
-            floor = float(self.ground.vertices[away.argmin(), 2])
+        floor = 0.0 if self.ground is None else self.ground.height(x, y)
         return floor, float(z) - robot.FOOT_RADIUS - floor
 
     def silence(self, topic: str, now: float) -> float:

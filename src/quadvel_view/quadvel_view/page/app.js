@@ -2,7 +2,6 @@
 "use strict";
 
 const AGAIN = 50;          // ms between two words of a hand that holds something
-const KNOB = 26;           // px, radius of the pad's knob, which stays inside
 const TURN = 1.6;          // rad/s at the pad's edge, per m/s of the speed that is set, 1.2 at most
 const SIDEWAYS = 0.6;      // share of the speed that is set
 const SECONDS = 10;        // of the graphs
@@ -78,7 +77,7 @@ function draggable(name, both) {
   const follow = (event) => {
     const box = element.getBoundingClientRect();
     let x = event.clientX - box.left - box.width / 2, y = both ? event.clientY - box.top - box.height / 2 : 0;
-    const far = Math.hypot(x, y), most = box.width / 2 - (both ? KNOB : 18);
+    const far = Math.hypot(x, y), most = (box.width - element.querySelector(".knob").offsetWidth) / 2;
     if (far > most) { x *= most / far; y *= most / far; }
     held[name] = [-x / most, -y / most];
     place(element, x, y);
