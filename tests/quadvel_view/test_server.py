@@ -112,3 +112,9 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
     assert port is not None
     with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: the page can't be served there"):
         PageServer("127.0.0.1", port, 9, lambda page, word: None, lambda page: None)
+
+
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 99999), ("127.0.0.1", -1), ("a" * 300, 0)])
+def test_an_address_that_does_not_exist_is_told_and_not_waited_for(host: str, port: int) -> None:
+    with pytest.raises(AddressError, match="the page can't be served there"):
+        PageServer(host, port, 9, lambda page, word: None, lambda page: None)

@@ -131,8 +131,7 @@ class Node:
             read_word(word)
         except WordError:
             with pytest.raises(ConnectionClosed, match="not understood"):
-                while True:
-                    self._page.recv(timeout=10.0)
+                _hear_to_the_end(self._page)
             self._page = None
 
     def is_alive(self) -> bool:
@@ -146,6 +145,11 @@ class Node:
                 pass
             page.send('{"do":"release"}')
         return self.process.poll() is None
+
+
+def _hear_to_the_end(page: Any) -> None:
+    while True:
+        page.recv(timeout=10.0)
 
 
 @pytest.fixture(scope="module")

@@ -165,7 +165,7 @@ def view(
         typer.Option(help="Address to listen on; others than this host's own need the token that is shown."),
     ] = "127.0.0.1",
     port: Annotated[
-        int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
+        int | None, typer.Option(min=0, max=65535, help="TCP port.", show_default="8770, for Foxglove 8765")
     ] = None,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Serve the topics to Foxglove or Lichtblick instead of a page.")

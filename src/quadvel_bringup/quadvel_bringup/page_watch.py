@@ -1,4 +1,4 @@
-"""Which processes of a robot have ended. The operator's page is no part of the robot: when it ends, the robot goes on, and that is said."""
+"""Which processes of a robot have ended. The operator's page is no part of the robot: without it the robot goes on."""
 
 from __future__ import annotations
 

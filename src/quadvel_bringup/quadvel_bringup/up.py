@@ -17,8 +17,10 @@ def up(stack: Stack, view: bool = False) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command. view: with a page.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0). Without the page alone they go on. Raises ValueError or OSError where a parameter or
-    a file is wrong, and NotAlone where a robot is there already that nobody asked for.
+    are stopped, and its exit code is ours (1 if that was 0). Without the page alone they go on.
+
+    Raises ValueError or OSError where a parameter or a file is wrong, and NotAlone where a robot is there already that nobody
+    asked for.
     """
     rehearse(stack)
     if stack.brings_robot:

@@ -165,10 +165,10 @@ class PageServer:
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
                 await self._stop.wait()
-        except OSError as error:
-            self._error = (
-                f"{self._host}:{self._port}: the page can't be served there: {error.strerror or error}"
-            )
+        except (OSError, OverflowError, UnicodeError) as error:  # the latter two: no port, no host name
+            reason = getattr(error, "strerror", None) or error
+            self._error = f"{self._host}:{self._port}: the page can't be served there: {reason}"
+        finally:
             self._ready.set()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:

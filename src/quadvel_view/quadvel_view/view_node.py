@@ -5,7 +5,6 @@ Messages come as bytes and wait: only the newest of each topic is read, as often
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -22,13 +21,14 @@ from std_srvs.srv import SetBool, Trigger
 
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
+from quadvel_nodes.scheduling import run_after_others
 from quadvel_recordings.definitions import STORE
 
 from .operator import PERIOD, Operator
 from .picture import LATCHED, TOPICS, RobotPicture
 from .recording import Recording
 from .server import AddressError
-from .viewer import FRAME, PORT, Viewer
+from .viewer import FRAME, LARGEST_PORT, PORT, Viewer
 from .words import Allow, Hold, LetGo, ModeRequest, Record, Release, Reset, Stop, Word
 from .words import Push as PushWord
 
@@ -53,6 +53,10 @@ class ViewParameters:
     )
     port: int = _parameter(PORT, "TCP port of the page; 0: any that is free")
     record_folder: str = _parameter("out", "folder for recordings that the page starts")
+
+    def __attrs_post_init__(self) -> None:
+        if not 0 <= self.port <= LARGEST_PORT:
+            raise ValueError(f"port is {self.port}, expected 0 to {LARGEST_PORT}")
 
 
 class View(Node):
@@ -214,5 +218,5 @@ def _ready(clients: list[Any]) -> Any:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the node. The robot's own nodes come first where the machine is short of time."""
-    os.nice(NICENESS)
+    run_after_others(NICENESS)
     run(View, args)

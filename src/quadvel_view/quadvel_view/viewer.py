@@ -20,6 +20,8 @@ FRAME = 1.0 / 30.0
 """s, between two pictures"""
 PORT = 8770
 """TCP port of the page, unless told otherwise"""
+LARGEST_PORT = 65535
+"""of TCP"""
 
 
 class Viewer:

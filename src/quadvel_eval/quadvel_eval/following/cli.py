@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from quadvel_nodes.number_text import number_text
+
 from .measure import measure
 
 HEADS = {
@@ -33,7 +35,7 @@ def following_command(
     found = measure(runs)
     table = Table(f"simulated, {runs} each", *HEADS.values())
     for name, row in found.items():
-        table.add_row(name, *(f"{row[head]:.2f}" for head in HEADS))
+        table.add_row(name, *(number_text(row[head], ".2f") for head in HEADS))
     Console().print(table)
     (out / "following.json").write_text(json.dumps(found, indent=1))
     print(f"written: {out}/following.json")
