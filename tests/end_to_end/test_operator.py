@@ -200,7 +200,7 @@ def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> N
 def test_a_walking_robot_is_reset_through_passive_and_its_odometry_starts_again(up: Robot) -> None:
     up.forget()
     with subprocess.Popen(
-        [*QUADVEL, "drive", "--vx", "0.6", "--seconds", "8"], stdout=subprocess.PIPE
+        [*QUADVEL, "drive", "--vx", "0.6", "--seconds", "60"], stdout=subprocess.PIPE
     ) as driving:
         up.says("walk: a velocity was commanded")
         up.forget()

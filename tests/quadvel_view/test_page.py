@@ -59,7 +59,7 @@ class Served:
 
     def said(self, pattern: str) -> str:
         """What the group of the pattern matched, once it did."""
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + 180.0
         while (found := re.search(pattern, self._log.read_text())) is None:
             assert self._process.poll() is None, self._log.read_text()
             assert time.monotonic() < until, self._log.read_text()

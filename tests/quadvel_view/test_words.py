@@ -109,7 +109,7 @@ class Node:
         program = [sys.executable, "-m", "quadvel_bringup", "run", "view", "--ros-args", "-p", "port:=0"]
         with log.open("w") as file:
             self.process = subprocess.Popen(program, stdout=file, stderr=subprocess.STDOUT, cwd=log.parent)
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + 180.0
         while (found := re.search(r"open http://127\.0\.0\.1:(\d+)/", log.read_text())) is None:
             assert self.process.poll() is None, log.read_text()
             assert time.monotonic() < until, log.read_text()
