@@ -34,8 +34,15 @@ def replay(
             then = now
             while (word := _next(words)) is not None:
                 heed(playback, word)
-            more = {"said": "", "recording": None, "playback": playback.words(), "notices": []}
-            viewer.show(playback.picture, nobody, playback.time, **more)
+            viewer.show(
+                playback.picture,
+                nobody,
+                playback.time,
+                said="",
+                recording=None,
+                notices=[],
+                playback=playback.words(),
+            )
     finally:
         viewer.close()
 
