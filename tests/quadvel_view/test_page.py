@@ -351,6 +351,8 @@ def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
     page = Page(browser, url, 800, 600, scene=True)
     page.until("state.playback.playing && state.playback.time > 0.3 && state.measured[0] > 0.4")
+    page.page.evaluate("say({ do: 'seek', time: 0.5 })")
+    page.until("state.loop.period === null && state.mode === 'walk'")
     page.page.click("#play")
     page.until("!state.playback.playing")
     page.page.evaluate("$('time').value = 1.5; $('time').dispatchEvent(new Event('input'))")
