@@ -32,7 +32,8 @@ from .viewer import FRAME, LARGEST_PORT, PORT, Viewer
 from .words import Allow, Hold, LetGo, ModeRequest, Record, Release, Reset, Stop, Word
 from .words import Push as PushWord
 
-NICENESS = 10
+NICENESS = 5
+"""a third of the processor time of each of the robot's processes where it is short: STOP comes through this one"""
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 SIMULATIONS = ("sim_node", "board")
