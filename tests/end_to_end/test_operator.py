@@ -45,6 +45,10 @@ class Robot:
             assert time.monotonic() < until, f"{text!r} is not in:\n{self._log.read_text()}"
             time.sleep(0.05)
 
+    def log(self) -> str:
+        """All that it said since it was told to forget."""
+        return self._log.read_text()
+
     def forget(self) -> None:
         """What it says from now on is what `says` looks at."""
         with self._log.open("r+") as file:
@@ -191,6 +195,26 @@ def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> N
     assert "request passive first" in text
     up.stand_up()
     assert quadvel("drive", "--vx", "0.3", "--seconds", "2")[0] == 0
+
+
+def test_a_walking_robot_is_reset_through_passive_and_its_odometry_starts_again(up: Robot) -> None:
+    up.forget()
+    with subprocess.Popen(
+        [*QUADVEL, "drive", "--vx", "0.6", "--seconds", "60"], stdout=subprocess.PIPE
+    ) as driving:
+        up.says("walk: a velocity was commanded")
+        up.forget()
+        assert quadvel("reset") == (0, "the robot is back in posture lie\n")
+        up.says("passive: was asked for")
+        up.says("odometry starts at zero")
+        assert driving.wait(60.0) == 1  # it was not followed to the end
+    code, text = quadvel("mode", "stand_up")
+    assert code == 0, text
+    assert "fault" not in up.log()
+    _, text = quadvel("status")
+    place = re.search(r"position +(-?[\d.]+), (-?[\d.]+)", text)
+    assert place, text
+    assert float(place[1]) == pytest.approx(0.0, abs=0.1)
 
 
 def test_the_simulator_is_paused_and_stepped(up: Robot) -> None:

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections import deque
+from io import StringIO
+from typing import Any
+
+from rich.console import Console
 
 import quadvel_dds
 
 quadvel_dds.install()
 
-from quadvel_bringup.status import look  # noqa: E402
+from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+
+from quadvel_bringup.demo import _report  # noqa: E402
+from quadvel_bringup.status import HEARD, _lines, look  # noqa: E402
+from quadvel_msgs.msg import ControllerState  # noqa: E402
+
+NAN = float("nan")
 
 ROBOT = """
 import sys, threading, time
@@ -46,3 +58,31 @@ def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_wa
         nodes = look()
         robot.stdin.close()
     assert list(nodes) == ["command_mux", "controller", "estimator", "sim_node"]
+
+
+def test_status_of_a_robot_that_has_not_ticked_yet_shows_dashes() -> None:
+    state = ControllerState(mode_name="passive", period_p99_ms=NAN, compute_p50_us=NAN)
+    odom, estimate = Odometry(), TwistWithCovarianceStamped()
+    odom.pose.pose.position.z = estimate.twist.twist.linear.x = NAN
+    heard: dict[str, deque[Any]] = {topic: deque() for topic in HEARD}
+    heard["controller/state"].append(state)
+    heard["odom"].append(odom)
+    heard["velocity_estimate"].append(estimate)
+    text = "\n".join(f"{name} {line}" for name, line in _lines(heard))
+    assert "nan" not in text
+    assert "period – ms, – us" in text
+    assert "estimate vx – m/s" in text
+    assert "0.00, 0.00, – m" in text
+
+
+def test_the_summary_of_a_demo_shows_dashes() -> None:
+    loop = dict.fromkeys(("period_p99_ms", "compute_p50_us", "compute_p99_us", "inference_p50_us", "rate_hz"))
+    errors = dict.fromkeys(("mean_error_xy", "max_error_xy", "mean_error_wz", "max_error_wz"), 0.1)
+    shown = StringIO()
+    _report(
+        {"segments": [], "falls": 0, "loop": {**loop, "overruns": 0}, "realtime_factor": None, **errors}
+        | {"estimator": {"rmse": [None, None, None]}},
+        Console(file=shown, width=200),
+    )
+    assert "RMSE –, –, – m/s" in shown.getvalue()
+    assert "loop – Hz, period p99 – ms" in shown.getvalue()

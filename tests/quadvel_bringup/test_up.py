@@ -10,11 +10,14 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from quadvel_bringup import up
 from quadvel_bringup.alone import NotAlone, look_for_others
+from quadvel_bringup.scripted_walk import ScriptedWalk
 from quadvel_bringup.stack import Stack
 
 NODE = """
@@ -75,6 +78,38 @@ def test_when_a_node_dies_the_others_are_stopped_and_its_exit_code_is_returned(
     use_programs(monkeypatch, lambda name: "raise SystemExit(3)" if name == "controller" else NODE)
     assert up.up(Stack()) == 3
     assert "controller ended with exit code 3; stopping the others" in capfd.readouterr().out
+
+
+def test_that_the_page_died_is_said_at_once_and_the_robot_goes_on(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    use_programs(monkeypatch, lambda name: "raise SystemExit(3)" if name == "view" else NODE)
+    said: list[str] = []
+
+    class Output(up.PrefixedOutput):
+        def __call__(self, name: str, line: str) -> None:
+            super().__call__(name, line)
+            said.append(line)
+            if "ended with exit code 3" in line:
+                os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(up, "PrefixedOutput", Output)
+    assert up.up(Stack(), view=True) == 1
+    death = next(number for number, line in enumerate(said) if "ended with exit code 3" in line)
+    assert "clean" not in said[:death]
+    assert sum("exit code 3" in line for line in said) == 1
+
+
+def test_a_demo_says_at_once_that_its_page_died(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The planner ends after the page, and in good order."""
+    page = [sys.executable, "-S", "-c", "raise SystemExit(3)"]
+    planner = [sys.executable, "-S", "-c", "import time; time.sleep(3)"]
+    walk = ScriptedWalk(tmp_path / "demo.mcap", "quick", {"view": page}, False, Console(soft_wrap=True))
+    walk._nodes = {"view": page, "planner": planner}
+    assert walk.run() == ""
+    assert "view | ended with exit code 3" in capfd.readouterr().out
 
 
 def test_a_node_that_ends_by_itself_is_a_fault_even_with_exit_code_0(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -146,6 +146,18 @@ def test_a_restart_leaves_the_position_where_it_was(tracker: VelocityTracker, st
     np.testing.assert_array_equal(after.position, before.position)
 
 
+def test_odometry_starts_at_zero_where_the_robot_was_put_to_another_place(
+    tracker: VelocityTracker, standing: State
+) -> None:
+    for time in (0.0, 0.005, 0.01):
+        tracker.take(standing(time))
+    tracker.start_again()
+    first = tracker.take(standing(0.015))
+    assert first is not None
+    assert not first.position.any()
+    assert not first.position_deviation.any()
+
+
 def test_the_estimator_sees_the_targets_in_force(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:

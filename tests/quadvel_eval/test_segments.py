@@ -57,3 +57,8 @@ def test_numbers_in_files_are_plain_and_short() -> None:
     assert rounded(np.float32(0.1)) == 0.1
     assert rounded(np.array([1.0, 2.00000049])) == [1.0, 2.0]
     assert type(rounded(np.float64(1.5))) is float
+
+
+def test_a_number_that_is_not_there_is_none_in_a_file() -> None:
+    assert rounded(float("nan")) is None
+    assert rounded([[1.0, float("nan")], [float("inf"), 0.1234567]]) == [[1.0, None], [None, 0.123457]]

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from quadvel_nodes.scheduling import SLICE, Scheduling, slice_of
+from quadvel_nodes.scheduling import AUTOGROUP, SLICE, Scheduling, slice_of
 
 APPLY = """
 import os, threading, time
@@ -100,3 +100,22 @@ def test_every_thread_stays_on_the_cores_that_were_chosen() -> None:
 def test_what_makes_no_sense_is_refused_by_name(parameters: dict[str, object], sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         Scheduling(**parameters)  # type: ignore[arg-type]
+
+
+YIELDING = """
+import os
+from pathlib import Path
+from quadvel_nodes.scheduling import AUTOGROUP, run_after_others
+run_after_others(10)
+print(os.nice(0), AUTOGROUP.read_text().split()[-1])
+"""
+
+
+@pytest.mark.skipif(not AUTOGROUP.exists(), reason="this kernel does not group processes by session")
+@pytest.mark.parametrize("own_session", [True, False])
+def test_a_process_that_runs_after_others_does_so_across_sessions_where_it_leads_its_own(
+    own_session: bool,
+) -> None:
+    program, ours = [sys.executable, "-c", YIELDING], AUTOGROUP.read_text().split()[-1]
+    done = subprocess.run(program, start_new_session=own_session, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == [str(min(os.nice(0) + 10, 19)), "10" if own_session else ours]

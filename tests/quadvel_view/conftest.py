@@ -36,20 +36,26 @@ def odometry(x: float, y: float, speed: float = SPEED) -> Any:
 
 @pytest.fixture(scope="session")
 def walked(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """joint_states and odom, 50 times a second, as `quadvel record` writes them."""
+    """joint_states, odom and controller/state, 50 times a second, as `quadvel record` writes them.
+
+    In the first second there are no times of the loop yet, as when a controller starts.
+    """
     path = tmp_path_factory.mktemp("walked") / "walked.mcap"
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="ros2", library="test")
         channels = {}
-        for topic in ("/joint_states", "/odom"):
+        for topic in ("/joint_states", "/odom", "/controller/state"):
             text, _ = STORE.generate_msgdef(TOPICS[topic], ros_version=2)
             schema = writer.register_schema(TOPICS[topic], "ros2msg", text.encode())
             channels[topic] = writer.register_channel(topic, "cdr", schema)
         for step in range(round(50 * SECONDS) + 1):
             angles = robot.NOMINAL_Q + 0.1 * np.sin(0.2 * step)
             joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=angles)
-            for topic, one in {"/joint_states": joints, "/odom": odometry(SPEED * step / 50, 0.0)}.items():
+            times = {name: float("nan") if step < 50 else 1.0 for name in ("period_p99_ms", "compute_p99_us")}
+            state = message("quadvel_msgs/msg/ControllerState", mode_name="walk", **times)
+            odom = odometry(SPEED * step / 50, 0.0)
+            for topic, one in {"/joint_states": joints, "/odom": odom, "/controller/state": state}.items():
                 data = bytes(STORE.serialize_cdr(one, TOPICS[topic]))
                 writer.add_message(channels[topic], 1_000_000_000 + 20_000_000 * step, data, 0)
         writer.finish()

@@ -59,7 +59,7 @@ class Served:
 
     def said(self, pattern: str) -> str:
         """What the group of the pattern matched, once it did."""
-        until = time.monotonic() + 60.0
+        until = time.monotonic() + 180.0
         while (found := re.search(pattern, self._log.read_text())) is None:
             assert self._process.poll() is None, self._log.read_text()
             assert time.monotonic() < until, self._log.read_text()
@@ -238,6 +238,112 @@ def test_nothing_overlaps(browser: Any, robot: str, width: int, height: int) -> 
     assert page.complaints == []
 
 
+NODES = ("sim_node", "estimator", "controller", "command_mux")
+VIEW_PORT = ("--ros-args", "-p", "port:=0")
+
+
+@pytest.mark.parametrize("rounds", [1, pytest.param(10, marks=pytest.mark.long)])
+def test_the_page_stays_before_during_and_after_the_start_of_each_node(
+    browser: Any, tmp_path: Path, rounds: int
+) -> None:
+    """A page opens on no robot; then each node starts, one after the other, and with each another page opens and reads on."""
+    for turn in range(rounds):
+        view = Served(tmp_path / f"view_{turn}.log", "run", "view", *VIEW_PORT)
+        url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
+        pages, nodes = [Page(browser, url)], []
+        pages[0].until("state.mode === ''")
+        for name in NODES:
+            nodes.append(Served(tmp_path / f"{name}_{turn}.log", "run", name))
+            pages.append(Page(browser, url))
+            pages[-1].until("true")
+            pages[-1].page.wait_for_timeout(500)
+        pages[0].until("state.mode !== '' && state.lamps.length >= 4")
+        for page in pages:
+            assert page.page.evaluate("socket.readyState === WebSocket.OPEN")
+            assert page.page.evaluate("performance.now() - heardAt < 10_000")
+            assert "NaN" not in page.page.inner_text("body")
+            page.page.close()
+            assert page.complaints == []
+        assert [one.end() for one in nodes] == [0] * len(NODES)
+        assert view.end() == 0
+
+
+def test_the_first_second_of_a_controller_shows_dashes(browser: Any, tmp_path: Path) -> None:
+    """No state comes, so that there are no times of a loop yet."""
+    view = Served(tmp_path / "view.log", "run", "view", *VIEW_PORT)
+    url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
+    controller = Served(tmp_path / "controller.log", "run", "controller")
+    page = Page(browser, url)
+    page.until("state.mode === 'passive' && state.loop.compute === null")
+    page.page.wait_for_timeout(300)
+    assert page.page.inner_text("#loop dl").split("\n")[3::2] == ["–", "–", "0"]
+    assert set(page.page.inner_text(".graphs").split()[1::2]) <= {"–", "+0.00"}
+    page.page.close()
+    assert controller.end() == 0
+    assert view.end() == 0
+    assert page.complaints == []
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 720), (800, 600)])
+def test_every_control_can_be_pressed_and_every_text_is_whole(
+    browser: Any, robot: str, width: int, height: int
+) -> None:
+    page = Page(browser, robot, width, height)
+    page.until("state.lamps.length > 2 && state.simulated")
+    assert page.page.evaluate(UNREACHABLE) == []
+    assert page.page.evaluate(CUT_OFF) == []
+    assert page.page.inner_text("#loading") == "loading the 3-D view…"
+    page.page.close()
+
+
+UNREACHABLE = """[...document.querySelectorAll(".controls button, .controls select, .controls input, #pad, #strafe, #stop")]
+    .filter((one) => one.offsetParent !== null)
+    .filter((one) => {
+        const box = one.getBoundingClientRect();
+        const middle = [box.left + box.width / 2, box.top + box.height / 2];
+        const corners = [[box.left + 9, box.top + 9], [box.right - 9, box.bottom - 9]];
+        const places = one.type === "range" || one.id === "pad" ? [middle] : [middle, ...corners];
+        return !places.every(([x, y]) => one.contains(document.elementFromPoint(x, y)));
+    }).map((one) => one.id || one.textContent)"""
+CUT_OFF = """(() => {
+    const pen = document.createElement("canvas").getContext("2d");
+    const cut = (one) => {
+        if (one.tagName !== "SELECT") return one.scrollWidth > one.clientWidth + 1;
+        pen.font = getComputedStyle(one).font;
+        const widest = Math.max(...[...one.options].map((option) => pen.measureText(option.textContent).width));
+        return widest + 26 > one.clientWidth;  // with its arrow
+    };
+    return [...document.querySelectorAll("button, select, .controls p, h1, h2, .pill, dt, dd, output, .graph span")]
+        .filter((one) => one.offsetParent !== null && cut(one)).map((one) => one.id || one.textContent);
+})()"""
+
+
+@pytest.mark.parametrize("ground", ["slope", "rough"])
+def test_a_walking_robot_that_is_reset_lies_in_passive_and_is_seen_on_its_ground(
+    browser: Any, robot: str, ground: str
+) -> None:
+    page = Page(browser, robot, scene=True)
+    stand = "[data-do=stand_up]"
+    page.until("state.mode !== ''")
+    if page.page.evaluate("state.mode") == "passive":
+        page.page.click(stand)
+    page.until("state.mode === 'stance' && state.refusal === ''")
+    page.press(0.0, 1.0)
+    page.until("state.mode === 'walk'")
+    page.page.select_option("#ground", ground)
+    page.page.evaluate("say({ do: 'reset', terrain: $('ground').value })")
+    page.page.mouse.up()
+    page.until(f"state.said.includes('lie, on {ground} ground')")
+    page.page.wait_for_timeout(1000)
+    assert page.page.evaluate("state.mode") == "passive"
+    page.shows_the_robot()
+    page.page.click(stand)
+    page.until("state.mode === 'stance'")
+    page.shows_the_robot()
+    page.page.close()
+    assert page.complaints == []
+
+
 def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     browser: Any, walked: Path, tmp_path: Path
 ) -> None:
@@ -245,6 +351,8 @@ def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
     page = Page(browser, url, 800, 600, scene=True)
     page.until("state.playback.playing && state.playback.time > 0.3 && state.measured[0] > 0.4")
+    page.page.evaluate("say({ do: 'seek', time: 0.5 })")
+    page.until("state.loop.period === null && state.mode === 'walk'")
     page.page.click("#play")
     page.until("!state.playback.playing")
     page.page.evaluate("$('time').value = 1.5; $('time').dispatchEvent(new Event('input'))")

@@ -10,6 +10,7 @@ from mcap.writer import Writer
 from quadvel_recordings.reading import RecordingError
 from quadvel_view.playback import Playback
 from quadvel_view.replay import heed
+from quadvel_view.words import Pace, Seek, Stop
 
 from .conftest import SECONDS, SPEED
 
@@ -47,13 +48,18 @@ def test_a_jump_back_shows_the_way_up_to_there_alone(walked: Path) -> None:
     assert min(point[0] for point in film.picture.trail) == pytest.approx(0.0, abs=0.06)
 
 
-def test_words_that_make_no_sense_change_nothing(walked: Path) -> None:
+def test_the_slider_and_the_pace_are_held_to_what_there_is_and_a_robot_is_not_commanded(
+    walked: Path,
+) -> None:
     film = Playback(walked)
-    for word in ({}, {"do": "seek"}, {"do": "seek", "time": "x"}, {"do": "pace", "pace": float("nan")}):
-        heed(film, word)
+    heed(film, Stop())
     assert (film.time, film.pace, film.playing) == (0.0, 1.0, True)
-    heed(film, {"do": "seek", "time": 99})
+    heed(film, Seek(99.0))
     assert film.time == film.length
+    heed(film, Seek(-1e300))
+    assert film.time == 0.0
+    heed(film, Pace(1e300))
+    assert film.pace == 4.0
 
 
 def test_a_recording_without_a_robot_is_refused(tmp_path: Path) -> None:

@@ -15,7 +15,8 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
-from quadvel_view.server import LARGEST_WORD, MOST_FRAGMENTS, AddressError, PageServer
+from quadvel_view.server import MOST_FRAGMENTS, AddressError, PageServer
+from quadvel_view.words import LARGEST_WORD, LetGo, Stop
 
 NOWHERE = Path("/nowhere")
 TEXT, CONTINUED, END, MASKED = 1, 0, 0x80, 0x80  # of RFC 6455, 5.2
@@ -86,7 +87,7 @@ def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
     until = time.monotonic() + 10.0
     while "left" not in heard and time.monotonic() < until:
         time.sleep(0.01)
-    assert heard == [{"do": "stop"}, {"do": "let_go"}, "left"]
+    assert heard == [Stop(), LetGo(), "left"]
 
 
 def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:
@@ -149,3 +150,9 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
     assert port is not None
     with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: the page can't be served there"):
         PageServer("127.0.0.1", port, NOWHERE, lambda page, word: None, lambda page: None)
+
+
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 99999), ("127.0.0.1", -1), ("a" * 300, 0)])
+def test_an_address_that_does_not_exist_is_told_and_not_waited_for(host: str, port: int) -> None:
+    with pytest.raises(AddressError, match="the page can't be served there"):
+        PageServer(host, port, NOWHERE, lambda page, word: None, lambda page: None)

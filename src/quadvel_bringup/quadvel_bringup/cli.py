@@ -243,7 +243,7 @@ def view(
         ),
     ] = "127.0.0.1",
     port: Annotated[
-        int | None, typer.Option(help="TCP port.", show_default="8770, for Foxglove 8765")
+        int | None, typer.Option(min=0, max=65535, help="TCP port.", show_default="8770, for Foxglove 8765")
     ] = None,
     foxglove: Annotated[
         bool, typer.Option("--foxglove", help="Serve the topics to Foxglove or Lichtblick instead of a page.")
@@ -343,9 +343,8 @@ def reset(
     """Put the simulated robot back to where it started, or on other ground.
 
     \b
-    After a fall:
+    After a fall, or from any mode:
       quadvel reset
-      quadvel mode passive
       quadvel mode stand_up
     On a slope of 10 degrees that rises ahead:
       quadvel reset --terrain slope --slope 0.175

@@ -20,6 +20,7 @@ from quadvel_eval.following.tour_cli import run_tour
 from quadvel_eval.output import output_folder, replacing
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import segment_table, write_figure, write_json
+from quadvel_nodes.number_text import number_text
 from quadvel_sim.world import SHIPPED
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
@@ -150,15 +151,16 @@ def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator:
 
 def _report(summary: dict[str, Any], console: Console) -> None:
     console.print(segment_table(summary["segments"]))
-    loop, rmse = summary["loop"], ", ".join(f"{x:.3f}" for x in summary["estimator"]["rmse"])
+    loop, n = summary["loop"], number_text
+    rmse = ", ".join(n(x, ".3f") for x in summary["estimator"]["rmse"])
     console.print(
-        f"error_xy mean {summary['mean_error_xy']:.3f}, largest {summary['max_error_xy']:.3f} m/s; "
-        f"yaw rate off by {summary['mean_error_wz']:.3f}, at most {summary['max_error_wz']:.3f} rad/s; "
+        f"error_xy mean {n(summary['mean_error_xy'], '.3f')}, largest {n(summary['max_error_xy'], '.3f')} m/s; "
+        f"yaw rate off by {n(summary['mean_error_wz'], '.3f')}, at most {n(summary['max_error_wz'], '.3f')} rad/s; "
         f"falls {summary['falls']}; estimator RMSE {rmse} m/s\n"
-        f"loop {loop['rate_hz']:.0f} Hz, period p99 {loop['period_p99_ms']:.2f} ms, compute p50 "
-        f"{loop['compute_p50_us']:.0f}, p99 {loop['compute_p99_us']:.0f} us, inference p50 "
-        f"{loop['inference_p50_us']:.0f} us, overruns {loop['overruns']}; "
-        f"real-time factor {summary['realtime_factor']:.3f}",
+        f"loop {n(loop['rate_hz'], '.0f')} Hz, period p99 {n(loop['period_p99_ms'], '.2f')} ms, compute p50 "
+        f"{n(loop['compute_p50_us'], '.0f')}, p99 {n(loop['compute_p99_us'], '.0f')} us, inference p50 "
+        f"{n(loop['inference_p50_us'], '.0f')} us, overruns {loop['overruns']}; "
+        f"real-time factor {n(summary['realtime_factor'], '.3f')}",
         highlight=False,
     )
 

@@ -16,6 +16,7 @@ from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_msgs.msg import ControllerState, VelocityCommand
+from quadvel_nodes.number_text import number_text
 
 from .orders import CONTROLLER, LONGEST, WAY_OUT
 from .processes import StopSignals
@@ -147,7 +148,7 @@ def planar(twist: Any) -> Array:
 
 def velocity_text(velocity: Array) -> str:
     """Such a velocity for people."""
-    return "vx {:+.2f} m/s, vy {:+.2f} m/s, wz {:+.2f} rad/s".format(*velocity)
+    return "vx {} m/s, vy {} m/s, wz {} rad/s".format(*(number_text(value, "+.2f") for value in velocity))
 
 
 def _mean(estimates: deque[Any]) -> Array:

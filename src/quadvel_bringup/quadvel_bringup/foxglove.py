@@ -5,11 +5,11 @@ Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
+from quadvel_nodes.scheduling import run_after_others
 from quadvel_recordings.definitions import STORE
 from quadvel_view.foxglove_live import FoxgloveServer
 from quadvel_view.view_node import NICENESS
@@ -24,7 +24,7 @@ LOOK = 0.5  # s, between two looks for new topics
 
 def serve(host: str, port: int) -> None:
     """Hand on what comes, until Ctrl-C. Raises AddressError."""
-    os.nice(NICENESS)
+    run_after_others(NICENESS)
     with StopSignals() as signals, Session("foxglove", rights="foxglove") as session:
         server = FoxgloveServer(host, port)
         try:

@@ -10,7 +10,7 @@ import time
 from typing import Any
 
 from geometry_msgs.msg import Vector3, Wrench
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import Push, ResetSim, SetMode, StepSim
@@ -24,6 +24,8 @@ SIMULATIONS = tuple(dict.fromkeys(level.simulation for level in LOW_LEVELS.value
 WAY_OUT = "quadvel mode passive, then quadvel mode stand_up"
 PASSING = {"stand_up": "stance", "lie_down": "passive"}
 """Modes that end by themselves, and the one that follows"""
+LOOK = 2.0
+"""s to find the controller and the estimator next to a simulator; it may run without them"""
 LONGEST = 10.0
 """s that standing up or lying down may take"""
 
@@ -57,8 +59,23 @@ def enable(enabled: bool) -> int:
 
 
 def reset(keyframe: str, terrain: str = "", slope: float = 0.0) -> int:
-    """Put the simulated robot back, on other ground where `terrain` names one."""
-    return _to_simulation("reset", ResetSim, keyframe=keyframe, terrain=terrain, slope=slope)
+    """Put the simulated robot back, on other ground where `terrain` names one.
+
+    It goes through passive, as a jump to another place is a fault of a robot that is not; odometry starts again there.
+    """
+    with Session("reset") as session:
+        passive = session.node.create_client(SetMode, "controller/set_mode")
+        odometry = session.node.create_client(Trigger, "estimator/reset_odometry")
+        session.spin_until(lambda: passive.service_is_ready() and odometry.service_is_ready(), LOOK)
+        if passive.service_is_ready():
+            session.call(SetMode, [passive.service_name], lambda: CONTROLLER, mode="passive")
+        put_back = _call_simulation(
+            session, "reset", ResetSim, keyframe=keyframe, terrain=terrain, slope=slope
+        )
+        code = _told(put_back)
+        if code == 0 and odometry.service_is_ready():
+            session.call(Trigger, [odometry.service_name], lambda: CONTROLLER)
+        return code
 
 
 def pause(paused: bool) -> int:
@@ -80,9 +97,13 @@ def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
 
 def _to_simulation(order: str, kind: Any, repeats: bool = True, **fields: Any) -> int:
     """Whichever node simulates the robot carries it out. repeats: whether twice is as good as once."""
-    services = [f"{node}/{order}" for node in SIMULATIONS]
     with Session(order) as session:
-        return _told(session.call(kind, services, lambda: _no_simulation(session), repeats, **fields))
+        return _told(_call_simulation(session, order, kind, repeats, **fields))
+
+
+def _call_simulation(session: Session, order: str, kind: Any, repeats: bool = True, **fields: Any) -> Any:
+    services = [f"{node}/{order}" for node in SIMULATIONS]
+    return session.call(kind, services, lambda: _no_simulation(session), repeats, **fields)
 
 
 def _no_simulation(session: Session) -> str:

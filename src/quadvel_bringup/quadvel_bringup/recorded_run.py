@@ -16,8 +16,8 @@ import quadvel_dds
 from .alone import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import enclave
+from .page_watch import PageWatch
 from .processes import ProcessGroup, StopSignals
-from .stack import VIEW
 
 RECORDED = {
     "/command": "quadvel_msgs/msg/VelocityCommand",
@@ -110,10 +110,10 @@ class RecordedRun(ABC):
 
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
         """Record until it is over, or a node ended that should not have."""
-        ended: dict[str, int] = {}
+        watch, ended = PageWatch(group, self._say), dict[str, int]()
         while not self.is_over(ended) and not ended and not signals.received:
             record()
-            ended = {name: code for name, code in group.ended().items() if name != VIEW}
+            ended = watch.ended()
         if self.is_over(ended):
             self._bar.update(self._task, completed=self._bar.tasks[0].total, description="done")
             return ""

@@ -16,6 +16,7 @@ from nav_msgs.msg import Odometry
 from rich.console import Console
 
 from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
+from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
 
 from .alone import ros_domain
@@ -126,7 +127,8 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
             "command",
             f"{velocity_text(planar(state.command))}, from {commands[-1].source if commands else 'nobody'}",
         )
-        loop = f"p99 of its period {state.period_p99_ms:.2f} ms, {state.compute_p50_us:.0f} us from state to command"
+        period, compute = number_text(state.period_p99_ms, ".2f"), number_text(state.compute_p50_us, ".0f")
+        loop = f"p99 of its period {period} ms, {compute} us from state to command"
         yield "loop", f"{state.rate_hz:.0f} Hz, {loop}, {state.overruns} deadlines missed"
     else:
         yield "mode", "[red]no controller runs"
@@ -134,10 +136,8 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
         yield "estimate", velocity_text(planar(estimates[-1].twist.twist))
     if heard["odom"]:
         position = heard["odom"][-1].pose.pose.position
-        yield (
-            "position",
-            f"x {position.x:.2f}, y {position.y:.2f} m since the estimator's start; height is not estimated",
-        )
+        x, y = (number_text(value, ".2f") for value in (position.x, position.y))
+        yield "position", f"x {x}, y {y} m since the estimator's start; height is not estimated"
     yield "rates", ", ".join(f"{topic} {_rate(heard[topic]):.0f}" for topic in RATES) + " Hz"
 
 

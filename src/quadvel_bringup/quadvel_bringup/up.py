@@ -7,6 +7,7 @@ from rich.console import Console
 from .alone import look_for_others
 from .node_output import PrefixedOutput
 from .nodes import command
+from .page_watch import PageWatch
 from .processes import ProcessGroup, StopSignals
 from .rehearsal import rehearse
 from .stack import VIEW, Stack
@@ -16,8 +17,10 @@ def up(stack: Stack, view: bool = False) -> int:
     """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command. view: with a page.
 
     It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0). Raises ValueError or OSError where a parameter or
-    a file is wrong, and NotAlone where a robot is there already that nobody asked for.
+    are stopped, and its exit code is ours (1 if that was 0). Without the page alone they go on.
+
+    Raises ValueError or OSError where a parameter or a file is wrong, and NotAlone where a robot is there already that nobody
+    asked for.
     """
     rehearse(stack)
     if stack.brings_robot:
@@ -29,16 +32,16 @@ def up(stack: Stack, view: bool = False) -> int:
         for name, arguments in nodes.items():
             if not signals.received:
                 group.start(name, command(name, arguments))
-        ended: dict[str, int] = {}
+        watch, ended = PageWatch(group, say), dict[str, int]()
         while not ended and not signals.wait(0.1):
-            ended = {name: code for name, code in group.ended().items() if name != VIEW}
+            ended = watch.ended()
         for name, code in ended.items():
             say("quadvel", f"{name} ended with exit code {code}; stopping the others")
         codes = group.stop()
         if ended:
             return next((_positive(code) for code in ended.values() if code), 1)
         for name, code in codes.items():
-            if code:
+            if code and not (name == VIEW and watch.page_ended):
                 say("quadvel", f"{name} did not stop cleanly: exit code {code}")
     return 1 if any(codes.values()) else 0
 

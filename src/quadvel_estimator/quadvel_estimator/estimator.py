@@ -18,6 +18,7 @@ from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
+from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.frames import BASE, ODOM, Placed, footprint
@@ -94,6 +95,7 @@ class EstimatorNode(Node):
         # The command first: where both wait, it is the answer to the state before the one that waits.
         self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
+        self.create_service(Trigger, "~/reset_odometry", self._on_reset_odometry)
         self.create_timer(1.0, self._report)
         if not self.get_parameter("use_sim_time").value:  # where time waits for the node there is no hurry
             self._settings.apply(self.get_logger().warning)
@@ -121,6 +123,12 @@ class EstimatorNode(Node):
         self._busy += perf_counter() - start
         if self._count % ODOM_EVERY == 0:
             self._publish_odometry(message.stamp, state, estimate)
+
+    def _on_reset_odometry(self, request: Any, response: Any) -> Any:
+        self._tracker.start_again()
+        response.success, response.message = True, "odometry starts at zero"
+        self.get_logger().info(response.message)
+        return response
 
     def _publish_velocity(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
         message = TwistWithCovarianceStamped()

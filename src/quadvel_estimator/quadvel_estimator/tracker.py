@@ -67,6 +67,11 @@ class VelocityTracker:
         """The joint targets now in force, as `features.previous_action` gives them."""
         self._previous_action = previous_action
 
+    def start_again(self) -> None:
+        """Count the position from here on, where the robot was put to another place."""
+        self._restart()
+        self._position, self._deviation = np.zeros(3), np.zeros(3)
+
     def take(self, state: RobotState) -> Estimate | None:
         """The estimate at this state, or None where the state comes between two samples of the estimator.
 
@@ -101,7 +106,7 @@ class VelocityTracker:
         self._newest = time
 
     def _restart(self) -> None:
-        """The position stays: an odometry frame does not jump."""
+        """The position stays: an odometry frame does not jump by itself."""
         self.restarts += 1
         self._estimator.reset()
         self._taken = None

@@ -23,6 +23,7 @@ from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver import wire
 from quadvel_estimator.learned import LearnedEstimator
+from quadvel_nodes.number_text import number_text
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim import Simulator, SimulatorConfig, World
@@ -252,5 +253,5 @@ def table(results: dict[str, dict[str, Any]]) -> Table:
     found = Table("figure", "measured", "wanted", title="Benchmark")
     for part, figure, about, wanted in ROWS:
         result = results[part]
-        found.add_row(about, result.get("skipped") or f"{result[figure]:,.4g}", wanted)
+        found.add_row(about, result.get("skipped") or number_text(result[figure], ",.4g"), wanted)
     return found

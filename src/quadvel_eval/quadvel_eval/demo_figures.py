@@ -10,6 +10,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
+from quadvel_nodes.number_text import DASH
+
 from .demo_summary import commands
 from .recording import Recording, Series
 from .robot_loop import PERIOD
@@ -75,10 +77,13 @@ def loop_figure(recording: Recording) -> Figure:
 
 
 def _distribution(panel: Any, values: Array, name: str) -> None:
+    panel.set_xlabel(name)
+    panel.set_ylabel("ticks")
+    if not len(values):
+        panel.text(0.5, 0.5, DASH, ha="center", transform=panel.transAxes)
+        return
     median, p99 = np.quantile(values, (0.5, 0.99))
     panel.hist(values, bins=np.linspace(0.0, max(10.0, 1.5 * p99), 120), log=True, color="tab:blue")
     for value, label in ((median, "median"), (p99, "99 %")):
         panel.axvline(value, color="black", linestyle="--", linewidth=1.0)
         panel.annotate(f" {label} {value:.2f}", (value, 0.97), xycoords=("data", "axes fraction"), va="top")
-    panel.set_xlabel(name)
-    panel.set_ylabel("ticks")

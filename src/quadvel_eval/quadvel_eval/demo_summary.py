@@ -63,8 +63,12 @@ def summarise(recording: Recording) -> dict[str, Any]:
         **tracking_errors(walked),
         "loop": _loop_figures(recording),
         "estimator": {"rmse": rounded(_estimator_rmse(recording))},
-        "realtime_factor": rounded(recording.realtime_factor.value.mean()),
+        "realtime_factor": rounded(_mean(recording.realtime_factor.value)),
     }
+
+
+def _mean(values: Array) -> float:
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def _falls(recording: Recording) -> int:
@@ -95,5 +99,5 @@ def _estimator_rmse(recording: Recording) -> Array:
     instants = estimate.time[walking]
     there = np.column_stack([np.interp(instants, truth.time, truth.value[:, axis]) for axis in range(3)])
     error = estimate.value[walking] - there
-    rmse: Array = np.sqrt(np.square(error).mean(axis=0))
+    rmse: Array = np.sqrt(np.square(error).mean(axis=0)) if len(error) else np.full(3, np.nan)
     return rmse

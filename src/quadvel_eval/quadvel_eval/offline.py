@@ -22,6 +22,7 @@ from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_estimator.tracker import Estimator, VelocityTracker
 from quadvel_nodes.messages import MessageError, read_low_state
+from quadvel_nodes.number_text import number_text
 from quadvel_nodes.robot_time import RobotTime
 from quadvel_recordings.reading import RecordingError, read_messages
 
@@ -189,7 +190,11 @@ def _show(said: Torques, errors: Mapping[str, Array]) -> None:
     table = Table("torque, RMS in N m", "measured", "off by", title="actuator model on the recorded motion")
     for joint, name in enumerate(JOINT_NAMES):
         rms = np.sqrt(np.mean(said.measured[:, joint] ** 2))
-        table.add_row(name.removesuffix("_joint"), f"{rms:.2f}", f"{said.errors[joint]:.2f}")
+        table.add_row(
+            name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(said.errors[joint], ".2f")
+        )
     Console().print(table)
     for name, (x, y) in errors.items():
-        typer.echo(f"estimator, offline, beside the {name}: RMS {x:.3f} m/s in vx, {y:.3f} in vy")
+        typer.echo(
+            f"estimator, offline, beside the {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"
+        )

@@ -79,5 +79,6 @@ def response_delay(asked: Array, velocity: Array, period: float) -> float | None
 
 
 def rounded(value: ArrayLike) -> Any:
-    """`value` as JSON keeps it: a number or nested lists of numbers, with as many digits as make sense."""
-    return np.round(np.asarray(value, float), DIGITS).tolist()
+    """`value` as JSON keeps it: a number or nested lists of numbers, with as many digits as make sense; None for NaN."""
+    digits = np.round(np.asarray(value, float), DIGITS)
+    return np.where(np.isfinite(digits), digits.astype(object), np.array(None, object)).tolist()

@@ -1,4 +1,4 @@
-"""When a node of the control loop runs: before others, and on which cores. Needs Linux, not ROS."""
+"""When a node runs: those of the control loop before others, and on which cores; the page after them. Needs Linux, not ROS."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import resource
 import threading
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import attrs
@@ -22,6 +23,7 @@ BUSY = 0.9
 SLICE = 100_000
 """ns, the shortest that there is: a thread that asks for so little of a core at once is let in before those that ask for
 more, such as programs that compute without a pause beside it."""
+AUTOGROUP = Path("/proc/self/autogroup")
 LAST_RESORT = 1_000_000
 """us of computing without a pause after which the kernel ends the process: the watchdog could not run"""
 
@@ -79,6 +81,22 @@ class Scheduling:
         watched = threading.get_native_id(), time.pthread_getcpuclockid(threading.get_ident())
         above = min(self.realtime_priority + 1, HIGHEST)
         threading.Thread(target=_watch, args=(*watched, above, say), name="watchdog", daemon=True).start()
+
+
+def run_after_others(niceness: int) -> None:
+    """Let other processes run first.
+
+    Where Linux groups processes by session (sched_autogroup_enabled), a process's niceness counts within its session alone;
+    the session has a niceness of its own, which is set where this process leads it, as the nodes of `quadvel up` do. A shell's
+    session is left as it is.
+
+    Args:
+        niceness: 1 to 19, the weaker the larger.
+    """
+    os.nice(niceness)
+    if os.getsid(0) == os.getpid():
+        with suppress(OSError):  # a kernel that forms no such groups
+            AUTOGROUP.write_text(str(niceness))
 
 
 class _Attributes(ctypes.Structure):

@@ -25,6 +25,7 @@ from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state, seconds, write_low_cmd
 from quadvel_nodes.node import read_parameters, run
+from quadvel_nodes.number_text import number_text
 
 from .announcements import Announcements
 from .control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
@@ -197,7 +198,7 @@ class Controller(Node):
             "reason": self._supervisor.reason,
             "policy": self._settings.policy or f"the shipped one ({SHIPPED_POLICY.name})",
             **{
-                name: f"{value:.4g}"
+                name: number_text(value, ".4g")
                 for name, value in attrs.asdict(self._loop.stats.summary(time.perf_counter())).items()
             },
             "pauses": self._loop.pauses.count,

@@ -36,6 +36,8 @@ FRESH = 1.0  # s, after which what came counts as silent
 LONGEST_SILENCE = 3.0  # s, of a node on /diagnostics, which speaks once a second
 TRAIL_STEP = 0.05  # m between two points of the way behind
 TRAIL = 600  # points of it
+JUMP = 1.0  # m between two poses: nobody walked this way
+STARTED_AGAIN = 0.5  # share of the variance of a position before: one that grows by dead reckoning falls where that starts again
 CYLINDER, TRIANGLES = 3, 11  # of visualization_msgs/Marker
 LEVELS = ("ok", "warning", "error", "stale")  # of diagnostic_msgs/DiagnosticStatus
 
@@ -64,6 +66,22 @@ class Ground:
 
     vertices: Array
 
+    def height(self, x: float, y: float) -> float:
+        """Height at a place, m; beyond the edge that of the edge.
+
+        It is a + u (b - a) + v (c - a) in the triangle a, b, c for which the weights u, v and 1 - u - v are not negative.
+        """
+        low, high = self.vertices[:, :2].min(axis=0), self.vertices[:, :2].max(axis=0)
+        a, b, c = self.vertices.reshape(-1, 3, 3).transpose(1, 0, 2)
+        ab, ac, ap = b - a, c - a, np.clip((x, y), low, high) - a[:, :2]
+        area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
+        area[area == 0.0] = np.nan  # a triangle that stands upright
+        u = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
+        v = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
+        outside = np.nan_to_num(np.max([-u, -v, u + v - 1.0], axis=0), nan=np.inf)
+        i = outside.argmin()
+        return float(a[i, 2] + u[i] * ab[i, 2] + v[i] * ac[i, 2]) if np.isfinite(outside[i]) else 0.0
+
 
 @attrs.define
 class RobotPicture:
@@ -87,11 +105,26 @@ class RobotPicture:
     path: Array = attrs.field(factory=lambda: np.zeros((0, 3)))
     ground: Ground | None = None
     trail: deque[Array] = attrs.field(factory=lambda: deque(maxlen=TRAIL))
+    refused: dict[str, str] = attrs.field(factory=dict)
+    """by topic: what was wrong with its newest message, where that could not be taken"""
+    _position_variance: float = 0.0
     _heard: dict[str, float] = attrs.field(factory=dict)
     _fixed: dict[str, tuple[str, Array, Array]] = attrs.field(factory=dict)
 
+    def read(self, topic: str, read: Callable[[], Any], now: float) -> None:
+        """Take what `read` returns, or note in `refused` what is wrong with it: no message ends the page, and STOP with it."""
+        try:
+            self.take(topic, read(), now)
+        except Exception as error:  # bytes that are no message fail in as many ways as there are decoders
+            self.refused[topic] = f"{error}" or type(error).__name__
+        else:
+            self.refused.pop(topic, None)
+
     def take(self, topic: str, message: Any, now: float) -> None:
-        """Note a message of one of TOPICS, or of LOW_STATE; others are left alone. now: s, on any clock that goes on."""
+        """Note a message of one of TOPICS, or of LOW_STATE; others are left alone. now: s, on any clock that goes on.
+
+        Raises ValueError for a message whose joints are not the robot's, or whose places are not finite.
+        """
         take = _TAKES.get(topic)
         if take is not None:
             take(self, message, now)
@@ -101,42 +134,57 @@ class RobotPicture:
         """Whether something came on a topic within the last second."""
         return now - self._heard.get(topic, -np.inf) < FRESH
 
-    def above_floor(self) -> float:
-        """How far the lowest foot is above the ground, m, as odometry and ground have it: what they are off each other, mostly."""
+    def shows_joints(self, now: float) -> bool:
+        """Whether the joints' angles and torques are those of the last second."""
+        return self.is_fresh("/joint_states", now) or self.is_fresh(LOW_STATE, now)
+
+    def floor(self) -> tuple[float, float]:
+        """The ground below the lowest foot, m in odom, and how far that foot is above it, m.
+
+        The latter is what odometry and ground are off each other, mostly.
+        """
         feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
         x, y, z = feet[feet[:, 2].argmin()]
-        floor = 0.0
-        if self.ground is not None:
-            away = (self.ground.vertices[:, 0] - x) ** 2 + (self.ground.vertices[:, 1] - y) ** 2
-            floor = float(self.ground.vertices[away.argmin(), 2])
-        return float(z) - robot.FOOT_RADIUS - floor
+        floor = 0.0 if self.ground is None else self.ground.height(x, y)
+        return floor, float(z) - robot.FOOT_RADIUS - floor
+
+    def silence(self, topic: str, now: float) -> float:
+        """For how long nothing came on a topic, s; 0 where nothing ever came."""
+        return now - self._heard.get(topic, now)
 
     def forget_the_past(self) -> None:
         """As after a jump in time: nothing was heard, and there is no way behind."""
         self._heard.clear()
         self.trail.clear()
         self.nodes.clear()
+        self.refused.clear()
+        self._position_variance = 0.0
         self.scan, self.path, self.persons, self.state = np.zeros((0, 3)), np.zeros((0, 3)), (), None
 
     # How each message is taken.
 
     def _joint_states(self, message: Any, now: float) -> None:
         order = robot.joint_index(message.name)
-        self.q[order] = message.position
-        if len(message.effort) == len(order):
-            self.torque[order] = message.effort
+        self.q[order] = _finite("position", message.position)
+        self.torque[order] = message.effort if len(message.effort) == len(order) else np.nan
 
     def _low_state(self, message: Any, now: float) -> None:
         if not self.is_fresh("/joint_states", now):
-            self.q, self.torque = np.array(message.q, float), np.array(message.tau, float)
+            self.q, self.torque = _finite("q", message.q), np.array(message.tau, float)
         if not self.is_fresh("/odom", now):
-            self.quaternion = np.array(message.orientation_wxyz, float)
+            self.quaternion = _finite("orientation_wxyz", message.orientation_wxyz)
 
     def _odom(self, message: Any, now: float) -> None:
         self.position = _vector(message.pose.pose.position)
         self.quaternion = _quaternion(message.pose.pose.orientation)
         self.measured = _planar(message.twist.twist)
         here = self.position * [1.0, 1.0, 0.0]
+        variance = float(message.pose.covariance[0])
+        if variance < STARTED_AGAIN * self._position_variance or (
+            self.trail and np.linalg.norm(here - self.trail[-1]) > JUMP
+        ):
+            self.trail.clear()
+        self._position_variance = variance
         if not self.trail or np.linalg.norm(here - self.trail[-1]) > TRAIL_STEP:
             self.trail.append(here)
 
@@ -153,7 +201,9 @@ class RobotPicture:
             self.nodes[one.name] = NodeHealth(LEVELS[min(level, 3)], one.message, now)
         gone = [name for name, node in self.nodes.items() if now - node.heard > LONGEST_SILENCE]
         for name in gone:
-            self.nodes[name] = attrs.evolve(self.nodes[name], level="stale", text="says nothing any more")
+            self.nodes[name] = attrs.evolve(
+                self.nodes[name], level="stale", text=f"no diagnostics for {LONGEST_SILENCE:g} s"
+            )
 
     def _tf_static(self, message: Any, now: float) -> None:
         for one in message.transforms:
@@ -162,13 +212,15 @@ class RobotPicture:
 
     def _scan(self, message: Any, now: float) -> None:
         ranges = np.array(message.ranges, float)
+        _finite("angles", [message.angle_min, message.angle_increment])
         seen = (ranges >= message.range_min) & (ranges < message.range_max)
         angles = (message.angle_min + message.angle_increment * np.arange(len(ranges)))[seen]
         flat = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
         points, frame = flat * ranges[seen, None], message.header.frame_id
-        while frame in self._fixed:
-            frame, origin, turn = self._fixed[frame]
-            points = rotate(turn, points) + origin
+        for _ in self._fixed:  # a tree has no longer branch; what is none does not keep us here
+            if frame in self._fixed:
+                frame, origin, turn = self._fixed[frame]
+                points = rotate(turn, points) + origin
         self.scan = rotate(self.quaternion, points) + self.position
 
     def _markers(self, message: Any, now: float) -> None:
@@ -188,7 +240,10 @@ class RobotPicture:
     def _ground(self, message: Any, now: float) -> None:
         self.ground = None
         if message.type == TRIANGLES and message.points:
-            self.ground = Ground(np.array([(p.x, p.y, p.z) for p in message.points]).reshape(-1, 3))
+            points = _finite("points", [(p.x, p.y, p.z) for p in message.points])
+            if len(points) % 3:
+                raise ValueError(f"points are {len(points)}, expected three for each triangle")
+            self.ground = Ground(points)
 
 
 _TAKES: dict[str, Callable[[RobotPicture, Any, float], None]] = {
@@ -206,12 +261,20 @@ _TAKES: dict[str, Callable[[RobotPicture, Any, float], None]] = {
 }
 
 
+def _finite(field: str, values: Any) -> Array:
+    """The values (...) as an array. Raises ValueError where one of them is not finite."""
+    found = np.array(values, float)
+    if not np.isfinite(found).all():
+        raise ValueError(f"{field} is {found[~np.isfinite(found)][0]}, expected finite numbers")
+    return found
+
+
 def _vector(message: Any) -> Array:
-    return np.array([message.x, message.y, message.z], float)
+    return _finite("place", [message.x, message.y, message.z])
 
 
 def _quaternion(message: Any) -> Array:
-    return np.array([message.w, message.x, message.y, message.z], float)
+    return _finite("orientation", [message.w, message.x, message.y, message.z])
 
 
 def _planar(twist: Any) -> Array:

@@ -68,7 +68,7 @@ class Playback:
         if "/odom" in self._tracks:
             behind = self._tracks["/odom"].between(self.time - AGO, self.time)
             for message in behind[:: max(1, len(behind) // BEHIND)]:
-                self.picture.take("/odom", message(), self.time)
+                self.picture.read("/odom", message, self.time)
         self._take_between(-np.inf, self.time)
 
     def set_pace(self, pace: float) -> None:
@@ -89,7 +89,7 @@ class Playback:
         for topic, track in self._tracks.items():
             came = track.between(max(after, until - 3.0) if topic == ALL else after, until)
             for message in came if topic == ALL else came[-1:]:
-                self.picture.take(topic, message(), until)
+                self.picture.read(topic, message, until)
 
 
 def _load(path: Path) -> dict[str, _Track]:

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 from pathlib import Path
 from queue import Empty, SimpleQueue
-from typing import Any
 
 from .operator import Operator
 from .playback import Playback
 from .viewer import FRAME, Viewer
+from .words import Pace, Play, Seek, Word
 
 
 def replay(
@@ -22,7 +21,7 @@ def replay(
     tell: told the address. Raises RecordingError, OSError, and AddressError where the page can't be served.
     """
     playback = Playback(path)
-    words: SimpleQueue[dict[str, Any]] = SimpleQueue()
+    words: SimpleQueue[Word] = SimpleQueue()
     viewer = Viewer(host, port, lambda page, word: words.put(word), lambda page: None)
     nobody = Operator()
     try:
@@ -35,24 +34,31 @@ def replay(
             then = now
             while (word := _next(words)) is not None:
                 heed(playback, word)
-            more = {"said": "", "recording": None, "playback": playback.words()}
-            viewer.show(playback.picture, nobody, playback.time, **more)
+            viewer.show(
+                playback.picture,
+                nobody,
+                playback.time,
+                said="",
+                recording=None,
+                notices=[],
+                playback=playback.words(),
+            )
     finally:
         viewer.close()
 
 
-def heed(playback: Playback, word: dict[str, Any]) -> None:
-    """Do what the page asks for; what makes no sense is left alone."""
+def heed(playback: Playback, word: Word) -> None:
+    """Do what the page asks of a recording; the orders to a robot are ignored."""
     match word:
-        case {"do": "play"}:
+        case Play():
             playback.toggle()
-        case {"do": "seek", "time": float() | int() as moment} if math.isfinite(moment):
+        case Seek(time=moment):
             playback.seek(moment)
-        case {"do": "pace", "pace": float() | int() as pace} if math.isfinite(pace):
+        case Pace(pace=pace):
             playback.set_pace(pace)
 
 
-def _next(words: SimpleQueue[dict[str, Any]]) -> dict[str, Any] | None:
+def _next(words: SimpleQueue[Word]) -> Word | None:
     try:
         return words.get_nowait()
     except Empty:

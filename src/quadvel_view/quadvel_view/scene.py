@@ -70,17 +70,20 @@ class Scene:
             shadow_opacity=0.35,
         )
         self._lifted = 0.0  # m, by which odometry has the robot too high; its height drifts
+        self._floor = 0.0  # m, of the ground below the robot in odom
         self._drawn: dict[str, Any] = {}
         self._persons: dict[int, Any] = {}
 
     def draw(self, picture: RobotPicture) -> None:
         """Show the picture."""
         x, y, z = picture.position.tolist()
-        self._lifted += LIFTING * (picture.above_floor() - self._lifted)
-        z -= self._lifted
+        floor, above = picture.floor()
+        self._floor += LIFTING * (floor - self._floor)
+        self._lifted += LIFTING * (above - self._lifted)
+        height = z - self._lifted - self._floor - robot.NOMINAL_HEIGHT
         with self._server.atomic():
-            self._base.position, self._base.wxyz = (0.0, 0.0, z - robot.NOMINAL_HEIGHT), picture.quaternion
-            self._world.position = (-x, -y, -robot.NOMINAL_HEIGHT)
+            self._base.position, self._base.wxyz = (0.0, 0.0, height), picture.quaternion
+            self._world.position = (-x, -y, -self._floor - robot.NOMINAL_HEIGHT)
             self._grid.position = (-x % 1.0, -y % 1.0, -robot.NOMINAL_HEIGHT)
             for placed in moving_links(picture.q):
                 self._links[placed.child].wxyz = placed.quaternion

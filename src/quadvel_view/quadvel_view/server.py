@@ -31,21 +31,22 @@ from websockets.typing import Subprotocol
 
 from . import scene_server
 from .guard import Guard, RequestError, Visitor, is_loopback
+from .words import LARGEST_WORD, Word, WordError, read_word
 
 COOKIE = "quadvel_view"
 """start of the name of the cookie with the token; the port follows, as cookies are sent to all ports of a host"""
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE, WORDS = "/scene", "/words"
-LARGEST_WORD = 4096
-"""bytes of one message of a browser; a longer one ends its connection while it arrives"""
 MOST_FRAGMENTS = 16
-"""of one message: browsers send one of this size whole, and an empty fragment costs memory, too"""
+"""of one message: browsers send one of LARGEST_WORD whole, and an empty fragment costs memory, too"""
 # viser's own panel and notes have no place beside ours: of its page there is the picture alone. It looks for its server while
 # it has the focus, which stays with our page.
 PICTURE_ALONE = (
     b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
-    b"<script>document.hasFocus = () => true;</script>"
+    b"<script>document.hasFocus = () => true;"
+    b"new MutationObserver((_, self) => { if (document.querySelector('canvas')) { self.disconnect();"
+    b"parent.postMessage('drawn', '*'); } }).observe(document, { childList: true, subtree: true });</script>"
 )
 
 
@@ -65,7 +66,7 @@ LOG.addFilter(_is_own_fault)
 class PageServer:
     """Serves from the time it is made until `close`, in a thread of its own.
 
-    on_word: called there with the number of a page and what it said (an object of JSON); on_leave: with that of one that left.
+    on_word: called there with the number of a page and what it said; on_leave: with that of one that left.
     scene: the Unix socket of viser. Raises AddressError where address and port can't be listened on.
     """
 
@@ -74,7 +75,7 @@ class PageServer:
         host: str,
         port: int,
         scene: Path,
-        on_word: Callable[[int, dict[str, Any]], None],
+        on_word: Callable[[int, Word], None],
         on_leave: Callable[[int], None],
     ) -> None:
         self._host, self._port, self._scene = host, port, scene
@@ -132,10 +133,10 @@ class PageServer:
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
                 await self._stop.wait()
-        except OSError as error:
-            self._error = (
-                f"{self._host}:{self._port}: the page can't be served there: {error.strerror or error}"
-            )
+        except (OSError, OverflowError, UnicodeError) as error:  # the latter two: no port, no host name
+            reason = getattr(error, "strerror", None) or error
+            self._error = f"{self._host}:{self._port}: the page can't be served there: {reason}"
+        finally:
             self._ready.set()
 
     def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
@@ -179,11 +180,9 @@ class PageServer:
         self._pages.add(connection)
         try:
             while (text := await _message(connection)) is not None:
-                word = _word(text)
-                if word is None:
-                    await connection.close(1008, "not understood")
-                else:
-                    self._on_word(page, word)
+                self._on_word(page, read_word(text))
+        except WordError as error:
+            await connection.close(1008, str(error))
         except ConnectionClosed:
             pass
         finally:
@@ -231,15 +230,6 @@ async def _message(connection: ServerConnection) -> bytes | None:
             await connection.close(CloseCode.MESSAGE_TOO_BIG, f"more than {MOST_FRAGMENTS} fragments")
             return None
     return b"".join(fragments)
-
-
-def _word(text: bytes) -> dict[str, Any] | None:
-    """What a page said, or None where it makes no sense."""
-    try:
-        word = json.loads(text)
-    except (ValueError, RecursionError):
-        return None
-    return word if isinstance(word, dict) else None
 
 
 def _sentence(status: HTTPStatus, sentence: str) -> Response:

@@ -5,9 +5,9 @@ Messages come as bytes and wait: only the newest of each topic is read, as often
 
 from __future__ import annotations
 
-import os
 import time
 from collections import deque
+from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -17,22 +17,25 @@ from geometry_msgs.msg import Twist, Vector3, Wrench
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
+from quadvel_nodes.scheduling import run_after_others
 from quadvel_recordings.definitions import STORE
 
 from .operator import PERIOD, Operator
 from .picture import LATCHED, TOPICS, RobotPicture
 from .recording import Recording
 from .server import AddressError
-from .viewer import FRAME, PORT, Viewer
+from .viewer import FRAME, LARGEST_PORT, PORT, Viewer
+from .words import Allow, Hold, LetGo, ModeRequest, Record, Release, Reset, Stop, Word
+from .words import Push as PushWord
 
-NICENESS = 10
+NICENESS = 5
+"""a third of the processor time of each of the robot's processes where it is short: STOP comes through this one"""
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-MODES = ("passive", "stand_up", "stance", "walk", "lie_down")
 SIMULATIONS = ("sim_node", "board")
 PUSH, PUSH_TIME = 60.0, 0.2  # N, s
 SLOPE = 0.175  # rad, of the page's slope
@@ -52,6 +55,10 @@ class ViewParameters:
     port: int = _parameter(PORT, "TCP port of the page; 0: any that is free")
     record_folder: str = _parameter("out", "folder for recordings that the page starts")
 
+    def __attrs_post_init__(self) -> None:
+        if not 0 <= self.port <= LARGEST_PORT:
+            raise ValueError(f"port is {self.port}, expected 0 to {LARGEST_PORT}")
+
 
 class View(Node):
     """The page, what it shows, and what it asks for."""
@@ -66,6 +73,7 @@ class View(Node):
         self._velocity = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable = self.create_client(SetBool, "controller/enable_walking")
+        self._reset_odometry = self.create_client(Trigger, "estimator/reset_odometry")
         self._resets = [self.create_client(ResetSim, f"{name}/reset") for name in SIMULATIONS]
         self._pushes = [self.create_client(Push, f"{name}/push") for name in SIMULATIONS]
         for topic, typename in TOPICS.items():
@@ -103,7 +111,9 @@ class View(Node):
         now = time.monotonic()
         for topic, waiting in self._waiting.items():
             while waiting:
-                self._picture.take(topic, STORE.deserialize_cdr(waiting.popleft(), TOPICS[topic]), now)
+                self._picture.read(
+                    topic, partial(STORE.deserialize_cdr, waiting.popleft(), TOPICS[topic]), now
+                )
         self._viewer.show(
             self._picture, self._operator, now, said=self._said, recording=self._recording.file, playback=None
         )
@@ -128,7 +138,7 @@ class View(Node):
 
     # What a page says; it comes in the server's thread, and is heeded in the executor's.
 
-    def _on_word(self, page: int, word: dict[str, Any]) -> None:
+    def _on_word(self, page: int, word: Word) -> None:
         self._soon(partial(self._heed, page, word))
 
     def _on_leave(self, page: int) -> None:
@@ -138,48 +148,57 @@ class View(Node):
         if self.executor is not None:
             self.executor.create_task(task)
 
-    def _heed(self, page: int, word: dict[str, Any]) -> None:
+    def _heed(self, page: int, word: Word) -> None:
         match word:
-            case {"do": "stop"}:
+            case Stop():
                 self._operator.stop()
                 self.get_logger().warning("STOP was pressed on the page")
                 self._ask_to_stop()
-            case {"do": "hold", "velocity": [vx, vy, wz]}:
-                self._hold(page, (vx, vy, wz))
-            case {"do": "let_go"}:
+            case Hold(velocity=velocity):
+                self._operator.hold(page, velocity, time.monotonic())
+            case LetGo():
                 self._operator.let_go(page, time.monotonic())
-            case {"do": "release"}:
+            case Release():
                 self._operator.release()
                 self.get_logger().info("the STOP was released on the page")
-            case {"do": "record"}:
+            case Record():
                 self._said = self._recording.toggle()
-            case {"do": str(order)} if not self._operator.stopped:
-                self._order(order, word)
+            case _ if not self._operator.stopped:
+                self._order(word)
 
-    def _hold(self, page: int, velocity: tuple[Any, Any, Any]) -> None:
-        try:
-            self._operator.hold(page, velocity, time.monotonic())
-        except (TypeError, ValueError) as error:
-            self._said = str(error)
-
-    def _order(self, order: str, word: dict[str, Any]) -> None:
+    def _order(self, word: Word) -> None:
         """What may not be asked for while STOP is pressed."""
-        if order in MODES:
-            self._call(self._set_mode, SetMode.Request(mode=order), order.replace("_", " "))
-        elif order == "allow":
-            self._call(self._enable, SetBool.Request(data=True), "allow walking")
-        elif order == "reset":
-            terrain = str(word.get("terrain") or "")
-            slope = SLOPE if terrain == "slope" else 0.0
-            request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
-            self._call(_ready(self._resets), request, "reset")
-        elif order == "push":
-            force = Vector3(y=-PUSH if word.get("to") == "right" else PUSH)
-            request = Push.Request(body="trunk", wrench=Wrench(force=force), duration=PUSH_TIME)
-            self._call(_ready(self._pushes), request, "push")
+        match word:
+            case ModeRequest():
+                self._call(self._set_mode, SetMode.Request(mode=word.mode), word.mode.replace("_", " "))
+            case Allow():
+                self._call(self._enable, SetBool.Request(data=True), "allow walking")
+            case Reset(terrain=terrain):
+                self._reset(terrain)
+            case PushWord(to=side):
+                force = Vector3(y=-PUSH if side == "right" else PUSH)
+                request = Push.Request(body="trunk", wrench=Wrench(force=force), duration=PUSH_TIME)
+                self._call(_ready(self._pushes), request, "push")
 
-    def _call(self, client: Any, request: Any, what: str) -> None:
-        """Call a service, and show what came of it."""
+    def _reset(self, terrain: str) -> None:
+        """Put the simulated robot back: a jump to another place is a fault of a robot that is not passive."""
+        slope = SLOPE if terrain == "slope" else 0.0
+        request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
+
+        def put_back() -> None:
+            self._call(_ready(self._resets), request, "reset", then=start_odometry)
+
+        def start_odometry() -> None:
+            if self._reset_odometry.service_is_ready():
+                self._reset_odometry.call_async(Trigger.Request())
+
+        if self._set_mode.service_is_ready():
+            self._call(self._set_mode, SetMode.Request(mode="passive"), "passive", then=put_back)
+        else:
+            put_back()
+
+    def _call(self, client: Any, request: Any, what: str, then: Callable[[], None] = lambda: None) -> None:
+        """Call a service, show its answer, and where it was a success do what comes `then`."""
         if not client.service_is_ready():
             self._said = f"{what}: nobody is there who could"
             return
@@ -187,6 +206,8 @@ class View(Node):
         def answered(future: Any) -> None:
             response = future.result()
             self._said = response.message if response.success else f"{what} refused: {response.message}"
+            if response.success:
+                then()
 
         client.call_async(request).add_done_callback(answered)
 
@@ -198,5 +219,5 @@ def _ready(clients: list[Any]) -> Any:
 
 def main(args: list[str] | None = None) -> None:
     """Entry point of the node. The robot's own nodes come first where the machine is short of time."""
-    os.nice(NICENESS)
+    run_after_others(NICENESS)
     run(View, args)

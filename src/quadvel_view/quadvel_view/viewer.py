@@ -11,11 +11,14 @@ from .picture import RobotPicture
 from .scene import Scene
 from .scene_server import SceneServer, SceneServerError
 from .server import AddressError, PageServer
+from .words import Word
 
 FRAME = 1.0 / 30.0
 """s, between two pictures"""
 PORT = 8770
 """TCP port of the page, unless told otherwise"""
+LARGEST_PORT = 65535
+"""of TCP"""
 
 
 class Viewer:
@@ -25,7 +28,7 @@ class Viewer:
         self,
         host: str,
         port: int,
-        on_word: Callable[[int, dict[str, Any]], None],
+        on_word: Callable[[int, Word], None],
         on_leave: Callable[[int], None],
     ) -> None:
         try:

@@ -10,6 +10,8 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from quadvel_nodes.number_text import number_text
+
 from ..output import output_folder, replacing
 from .measure import measure
 
@@ -36,7 +38,7 @@ def following_command(
     found = measure(runs)
     table = Table(f"simulated, {runs} each", *HEADS.values())
     for name, row in found.items():
-        table.add_row(name, *(f"{row[head]:.2f}" for head in HEADS))
+        table.add_row(name, *(number_text(row[head], ".2f") for head in HEADS))
     Console().print(table)
     with replacing(out / "following.json") as draft:
         draft.write_text(json.dumps(found, indent=1))

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from rich.table import Table
 
 from quadvel_follow.follow_planner import State
+from quadvel_nodes.number_text import number_text
 from quadvel_sim.world import World
 
 from ..report import write_figure, write_json
@@ -64,17 +65,18 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
     """The figures, for people, beside what the paper reports of its own."""
     table = Table("", "here", "paper", title=f"Following through {figures['world']}, seed {figures['seed']}")
     touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
+    n = number_text
     rows = [
-        ("way", f"{figures['walked']:.0f} m in {figures['minutes']:.1f} min", "3100 m in 37 min"),
+        ("way", f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min", "3100 m in 37 min"),
         ("fell", "yes" if figures["fell"] else "no", "no"),
         ("touched", touched, ""),
-        ("error of the velocity, mean", f"{figures['error_xy']:.3f} m/s", f"{PAPER_XY} m/s"),
-        ("error of the yaw rate, mean", f"{figures['error_wz']:.3f} rad/s", f"{PAPER_WZ} rad/s"),
-        ("distance, mean", f"{figures['distance_mean']:.2f} m", ""),
-        (f"within {BAND} m of the set distance", f"{100 * figures['distance_kept']:.0f} % of the time", ""),
+        ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
+        ("error of the yaw rate, mean", f"{n(figures['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),
+        ("distance, mean", f"{n(figures['distance_mean'], '.2f')} m", ""),
+        (f"within {BAND} m of the set distance", f"{n(figures['distance_kept'], '.0%')} of the time", ""),
         ("least clearance from things", _metres(figures["least_clearance"]), ""),
         ("least clearance from persons", _metres(figures["least_gap"]), ""),
-        ("person lost", f"{figures['losses']} times, {figures['lost_seconds']:.0f} s together", ""),
+        ("person lost", f"{figures['losses']} times, {n(figures['lost_seconds'], '.0f')} s together", ""),
     ]
     if planner := figures.get("planner_ms"):
         rows.append(("planner, mean and p99", f"{planner['mean']:.1f}, {planner['p99']:.1f} ms", ""))

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from quadvel_follow.leg_detector import SHIPPED_MODEL, LegDetector
+from quadvel_nodes.number_text import number_text
 
 from ..output import output_folder, replacing
 from .figure import draw_tracks
@@ -68,5 +69,5 @@ def _table(title: str, figures: Figures) -> Table:
     heads = [head for head in HEADS if any(head in row for row in figures.values())]
     table = Table(title, *(HEADS[head] for head in heads))
     for name, row in figures.items():
-        table.add_row(name, *(f"{row[head]:.3g}" if head in row else "" for head in heads))
+        table.add_row(name, *(number_text(row[head], ".3g") if head in row else "" for head in heads))
     return table

@@ -2,10 +2,12 @@
 "use strict";
 
 const AGAIN = 50;          // ms between two words of a hand that holds something
-const REACH = 62;          // px that the pad's knob goes from its middle
 const TURN = 1.6;          // rad/s at the pad's edge, per m/s of the speed that is set, 1.2 at most
 const SIDEWAYS = 0.6;      // share of the speed that is set
 const SECONDS = 10;        // of the graphs
+const SILENT = 1.5;        // s without news, of which thirty a second are expected
+const SLOW = 30_000;       // ms after which the 3-D view should have been loaded
+const DASH = "\u2013";
 const AXES = [["forward", "m/s"], ["left", "m/s"], ["turn", "rad/s"]];
 const LEGS = ["FR", "FL", "RR", "RL"], JOINTS = ["hip", "thigh", "calf"];
 const $ = (id) => document.getElementById(id);
@@ -27,6 +29,7 @@ function connect() {
     $("mode").className = "pill fault";
     $("mode").textContent = "no connection";
     $("reason").textContent = "the page lost `quadvel view`; it tries again";
+    $("refusal").textContent = "";
     letGo();
     setTimeout(connect, 1000);
   };
@@ -74,7 +77,7 @@ function draggable(name, both) {
   const follow = (event) => {
     const box = element.getBoundingClientRect();
     let x = event.clientX - box.left - box.width / 2, y = both ? event.clientY - box.top - box.height / 2 : 0;
-    const far = Math.hypot(x, y), most = both ? REACH : box.width / 2 - 18;
+    const far = Math.hypot(x, y), most = (box.width - element.querySelector(".knob").offsetWidth) / 2;
     if (far > most) { x *= most / far; y *= most / far; }
     held[name] = [-x / most, -y / most];
     place(element, x, y);
@@ -113,8 +116,11 @@ setInterval(speak, AGAIN);
 
 const past = [];  // [ms, commanded, measured]
 
+let heardAt = performance.now();
+
 function show(news) {
   state = news;
+  heardAt = performance.now();
   const playing = news.playback !== null;
   document.body.classList.toggle("playing", playing);
   document.body.classList.toggle("stopped", news.stopped);
@@ -123,7 +129,8 @@ function show(news) {
   $("simulation").hidden = !news.simulated;
   $("mode").textContent = news.mode.replace("_", " ") || (playing ? "recording" : "silent");
   $("mode").className = `pill ${news.mode}`;
-  $("reason").textContent = playing && !news.mode ? news.playback.name : news.refusal || news.reason;
+  $("reason").textContent = playing && !news.mode ? news.playback.name : news.reason;
+  $("refusal").textContent = news.refusal;
   $("stop").innerHTML = news.stopped ? "<b>STOPPED</b><small>press to release</small>" : "<b>STOP</b><small>space</small>";
   $("said").textContent = news.said || "";
   $("record").classList.toggle("on", Boolean(news.recording));
@@ -141,16 +148,21 @@ function drawReadings() {
     drawGraph(graph.querySelector("canvas"), axis);
   });
   document.querySelectorAll(".bar").forEach((bar, joint) => {
-    const share = Math.min(Math.abs(state.torque[joint]), 1);
+    const share = Math.min(Math.abs(state.torque[joint] ?? 0), 1);
     bar.firstElementChild.style.transform = `scaleY(${share})`;
     bar.className = `bar ${share > 0.95 ? "full" : share > 0.7 ? "high" : ""}`;
   });
   const { rate, period, compute, missed } = state.loop;
   const rows = rate === undefined ? [["", "silent"]]
-    : [["rate", `${rate.toFixed(0)} Hz`], ["period", `${period.toFixed(1)} ms`], ["compute", `${(compute / 1000).toFixed(1)} ms`], ["missed", missed]];
+    : [["rate", text(rate, 0, " Hz")], ["period", text(period, 1, " ms")], ["compute", text(compute && compute / 1000, 1, " ms")], ["missed", missed]];
   fill(document.querySelector("#loop dl"), rows.flatMap(([name, value]) => [["dt", name], ["dd", value]]));
   showLamps(state.lamps);
+  const silence = (performance.now() - heardAt) / 1000;
+  fill($("notices"), [...state.notices, ...(silence > SILENT ? [`no news from quadvel view for ${silence.toFixed(0)} s`] : [])].map((one) => ["li", one]));
 }
+
+// A number for people; a dash where it is not there.
+function text(value, digits, unit = "") { return value === null ? DASH : value.toFixed(digits) + unit; }
 
 function fill(parent, children) {
   parent.replaceChildren(...children.map(([tag, text]) => Object.assign(document.createElement(tag), { textContent: text })));
@@ -171,13 +183,13 @@ function showLamps(lamps) {
   }));
 }
 
-function signed(value) { return (value < 0 ? "\u2212" : "+") + Math.abs(value).toFixed(2); }
+function signed(value) { return value === null ? DASH : (value < 0 ? "\u2212" : "+") + Math.abs(value).toFixed(2); }
 
 function drawGraph(canvas, axis) {
   const ratio = devicePixelRatio || 1, width = canvas.clientWidth * ratio, height = canvas.clientHeight * ratio;
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const context = canvas.getContext("2d"), now = performance.now();
-  const most = Math.max(0.6, ...past.map(([, asked, got]) => Math.max(Math.abs(asked[axis]), Math.abs(got[axis]))));
+  const most = Math.max(0.6, ...past.map(([, asked, got]) => Math.max(Math.abs(asked[axis] ?? 0), Math.abs(got[axis] ?? 0))));
   context.clearRect(0, 0, width, height);
   context.fillStyle = "#252c37";
   context.fillRect(0, height / 2, width, ratio);
@@ -185,8 +197,11 @@ function drawGraph(canvas, axis) {
     context.strokeStyle = colour;
     context.lineWidth = 1.5 * ratio;
     context.beginPath();
+    let gap = true;
     for (const one of past) {
-      context.lineTo(width * (1 - (now - one[0]) / (1000 * SECONDS)), height * (0.5 - 0.46 * one[which][axis] / most));
+      if (one[which][axis] === null) { gap = true; continue; }
+      context[gap ? "moveTo" : "lineTo"](width * (1 - (now - one[0]) / (1000 * SECONDS)), height * (0.5 - 0.46 * one[which][axis] / most));
+      gap = false;
     }
     context.stroke();
   }
@@ -223,7 +238,8 @@ LEGS.forEach((leg) => {
 draggable("pad", true);
 draggable("strafe", false);
 $("stop").addEventListener("click", () => { letGo(); stopOrRelease(); });
-document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, to: one.dataset.to, terrain: $("ground").value })));
+const FIELDS = { reset: () => ({ terrain: $("ground").value }), push: (button) => ({ to: button.dataset.to }) };  // of the words that have some
+document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, ...FIELDS[one.dataset.do]?.(one) })));
 $("speed").addEventListener("input", () => { $("top").textContent = `${Number($("speed").value).toFixed(1)} m/s`; });
 $("speed").dispatchEvent(new Event("input"));
 $("play").addEventListener("click", () => say({ do: "play" }));
@@ -231,6 +247,9 @@ $("time").addEventListener("input", () => { seeking = true; say({ do: "seek", ti
 $("time").addEventListener("change", () => { seeking = false; });
 document.querySelectorAll("#paces button").forEach((one) => one.addEventListener("click", () => say({ do: "pace", pace: Number(one.dataset.pace) })));
 setInterval(drawReadings, 100);
+
+addEventListener("message", (event) => { if (event.source === $("scene").contentWindow && event.data === "drawn") $("loading").hidden = true; });
+setTimeout(() => { $("loading").textContent = "no 3-D view yet: this browser may lack WebGL, or be short of time"; }, SLOW);
 
 // Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours.
 const OTHER_NAME = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
