@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
+from . import lerobot
 from .columns import ColumnMap
 from .log import Log
 from .recordings import read as read_recording
@@ -12,7 +13,7 @@ from .tables import read_table
 
 
 def read_log(path: str | Path, joints: Sequence[str] | None = None, names: ColumnMap | None = None) -> Log:
-    """The log at `path`: an .mcap file, a rosbag2 folder, an .npz, .csv or .json; only `joints` where they are given.
+    """The log at `path`: a recording (MCAP, rosbag2, ROS 1) or a table of `files.READERS`; only `joints` where they are given.
 
     `names` says what the fields are called in a table. Raises LogError, one sentence that names the file and the
     field, and OSError where there is no such file.
@@ -20,7 +21,7 @@ def read_log(path: str | Path, joints: Sequence[str] | None = None, names: Colum
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    if path.is_dir() or path.suffix in (".mcap", ".db3"):
+    if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.root_of(path) != path):
         log = read_recording(path)
     else:
         log = read_table(path, names or ColumnMap())

@@ -16,8 +16,8 @@ from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_SERVO
 from quadvel_recordings.reading import RecordingError, read_messages
 
-from .files import precision
 from .log import Array, Log, LogError
+from .raw import precision
 from .tables import drop_repeated_times
 
 STATE, COMMAND = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
