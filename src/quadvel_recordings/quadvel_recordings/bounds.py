@@ -127,7 +127,9 @@ def _chunks(file: IO[bytes]) -> Iterator[tuple[_Chunk, bytes]]:
 
 def _most_at_once(chunks: list[_Chunk]) -> int:
     """Bytes of the chunks that hold one instant, at most."""
-    changes = [(chunk.first, chunk.size) for chunk in chunks] + [(chunk.last + 1, -chunk.size) for chunk in chunks]
+    changes = [(chunk.first, chunk.size) for chunk in chunks] + [
+        (chunk.last + 1, -chunk.size) for chunk in chunks
+    ]
     most = now = 0
     for _, change in sorted(changes):
         now += change

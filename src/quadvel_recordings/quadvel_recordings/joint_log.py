@@ -22,7 +22,9 @@ from .stamps import stamp_of, unstamped
 Array = NDArray[np.floating[Any]]
 Names = tuple[str, ...]
 
-LEG_JOINTS = tuple(f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf"))
+LEG_JOINTS = tuple(
+    f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")
+)
 """The joints of LowState and LowCmd, Unitree's and ours, in their order."""
 STATE_FIELDS = ("q", "dq", "tau")
 COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
@@ -30,7 +32,9 @@ OWN_SERVO, UNITREE_SERVO = 10, 1
 """Modes in which a drive obeys position and gains."""
 NO_TARGET = 1e4
 """Unitree sends an angle of 2.146e9 rad and a speed of 16000 rad/s for "none"."""
-COMMANDS = re.compile(r"cmd|command|desired|target|reference|(^|[/_])(des|ref)($|[/_])|goal|setpoint|action", re.IGNORECASE)
+COMMANDS = re.compile(
+    r"cmd|command|desired|target|reference|(^|[/_])(des|ref)($|[/_])|goal|setpoint|action", re.IGNORECASE
+)
 """How topics of commands are called."""
 SLOW = re.compile(r"(^|/)lf/")
 """Where Unitree publishes the same states once more, less often."""
@@ -222,7 +226,9 @@ def _pair(
         types = [getattr(family, role) for family in FAMILIES]
         if topic is not None and there.get(topic) not in types:
             found = there.get(topic, "no such topic")
-            raise RecordingError(f"{path}: {topic}: found {found}, expected {' or '.join(types)}; {_listed(there)}")
+            raise RecordingError(
+                f"{path}: {topic}: found {found}, expected {' or '.join(types)}; {_listed(there)}"
+            )
     halves: tuple[str, str | None] | None = None
     for family in FAMILIES:
         states, commands = _candidates(there, family, state, command)
@@ -267,7 +273,9 @@ def expect_commands(path: Path, log: JointLog) -> Series:
         expected = f"expected commands beside the states on {log.state.topic}: a topic of {types}"
         raise RecordingError(f"{path}: {expected}; --command-topic says which; {_listed(topics(path))}")
     if "q" not in log.command.values:
-        raise RecordingError(f"{path}: {log.command.topic}: found no angles in it, expected commanded positions")
+        raise RecordingError(
+            f"{path}: {log.command.topic}: found no angles in it, expected commanded positions"
+        )
     return log.command
 
 

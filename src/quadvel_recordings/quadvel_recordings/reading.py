@@ -84,10 +84,14 @@ def _parts(path: Path, tell: Callable[[str], None] | None) -> Sequence[Path]:
     metadata = path / "metadata.yaml"
     if not metadata.exists():
         if not files:
-            raise RecordingError(f"{path}: the folder is no recording: a rosbag2 folder holds a metadata.yaml")
+            raise RecordingError(
+                f"{path}: the folder is no recording: a rosbag2 folder holds a metadata.yaml"
+            )
         reason = "metadata.yaml is missing"
     else:
-        kind = re.search(r"^\s*storage_identifier:\s*(.*?)\s*$", metadata.read_text(errors="replace"), re.MULTILINE)
+        kind = re.search(
+            r"^\s*storage_identifier:\s*(.*?)\s*$", metadata.read_text(errors="replace"), re.MULTILINE
+        )
         name = "mcap" if kind is None else kind[1].strip("\"'")
         if not files or name in STORAGES.values():
             return [path]
@@ -154,7 +158,9 @@ def _of_ros1(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tuple[s
     try:
         with Ros1Reader(path) as reader:
             for position, chunk in reader.chunks.items():
-                packing = next((name for name in ("bz2", "lz4") if chunk.decompressor is decompressors[name]), None)
+                packing = next(
+                    (name for name in ("bz2", "lz4") if chunk.decompressor is decompressors[name]), None
+                )
                 if packing:
                     bounded = partial(unpacked, compression=packing)
                     reader.chunks[position] = chunk._replace(decompressor=bounded)

@@ -70,7 +70,9 @@ def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> l
     joints = shared(state.joints, command.joints)
     if not joints:
         found = f"found {', '.join(command.joints[:3])}, ..."
-        raise LogError(f"{path}: {command.topic}: {found}, expected joints of {state.topic}: {', '.join(state.joints[:3])}, ...")
+        raise LogError(
+            f"{path}: {command.topic}: {found}, expected joints of {state.topic}: {', '.join(state.joints[:3])}, ..."
+        )
     left = [name for name in (*state.joints, *command.joints) if name not in joints]
     if left:
         remarks.append(f"joint_names: {', '.join(left)}: not both measured and commanded; left out")
