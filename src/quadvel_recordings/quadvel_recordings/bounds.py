@@ -5,7 +5,6 @@ from __future__ import annotations
 import bz2
 import shutil
 import struct
-import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from io import BytesIO
@@ -14,11 +13,7 @@ from typing import IO, Any
 
 import attrs
 import lz4.frame
-
-if sys.version_info >= (3, 14):
-    from compression import zstd
-else:
-    from backports import zstd
+from backports import zstd
 
 LARGEST_CHUNK = 1 << 28
 """Bytes of a chunk or message once unpacked: recorders write chunks of some MB."""

@@ -13,7 +13,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
-from itertools import chain, islice
+from itertools import chain
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,7 +28,9 @@ from .raw import LARGEST, LARGEST_TEXT, LONGEST_LINE, Choose, Raw, type_of
 SEPARATORS = (",", ";", "\t", "|")
 LINES = 20_000
 """Lines of a table that are read at once."""
-BLOCK = 1 << 25
+SEEN = 100
+"""Lines below the head that tell how numbers are written."""
+BLOCK = 1 << 23
 """Characters that are read at once."""
 MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-")
 EXPECTED = "expected t, q/FR_hip_joint, ..."
@@ -100,7 +102,7 @@ def _read(path: Path, file: IO[str], choose: Choose) -> Raw:
     lines = _lines(path, file)
     form, stated, begin = _head(path, lines)
     chosen = _chosen(path, form.columns, choose)
-    first = list(islice(chain(begin, lines), 100))
+    first = list(_block(chain(begin, lines), SEEN))
     below = _units_below(form, chosen, first)
     if below:
         stated, first = stated | below, first[1:]
@@ -165,7 +167,11 @@ def _head(path: Path, lines: Iterator[Line]) -> tuple[_Form, dict[str, str], lis
 
 
 def _separator(head: str) -> str | None:
+    """What stands between the cells of a line, None for white space."""
     bare = re.sub(r'"[^"]*"', "", head)
+    for one in SEPARATORS[1:]:
+        if one in bare and all(map(_is_number, _Form(one, ()).cells(head))):
+            return one
     most = max(SEPARATORS, key=bare.count)
     return most if most in bare or len(head.split()) == 1 else None
 
@@ -220,14 +226,15 @@ def _blocks(
         ]
 
 
-def _block(lines: Iterator[Line]) -> Iterator[Line]:
+def _block(lines: Iterator[Line], most: int = LINES) -> Iterator[Line]:
     """The next lines, as many as are read at once, without comments."""
     length = count = 0
     for number, line in lines:
+        if line.lstrip().startswith("#"):
+            continue
+        yield number, line
         length, count = length + len(line), count + 1
-        if not line.lstrip().startswith("#"):
-            yield number, line
-        if length > BLOCK or count == LINES:
+        if length > BLOCK or count == most:
             return
 
 
