@@ -41,7 +41,8 @@ def test_legs_are_in_the_models_order() -> None:
 
 @pytest.mark.parametrize("topics", [
     ("/joint_states", "/joint_commands"), ("/robot/joint_states", "/robot/joint_cmd"), ("/joint_states", "/joint_states_desired"),
-    ("/isaac_joint_states", "/isaac_joint_commands"), ("/measured", "/target_positions"), ("/joint_states", "/arm_controller/reference"),
+    ("/isaac_joint_states", "/isaac_joint_commands"), ("/measured", "/target_positions"),
+    ("/joint_states", "/arm_controller/reference"),
 ])  # fmt: skip
 def test_a_pair_of_joint_states_is_told_apart_by_its_names(tmp_path: Path, topics: tuple[str, str]) -> None:
     names = ("shoulder", "elbow", "wrist")

@@ -28,8 +28,15 @@ from quadvel_recordings.reading import RecordingError, read_messages
 from .demo_figures import AXES
 from .output import output_folder, replacing
 from .recording_plot import (
-    CommandTopic, Recorded, Run, StateTopic, add_legend, panels_over, read_run, to_stderr,
-)  # fmt: skip
+    CommandTopic,
+    Recorded,
+    Run,
+    StateTopic,
+    add_legend,
+    panels_over,
+    read_run,
+    to_stderr,
+)
 from .replay import PAST, Joints, joints_of, modelled_torque, read_joints
 from .segments import rounded
 

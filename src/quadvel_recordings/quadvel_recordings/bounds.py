@@ -70,7 +70,7 @@ def _parts(file: IO[bytes], compression: str) -> Iterator[bytes]:
 
 
 def check_chunks(path: Path) -> None:
-    """Raises TooLargeError where chunks of an MCAP file unpack to more than they may. Of a file that is broken, what is whole counts."""
+    """Raises TooLargeError where chunks of an MCAP file unpack to more than they may; of a broken file what is whole counts."""
     chunks = []
     with path.open("rb") as file:
         for chunk, data in _chunks(file):

@@ -21,7 +21,6 @@ from .bounds import TooLargeError, check_chunks, check_packed_file, unpacked
 from .cut_off import is_cut_off, kept_messages, what_is_kept
 from .recorded import is_known, read
 
-
 STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
 """What metadata.yaml calls the files of a rosbag2, by their suffix."""
 

@@ -25,6 +25,11 @@ BROKEN = (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, Runtime
 """What zipfile raises where an archive is cut off, packed in an unknown way, or encrypted."""
 UNPICKLED = "{path}: {name}: found the type object, a pickle, which may run programs and is not read; if you trust it: {command}"
 
+CONVERSION = (
+    'python -c "import numpy as np; '
+    "np.savez('log.npz', **np.load('{name}', allow_pickle=True){member}.item())\""
+)
+
 
 def read_npz(path: Path, choose: Choose) -> Raw:
     """An archive as `numpy.savez` writes it."""
@@ -53,7 +58,7 @@ def read_npy(path: Path, choose: Choose) -> Raw:
         except ValueError as error:
             raise LogError(f"{path}: no NumPy array: {error}") from None
         if dtype.hasobject:
-            command = f"python -c \"import numpy as np; np.savez('log.npz', **np.load('{path.name}', allow_pickle=True).item())\""
+            command = CONVERSION.format(name=path.name, member="")
             raise LogError(UNPICKLED.format(path=path, name="log", command=command))
         if dtype.names is None:
             raise LogError(
@@ -114,7 +119,7 @@ def _refuse_objects(path: Path, archive: zipfile.ZipFile, names: list[str]) -> N
             except ValueError:
                 continue
         if dtype.hasobject:
-            command = f"python -c \"import numpy as np; np.savez('log.npz', **np.load('{path.name}', allow_pickle=True)['{name}'].item())\""
+            command = CONVERSION.format(name=path.name, member=f"['{name}']")
             raise LogError(UNPICKLED.format(path=path, name=name, command=command))
 
 

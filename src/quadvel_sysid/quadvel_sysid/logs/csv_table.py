@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import codecs
 import csv
-import gzip
+import io
 import json
 import re
 from collections import Counter
@@ -23,7 +23,7 @@ import numpy as np
 from . import units
 from .log import Array, LogError
 from .names import TIMES
-from .raw import LARGEST, LARGEST_TEXT, LONGEST_LINE, Choose, Raw, type_of
+from .raw import LARGEST, LARGEST_TEXT, LONGEST_LINE, Choose, Raw, opened, type_of
 
 SEPARATORS = (",", ";", "\t", "|")
 LINES = 20_000
@@ -120,14 +120,9 @@ def _read(path: Path, file: IO[str], choose: Choose) -> Raw:
 
 
 def _text(path: Path) -> IO[str]:
-    opened = gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")
-    with opened as file:
-        start = file.read(2)
-    wide = start in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    encoding = "utf-16" if wide else "utf-8-sig"
-    if path.suffix == ".gz":
-        return gzip.open(path, "rt", encoding=encoding, errors="replace")
-    return path.open(encoding=encoding, errors="replace")
+    with opened(path) as file:
+        wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+    return io.TextIOWrapper(opened(path), encoding="utf-16" if wide else "utf-8-sig", errors="replace")
 
 
 def _lines(path: Path, file: IO[str]) -> Iterator[Line]:
@@ -295,7 +290,8 @@ def _rows(
 
     def text() -> Iterator[str]:
         nonlocal at
-        for at, line in chain(block, lines):
+        for number, line in chain(block, lines):
+            at = number
             yield line
 
     rows: list[tuple[int, list[str]]] = []

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import numpy as np
 
 from .log import LogError
 from .names import NAMES
-from .raw import Choose, Raw, check_size
+from .raw import Choose, Raw, check_size, opened
 
 LARGEST_DOCUMENT = 100_000_000
 """Characters of a JSON document, which is read whole."""
@@ -19,8 +18,7 @@ LARGEST_DOCUMENT = 100_000_000
 
 def read(path: Path, choose: Choose) -> Raw:
     """A document of named lists, or of a list of records, wherever it stands; numbers beside it count for all rows."""
-    opened = gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb")
-    with opened as file:
+    with opened(path) as file:
         text = file.read(LARGEST_DOCUMENT + 1)
     if len(text) > LARGEST_DOCUMENT:
         raise LogError(f"{path}: more than {LARGEST_DOCUMENT} characters; expected an NPZ archive of so much")

@@ -17,7 +17,10 @@ from .raw import Choose, Raw, check_size, check_type, numbers
 MOST_GROUPS = 1000
 """Structs or groups of a file among which a log is looked for."""
 
-_TORCH = "python -c \"import numpy, torch; numpy.savez('log.npz', **{k: numpy.asarray(v) for k, v in torch.load('{name}', weights_only=True).items()})\""
+_TORCH = (
+    "python -c \"import numpy, torch; numpy.savez('log.npz', "
+    "**{k: numpy.asarray(v) for k, v in torch.load('{name}', weights_only=True).items()})\""
+)
 _PICKLE = "python -c \"import numpy, pickle; numpy.savez('log.npz', **pickle.load(open('{name}', 'rb')))\""
 _JOBLIB = "python -c \"import joblib, numpy; numpy.savez('log.npz', **joblib.load('{name}'))\""
 _PANDAS = "python -c \"import pandas; pandas.{reader}.to_csv('log.csv', index=False)\""
@@ -41,7 +44,8 @@ def refusal(path: Path, known: Collection[str]) -> str:
     command = command.replace("{name}", path.name)
     if reason:
         return f"{path}: the suffix is '{path.suffix}': {reason.format(command=command)}"
-    return f"{path}: the suffix is '{path.suffix}', expected {', '.join(('.mcap', '.db3', '.bag', *known))}, or a folder of rosbag2 or LeRobot"
+    listed = ", ".join((".mcap", ".db3", ".bag", *known))
+    return f"{path}: the suffix is '{path.suffix}', expected {listed}, or a folder of rosbag2 or LeRobot"
 
 
 def library(path: Path, name: str) -> Any:

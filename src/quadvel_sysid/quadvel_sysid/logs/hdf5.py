@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -62,7 +63,7 @@ def _stored(h5py: Any, data: Any, place: str) -> Iterator[tuple[str, Stored]]:
             column = data.dtype[name]
             yield (
                 f"{place}/{name}",
-                Stored((*data.shape, *column.shape), column.base, lambda name=name: data[name]),
+                Stored((*data.shape, *column.shape), column.base, partial(data.__getitem__, name)),
             )
     elif kind == b"cell" and place.endswith(NAMES):
         yield place, Stored.of(np.array([_characters(data.file[one]) for one in np.ravel(data[()])]))

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import gzip
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import attrs
 import numpy as np
@@ -38,6 +39,11 @@ class Raw:
     others: tuple[str, ...] = ()
     units: Mapping[str, str] = attrs.field(factory=dict)
     remarks: tuple[str, ...] = ()
+
+
+def opened(path: Path) -> IO[bytes]:
+    """The bytes of a file, unpacked where its name ends in .gz."""
+    return cast(IO[bytes], gzip.open(path, "rb")) if path.suffix == ".gz" else path.open("rb")
 
 
 def precision(values: int) -> DTypeLike:

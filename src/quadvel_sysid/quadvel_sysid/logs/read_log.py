@@ -19,10 +19,17 @@ def read_log(
     names: ColumnMap | None = None,
     topics: Topics | None = None,
 ) -> Log:
-    """The log at `path`: a recording (MCAP, rosbag2, ROS 1) or a table of `files.READERS`; only `joints` where they are given.
+    """The log at `path`, whatever its format.
 
-    `names` says what the fields are called in a table, `topics` which topics of a recording hold the log. Raises LogError, one sentence that names the file and the
-    field, and OSError where there is no such file.
+    Args:
+        path: a recording (MCAP, rosbag2, ROS 1) or a table of `files.READERS`.
+        joints: use these joints only.
+        names: what the fields are called in a table.
+        topics: which topics of a recording hold the log.
+
+    Raises:
+        LogError: one sentence that names the file and the field.
+        OSError: there is no such file.
     """
     path = Path(path)
     if not path.exists():

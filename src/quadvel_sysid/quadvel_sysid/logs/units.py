@@ -8,7 +8,8 @@ import re
 _DEGREE = math.pi / 180.0
 _TURN_PER_MINUTE = math.pi / 30.0
 _FACTORS = {
-    1.0: ("s", "sec", "second", "seconds", "rad", "radian", "radians", "rad/s", "rads", "nm", "nm/rad", "nms/rad", "v", "c", "degc", "1", "-"),
+    1.0: ("s", "sec", "second", "seconds", "rad", "radian", "radians", "rad/s", "rads", "nm", "nm/rad",
+          "nms/rad", "v", "c", "degc", "1", "-"),
     1e-3: ("ms", "msec", "milliseconds", "mrad", "mrad/s", "mnm", "nmm", "mv"),
     1e-6: ("us", "µs", "usec", "microseconds"),
     1e-9: ("ns", "nsec", "nanoseconds"),
