@@ -172,7 +172,7 @@ def torch_saved(path: Path) -> None:
     [
         ("log.pkl", pickled),
         ("log.pt", torch_saved),
-        ("log.npy", lambda path: np.save(path, GIVEN, allow_pickle=True)),  # type: ignore[arg-type]
+        ("log.npy", lambda path: np.save(path, GIVEN)),  # type: ignore[arg-type]
         ("dict.npz", lambda path: np.savez(path, log=np.array(GIVEN, dtype=object))),
     ],
 )
