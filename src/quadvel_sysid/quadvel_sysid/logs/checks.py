@@ -48,8 +48,8 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     `gains` are the commanded kp and kd (N m/rad, N m s/rad) of a log that holds none.
     """
     log = log.with_gains(gains)
-    read = [("note", text) for text in log.remarks] + [("warning", text) for text in log.warnings]
-    findings = [Finding(kind, text.partition(":")[0], (), text) for kind, text in read]
+    findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
+    findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
     for check in OF_ROWS:
         log = _looked(check, findings, log)
     if not _refused(findings) and (found := response.measured(log, response.FAR)):

@@ -28,6 +28,7 @@ from . import files
 from .findings import some
 from .log import Array, LogError
 from .names import FIELDS, NAMES, WHOLE, resolve
+from .raw import Raw
 from .units import factor
 
 
@@ -132,7 +133,7 @@ def read(path: Path, names: ColumnMap) -> tuple[dict[str, Array], list[str] | No
 
 def _choose(plain: bool, sources: Mapping[str, Source], there: Sequence[str]) -> dict[str, str]:
     """Of all names in a file those that are needed, each with its field."""
-    chosen = {}
+    chosen: dict[str, str] = {}
     for field, source in sources.items():
         for column in source.columns:
             chosen |= {name: field for name in there if name == column or name.startswith(f"{column}/")}
@@ -152,7 +153,7 @@ def _resolved(there: Sequence[str], sources: Mapping[str, Source]) -> dict[str, 
 
 def _plain(
     path: Path,
-    raw: files.Raw,
+    raw: Raw,
     names: ColumnMap,
     fields: dict[str, Array],
     joints: list[str] | None,
@@ -196,7 +197,7 @@ def _in_order(
 
 
 def _columns_of(
-    path: Path, field: str, columns: tuple[str, ...], raw: files.Raw, joints: list[str] | None
+    path: Path, field: str, columns: tuple[str, ...], raw: Raw, joints: list[str] | None
 ) -> tuple[list[str], list[str] | None]:
     """The columns that a map means, and the joints that they name: `positions` may stand for `positions/knee`."""
     if len(columns) == 1 and columns[0] not in raw.arrays:
@@ -216,7 +217,7 @@ def _stacked(
     path: Path,
     field: str,
     columns: Sequence[str],
-    raw: files.Raw,
+    raw: Raw,
     scale: float | list[float] | None,
     of_joints: bool = False,
 ) -> Array:
