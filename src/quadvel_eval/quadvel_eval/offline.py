@@ -188,11 +188,11 @@ def replay_command(
         joints = joints_of(recording, run.foreign, SLOWEST, gains)
     said = torques(joints, model)
     output_folder(out)
-    pictures, errors = {"torque": torque_figure(run, said)}, {}
+    pictures, errors = {"torque": torque_figure(run, said)}, dict[str, Array]()
     if run.foreign is None:
         asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
         times, found = estimated(recording, asked, run.received)
-        errors = velocity_errors(run, times, found)
+        errors |= velocity_errors(run, times, found)
         pictures["velocity"] = velocity_figure(run, times, found)
     _show(said, errors)
     _write(out, said, errors, pictures)

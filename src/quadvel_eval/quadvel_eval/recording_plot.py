@@ -94,7 +94,7 @@ class _Topic:
 
     def times(self, received: bool) -> Array:
         """s, on the clock that counts."""
-        return 1e-9 * np.array(self.receipts if received else self.stamps, np.int64)
+        return np.asarray(1e-9 * np.array(self.receipts if received else self.stamps, np.int64), np.float64)
 
 
 def read_run(
@@ -116,8 +116,9 @@ def read_run(
     """
     rows = _read_topics(path, tell)
     missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
-    for sentence in missing if tell else ():
-        tell(f"warning: {sentence}")
+    if tell:
+        for sentence in missing:
+            tell(f"warning: {sentence}")
     received = bool(missing)
     lines = {topic: (found.times(received), np.array(found.numbers, float)) for topic, found in rows.items()}
     foreign = None

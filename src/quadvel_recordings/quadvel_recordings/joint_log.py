@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from .reading import RecordingError, read_messages, topics
 from .stamps import stamp_of, unstamped
 
-Array = NDArray[np.floating[Any]]
+Array = NDArray[Any]  # of floats
 Names = tuple[str, ...]
 
 LEG_JOINTS = tuple(
