@@ -88,7 +88,7 @@ $(VENV)/.lint: $(VENV)/.run
 	@touch $@
 
 $(VENV)/.test: $(VENV)/.run
-	$(PY) $(INSTALL) '.[video,view,test,train]'
+	$(PY) $(INSTALL) '.[video,view,formats,test,train]'
 	@touch $@
 
 # The wheels are for x86-64 alone, and our interfaces are compiled: looked at before anything is installed.
@@ -103,5 +103,5 @@ $(ROS_VENV)/.run: $(ROS_PY) $(LOCKED) $(INTERFACES)
 	@touch $@
 
 $(ROS_VENV)/.test: $(ROS_VENV)/.run
-	$(ROS_PY) $(INSTALL) '.[video,view,ros,test]'
+	$(ROS_PY) $(INSTALL) '.[video,view,formats,ros,test]'
 	@touch $@

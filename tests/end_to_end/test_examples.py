@@ -100,6 +100,12 @@ LEFT_OUT = {
     "quadvel view out/demo/demo.mcap": "tests/quadvel_view/test_page.py plays one",
     "quadvel plot out/demo/demo.mcap --out out/plot": "tests/end_to_end/test_demo.py draws it",
     "quadvel replay out/demo/demo.mcap --out out/replay": "tests/end_to_end/test_demo.py asks it",
+    "quadvel identify arm.mcap --gains 30 0.5 --out out/identify": "needs a recording of another robot; "
+    "tests/quadvel_sysid/test_formats.py and tests/quadvel_recordings/test_joint_log.py read such recordings",
+    "quadvel identify arm.mcap --state-topic /joint_states --command-topic /joint_commands --gains 30 0.5 "
+    "--out out/identify": "the same",
+    "quadvel replay walk.mcap --actuator out/identify/actuator.yaml": "a replay of another recording; "
+    "tests/quadvel_eval/test_recorded_joints.py has several",
     "quadvel record --ring 30 --out out/faults": "tests/quadvel_bringup/test_recorder.py has a fault recorded",
     "quadvel view --foxglove": "tests/quadvel_view/test_foxglove.py asks such a server",
     "quadvel teleop": "tests/end_to_end/test_operator.py types its keys",

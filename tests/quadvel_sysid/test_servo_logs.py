@@ -264,7 +264,7 @@ def test_a_map_that_says_nothing_is_refused_by_its_entry(tmp_path: Path, names: 
 def test_a_column_that_a_map_names_and_the_log_lacks_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "log.npz", **recorded(3, 1.0))
     (tmp_path / "map.yaml").write_text("q: angles\n")
-    with pytest.raises(LogError, match=r"log\.npz: q: no 'angles' in it, found t, q, dq"):
+    with pytest.raises(LogError, match=r"log\.npz: q: no 'angles' in it, found t, dq, tau"):
         read_log(tmp_path / "log.npz", names=ColumnMap.load(tmp_path / "map.yaml"))
 
 

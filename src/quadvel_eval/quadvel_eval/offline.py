@@ -28,8 +28,17 @@ from quadvel_recordings.reading import RecordingError, read_messages
 
 from .demo_figures import AXES
 from .output import output_folder, replacing
-from .recording_plot import Run, add_legend, panels_over, read_run
-from .replay import PAST, Joints, modelled_torque, read_joints
+from .recording_plot import (
+    CommandTopic,
+    Recorded,
+    Run,
+    StateTopic,
+    add_legend,
+    panels_over,
+    read_run,
+    to_stderr,
+)
+from .replay import PAST, Joints, joints_of, modelled_torque, read_joints
 from .segments import rounded
 
 Array = NDArray[np.float64]
@@ -64,19 +73,21 @@ def torques(joints: Joints, actuator: ActuatorParameters) -> Torques:
     return Torques(joints.time[rows], joints.tau[rows], modelled[rows])
 
 
-def estimated(path: Path, estimator: Estimator) -> tuple[Array, Array]:
+def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple[Array, Array]:
     """What `estimator` says of the recorded states and commands: times (n,), s, and velocities (n, 3), m/s, body frame.
 
-    States that it can't use are left out. Raises RecordingError where none can be.
+    States that it can't use are left out; with `received` the times of receipt count. Raises RecordingError where none can be used.
     """
     tracker, clock = VelocityTracker(estimator), RobotTime()
     times, found = [], []
-    for topic, _, message in read_messages(path, lambda topic, _: topic in ("/low_state", "/low_cmd")):
+    topics = ("/low_state", "/low_cmd")
+    for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):
         if topic == "/low_cmd":
             tracker.command(previous_action(np.asarray(message.q, float), message.mode))
             continue
         try:
             state = read_low_state(message)
+            state.time = 1e-9 * receipt if received else state.time
             stamp, state.time = state.time, clock.follow(state.time, state.tick)
             estimate = tracker.take(state)
         except (MessageError, FloatingPointError):
@@ -139,7 +150,7 @@ def velocity_figure(run: Run, times: Array, found: Array) -> Figure:
 
 
 def replay_command(
-    recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
+    recording: Recorded,
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for replay.json and pictures.")
     ] = Path("out/replay"),
@@ -153,8 +164,20 @@ def replay_command(
         Path,
         typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
+    gains: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="<kp kd>",
+            help="Commanded gains, N m/rad and N m s/rad, of recordings that hold none.",
+            show_default="none",
+        ),
+    ] = None,
+    state_topic: StateTopic = None,
+    command_topic: CommandTopic = None,
 ) -> None:
     """Ask the actuator model and the estimator offline what they say of a recording of low_state and low_cmd.
+
+    Of another robot's recording (sensor_msgs/JointState, unitree_go) the actuator model alone is asked.
 
     \b
     For example, whether a corrected model says more of a walk than the shipped one:
@@ -164,11 +187,23 @@ def replay_command(
     model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
     asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
-    run = read_run(recording)
-    said = torques(read_joints(recording, SLOWEST), model)
-    times, found = estimated(recording, asked)
-    errors = velocity_errors(run, times, found)
+    run = read_run(recording, state_topic, command_topic, to_stderr)
+    if run.foreign is None:
+        joints = read_joints(recording, SLOWEST, run.received)
+    else:
+        joints = joints_of(recording, run.foreign, SLOWEST, gains)
+    said = torques(joints, model)
+    pictures, errors = {"torque": torque_figure(run, said)}, dict[str, Array]()
+    if run.foreign is None:
+        times, found = estimated(recording, asked, run.received)
+        errors |= velocity_errors(run, times, found)
+        pictures["velocity"] = velocity_figure(run, times, found)
     _show(said, errors)
+    _write(out, said, errors, pictures)
+
+
+def _write(out: Path, said: Torques, errors: Mapping[str, Array], pictures: Mapping[str, Figure]) -> None:
+    """replay.json and the pictures."""
     result: dict[str, Any] = {
         "schema": 1,
         "torque_rms_nm": dict(
@@ -179,11 +214,10 @@ def replay_command(
     }
     with replacing(out / "replay.json") as draft:
         draft.write_text(json.dumps(result, indent=1))
-    pictures = {"torque": torque_figure(run, said), "velocity": velocity_figure(run, times, found)}
     for name, figure in pictures.items():
         with replacing(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)
-    typer.echo(f"written: {out}/replay.json, torque.png, velocity.png")
+    typer.echo(f"written: {out}/replay.json, {', '.join(f'{name}.png' for name in pictures)}")
 
 
 def _show(said: Torques, errors: Mapping[str, Array]) -> None:

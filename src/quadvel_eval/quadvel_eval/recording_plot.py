@@ -6,7 +6,7 @@ Of each topic what there is: a recording of a real robot knows no true velocity,
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,8 +19,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
-from quadvel_nodes.messages import seconds
+from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.reading import RecordingError, read_messages
+from quadvel_recordings.stamps import stamp_of, unstamped
 
 from .demo_figures import AXES
 from .output import output_folder, replacing
@@ -45,53 +46,140 @@ def _joints(message: Any) -> list[float]:
 
 @attrs.frozen
 class _Kind:
-    """How a topic is read: the stamp of its messages, and their numbers."""
+    """How a topic is read: the type of its messages, and their numbers."""
 
-    stamp: Callable[[Any], Any]
+    typename: str
     numbers: Callable[[Any], Any]
 
 
 KINDS: Mapping[str, _Kind] = {
-    "/command": _Kind(lambda m: m.stamp, lambda m: planar(m.twist)),
-    "/velocity_estimate": _Kind(lambda m: m.header.stamp, lambda m: planar(m.twist.twist)),
-    "/ground_truth/odom": _Kind(lambda m: m.header.stamp, lambda m: planar(m.twist.twist)),
-    "/low_state": _Kind(lambda m: m.stamp, _joints),
-    "/low_cmd": _Kind(lambda m: m.stamp, lambda m: list(m.q)),
-    "/controller/state": _Kind(lambda m: m.stamp, lambda m: [getattr(m, name) for name in LOOP]),
+    "/command": _Kind("quadvel_msgs/msg/VelocityCommand", lambda m: planar(m.twist)),
+    "/velocity_estimate": _Kind(
+        "geometry_msgs/msg/TwistWithCovarianceStamped", lambda m: planar(m.twist.twist)
+    ),
+    "/ground_truth/odom": _Kind("nav_msgs/msg/Odometry", lambda m: planar(m.twist.twist)),
+    "/low_state": _Kind("quadvel_msgs/msg/LowState", _joints),
+    "/low_cmd": _Kind("quadvel_msgs/msg/LowCmd", lambda m: list(m.q)),
+    "/controller/state": _Kind(
+        "quadvel_msgs/msg/ControllerState", lambda m: [getattr(m, name) for name in LOOP]
+    ),
 }
 
 
 @attrs.frozen(eq=False)
 class Run:
     """begin: s, on the clock of the stamps, of the first of all; lines: of each topic that was recorded, times (n,), s since then,
-    and numbers (n, k); modes: the controller's in their order, each with its beginning, s; ends: s.
+    and numbers (n, k); modes: the controller's in their order, each with its beginning, s; ends: s. joints: whose angles and then
+    torques are the numbers of low_state. received: times of receipt count, as stamps are missing. foreign: what the lines of the
+    joints are made of where they are no low_state of this stack.
     """
 
     begin: float
     lines: Mapping[str, tuple[Array, Array]]
     modes: list[tuple[float, str]]
     ends: float
+    joints: Sequence[str] = JOINT_NAMES
+    received: bool = False
+    foreign: JointLog | None = None
 
 
-def read_run(path: Path) -> Run:
-    """Raises RecordingError where none of the topics of KINDS was recorded."""
-    rows: dict[str, list[tuple[float, list[float]]]] = defaultdict(list)
-    modes: list[tuple[float, str]] = []
-    for topic, _, message in read_messages(path, lambda topic, _: topic in KINDS):
-        time = seconds(KINDS[topic].stamp(message))
-        rows[topic].append((time, KINDS[topic].numbers(message)))
-        if topic == "/controller/state" and (not modes or modes[-1][1] != message.mode_name):
-            modes.append((time, message.mode_name))
-    if not rows:
-        raise RecordingError(f"{path}: found none of the topics {', '.join(KINDS)}")
-    begin = min(row[0][0] for row in rows.values())
-    lines = {}
-    for topic, found in rows.items():
-        every = max(1, len(found) // POINTS)
-        times, numbers = zip(*found[::every], strict=True)
-        lines[topic] = np.array(times) - begin, np.array(numbers, float)
+@attrs.define
+class _Topic:
+    """Stamps and times of receipt, ns, and numbers of one topic."""
+
+    stamps: list[int] = attrs.field(factory=list)
+    receipts: list[int] = attrs.field(factory=list)
+    numbers: list[list[float]] = attrs.field(factory=list)
+    modes: list[str] = attrs.field(factory=list)
+
+    def times(self, received: bool) -> Array:
+        """s, on the clock that counts."""
+        return np.asarray(1e-9 * np.array(self.receipts if received else self.stamps, np.int64), np.float64)
+
+
+def read_run(
+    path: Path,
+    state_topic: str | None = None,
+    command_topic: str | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Run:
+    """What a recording holds, of this stack or of joints of any robot.
+
+    Args:
+        path: the recording.
+        state_topic: topic of the joints' states, where it is not low_state.
+        command_topic: topic of their commands, likewise.
+        tell: called with a sentence for what had to be assumed.
+
+    Raises:
+        RecordingError: nothing that can be drawn was recorded; the sentence names the topics that are there.
+    """
+    rows = _read_topics(path, tell)
+    missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
+    if tell:
+        for sentence in missing:
+            tell(f"warning: {sentence}")
+    received = bool(missing)
+    lines = {topic: (found.times(received), np.array(found.numbers, float)) for topic, found in rows.items()}
+    foreign = None
+    if "/low_state" not in rows or state_topic or command_topic:
+        foreign = _foreign(path, state_topic, command_topic, tell, rows != {})
+        lines |= _lines_of(foreign) if foreign else {}
+    begin = min(float(times[0]) for times, _ in lines.values())
+    lines = {topic: _thinned(times - begin, numbers) for topic, (times, numbers) in lines.items()}
+    loop = rows.get("/controller/state", _Topic())
+    changes = [k for k, mode in enumerate(loop.modes) if not k or loop.modes[k - 1] != mode]
+    modes = [(float(loop.times(received)[k]) - begin, loop.modes[k]) for k in changes]
     ends = max(float(times[-1]) for times, _ in lines.values())
-    return Run(begin, lines, [(time - begin, mode) for time, mode in modes], ends)
+    joints = foreign.state.joints if foreign else JOINT_NAMES
+    return Run(begin, lines, modes, ends, joints, received, foreign)
+
+
+def _read_topics(path: Path, tell: Callable[[str], None] | None) -> dict[str, _Topic]:
+    rows: dict[str, _Topic] = defaultdict(_Topic)
+    known = {topic: kind.typename for topic, kind in KINDS.items()}
+    for topic, receipt, message in read_messages(path, lambda topic, kind: known.get(topic) == kind, tell):
+        rows[topic].stamps.append(stamp_of(message) or 0)
+        rows[topic].receipts.append(receipt)
+        rows[topic].numbers.append(KINDS[topic].numbers(message))
+        if topic == "/controller/state":
+            rows[topic].modes.append(message.mode_name)
+    return dict(rows)
+
+
+def _foreign(
+    path: Path, state: str | None, command: str | None, tell: Callable[[str], None] | None, others: bool
+) -> JointLog | None:
+    """The joints of another robot, or None where other things can be drawn. Raises RecordingError."""
+    try:
+        return read_joint_log(
+            path, state, command, tell, None if tell is None else lambda text: tell(f"warning: {text}")
+        )
+    except RecordingError:
+        if others and not (state or command):
+            return None
+        raise
+
+
+def _lines_of(log: JointLog) -> dict[str, tuple[Array, Array]]:
+    """Its lines as if they were low_state and low_cmd, of the joints that are measured; NaN for what is not there."""
+    begin, joints = 1e-9 * log.begin, log.state.joints
+    none = np.full((len(log.state.time), len(joints)), np.nan)
+    numbers = np.hstack([log.state.values.get("q", none), log.state.values.get("tau", none)])
+    lines = {"/low_state": (log.state.time + begin, numbers)}
+    if log.command is not None and "q" in log.command.values:
+        targets = np.full((len(log.command.time), len(joints)), np.nan)
+        for k, joint in enumerate(joints):
+            if joint in log.command.joints:
+                targets[:, k] = log.command.values["q"][:, log.command.joints.index(joint)]
+        lines["/low_cmd"] = log.command.time + begin, targets
+    return lines
+
+
+def _thinned(times: Array, numbers: Array) -> tuple[Array, Array]:
+    """At most about POINTS of a line."""
+    every = max(1, len(times) // POINTS)
+    return times[::every], numbers[::every]
 
 
 def velocity_figure(run: Run) -> Figure | None:
@@ -116,29 +204,30 @@ def joints_figure(run: Run) -> Figure | None:
     """Angle of each joint and where it was sent; None without low_state."""
     if "/low_state" not in run.lines:
         return None
-    figure, panels = panels_over(run, 4, 3, (13.0, 9.0))
-    for joint, panel in enumerate(panels.ravel()):
+    figure, panels = panels_of_joints(run)
+    for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
         if "/low_cmd" in run.lines:
             time, targets = run.lines["/low_cmd"]
             panel.plot(time, targets[:, joint], color="black", lw=0.6, label="target")
         time, numbers = run.lines["/low_state"]
         panel.plot(time, numbers[:, joint], color="tab:blue", lw=0.6, label="measured")
-        panel.set_title(f"{JOINT_NAMES[joint].removesuffix('_joint')}, rad", fontsize="small", loc="left")
+        panel.set_title(f"{name.removesuffix('_joint')}, rad", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
 def torques_figure(run: Run) -> Figure | None:
-    """Torque of each joint, between its limits; None without low_state."""
-    if "/low_state" not in run.lines:
+    """Torque of each joint, of this stack's robot between its limits; None where none was measured."""
+    time, numbers = run.lines.get("/low_state", (None, np.empty(0)))
+    if np.isnan(numbers[..., len(run.joints) :]).all():
         return None
-    figure, panels = panels_over(run, 4, 3, (13.0, 9.0))
-    time, numbers = run.lines["/low_state"]
-    for joint, panel in enumerate(panels.ravel()):
-        panel.plot(time, numbers[:, 12 + joint], color="tab:blue", lw=0.6, label="measured")
-        panel.axhline(TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--", label="limit")
-        panel.axhline(-TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--")
-        panel.set_title(f"{JOINT_NAMES[joint].removesuffix('_joint')}, N m", fontsize="small", loc="left")
+    figure, panels = panels_of_joints(run)
+    for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
+        panel.plot(time, numbers[:, len(run.joints) + joint], color="tab:blue", lw=0.6, label="measured")
+        if run.foreign is None:
+            panel.axhline(TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--", label="limit")
+            panel.axhline(-TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--")
+        panel.set_title(f"{name.removesuffix('_joint')}, N m", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure
 
@@ -178,6 +267,11 @@ def panels_over(run: Run, rows: int, columns: int, size: tuple[float, float]) ->
     return figure, panels
 
 
+def panels_of_joints(run: Run) -> tuple[Figure, Any]:
+    """The same with a panel for each joint, three in a row as a leg has."""
+    return panels_over(run, max(1, -(-len(run.joints) // 3)), 3, (13.0, max(3.0, 0.75 * len(run.joints))))
+
+
 def add_legend(figure: Figure, run: Run, panel: Any) -> None:
     """Above the panels: what the lines of `panel` are, and which colour is which mode."""
     lines = panel.get_legend_handles_labels()[0]
@@ -192,18 +286,37 @@ def _shade(mode: str) -> str:
     return SHADES.get(mode, "grey")
 
 
+Recorded = Annotated[
+    Path, typer.Argument(help="An MCAP file, a rosbag2 folder or a bag of ROS 1.", show_default=False)
+]
+StateTopic = Annotated[
+    str | None, typer.Option(metavar="<topic>", help="States of the joints.", show_default="found by type")
+]
+CommandTopic = Annotated[
+    str | None,
+    typer.Option(metavar="<topic>", help="Commands of the joints.", show_default="found by type and name"),
+]
+
+
+def to_stderr(text: str) -> None:
+    """Print what was assumed about a recording."""
+    typer.echo(text, err=True)
+
+
 def plot_command(
-    recording: Annotated[Path, typer.Argument(help="An MCAP file or a rosbag2 folder.", show_default=False)],
+    recording: Recorded,
     out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
         "out/plot"
     ),
+    state_topic: StateTopic = None,
+    command_topic: CommandTopic = None,
 ) -> None:
     """Draw what was recorded of a run: velocity, joints, torques, the controller's loop.
 
-    Colours show the controller's mode.
+    Of another robot its joints: sensor_msgs/JointState, or unitree_go LowState and LowCmd. Colours show the controller's mode.
     """
     output_folder(out)
-    run = read_run(recording)
+    run = read_run(recording, state_topic, command_topic, to_stderr)
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:

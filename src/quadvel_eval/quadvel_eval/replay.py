@@ -17,10 +17,12 @@ from scipy.interpolate import interp1d
 from scipy.signal import savgol_filter
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
+from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
+from quadvel_recordings.joint_log import JointLog, Series, expect_commands
 from quadvel_recordings.reading import read_messages
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
@@ -70,17 +72,94 @@ class ReplayError:
     growth: tuple[float, ...]
 
 
-def read_joints(path: Path, longest: float = DT) -> Joints:
+def read_joints(path: Path, longest: float = DT, received: bool = False) -> Joints:
     """The joints' part of a recording at 1 kHz; states that the recorder missed are marked, and interpolated.
 
-    longest: s, from one state to the next, usually. A command counts from the instant of the state that it answers, whatever
-    its own stamp says. ValueError where the recording holds nothing of that rate.
+    A command counts from the instant of the state that it answers, whatever its own stamp says.
+
+    Args:
+        path: the recording.
+        longest: s, from one state to the next, usually.
+        received: take the times of receipt in place of the stamps.
+
+    Raises:
+        ValueError: the recording holds nothing of that rate.
     """
-    states: dict[int, Any] = {}
+    states: dict[int, tuple[float, Any]] = {}
     commands: dict[int, Any] = {}
-    for topic, _, message in read_messages(path, lambda topic, _: topic in ("/low_state", "/low_cmd")):
-        (states if topic == "/low_state" else commands)[message.tick] = message
-    ticks = np.array(sorted(states))
+    for topic, receipt, message in read_messages(
+        path, lambda topic, _: topic in ("/low_state", "/low_cmd"), _quiet
+    ):
+        if topic == "/low_state":
+            states[message.tick] = 1e-9 * receipt if received else seconds(message.stamp), message
+        else:
+            commands[message.tick] = np.concatenate(
+                [*(getattr(message, field) for field in COMMAND), [message.mode]]
+            )
+    ticks = sorted(states)
+    time = np.array([states[tick][0] for tick in ticks])
+    values = [
+        np.array([getattr(states[tick][1], field) for tick in ticks], float) for field in ("q", "dq", "tau")
+    ]
+    return _every_millisecond(path, np.array(ticks), time, values, commands, longest)
+
+
+def joints_of(path: Path, log: JointLog, longest: float, gains: tuple[float, float] | None) -> Joints:
+    """The same of another robot's recording, whose times are rounded to ms.
+
+    Args:
+        path: the recording, for messages.
+        log: what was read of it; all joints of the model have to be in it.
+        longest: s, from one state to the next, usually.
+        gains: kp and kd (N m/rad, N m s/rad) where the commands hold none.
+
+    Raises:
+        ValueError: a joint, the torque, the angles or the gains are missing.
+    """
+    state, command = log.state, expect_commands(path, log)
+    for field, meaning in (("q", "angles"), ("tau", "torques")):
+        if field not in state.values:
+            raise ValueError(
+                f"{path}: {state.topic}: found no {meaning} in it, expected them beside the commands"
+            )
+    values = {name: _of_model(path, state, each) for name, each in state.values.items()}
+    speed = values.get("dq", np.gradient(values["q"], state.time, axis=0))
+    ticks, first = np.unique(np.round(1e3 * state.time).astype(int), return_index=True)
+    sent = {name: _of_model(path, command, each) for name, each in command.values.items()}
+    for name, gain in zip(("kp", "kd"), gains or (None, None), strict=True):
+        if name not in sent and gain is None:
+            raise ValueError(f"{path}: {command.topic}: {name}: not in the recording, expected --gains KP KD")
+        sent.setdefault(name, np.broadcast_to(np.float64(gain or 0.0), sent["q"].shape))
+    none = np.zeros(sent["q"].shape)
+    rows = np.hstack([*(sent.get(name, none) for name in COMMAND), np.full((len(none), 1), MODE_SERVO)])
+    commands = dict(zip(np.round(1e3 * command.time).astype(int).tolist(), rows, strict=True))
+    measured = [each[first] for each in (values["q"], speed, values["tau"])]
+    return _every_millisecond(
+        path, ticks, (state.time + 1e-9 * log.begin)[first], measured, commands, longest
+    )
+
+
+def _of_model(path: Path, series: Series, values: Array) -> Array:
+    """Of the values (n, J) those of the model's joints, (n, 12), in its order. Raises ValueError."""
+    named = [name.removesuffix("_joint") for name in series.joints]
+    missing = [name for name in JOINT_NAMES if name.removesuffix("_joint") not in named]
+    if missing:
+        found = f"found {', '.join(series.joints[:3])}, ..."
+        raise ValueError(
+            f"{path}: {series.topic}: {found}, expected the model's joints, {missing[0]} among them"
+        )
+    return np.asarray(values[:, [named.index(name.removesuffix("_joint")) for name in JOINT_NAMES]], float)
+
+
+def _every_millisecond(
+    path: Path,
+    ticks: Array,
+    time: Array,
+    values: Sequence[Array],
+    commands: Mapping[int, Array],
+    longest: float,
+) -> Joints:
+    """States (n, 12) of q, dq and torque at `ticks` (n,), ms, and commands by the tick that they answer, a row each ms."""
     period = np.median(np.diff(ticks)) * 1e-3 if len(ticks) > 1 else np.nan
     if not period <= longest or not commands:
         raise ValueError(
@@ -88,25 +167,20 @@ def read_joints(path: Path, longest: float = DT) -> Joints:
             " at most, and commands"
         )
     every = np.arange(ticks[0], ticks[-1] + 1)
-    rows = [states[tick] for tick in ticks.tolist()]
-    time = np.interp(every, ticks, [seconds(message.stamp) for message in rows])
-    q, dq, tau = (
-        interp1d(ticks, np.array([getattr(message, field) for message in rows], float), axis=0)(every)
-        for field in ("q", "dq", "tau")
-    )
-    return Joints(time, q, dq, tau, _held(commands, every), np.isin(every, ticks))
+    q, dq, tau = (interp1d(ticks, each, axis=0)(every) for each in values)
+    return Joints(np.interp(every, ticks, time), q, dq, tau, _held(commands, every), np.isin(every, ticks))
 
 
-def _held(commands: Mapping[int, Any], ticks: Array) -> Array:
+def _held(commands: Mapping[int, Array], ticks: Array) -> Array:
     """The command held at each of the ticks (n,), (n, 61); before the first one the robot brakes."""
-    sent = np.array(sorted(commands))
-    values = [
-        np.concatenate([*(getattr(c, field) for field in COMMAND), [c.mode]])
-        for c in map(commands.__getitem__, sent.tolist())
-    ]
-    table = np.array([np.zeros(12 * len(COMMAND) + 1), *values], float)
+    sent = sorted(commands)
+    table = np.array([np.zeros(12 * len(COMMAND) + 1), *(commands[tick] for tick in sent)], float)
     held: Array = table[np.searchsorted(sent, ticks, side="right")]
     return held
+
+
+def _quiet(_: str) -> None:
+    """What a reader assumes was said when the recording was read first."""
 
 
 def modelled_torque(actuator: ActuatorParameters, joints: Joints, first: int, stop: int) -> Array:

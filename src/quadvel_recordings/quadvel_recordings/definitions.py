@@ -1,4 +1,5 @@
-"""Definitions of the messages and services that quadvel's nodes speak: those of ROS 2 Jazzy that `rosbags` carries, and ours."""
+"""Definitions of the messages and services that quadvel's nodes speak, those of ROS 2 Jazzy that `rosbags` carries and ours, and
+of the robots' messages that recordings are read of."""
 
 from __future__ import annotations
 
@@ -7,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from . import unitree_go
 
 HERE = Path(__file__).parent
 OWN_PACKAGE = "quadvel_msgs"
@@ -46,6 +49,8 @@ def _load_store() -> Any:
     store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
     for file in sorted(own_files.glob("msg/*.msg")):
         store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
+    for name, text in unitree_go.DEFINITIONS.items():
+        store.register(get_types_from_msg(text, f"unitree_go/msg/{name}"))
     own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
     for name, text in {**SERVICES, **own}.items():
         package, _, short = name.split("/")

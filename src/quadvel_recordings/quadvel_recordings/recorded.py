@@ -24,13 +24,14 @@ def is_known(typename: str, recorded: MessageDefinition) -> bool:
     return typename in _store(typename, recorded).fielddefs
 
 
-def read(data: bytes, typename: str, recorded: MessageDefinition) -> Any:
-    """The message that these bytes (CDR) are, of a known type.
+def read(data: bytes, typename: str, recorded: MessageDefinition, ros1: bool = False) -> Any:
+    """The message that these bytes (CDR, or ROS 1's own) are, of a known type.
 
     It has the fields of the present definition; of a type that we do not know, those of the recorded one. Where the recording
     has no definition, an empty one, or none in the form of a .msg file, the present one counts.
     """
-    return _store(typename, recorded).deserialize_cdr(data, typename)
+    store = _store(typename, recorded)
+    return store.deserialize_ros1(data, typename) if ros1 else store.deserialize_cdr(data, typename)
 
 
 @cache

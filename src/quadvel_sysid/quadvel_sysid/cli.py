@@ -23,6 +23,7 @@ from .logs.checks import Inspection
 from .logs.columns import ColumnMap
 from .logs.dataset import Dataset
 from .logs.read_log import read_log
+from .logs.recordings import Topics
 from .memory import give_large_arrays_back, keep_freed_arrays
 
 if TYPE_CHECKING:
@@ -65,7 +66,9 @@ app = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions
 def identify(
     logs: Annotated[
         list[Path],
-        typer.Argument(help="Logs to fit: .mcap, rosbag2 folder, .npz, .csv or .json."),
+        typer.Argument(
+            help="Logs to fit: recordings, tables, arrays; docs/identification.md lists the formats.",
+        ),
     ],
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for report.html, report.json and actuator.yaml.")
@@ -109,6 +112,14 @@ def identify(
             show_default="no replay",
         ),
     ] = None,
+    state_topic: Annotated[
+        str | None,
+        typer.Option(metavar="<topic>", help="States in recordings.", show_default="found by type"),
+    ] = None,
+    command_topic: Annotated[
+        str | None,
+        typer.Option(metavar="<topic>", help="Commands in recordings.", show_default="found by type and name"),
+    ] = None,
     cores: Annotated[
         int | None,
         typer.Option(
@@ -141,8 +152,9 @@ def identify(
     What is in the folder besides the three files stays. Ctrl-C leaves the folder as it was.
     """
     messages = Console(stderr=True)
+    topics = Topics(state_topic, command_topic)
     try:
-        _run(logs, holdout or [], out, base, gains, joints, columns, robot, cores, messages)
+        _run(logs, holdout or [], out, base, gains, joints, columns, topics, robot, cores, messages)
     except KeyboardInterrupt:
         messages.print("stopped; nothing was written")
         raise typer.Exit(130) from None
@@ -156,6 +168,7 @@ def _run(
     gains: tuple[float, float] | None,
     joints: Sequence[str] | None,
     columns: Path | None,
+    topics: Topics,
     robot: str | None,
     cores: int | None,
     messages: Console,
@@ -171,7 +184,7 @@ def _run(
         def tell(share: float, text: str) -> None:
             bar.update(task, completed=share, description=text)
 
-        material, long = _material(logs, holdout, joints, names, gains, messages, tell)
+        material, long = _material(logs, holdout, joints, names, topics, gains, messages, tell)
         if not long:
             keep_freed_arrays()
         from .identify import identified
@@ -197,13 +210,16 @@ def _material(
     holdout: Sequence[Path],
     joints: Sequence[str] | None,
     names: ColumnMap,
+    topics: Topics,
     gains: tuple[float, float] | None,
     messages: Console,
     tell: Tell,
 ) -> tuple[Material, bool]:
     """What of the files is computed on, and whether they hold long logs, which are let go of here."""
     with threadpool_limits(1):
-        fitted, heldout = ([read_log(path, joints, names) for path in paths] for paths in (logs, holdout))
+        fitted, heldout = (
+            [read_log(one, joints, names, topics) for one in paths] for paths in (logs, holdout)
+        )
         data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
         long = sum(log.q.size for log in data.logs) >= _LONG
         from .material import gathered  # what is wrong with the files shows before the engine is loaded

@@ -49,6 +49,7 @@ def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
     """
     log = log.with_gains(gains)
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
+    findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
     for check in OF_ROWS:
         log = _looked(check, findings, log)
     if _refused(findings):

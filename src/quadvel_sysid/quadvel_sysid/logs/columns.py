@@ -15,7 +15,7 @@ A map file is YAML, a line for each field that is called otherwise:
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,19 +27,9 @@ import yaml
 from . import files
 from .findings import some
 from .log import Array, LogError
-
-FIELDS = (
-    "t", "q", "dq", "tau", "q_des", "t_cmd", "q_des_cmd", "dq_des", "tau_ff", "kp", "kd", "temperature", "voltage", "valid",
-)  # fmt: skip
-NAMES = "joint_names"
-ALIASES = {
-    "t": ("time", "timestamp"),
-    "q": ("dof_pos", "position", "positions"),
-    "dq": ("dof_vel", "velocity", "velocities", "speed"),
-    "tau": ("effort", "torque", "torques"),
-    "q_des": ("des_dof_pos", "goal_position"),
-}
-"""What PACE, the message JointState, SAGE and BAM call them; taken where a field is not there by its own name."""
+from .names import FIELDS, NAMES, WHOLE, resolve
+from .raw import Raw
+from .units import factor
 
 
 def _known(mapping: Mapping[str, Any], known: tuple[str, ...], where: str) -> None:
@@ -58,7 +48,8 @@ class Source:
     """Where a field stands: in `columns` of a file, times `scale`, or nowhere, with one `value`, or left out."""
 
     columns: tuple[str, ...] = ()
-    scale: float | list[float] = 1.0
+    scale: float | list[float] | None = None
+    """None: the unit that the file states counts, or else SI"""
     value: Any = None
     file: tuple[str, str] | None = None
     """what of the log's own file name is replaced by what, where the field stands in another file"""
@@ -70,10 +61,10 @@ class Source:
         _known(entry, ("from", "scale", "value", "file"), f"{where}/")
         names = entry.get("from")
         names = names if isinstance(names, list) else [] if names is None else [names]
-        scale, value, file = entry.get("scale", 1.0), entry.get("value"), entry.get("file")
+        scale, value, file = entry.get("scale"), entry.get("value"), entry.get("file")
         for field, good, expected in (
             ("from", all(isinstance(name, str) for name in names), "a name or a list of names"),
-            ("scale", _numbers(scale), "a number, or one for each joint"),
+            ("scale", scale is None or _numbers(scale), "a number, or one for each joint"),
             ("value", value is None or _numbers(value), "a number, or one for each joint"),
             (
                 "file",
@@ -124,86 +115,135 @@ def read(path: Path, names: ColumnMap) -> tuple[dict[str, Array], list[str] | No
     for place in places:
         mine = {name: one for name, one in names.sources.items() if one.stands_in(path) == place}
         plain = place == path
-        raw = files.read(place, partial(_is_wanted, plain, mine))
+        raw = files.read(place, partial(_choose, plain, mine))
+        remarks += raw.remarks
         if plain and joints is None and NAMES in raw.arrays:
-            joints = [str(name) for name in np.ravel(raw.arrays[NAMES])]
+            joints = [str(name).strip() for name in np.ravel(raw.arrays[NAMES])]
         for name, source in mine.items():
             if source.value is not None:
                 fields[name] = np.asarray(source.value, dtype=float)
             elif source.columns:
-                fields[name] = _stacked(place, name, source.columns, raw.arrays, joints)[0] * np.asarray(
-                    source.scale
-                )
+                columns, own = _columns_of(place, name, source.columns, raw, joints)
+                fields[name] = _stacked(place, name, columns, raw, source.scale)
+                joints = joints or (own if name == "q" else None)
         if plain:
             joints = _plain(place, raw, names, fields, joints, remarks)
     return fields, joints, remarks
 
 
-def _is_wanted(plain: bool, sources: Mapping[str, Source], name: str) -> bool:
-    base = name.partition("/")[0]
-    if any(base == column or name == column for one in sources.values() for column in one.columns):
-        return True
-    if not plain:
-        return False
-    usual = (*FIELDS, NAMES, *(alias for names in ALIASES.values() for alias in names))
-    return base in usual
+def _choose(plain: bool, sources: Mapping[str, Source], there: Sequence[str]) -> dict[str, str]:
+    """Of all names in a file those that are needed, each with its field."""
+    chosen: dict[str, str] = {}
+    for field, source in sources.items():
+        for column in source.columns:
+            chosen |= {name: field for name in there if name == column or name.startswith(f"{column}/")}
+    if plain:
+        for field, columns in _resolved(there, sources).items():
+            chosen |= {name: field for name in columns.values() if name not in chosen}
+        chosen |= {NAMES: NAMES} if NAMES in there else {}
+    return chosen
+
+
+def _resolved(there: Sequence[str], sources: Mapping[str, Source]) -> dict[str, dict[str, str]]:
+    """The columns of the fields that no map names; a map's own columns hold nothing else."""
+    used = {column for one in sources.values() if one.file is None for column in one.columns}
+    free = [name for name in there if name not in used and name.partition("/")[0] not in used]
+    return {field: columns for field, columns in resolve(free).items() if field not in sources}
 
 
 def _plain(
     path: Path,
-    raw: files.Raw,
+    raw: Raw,
     names: ColumnMap,
     fields: dict[str, Array],
     joints: list[str] | None,
     remarks: list[str],
 ) -> list[str] | None:
     """Adds the fields that no map names, by their own names or aliases; the joints as q's columns name them."""
-    there = {name.partition("/")[0] for name in raw.arrays}
     used = {column for one in names.sources.values() if one.file is None for column in one.columns}
-    for name in FIELDS:
-        if name in names.sources:
-            continue
-        column = next((one for one in (name, *ALIASES.get(name, ())) if one in there - used), None)
-        if column is None:
-            continue
-        if column != name:
-            remarks.append(f"{name}: read from '{column}'")
-            used.add(column)
-        fields[name], own = _stacked(path, name, (column,), raw.arrays, joints)
-        joints = own if name == "q" and own else joints
+    found = _resolved([*raw.arrays, *raw.others], names.sources)
+    for field, columns in found.items():
+        column = next(iter(columns.values()))
+        own = [joint for joint in columns if joint != WHOLE]
+        if column.partition("/")[0] != field:
+            remarks.append(f"{field}: read from {some([repr(name) for name in columns.values()])}")
+        if own:
+            joints, ordered = _in_order(path, field, own, joints)
+            columns = {joint: columns[joint] for joint in ordered}
+        fields[field] = _stacked(path, field, list(columns.values()), raw, None, own != [])
+        used |= set(columns.values())
     others = [
-        *raw.others,
-        *(one for one in raw.arrays if one.partition("/")[0] not in {*FIELDS, NAMES, *used}),
+        name for name in (*raw.others, *raw.arrays) if name and name != NAMES and not _is_used(name, used)
     ]
     if others:
         remarks.append(f"{others[0]}: not used, as no log has such fields: {some(others)}")
     return joints
 
 
-def _stacked(
-    path: Path, field: str, columns: tuple[str, ...], arrays: Mapping[str, Any], joints: list[str] | None
-) -> tuple[Array, list[str] | None]:
-    """One array of the columns, without the rows at its end that hold no number, and the joints that they name."""
-    own = None
-    if len(columns) == 1 and columns[0] not in arrays:
-        of_joints = {name.partition("/")[2]: name for name in arrays if name.startswith(f"{columns[0]}/")}
-        own = list(of_joints)
-        if own and joints and sorted(own) == sorted(joints):
-            own = joints
-        elif own and joints and field != "q":
-            odd = sorted(set(own) ^ set(joints))
-            raise LogError(f"{path}: {field}/{odd[0]}: the columns of {field} and of q name different joints")
-        columns = tuple(of_joints[joint] for joint in own) or columns
+def _is_used(name: str, used: Collection[str]) -> bool:
+    return name in used or name.partition("/")[0] in used
+
+
+def _in_order(
+    path: Path, field: str, own: list[str], joints: list[str] | None
+) -> tuple[list[str], list[str]]:
+    """The log's joints once a field's columns name `own`, and those columns in their order."""
+    if joints and sorted(own) == sorted(joints):
+        return joints, joints
+    if joints and field != "q":
+        odd = sorted(set(own) ^ set(joints))
+        raise LogError(f"{path}: {field}/{odd[0]}: the columns of {field} and of q name different joints")
+    return (own if field == "q" or joints is None else joints), own
+
+
+def _columns_of(
+    path: Path, field: str, columns: tuple[str, ...], raw: Raw, joints: list[str] | None
+) -> tuple[list[str], list[str] | None]:
+    """The columns that a map means, and the joints that they name: `positions` may stand for `positions/knee`."""
+    if len(columns) == 1 and columns[0] not in raw.arrays:
+        of_joints = {name.partition("/")[2]: name for name in raw.arrays if name.startswith(f"{columns[0]}/")}
+        if of_joints:
+            _, ordered = _in_order(path, field, list(of_joints), joints)
+            return [of_joints[joint] for joint in ordered], ordered
     for name in columns:
-        if name not in arrays:
-            raise LogError(f"{path}: {field}: no '{name}' in it, found {some(list(arrays), 12)}")
-    values = (
-        arrays[columns[0]]
-        if len(columns) == 1 and own is None
-        else np.stack([arrays[one] for one in columns], 1)
-    )
+        if name not in raw.arrays:
+            raise LogError(
+                f"{path}: {field}: no '{name}' in it, found {some([*raw.arrays, *raw.others], 12)}"
+            )
+    return list(columns), None
+
+
+def _stacked(
+    path: Path,
+    field: str,
+    columns: Sequence[str],
+    raw: Raw,
+    scale: float | list[float] | None,
+    of_joints: bool = False,
+) -> Array:
+    """One array of the columns in SI units, without the rows at its end that hold no number."""
+    parts = [raw.arrays[name] * _scale(path, name, raw.units.get(name), scale) for name in columns]
+    values = np.stack(parts, 1) if len(columns) > 1 or of_joints else parts[0]
+    if scale is not None:
+        values = values * np.asarray(scale)
     if values.ndim == 0:
-        return values, own
+        return values
     there = ~np.isnan(values)
     whole = np.flatnonzero(there if there.ndim == 1 else there.all(axis=1))
-    return values[: whole[-1] + 1 if whole.size else 0], own
+    if len(values) and not whole.size:
+        raise LogError(
+            f"{path}: {field}: no row holds a number for each joint, {len(values)} rows are not finite"
+        )
+    return values[: whole[-1] + 1 if whole.size else 0]
+
+
+def _scale(path: Path, column: str, unit: str | None, scale: Any) -> float:
+    """The factor to SI that a file's own unit asks for, where no map says what counts."""
+    if unit is None or scale is not None:
+        return 1.0
+    found = factor(unit)
+    if found is None:
+        raise LogError(
+            f"{path}: {column}: the unit '{unit}' is unknown, expected s, rad, N m or the like; --columns gives its scale"
+        )
+    return found

@@ -2,7 +2,7 @@
 
 Here stands what a log has to be before anything can be computed from it: shapes that fit, finite numbers, times
 that rise. What a well-formed log says about the robot is for `checks.py`; the formats are in `recordings.py`
-(MCAP, rosbag2) and `tables.py` (NPZ, CSV).
+(MCAP, rosbag2, ROS 1) and `tables.py` (all others, read by `files.py`).
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Log:
 
     A row holds what was at its time; a command counts from its time until the next. Times rise strictly and all
     numbers are finite: building a Log that breaks this raises LogError. Floats are double precision, single in
-    a log of more than `tables.LONG` values: cast before solving with them.
+    a log of more than `raw.LONG` values: cast before solving with them.
     """
 
     name: str  # the file
@@ -62,6 +62,7 @@ class Log:
     kd: Array | None = None  # (M, J) N m s/rad
     began: float | None = None  # s, of a piece: when the whole log began
     remarks: tuple[str, ...] = ()  # what the reader had to assume
+    warnings: tuple[str, ...] = ()  # what it found that is to be read with care
     made: tuple[str, ...] = ()  # fields that the file did not hold, such as a dq that is made from q
 
     def __attrs_post_init__(self) -> None:

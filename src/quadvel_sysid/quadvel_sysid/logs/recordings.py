@@ -1,102 +1,94 @@
-"""Logs out of recordings of the stack: low_state and low_cmd of quadvel_msgs, as `quadvel record` writes them.
+"""Logs out of recordings: of the stack, of a Go2, or of any robot whose states and commands are `sensor_msgs/JointState`.
 
-Found by their types, so namespaces and other topics of the recording do not matter. Rows are stamped as their
-messages are, not as they arrived.
+Topics are found by their types, so namespaces and other topics of the recording do not matter. Rows are stamped as their
+messages are, or as they were received where messages have no stamps.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+import attrs
 import numpy as np
 
-from quadvel_description.robot import JOINT_NAMES
-from quadvel_description.state import MODE_SERVO
-from quadvel_recordings.reading import RecordingError, read_messages
+from quadvel_recordings.joint_log import Series, expect_commands, read_joint_log, shared
+from quadvel_recordings.reading import RecordingError
 
-from .files import precision
-from .log import Array, Log, LogError
+from .log import Array, Log, LogError, joint_name
+from .raw import check_size, precision
 from .tables import drop_repeated_times
 
-STATE, COMMAND = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
-STATE_FIELDS = ("q", "dq", "tau")
-COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
+
+@attrs.frozen
+class Topics:
+    """Topics of states and commands, where a recording has several that could hold them."""
+
+    state: str | None = None
+    command: str | None = None
 
 
-class _Rows:
-    """Stamps (ns) and values of one topic, kept as bytes while they come: a log is long."""
-
-    def __init__(self) -> None:
-        self._stamps: list[int] = []
-        self._values = bytearray()
-
-    def add(self, message: Any, fields: tuple[str, ...]) -> None:
-        self._stamps.append(message.stamp.sec * 10**9 + message.stamp.nanosec)
-        row = np.concatenate([getattr(message, field) for field in fields], dtype=np.float32)
-        if getattr(message, "mode", MODE_SERVO) != MODE_SERVO:  # kp and tau are ignored, see LowCmd.msg
-            row[2 * len(JOINT_NAMES) : 4 * len(JOINT_NAMES)] = 0.0
-        self._values += row.tobytes()
-
-    def arrays(self, fields: tuple[str, ...], start: int) -> tuple[Array, dict[str, Array]]:
-        """Times since `start` (ns), s, and the values (n, 12) of each field."""
-        values = np.frombuffer(self._values, np.float32).reshape(len(self._stamps), len(fields), -1)
-        values = values.astype(precision(values.size), copy=False)
-        time = (np.array(self._stamps, np.int64) - start) * 1e-9
-        return time, {field: values[:, k] for k, field in enumerate(fields)}
-
-    @property
-    def first(self) -> int:
-        return self._stamps[0]
-
-
-def read(path: Path) -> Log:
+def read(path: Path, topics: Topics) -> Log:
     """The recording as a log; torque control and damping stand in it as kp = 0. Raises LogError."""
-    rows: dict[str, _Rows] = defaultdict(_Rows)
-    topics: dict[str, str] = {}
-    types: dict[str, str] = {}
     remarks: list[str] = []
-
-    def wanted(topic: str, typename: str) -> bool:
-        if typename in (STATE, COMMAND):
-            types[topic] = typename
-        return topic in types
-
+    warnings: list[str] = []
     try:
-        for topic, _, message in read_messages(path, wanted, remarks.append):
-            kind = types[topic]
-            if topics.setdefault(kind, topic) != topic:
-                raise LogError(f"{path}: {kind}: found on {topics[kind]} and on {topic}, expected one topic")
-            rows[kind].add(message, STATE_FIELDS if kind == STATE else COMMAND_FIELDS)
+        found = read_joint_log(path, topics.state, topics.command, remarks.append, warnings.append)
+        state, command = found.state, expect_commands(path, found)
     except RecordingError as error:
         raise LogError(str(error)) from None
-    for kind, topic in ((STATE, "low_state"), (COMMAND, "low_cmd")):
-        if kind not in rows:
-            raise LogError(f"{path}: {topic}: no messages of the type {kind} were recorded")
-
-    start = rows[STATE].first
-    t, state = rows[STATE].arrays(STATE_FIELDS, start)
-    t_cmd, command = rows[COMMAND].arrays(COMMAND_FIELDS, start)
-    t, state = drop_repeated_times("t", t, state, remarks)
-    t_cmd, command = drop_repeated_times("t_cmd", t_cmd, command, remarks)
+    joints = _joints(path, state, command, remarks)
+    if "q" not in state.values:
+        raise LogError(f"{path}: {state.topic}: found no angles in it, expected positions")
+    t, states = _of_joints(path, "t", state, joints, remarks)
+    t_cmd, commands = _of_joints(path, "t_cmd", command, joints, remarks)
+    made = () if "dq" in states else ("dq",)
+    if made and (np.diff(t) > 0.0).all():
+        states["dq"] = np.gradient(states["q"], t, axis=0)
     return Log(
         name=str(path),
-        joints=JOINT_NAMES,
+        joints=tuple(joint_name(name) for name in joints),
         t=t,
-        q=state["q"],
-        dq=state["dq"],
-        tau=state["tau"],
-        valid=np.ones(state["q"].shape, bool),
+        q=states["q"],
+        dq=states.get("dq", states["q"]),
+        tau=states.get("tau"),
+        valid=np.ones(states["q"].shape, bool),
         t_cmd=t_cmd,
-        q_des=command["q"],
-        dq_des=_unless_zero(command["dq"]),
-        tau_ff=_unless_zero(command["tau"]),
-        kp=command["kp"],
-        kd=command["kd"],
+        q_des=commands["q"],
+        dq_des=_unless_zero(commands.get("dq")),
+        tau_ff=_unless_zero(commands.get("tau")),
+        kp=commands.get("kp"),
+        kd=commands.get("kd"),
         remarks=tuple(remarks),
+        warnings=tuple(warnings),
+        made=made,
     )
 
 
-def _unless_zero(values: Array) -> Array | None:
-    return values if values.any() else None
+def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> list[str]:
+    """The joints that states and commands both name."""
+    joints = shared(state.joints, command.joints)
+    if not joints:
+        found = f"found {', '.join(command.joints[:3])}, ..."
+        raise LogError(
+            f"{path}: {command.topic}: {found}, expected joints of {state.topic}: {', '.join(state.joints[:3])}, ..."
+        )
+    left = [name for name in (*state.joints, *command.joints) if name not in joints]
+    if left:
+        remarks.append(f"joint_names: {', '.join(left)}: not both measured and commanded; left out")
+    return joints
+
+
+def _of_joints(
+    path: Path, field: str, series: Series, joints: list[str], remarks: list[str]
+) -> tuple[Array, dict[str, Any]]:
+    """Times and values of these joints, without rows that repeat a time."""
+    columns = [series.joints.index(name) for name in joints]
+    check_size(path, {name: values.shape for name, values in series.values.items()})
+    dtype = precision(sum(values.size for values in series.values.values()))
+    values = {name: each[:, columns].astype(dtype, copy=False) for name, each in series.values.items()}
+    return drop_repeated_times(field, series.time, values, remarks)
+
+
+def _unless_zero(values: Array | None) -> Array | None:
+    return values if values is not None and values.any() else None

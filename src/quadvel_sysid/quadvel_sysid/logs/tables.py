@@ -11,8 +11,8 @@ import numpy as np
 from quadvel_description.robot import JOINT_NAMES
 
 from .columns import ColumnMap, read
-from .files import check_size
 from .log import Array, Bools, Log, LogError, joint_name
+from .raw import check_size
 
 STATE_FIELDS = ("q", "dq", "tau", "temperature")
 COMMAND_FIELDS = ("dq_des", "tau_ff", "kp", "kd")
