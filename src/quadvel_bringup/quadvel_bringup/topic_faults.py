@@ -136,11 +136,15 @@ class TopicRobot:
             topics = [topic for topic, senders in SENDERS.items() if name in senders]
             renamed = [word for topic in topics for word in ("-r", f"{topic}:=before/{topic}")]
             self._group.start(name, [*words, *renamed])
-        self.until(lambda state: state.mode_name == "stance", "it does not stand up at the start")
+        try:
+            self.until(lambda state: state.mode_name != "passive", "it does not report")
+        except BaseException:
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *error: Any) -> None:
-        self._session.__exit__(*error)
+        self._session.__exit__(None, None, None)
         self._group.stop()
 
     def provoke(self, fault: TopicFault) -> ControllerState:
