@@ -113,6 +113,10 @@ class CommandGrid:
         middles = self._middle[cells]
         return middles[rng.integers(len(middles), size=n)] + rng.uniform(-0.5, 0.5, (n, 3)) * WIDTH
 
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) lie in open cells and within the limits, (n,) bool."""
+        return np.array([self.open[self.cell_of(one)] and self._inside(one) for one in command], bool)
+
     def cell_of(self, command: np.ndarray) -> tuple[int, ...]:
         """The index of the cell that a command (3,) lies in."""
         cell = np.floor(command / WIDTH + 0.5).astype(int) - self._first

@@ -77,6 +77,11 @@ class CommandRange:
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command
 
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) lie in the box, (n,) bool."""
+        low, high = [self.vx[0], -self.vy, -self.wz], [self.vx[1], self.vy, self.wz]
+        return np.asarray(((command >= low) & (command <= high)).all(axis=1))
+
 
 class Commands(Protocol):
     """Where velocity commands come from."""
@@ -88,6 +93,10 @@ class Commands(Protocol):
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        ...
+
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) may be drawn, (n,) bool."""
         ...
 
 
@@ -107,6 +116,7 @@ class EnvConfig:
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
     ramped: float = 0.6  # share of the commands that are led to the new velocity as the command mux does it
+    reversed: float = 0.0  # share of the new commands that reverse the one before
     terrain: Terrain = Terrain()
 
 
@@ -127,7 +137,8 @@ class VelocityEnv:
     command (n, 4); q, dq, torque (n, 12); quaternion (n, 4); velocity, angular_velocity, acceleration (n, 3) in the body
     frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
     contact (n, 4) bool; height (n,) of the trunk above ground; power (n,) of the joints by the paper's energy term, mean of
-    the sample, W; fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
+    the sample, W; fastest (n, 12) of each joint's speeds in the sample, rad/s; foot_position (n, 4, 3) in the body frame, m;
+    fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
     command is new. `command` may be on its way yet to the velocity that was drawn.
     """
 
@@ -155,6 +166,7 @@ class VelocityEnv:
         self.changed = np.zeros(n, bool)
         self.broken = np.zeros(n, bool)
         self.power = np.zeros(n)
+        self.fastest = np.zeros((n, 12))
         self.torque = np.zeros((n, 12))
         self.acceleration = np.zeros((n, 3))
         self.time = np.zeros(n)
@@ -192,7 +204,11 @@ class VelocityEnv:
 
     def _new_commands(self, ids: np.ndarray) -> None:
         n, (slow, quick) = len(ids), RAMP
-        self._goal[ids] = self.commands.draw(self.rng, n)
+        before = self._goal[ids]
+        self._goal[ids] = goal = self.commands.draw(self.rng, n)
+        back = self.rng.random(n) < self.config.reversed
+        back &= before[:, :3].any(axis=1) & self.commands.contains(-before[:, :3])
+        self._goal[ids[back]] = np.where([True, True, True, False], -before, 0.0 * goal)[back]
         led = self.rng.random(n) < self.config.ramped
         self._ramp[ids] = np.where(led, slow * (quick / slow) ** self.rng.random(n), np.inf)
         self._lead_commands(ids)
@@ -222,7 +238,7 @@ class VelocityEnv:
         """
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
         self.changed[:] = False
-        self.power[:] = 0.0
+        self.power[:], self.fastest[:] = 0.0, 0.0
         self._push()
         end = self._clock.ravel() + self.config.period
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
@@ -234,6 +250,7 @@ class VelocityEnv:
             self.torque = self.actuators.step(q, dq, sent, *gains, target_speed, push)
             self._ctrl[:] = self.torque
             self.batch.step()
+            np.maximum(self.fastest, np.abs(dq), out=self.fastest)
             self.power += np.maximum(HEAT * self.torque**2 + self.torque * dq, 0.0).sum(axis=1)
         self.power /= self.substeps
         self.time += self.config.period
@@ -259,7 +276,7 @@ class VelocityEnv:
         if len(ids):
             self._qpos[ids, :3], self._qpos[ids, 3:7] = 0.0, [0.0, 1.0, 0.0, 0.0]
             self._qpos[ids, 7:], self._qvel[ids] = robot.NOMINAL_Q, 0.0
-            self.torque[ids], self.power[ids], before[ids] = 0.0, 0.0, 0.0
+            self.torque[ids], self.power[ids], self.fastest[ids], before[ids] = 0.0, 0.0, 0.0, 0.0
             self.actuators.reset(ids)
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
@@ -289,6 +306,7 @@ class VelocityEnv:
         self.roll_pitch = roll_pitch(self.quaternion)
         quaternion = self.quaternion[:, None]
         local, jacobians = foot_kinematics(self.q)
+        self.foot_position = local
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
         joints = self.dq.reshape(-1, 4, 3, 1)
         swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
