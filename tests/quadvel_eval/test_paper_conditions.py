@@ -7,12 +7,14 @@ import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_eval.grid import Cell, CellResult
+from quadvel_eval.paper.conditions import FOLLOWED
 from quadvel_eval.paper.energy import Energy
 from quadvel_eval.paper.gap import Gap, plants
 from quadvel_eval.paper.jitter import Jitter
-from quadvel_eval.paper.robustness import Robustness, conditions
+from quadvel_eval.paper.robustness import STOOD, Robustness, conditions
 from quadvel_eval.paper.section import Study
 from quadvel_eval.segments import Segment
+from quadvel_sim.physics import SECOND
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
@@ -26,7 +28,9 @@ def answer(labels: dict, command: tuple[float, float, float], error: float | Non
 
 def test_every_condition_is_a_plant_that_stands() -> None:
     found = conditions(seed=1)
-    assert {one.group for one in found} == {"friction", "payload", "slope", "rough ground", "push"}
+    assert {one.group for one in found} == {
+        *("friction", "payload", "slope", "slope, second plant", "rough ground", "push")
+    }
     for one in found:
         simulator = Simulator(SimulatorConfig(**one.plant))
         simulator.reset("stand")
@@ -48,15 +52,47 @@ def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> No
 
 def test_survival_counts_the_robots_that_did_not_fall() -> None:
     section = Robustness()
-    labels = {"policy": "mine", "group": "slope", "level": "15"}
+    labels = {"policy": "mine", "group": "payload", "level": 5}
     command = (1.0, 0.0, 0.0)
     records = section.judge(
         [answer(labels, command, 0.1), answer(labels, command, 0.3), answer(labels, command, None)]
     )
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
-    assert ours["slope: survival"] == pytest.approx(100.0 * 2 / 3)
-    assert ours["slope: mean error"] == pytest.approx(0.2)
+    assert ours["payload: survival"] == pytest.approx(100.0 * 2 / 3)
+    assert ours["payload: mean error"] == pytest.approx(0.2)
     section.figure(records)
+
+
+def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled() -> None:
+    section, command = Robustness(), (1.0, 0.0, 0.0)
+    errors = {15: (FOLLOWED + 0.01, FOLLOWED - 0.01, None), 7.5: (0.01, 0.02, 0.03), -15: (None, None, 0.02)}
+    for group in ("slope", "slope, second plant"):
+        records = section.judge(
+            [
+                answer({"policy": "mine", "group": group, "level": level}, command, error)
+                for level, some in errors.items()
+                for error in some
+            ]
+        )
+        ours = {row.what: row.ours["mine"] for row in section.rows(records)}
+        for what, survive, follow in (
+            ("15 degrees up", 200 / 3, 100 / 3),
+            ("7.5 degrees up", 100.0, 100.0),
+            ("15 degrees down", 100 / 3, 100 / 3),
+        ):
+            assert ours[f"{group}, {what}: survival"] == pytest.approx(survive)
+            assert ours[f"{group}, {what}: survive and follow"] == pytest.approx(follow)
+        assert f"{group}: survival" not in ours
+        section.figure(records)
+
+
+def test_robots_stand_on_slopes_before_they_walk() -> None:
+    study = Study(seeds=1)
+    jobs = Robustness(groups=("slope", "slope, second plant")).jobs(study)
+    stood = {job.call[-1] for job in jobs}
+    assert len(jobs) == 2 * 4 * 3
+    assert stood == {STOOD}
+    assert {job.call[1].plant.get("physics") for job in jobs} == {None, SECOND}
 
 
 def test_the_gap_is_told_plant_by_plant() -> None:
