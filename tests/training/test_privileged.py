@@ -317,3 +317,11 @@ def test_hips_away_from_straight_down_cost_and_less_so_sideways():
     assert hips_astray(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
         [0.6, 0.3]
     )
+
+
+def test_a_checkpoint_of_a_version_without_the_share_in_the_air_is_refused():
+    run = PrivilegedRun(SMALL)
+    state = run.state()
+    del state["airborne"]
+    with pytest.raises(loop.CheckpointError, match="airborne"):
+        run.restore(state)

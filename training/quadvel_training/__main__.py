@@ -316,7 +316,7 @@ def write_card(
     paper: Annotated[
         Path | None,
         typer.Option(
-            help="Folder of `quadvel paper`, for gait, sustained velocities and robustness.", file_okay=False
+            help="Folder of `quadvel paper`, for gait, sustained velocities and slopes.", file_okay=False
         ),
     ] = None,
 ) -> None:

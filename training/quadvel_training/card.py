@@ -118,7 +118,7 @@ def _measured(found: Json, estimator: bool) -> list[str]:
     return _table(f"evaluation: {_conditions(found['setup'])}", "measured", rows)
 
 
-SECTIONS = ("gait.json", "sustained.json", "robustness.json")
+SECTIONS = ("gait.json", "sustained.json", "slopes.json")
 
 
 def _section(network: Path, file: Path) -> list[str]:

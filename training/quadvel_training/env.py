@@ -13,6 +13,7 @@ import attrs
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
@@ -188,7 +189,7 @@ class VelocityEnv:
         qpos, qvel = np.zeros((n, 19)), rng.normal(0, 0.1, (n, 18))
         heading = rng.uniform(-np.pi, np.pi, n)
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
-        qpos[:, 3], qpos[:, 6] = np.cos(heading / 2), np.sin(heading / 2)
+        qpos[:, 3:7] = self._along_the_ground(qpos[:, :2], heading)
         qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
         feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
@@ -201,6 +202,31 @@ class VelocityEnv:
         self._read()
         self.torque[ids] = 0.0
         self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
+
+    def _along_the_ground(self, place: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        """Attitudes of trunks that stand on the ground as it slopes there.
+
+        Args:
+            place: x, y (n, 2), m, world.
+            heading: (n,) rad.
+
+        Returns:
+            Quaternions (n, 4), w first, body to world.
+        """
+        level = Rotation.from_euler("Z", heading[:, None])
+        corners = foot_positions(robot.NOMINAL_Q)
+        feet = np.stack([level.apply(corner) for corner in corners], axis=1)
+        forward, left = self._falls(self._ground(feet[..., :2] + place[:, None]))
+        pitch = np.arctan(forward)
+        leaning = Rotation.from_euler("YX", np.stack([pitch, -np.arctan(left * np.cos(pitch))], axis=1))
+        return np.roll((level * leaning).as_quat(), 1, axis=1)
+
+    @staticmethod
+    def _falls(ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By how much ground of heights (n, 4) below the four feet falls away, for 1 m forward and for 1 m to the left."""
+        forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
+        left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
+        return forward / STANCE_LENGTH, left / STANCE_WIDTH
 
     def _new_commands(self, ids: np.ndarray) -> None:
         n, (slow, quick) = len(ids), RAMP
@@ -285,10 +311,7 @@ class VelocityEnv:
     @property
     def ground_slope(self) -> np.ndarray:
         """By how much (n, 2) the ground falls away below the four feet, for 1 m forward and for 1 m to the left."""
-        ground = self._ground(self.feet)
-        forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
-        left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
-        return np.stack([forward / STANCE_LENGTH, left / STANCE_WIDTH], axis=-1)
+        return np.stack(self._falls(self._ground(self.feet)), axis=-1)
 
     def _push(self) -> None:
         r = self.config.randomisation

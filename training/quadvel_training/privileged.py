@@ -285,7 +285,15 @@ class PrivilegedRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of its grid."""
+        """Go on from a checkpoint; robots start over, under commands of its grid.
+
+        Raises:
+            CheckpointError: the checkpoint is of another grid, or of a version whose critic saw less.
+        """
+        if "airborne" not in state:
+            raise loop.CheckpointError(
+                "checkpoint: found no field 'airborne', expected one of this version's stage 1"
+            )
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])

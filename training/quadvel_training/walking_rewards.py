@@ -78,7 +78,7 @@ def pace_of(command: np.ndarray) -> np.ndarray:
 def hips_astray(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
     """By how much the four hips are away from straight down (n,), rad; moving sideways, where they have to swing, it counts less.
 
-    Trotting on feet close to the middle costs the least, and tips over the soonest.
+    Feet close to the middle cost the least energy, and a robot on them tips over the soonest.
     """
     astray = np.abs(env.q[:, ::3]).sum(axis=1)
     return np.asarray(astray / (1.0 + 2.0 * np.abs(command[:, 1])))

@@ -20,7 +20,6 @@ COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.
 """ahead, sideways, along an arc; m/s, rad/s"""
 LOOSE: Mapping[str, Any] = {"physics": SECOND, "joint_friction": np.zeros(12), "joint_damping": np.zeros(12)}
 """Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
-FOLLOWED = 0.15  # m/s: a robot whose error over the judged seconds is larger does not follow: it is stuck
 PUSH_TIME, PUSH_SECONDS = 1.0, 0.2  # s after the start of a walk, and for how long
 
 
@@ -76,12 +75,6 @@ def condition_job(study: Study, policy: str, one: Condition, command: Command, s
 def survival(records: Sequence[Record]) -> float:
     """Share of the robots that did not fall, %; nan without any."""
     return 100.0 * (1.0 - mean(records, "fell"))
-
-
-def survival_and_following(records: Sequence[Record]) -> float:
-    """Share of the robots that neither fell nor were off their command by more than FOLLOWED, %; nan without any."""
-    good = [not r["fell"] and r["error_xy"] <= FOLLOWED for r in records]
-    return 100.0 * float(np.mean(good)) if good else float("nan")
 
 
 def draw(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
