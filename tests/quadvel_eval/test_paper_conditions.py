@@ -7,12 +7,17 @@ import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_eval.grid import Cell, CellResult
+from quadvel_eval.paper import conditions as paper_conditions
+from quadvel_eval.paper import slopes
+from quadvel_eval.paper.conditions import walk_under
 from quadvel_eval.paper.energy import Energy
 from quadvel_eval.paper.gap import Gap, plants
 from quadvel_eval.paper.jitter import Jitter
 from quadvel_eval.paper.robustness import Robustness, conditions
 from quadvel_eval.paper.section import Study
+from quadvel_eval.paper.slopes import FOLLOWED, STOOD, Slopes
 from quadvel_eval.segments import Segment
+from quadvel_sim.physics import SECOND
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
@@ -26,7 +31,8 @@ def answer(labels: dict, command: tuple[float, float, float], error: float | Non
 
 def test_every_condition_is_a_plant_that_stands() -> None:
     found = conditions(seed=1)
-    assert {one.group for one in found} == {"friction", "payload", "slope", "rough ground", "push"}
+    assert {one.group for one in found} == {"friction", "payload", "rough ground", "push"}
+    found += slopes.conditions("usual") + slopes.conditions("second")
     for one in found:
         simulator = Simulator(SimulatorConfig(**one.plant))
         simulator.reset("stand")
@@ -48,15 +54,51 @@ def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> No
 
 def test_survival_counts_the_robots_that_did_not_fall() -> None:
     section = Robustness()
-    labels = {"policy": "mine", "group": "slope", "level": "15"}
+    labels = {"policy": "mine", "group": "payload", "level": 5}
     command = (1.0, 0.0, 0.0)
     records = section.judge(
         [answer(labels, command, 0.1), answer(labels, command, 0.3), answer(labels, command, None)]
     )
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
-    assert ours["slope: survival"] == pytest.approx(100.0 * 2 / 3)
-    assert ours["slope: mean error"] == pytest.approx(0.2)
+    assert ours["payload: survival"] == pytest.approx(100.0 * 2 / 3)
+    assert ours["payload: mean error"] == pytest.approx(0.2)
     section.figure(records)
+
+
+def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled() -> None:
+    section, command = Slopes(), (1.0, 0.0, 0.0)
+    errors = {15: (FOLLOWED + 0.01, FOLLOWED - 0.01, None), 7.5: (0.01, 0.02, 0.03), -15: (None, None, 0.02)}
+    records = section.judge(
+        [
+            answer({"policy": "mine", "group": plant, "level": level}, command, error)
+            for plant in ("usual", "second")
+            for level, some in errors.items()
+            for error in some
+        ]
+    )
+    ours = {row.what: row.ours.get("mine") for row in section.rows(records)}
+    for what, survive, follow in (
+        ("15 degrees up", 200 / 3, 100 / 3),
+        ("7.5 degrees up", 100.0, 100.0),
+        ("15 degrees down", 100 / 3, 100 / 3),
+    ):
+        for where in (what, f"second plant, {what}"):
+            assert ours[f"{where}: survival"] == pytest.approx(survive)
+            assert ours[f"{where}: survive and follow"] == pytest.approx(follow)
+    section.figure(records)
+
+
+def test_robots_stand_on_slopes_before_they_walk() -> None:
+    jobs = Slopes().jobs(Study(seeds=1))
+    assert len(jobs) == 2 * 4 * 3
+    assert {job.call[-1] for job in jobs} == {STOOD}
+    assert {job.call[1].plant.get("physics") for job in jobs} == {None, SECOND}
+
+
+def test_a_robot_that_falls_while_it_stands_has_fallen(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(paper_conditions, "record", lambda loop, commands: None)
+    cell = Cell((0.3, 0.0, 0.0), 0)
+    assert walk_under(Study().setup("crl_eam"), cell, None, 1.0).segment is None
 
 
 def test_the_gap_is_told_plant_by_plant() -> None:

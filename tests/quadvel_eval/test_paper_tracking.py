@@ -70,7 +70,7 @@ def test_the_grid_has_every_command_with_every_seed_on_both_plants() -> None:
 
 def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     section = Sustained()
-    labels = {"policy": "mine", "direction": "forward", "limit": 4.0}
+    labels = {"policy": "mine", "plant": "usual", "direction": "forward", "limit": 4.0}
     stood = {"reached": 2.9, "fell": 0, "ended": "", "joint_speed": 0.9, "torque": 0.7}
     fell = {"reached": None, "fell": 1, "ended": "the robot fell", "joint_speed": 1.2, "torque": 1.0}
     records = section.judge([({**labels, "command": 3.0}, stood), ({**labels, "command": 4.0}, fell)])
@@ -80,3 +80,30 @@ def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     assert rows["forward: fastest joint, share of its drive's speed"].ours == {"mine": 1.2}
     assert rows["falls"].ours == {"mine": 1.0}
     section.figure(records)
+
+
+def test_what_other_plants_ask_of_the_drives_stands_by_itself() -> None:
+    section = Sustained(shares=(1.0,), directions=("forward",))
+    plants = [job.labels["plant"] for job in section.jobs(Study(seeds=1))]
+    assert plants == ["usual", "second", "loose joints"]
+    labels = {"policy": "mine", "direction": "forward", "limit": 3.0, "command": 3.0}
+    records = section.judge(
+        [
+            (
+                {**labels, "plant": plant},
+                {"reached": 2.9 - k, "fell": k // 2, "joint_speed": 0.9 + 0.1 * k, "torque": 0.5},
+            )
+            for k, plant in enumerate(plants)
+        ]
+    )
+    ours = {row.what: row.ours["mine"] for row in section.rows(records)}
+    assert ours["forward: reached"] == 2.9
+    speed = "forward: fastest joint, share of its drive's speed"
+    assert ours[speed] == pytest.approx(0.9)
+    assert ours[f"second plant, {speed}"] == pytest.approx(1.0)
+    assert ours[f"second plant, loose joints, {speed}"] == pytest.approx(1.1)
+    assert (ours["falls"], ours["second plant: falls"], ours["second plant, loose joints: falls"]) == (
+        0.0,
+        0.0,
+        1.0,
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 
 import numpy as np
@@ -14,7 +15,8 @@ from quadvel_eval.grid import Cell, CellResult, summarise  # noqa: E402
 from quadvel_eval.segments import Segment  # noqa: E402
 from quadvel_eval.walk import Setup  # noqa: E402
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile  # noqa: E402
-from quadvel_training.card import card  # noqa: E402
+from quadvel_training import __main__ as main  # noqa: E402
+from quadvel_training.card import SECTIONS, card  # noqa: E402
 
 
 @pytest.fixture
@@ -63,3 +65,41 @@ def test_an_evaluation_of_another_network_is_refused(evaluation, tmp_path):
     onnx.save(model, other)
     with pytest.raises(ValueError, match=r"is an evaluation of .*crl_eam[.]onnx, expected one of .*other"):
         card(other, [evaluation])
+
+
+def test_a_policys_card_has_what_the_papers_sections_measured_of_it(evaluation, tmp_path):
+    digest = hashlib.sha256(SHIPPED_POLICY.read_bytes()).hexdigest()[:12]
+    row = {"what": "1 m/s: diagonal feet alike", "unit": "%", "ours": {"mine": 5.0}}
+    for name in SECTIONS:
+        made = {"made_with": {"policies": {"other": "0" * 12, "mine": digest}}, "rows": [row]}
+        (tmp_path / name).write_text(json.dumps(made))
+    assert card(SHIPPED_POLICY, [evaluation], tmp_path).count("| 1 m/s: diagonal feet alike, % | 5 |") == len(
+        SECTIONS
+    )
+    made["made_with"]["policies"].pop("mine")
+    (tmp_path / SECTIONS[0]).write_text(json.dumps(made))
+    with pytest.raises(ValueError, match=f"made with .*, expected {digest}"):
+        card(SHIPPED_POLICY, [evaluation], tmp_path)
+
+
+def test_limits_of_commands_are_narrowed_in_the_file_and_the_network_stays(tmp_path):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(SHIPPED_POLICY.read_bytes())
+    before = PolicyFile(path)
+    main.limit(path, forward=1.5, turn=0.7)
+    after = PolicyFile(path)
+    vx, vy = (before.metadata.command_limits[axis] for axis in ("vx", "vy"))
+    assert after.metadata.command_limits == {"vx": (vx[0], 1.5), "vy": vy, "wz": (-0.7, 0.7)}
+    kept, now = (json.loads(one.metadata.to_json()) for one in (before, after))
+    assert {name for name in kept if kept[name] != now[name]} == {"command_limits"}
+    seen = np.linspace(-1.0, 1.0, before.metadata.observation.size, dtype=np.float32)
+    assert np.array_equal(before.step(seen), after.step(seen))
+
+
+@pytest.mark.parametrize("wider", [{"forward": 9.0}, {"backward": 9.0}, {"sideways": 9.0}, {"turn": 9.0}])
+def test_limits_are_never_widened_beyond_what_was_trained(tmp_path, wider):
+    path = tmp_path / "policy.onnx"
+    path.write_bytes(SHIPPED_POLICY.read_bytes())
+    with pytest.raises(ValueError, match=r"policy.onnx: command_limits[.]"):
+        main.limit(path, **wider)
+    assert path.read_bytes() == SHIPPED_POLICY.read_bytes()

@@ -13,9 +13,11 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import robot  # noqa: E402
 from quadvel_description.kinematics import rotate  # noqa: E402
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput  # noqa: E402
-from quadvel_training import loop  # noqa: E402
+from quadvel_sim.terrain import Terrain  # noqa: E402
+from quadvel_training import loop, recipe, stages  # noqa: E402
 from quadvel_training.constrained import PARTS, ConstrainedConfig, ConstrainedRun  # noqa: E402
 from quadvel_training.env import RAMP_AXES, RAMP_DOWN, TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.privileged import PrivilegedConfig  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
 
@@ -223,3 +225,25 @@ def test_a_resumed_run_of_stage_3_draws_on_where_it_was_saved(tmp_path):
 def test_a_missing_checkpoint_is_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"nowhere[.]pt: no such checkpoint"):
         loop.load(tmp_path / "nowhere.pt")
+
+
+@pytest.mark.parametrize("degrees", [0.0, 20.0, -20.0])
+def test_robots_start_with_four_feet_on_a_slope_whichever_way_they_look(degrees):
+    slope = Terrain(kind="slope", slope=float(np.radians(degrees))) if degrees else Terrain()
+    config = EnvConfig(n=16, threads=1, terrain=slope, randomisation=Randomisation.none())
+    env = VelocityEnv(config)
+    env._qpos[:, 7:] = robot.NOMINAL_Q
+    env._read()
+    across = env.clearance * np.cos(np.radians(degrees))  # m, from the ground, at right angles to it
+    assert np.ptp(across, axis=1).max() < 0.002
+    assert np.hypot(*env.roll_pitch.T) == pytest.approx(np.radians(abs(degrees)), abs=0.03)
+
+
+def test_the_field_of_hills_slopes_by_up_to_20_degrees():
+    ground = recipe.read(PrivilegedConfig, stages.RECIPES / "privileged_rough.yaml").terrain
+    ground = attrs.evolve(ground, roughness=0.001)
+    x, y = np.random.default_rng(0).uniform(-24.0, 24.0, (2, 20000))
+    steep = [
+        ground.height(x + dx, y + dy) - ground.height(x - dx, y - dy) for dx, dy in ((0.25, 0.0), (0.0, 0.25))
+    ]
+    assert np.degrees(np.arctan(np.hypot(*steep) / 0.5)).max() == pytest.approx(20.0, abs=2.0)

@@ -17,6 +17,7 @@ from quadvel_training.privileged import Judgement, Numbered, Past, PrivilegedCon
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
     HIGHEST,
+    LIFTING,
     LOWEST,
     WalkingRewards,
     WalkingWeights,
@@ -222,13 +223,16 @@ def test_a_robot_stands_once_its_four_feet_have_been_down_for_a_while():
     assert past.standing.tolist() == [True, False, True, True]
 
 
-def test_exploration_stays_wide_until_a_gait_has_formed():
+def test_exploration_stays_wide_until_feet_lift_and_the_first_samples_are_over():
     run = PrivilegedRun(SMALL)
     with torch.no_grad():
         run.actor.log_std.fill_(-5.0)
     run._bound_exploration()
     assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
     run.samples = int(SMALL.formed)
+    run._bound_exploration()
+    assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
+    run._note_airborne(LIFTING[1], 1.0)
     with torch.no_grad():
         run.actor.log_std.fill_(-5.0)
     run._bound_exploration()
@@ -238,6 +242,7 @@ def test_exploration_stays_wide_until_a_gait_has_formed():
 def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
     first = PrivilegedRun(SMALL)
     first.step(0.0)
+    first._note_airborne(0.25, 1.0)
     follow(first.grid, (1.0, 0.0, 0.0), 4)
     loop.save(first.state(), tmp_path / "privileged.pt")
     second = PrivilegedRun(SMALL)
@@ -246,6 +251,7 @@ def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
     assert first.grid.followed.any()
     assert np.array_equal(second.grid.open, first.grid.open)
     assert second.ppo.learning_rate == first.ppo.learning_rate
+    assert second.rewards.lifting == first.rewards.lifting == pytest.approx(0.5)
     second.step(0.0)
     third = PrivilegedRun(SMALL)
     third.restore(loop.load(tmp_path / "privileged.pt"))
@@ -288,6 +294,7 @@ def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():
 
 def test_the_learning_rate_is_bounded_once_a_gait_has_formed():
     run = PrivilegedRun(attrs.evolve(SMALL, formed=0.0, formed_rate=1e-5))
+    run._note_airborne(1.0, 1.0)
     run.step(0.0)
     assert run.ppo.learning_rate == 1e-5
     assert run.ppo.actor_optimiser.param_groups[0]["lr"] == 1e-5
@@ -310,3 +317,11 @@ def test_hips_away_from_straight_down_cost_and_less_so_sideways():
     assert hips_astray(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
         [0.6, 0.3]
     )
+
+
+def test_a_checkpoint_of_a_version_without_the_share_in_the_air_is_refused():
+    run = PrivilegedRun(SMALL)
+    state = run.state()
+    del state["airborne"]
+    with pytest.raises(loop.CheckpointError, match="airborne"):
+        run.restore(state)

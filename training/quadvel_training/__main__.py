@@ -14,7 +14,8 @@ from rich.progress import Progress, TextColumn
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_estimator.kalman import KalmanConfig
 from quadvel_eval.paper import gap
-from quadvel_policy.policy_file import SHIPPED_POLICY
+from quadvel_policy.observation import CommandLimits
+from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from . import (
     closing,
@@ -24,6 +25,7 @@ from . import (
     estimator,
     kalman_tuning,
     leg_classifier,
+    limiting,
     loop,
     parallel,
     privileged,
@@ -282,16 +284,45 @@ def cross_validate_legs(scans: Scans, source: Recipe = None) -> None:
         )
 
 
+@app.command("limit")
+def limit(
+    policy: Annotated[Path, typer.Argument(help="Policy file; its metadata are rewritten.", dir_okay=False)],
+    forward: Annotated[float | None, typer.Option(help="Fastest forward, m/s.", min=0.0)] = None,
+    backward: Annotated[float | None, typer.Option(help="Fastest backward, m/s.", min=0.0)] = None,
+    sideways: Annotated[float | None, typer.Option(help="Fastest to either side, m/s.", min=0.0)] = None,
+    turn: Annotated[float | None, typer.Option(help="Fastest turn either way, rad/s.", min=0.0)] = None,
+) -> None:
+    """Narrow the commands that a policy file answers; what is not given stays. Write its card again afterwards.
+
+    `quadvel paper --only sustained` shows which share of the drives' speed a command needs.
+    """
+    known = PolicyFile(policy).metadata.limits
+    low, high = list(known.low), list(known.high)
+    for axis, back, ahead in ((0, backward, forward), (1, sideways, sideways), (2, turn, turn)):
+        low[axis] = low[axis] if back is None else -back
+        high[axis] = high[axis] if ahead is None else ahead
+    limiting.limit_commands(
+        policy, CommandLimits((low[0], low[1], low[2]), (high[0], high[1], high[2]), known.curve)
+    )
+    _written(policy)
+
+
 @app.command("card")
 def write_card(
     network: Annotated[Path, typer.Argument(help="Policy or estimator file.")],
     evaluations: Annotated[
         list[Path], typer.Argument(help="eval.json of `quadvel eval`, or the folder it is in; one or more.")
     ],
+    paper: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of `quadvel paper`, for gait, sustained velocities and slopes.", file_okay=False
+        ),
+    ] = None,
 ) -> None:
-    """The model card of a network, written beside it: FILE.md of FILE.onnx."""
+    """Write the model card of a network next to it: FILE.md of FILE.onnx."""
     path = network.with_suffix(".md")
-    path.write_text(card(network, evaluations))
+    path.write_text(card(network, evaluations, paper))
     _written(path)
 
 

@@ -20,8 +20,18 @@ Json = Mapping[str, Any]
 UNITS = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}
 
 
-def card(network: Path, evaluations: Sequence[Path]) -> str:
-    """The text for a network file with what evaluations say of it. Raises ValueError or FileNotFoundError."""
+def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) -> str:
+    """The text of a network file's card.
+
+    Args:
+        network: the policy or estimator file.
+        evaluations: results of `quadvel eval`, files or folders.
+        paper: folder of `quadvel paper`; its gait, sustained and robustness sections go into a policy's card.
+
+    Raises:
+        ValueError: results of another network.
+        FileNotFoundError: a file is missing.
+    """
     metadata, found = _metadata(network), [read_evaluation(path) for path in evaluations]
     estimator = metadata.get("kind") == KIND
     for path, one in zip(evaluations, found, strict=True):
@@ -38,6 +48,7 @@ def card(network: Path, evaluations: Sequence[Path]) -> str:
             *_table("how it was made", "", _origin(metadata)),
             "",
             *(line for one in found for line in (*_measured(one, estimator), "")),
+            *(line for name in SECTIONS if paper for line in (*_section(network, paper / name), "")),
             "Known limits:",
             "",
             *(f"- {limit}" for limit in limits(metadata, found)),
@@ -105,6 +116,23 @@ def _measured(found: Json, estimator: bool) -> list[str]:
         if not estimator or "estimator" in name or name in ("runs", "falls")
     ]
     return _table(f"evaluation: {_conditions(found['setup'])}", "measured", rows)
+
+
+SECTIONS = ("gait.json", "sustained.json", "slopes.json")
+
+
+def _section(network: Path, file: Path) -> list[str]:
+    """The table of a section of `quadvel paper`. Raises ValueError where it was not made with this network."""
+    content = json.loads(file.read_text())
+    digest = hashlib.sha256(network.read_bytes()).hexdigest()
+    names = [name for name, made in content["made_with"]["policies"].items() if digest.startswith(made)]
+    if not names:
+        raise ValueError(f"{file}: made with {content['made_with']['policies']}, expected {digest[:12]}")
+    rows = [
+        (f"{row['what']}, {row['unit']}" if row["unit"] else row["what"], _number(row["ours"][names[0]]))
+        for row in content["rows"]
+    ]
+    return _table(f"`quadvel paper`: {file.stem}", "measured", rows)
 
 
 def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:

@@ -41,10 +41,10 @@ class GridConfig:
     error_wz: float = 0.12  # rad/s, the same of yaw,
     error_share: float = 0.06  # and so much more with every m/s and rad/s of the command
 
-    answered: CommandLimits = CommandLimits((-3.2, -2.0, -6.0), (3.1, 2.0, 6.0), curve=3.6)
+    answered: CommandLimits = CommandLimits((-2.9, -2.0, -5.0), (2.9, 2.0, 5.0), curve=3.6)
     """The commands that a policy file answers, m/s, rad/s, m/s^2; the grid goes beyond, so that none is at the edge of it.
 
-    Ahead at 3.3 m/s, swinging calves reach the speed at which the supervisor stops the robot, on some of the robots that vary.
+    Within these the shipped policy's joints stay below 1.1 of their drives' speed on the second plant (`quadvel paper`).
     """
 
     def limits(self) -> CommandLimits:
@@ -112,6 +112,10 @@ class CommandGrid:
     def _draw_from(self, cells: np.ndarray, rng: np.random.Generator, n: int) -> np.ndarray:
         middles = self._middle[cells]
         return middles[rng.integers(len(middles), size=n)] + rng.uniform(-0.5, 0.5, (n, 3)) * WIDTH
+
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) lie in open cells and within the limits, (n,) bool."""
+        return np.array([self.open[self.cell_of(one)] and self._inside(one) for one in command], bool)
 
     def cell_of(self, command: np.ndarray) -> tuple[int, ...]:
         """The index of the cell that a command (3,) lies in."""

@@ -13,6 +13,7 @@ import attrs
 import mujoco
 import numpy as np
 from mujoco.batch import Batch
+from scipy.spatial.transform import Rotation
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
@@ -77,6 +78,11 @@ class CommandRange:
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command
 
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) lie in the box, (n,) bool."""
+        low, high = [self.vx[0], -self.vy, -self.wz], [self.vx[1], self.vy, self.wz]
+        return np.asarray(((command >= low) & (command <= high)).all(axis=1))
+
 
 class Commands(Protocol):
     """Where velocity commands come from."""
@@ -88,6 +94,10 @@ class Commands(Protocol):
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        ...
+
+    def contains(self, command: np.ndarray) -> np.ndarray:
+        """Which of the velocities (n, 3) may be drawn, (n,) bool."""
         ...
 
 
@@ -107,6 +117,7 @@ class EnvConfig:
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
     ramped: float = 0.6  # share of the commands that are led to the new velocity as the command mux does it
+    reversed: float = 0.0  # share of the new commands that reverse the one before
     terrain: Terrain = Terrain()
 
 
@@ -127,7 +138,8 @@ class VelocityEnv:
     command (n, 4); q, dq, torque (n, 12); quaternion (n, 4); velocity, angular_velocity, acceleration (n, 3) in the body
     frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
     contact (n, 4) bool; height (n,) of the trunk above ground; power (n,) of the joints by the paper's energy term, mean of
-    the sample, W; fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
+    the sample, W; fastest (n, 12) of each joint's speeds in the sample, rad/s; foot_position (n, 4, 3) in the body frame, m;
+    fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
     command is new. `command` may be on its way yet to the velocity that was drawn.
     """
 
@@ -155,6 +167,7 @@ class VelocityEnv:
         self.changed = np.zeros(n, bool)
         self.broken = np.zeros(n, bool)
         self.power = np.zeros(n)
+        self.fastest = np.zeros((n, 12))
         self.torque = np.zeros((n, 12))
         self.acceleration = np.zeros((n, 3))
         self.time = np.zeros(n)
@@ -176,7 +189,7 @@ class VelocityEnv:
         qpos, qvel = np.zeros((n, 19)), rng.normal(0, 0.1, (n, 18))
         heading = rng.uniform(-np.pi, np.pi, n)
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
-        qpos[:, 3], qpos[:, 6] = np.cos(heading / 2), np.sin(heading / 2)
+        qpos[:, 3:7] = self._along_the_ground(qpos[:, :2], heading)
         qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
         feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
@@ -190,9 +203,38 @@ class VelocityEnv:
         self.torque[ids] = 0.0
         self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
 
+    def _along_the_ground(self, place: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        """Attitudes of trunks that stand on the ground as it slopes there.
+
+        Args:
+            place: x, y (n, 2), m, world.
+            heading: (n,) rad.
+
+        Returns:
+            Quaternions (n, 4), w first, body to world.
+        """
+        level = Rotation.from_euler("Z", heading[:, None])
+        corners = foot_positions(robot.NOMINAL_Q)
+        feet = np.stack([level.apply(corner) for corner in corners], axis=1)
+        forward, left = self._falls(self._ground(feet[..., :2] + place[:, None]))
+        pitch = np.arctan(forward)
+        leaning = Rotation.from_euler("YX", np.stack([pitch, -np.arctan(left * np.cos(pitch))], axis=1))
+        return np.roll((level * leaning).as_quat(), 1, axis=1)
+
+    @staticmethod
+    def _falls(ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """By how much ground of heights (n, 4) below the four feet falls away, for 1 m forward and for 1 m to the left."""
+        forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
+        left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
+        return forward / STANCE_LENGTH, left / STANCE_WIDTH
+
     def _new_commands(self, ids: np.ndarray) -> None:
         n, (slow, quick) = len(ids), RAMP
-        self._goal[ids] = self.commands.draw(self.rng, n)
+        before = self._goal[ids]
+        self._goal[ids] = goal = self.commands.draw(self.rng, n)
+        back = self.rng.random(n) < self.config.reversed
+        back &= before[:, :3].any(axis=1) & self.commands.contains(-before[:, :3])
+        self._goal[ids[back]] = np.where([True, True, True, False], -before, 0.0 * goal)[back]
         led = self.rng.random(n) < self.config.ramped
         self._ramp[ids] = np.where(led, slow * (quick / slow) ** self.rng.random(n), np.inf)
         self._lead_commands(ids)
@@ -222,7 +264,7 @@ class VelocityEnv:
         """
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
         self.changed[:] = False
-        self.power[:] = 0.0
+        self.power[:], self.fastest[:] = 0.0, 0.0
         self._push()
         end = self._clock.ravel() + self.config.period
         q, dq = self._qpos[:, 7:], self._qvel[:, 6:]
@@ -234,6 +276,7 @@ class VelocityEnv:
             self.torque = self.actuators.step(q, dq, sent, *gains, target_speed, push)
             self._ctrl[:] = self.torque
             self.batch.step()
+            np.maximum(self.fastest, np.abs(dq), out=self.fastest)
             self.power += np.maximum(HEAT * self.torque**2 + self.torque * dq, 0.0).sum(axis=1)
         self.power /= self.substeps
         self.time += self.config.period
@@ -259,7 +302,7 @@ class VelocityEnv:
         if len(ids):
             self._qpos[ids, :3], self._qpos[ids, 3:7] = 0.0, [0.0, 1.0, 0.0, 0.0]
             self._qpos[ids, 7:], self._qvel[ids] = robot.NOMINAL_Q, 0.0
-            self.torque[ids], self.power[ids], before[ids] = 0.0, 0.0, 0.0
+            self.torque[ids], self.power[ids], self.fastest[ids], before[ids] = 0.0, 0.0, 0.0, 0.0
             self.actuators.reset(ids)
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
@@ -268,10 +311,7 @@ class VelocityEnv:
     @property
     def ground_slope(self) -> np.ndarray:
         """By how much (n, 2) the ground falls away below the four feet, for 1 m forward and for 1 m to the left."""
-        ground = self._ground(self.feet)
-        forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
-        left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
-        return np.stack([forward / STANCE_LENGTH, left / STANCE_WIDTH], axis=-1)
+        return np.stack(self._falls(self._ground(self.feet)), axis=-1)
 
     def _push(self) -> None:
         r = self.config.randomisation
@@ -289,6 +329,7 @@ class VelocityEnv:
         self.roll_pitch = roll_pitch(self.quaternion)
         quaternion = self.quaternion[:, None]
         local, jacobians = foot_kinematics(self.q)
+        self.foot_position = local
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
         joints = self.dq.reshape(-1, 4, 3, 1)
         swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)

@@ -26,13 +26,23 @@ from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
 from .ppo import Ppo, PpoConfig, Rollout, spreads
 from .randomisation import Randomisation, actuator
-from .walking_rewards import SAMPLE, WalkingRewards, WalkingWeights, sizes
+from .walking_rewards import (
+    SAMPLE,
+    WalkingRewards,
+    WalkingWeights,
+    lifting,
+    one_diagonal_in_the_air,
+    sizes,
+)
 
 ACTION_SCALE = 0.4  # rad a unit of the network's output
 ACTION_BOUND = 4.0  # of the network's unit
 STRIDE = 0.35  # s, over which errors are low-passed: about a stride
 LONG = 1.5  # s, the same for what lasts
 TRANSIENT = 1.0  # s after a new command that what lasts, and the judgement of the command, leave out
+PAIRING = 0.7  # s, over which `Past.paired` is low-passed: about two strides
+HIPS_AHEAD = robot.HIP_OFFSET[0] * np.array([robot.FRONT[leg] for leg in robot.LEGS])  # m, body frame
+AIRBORNE = 0.05  # weight of a rollout's share of feet in the air in the run's mean, about 20 rollouts
 STOOD = 0.2  # s on four feet, after which a robot that sets off has to begin with a side
 TALL = 0.38  # m, about the height of a walking trunk
 
@@ -58,6 +68,7 @@ MIRROR = symmetry.stack(
 )
 SIZE = len(MIRROR.index)
 CRITIC_EXTRA = 4 + 4 + 1
+GAIT_EXTRA = 2  # more that this stage's critic alone sees: `Past.paired`, and `lifting`
 
 
 class Past:
@@ -65,6 +76,8 @@ class Past:
 
     stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG; the latter
     starts at zero with every new command, TRANSIENT after it. air, down (n, 4): s since the foot left the ground or touched it.
+    paired (n,): share of the time that one diagonal pair of feet alone was in the air, low-passed over PAIRING. off_hip (n, 4): of
+    a foot that has just left the ground, how far ahead of its hip the middle of its stance was, m, body frame; else 0.
     """
 
     def __init__(self, env: VelocityEnv) -> None:
@@ -72,11 +85,16 @@ class Past:
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
+        self.paired, self.off_hip = np.zeros(n), np.zeros((n, 4))
         self._age = np.zeros(n)  # s, of the command
+        self._landed, self._last = (
+            np.zeros((n, 4)),
+            np.zeros((n, 4)),
+        )  # m ahead of the hip: at touchdown, last on the ground
 
     def reset(self, ids: np.ndarray) -> None:
         """Forget the past of `ids`."""
-        for array in (self.stride, self.lasting, self.air, self.down, self._age):
+        for array in (self.stride, self.lasting, self.air, self.down, self.paired, self.off_hip, self._age):
             array[ids] = 0.0
 
     def advance(self, command: np.ndarray) -> None:
@@ -88,8 +106,19 @@ class Past:
         settled = (self._age > TRANSIENT)[:, None]
         self.lasting += (error - self.lasting) * settled * period / LONG
         self.lasting[env.changed] = self._age[env.changed] = 0.0
+        self._advance_stances()
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
+        paired = one_diagonal_in_the_air(env.contact)
+        self.paired += (paired - self.paired) * period / PAIRING
+
+    def _advance_stances(self) -> None:
+        """Note where feet touch down and leave the ground; `down` is still that of the sample before."""
+        contact, ahead = self.env.contact, self.env.foot_position[..., 0] - HIPS_AHEAD
+        was_down = self.down > 0.0
+        self._landed = np.where(contact & ~was_down, ahead, self._landed)
+        self.off_hip = np.where(was_down & ~contact, 0.5 * (self._landed + self._last), 0.0)
+        self._last = np.where(contact, ahead, self._last)
 
     @property
     def standing(self) -> np.ndarray:
@@ -149,10 +178,16 @@ class PrivilegedConfig:
     std: float = 0.7  # of the exploration at first, in the network's unit; an upper bound for it that falls
     final_std: float = 0.22  # to this
     std_samples: float = 2.5e7  # with so many samples
-    formed: float = 6e6  # samples after which a gait has formed;
+    formed: float = (
+        6e6  # samples after which a gait has formed, if feet lift (`walking_rewards.lifting`) then;
+    )
     forming_std: float = (
         0.45  # until then exploration is no less: robots that stand have to stumble upon steps,
     )
+    ramped: float = (
+        0.6  # share of the commands that are led up to their velocity; the others come in one step
+    )
+    reversed: float = 0.0  # share of the commands that reverse the one before
     formed_rate: float = 5e-4  # and from then on the learning rate is no more
     keep: float = 1e6  # samples between numbered checkpoints
     actuator: str = "eam"
@@ -219,16 +254,21 @@ class PrivilegedRun:
             actuator=actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
+            ramped=c.ramped,
+            reversed=c.reversed,
         )
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
         self.rewards = WalkingRewards(self.env, c.rewards)
         self.judgement = Judgement(c.n)
         self.actor = Gaussian(Mlp(SIZE, 12), 12, c.std)
-        self.critic = Mlp(SIZE + CRITIC_EXTRA, 1)
+        self.critic = Mlp(SIZE + CRITIC_EXTRA + GAIT_EXTRA, 1)
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
+        self._airborne = (
+            0.0  # share of the time that feet of walking robots are in the air, of the last rollouts
+        )
         self._spread = spreads(c.n)
         self._actions = np.zeros((2, c.n, 12), np.float32)  # the last ones, the newest first
 
@@ -240,16 +280,26 @@ class PrivilegedRun:
             "learner": self.ppo.state(),
             "grid": self.grid.state(),
             "samples": self.samples,
+            "airborne": self._airborne,
             "random": {"learner": torch.get_rng_state(), "environments": self.env.rng.bit_generator.state},
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of its grid."""
+        """Go on from a checkpoint; robots start over, under commands of its grid.
+
+        Raises:
+            CheckpointError: the checkpoint is of another grid, or of a version whose critic saw less.
+        """
+        if "airborne" not in state:
+            raise loop.CheckpointError(
+                "checkpoint: found no field 'airborne', expected one of this version's stage 1"
+            )
         self.actor.load_state_dict(state["actor"])
         self.critic.load_state_dict(state["critic"])
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
+        self._note_airborne(state["airborne"], 1.0)
         parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
@@ -258,15 +308,25 @@ class PrivilegedRun:
         rollout, seen = self.collect()
         self._bound_exploration()
         seen |= self.ppo.update(rollout)
-        if self.samples > self.config.formed:
+        if self.formed:
             self.ppo.learning_rate = min(self.ppo.learning_rate, self.config.formed_rate)
             loop.set_rate(self.ppo.actor_optimiser, self.ppo.learning_rate)
         return seen | self.grid.reach() | {"std": float(self.actor.log_std.detach().exp().mean())}
 
+    @property
+    def formed(self) -> bool:
+        """Whether a gait has formed: feet lift, and the first samples are over."""
+        return self.samples >= self.config.formed and self.rewards.lifting > 0.5
+
+    def _note_airborne(self, share: float, weight: float = AIRBORNE) -> None:
+        """Take up the share of the time in the air of walking robots' feet in the last rollout."""
+        self._airborne += weight * (share - self._airborne)
+        self.rewards.lifting = lifting(self._airborne)
+
     def _bound_exploration(self) -> None:
         c = self.config
         most = loop.linear(c.std, c.final_std, self.samples / c.std_samples)
-        least = c.forming_std if self.samples < c.formed else 0.5 * c.final_std
+        least = 0.5 * c.final_std if self.formed else c.forming_std
         with torch.no_grad():
             self.actor.log_std.clamp_(min=float(np.log(least)), max=float(np.log(max(most, least))))
 
@@ -279,7 +339,8 @@ class PrivilegedRun:
             self._actions[:, ids] = 0.0
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
-        return np.concatenate([obs, critic_extra(self.env, self.past)], axis=1)
+        gait = np.stack([self.past.paired, np.full(len(obs), self.rewards.lifting)], axis=1)
+        return np.concatenate([obs, critic_extra(self.env, self.past), gait.astype(np.float32)], axis=1)
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
         """One sequence of every environment with exploration noise."""
@@ -288,7 +349,7 @@ class PrivilegedRun:
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
         std = self.actor.log_std.exp().detach().numpy()
         terms: dict[str, float] = {}
-        seen = np.zeros(5)
+        seen, walking = np.zeros(6), 0
         for _ in range(c.length):
             obs = observe(env, self.past, self._actions[0])
             critic_obs, standing = self._critic_obs(obs), self.past.standing
@@ -311,10 +372,15 @@ class PrivilegedRun:
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
             errors = [size.mean() for size in sizes(self.past.stride)]
-            seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean()]
+            on_the_way = command[:, 3] < 0.5
+            walking += on_the_way.sum()
+            lifted = (~env.contact[on_the_way]).mean(axis=1).sum()
+            seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean(), lifted]
             self.judgement.end(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
         self.judgement.tell(self.grid)
+        airborne = float(np.mean(parallel.gather(seen[5] / max(walking, 1))))
+        self._note_airborne(airborne)
         self.samples += c.length * c.n * parallel.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = self._critic_obs(observe(env, self.past, self._actions[0]))
@@ -325,13 +391,14 @@ class PrivilegedRun:
             mask=torch.ones_like(t["reward"]),
             last_critic_obs=torch.from_numpy(last),
         )
-        xy, wz, falls, broken, contact = seen / c.length
+        xy, wz, falls, broken, contact, _ = seen / c.length
         return rollout, {
             "error_xy": xy,
             "error_wz": wz,
             "falls_per_minute": 60 * falls / SAMPLE,
             "broken": broken * c.length,
             "contact_ratio": contact,
+            "airborne": airborne,
             "reward": float(t["reward"].mean()),
         } | {f"reward/{name}": value for name, value in terms.items()}
 

@@ -9,9 +9,13 @@ from mujoco.batch import Batch
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters, Effect
-from quadvel_description.robot import JOINT_NAMES
+from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT, VELOCITY_LIMIT
 
 STALL, NO_LOAD = (24.0, 60.0), (12.0, 30.0)  # N m, rad/s, of `limited`, drawn for each robot
+RATED_STALL, RATED_SPEED = (
+    (1.6, 2.4),
+    (1.0, 1.15),
+)  # of `rated`: shares of the joints' torque and speed limits
 
 
 def limited() -> ActuatorParameters:
@@ -22,7 +26,31 @@ def limited() -> ActuatorParameters:
     return attrs.evolve(ActuatorParameters.default(), name="aliengo, limited", effects=(effect,))
 
 
-ACTUATORS = {"eam": ActuatorParameters.default, "limited": limited, "ideal": ActuatorParameters.ideal}
+def rated() -> ActuatorParameters:
+    """The shipped actuator model with the drives' own speed-torque curve: full torque up to about half the top speed, none at it.
+
+    Both ends are drawn for each robot: RATED_STALL times the torque limit (above it the limit itself counts), at rest, and
+    RATED_SPEED times the speed limit.
+    """
+    kinds = {kind: tuple(name for name in JOINT_NAMES if kind in name) for kind in ("hip", "thigh", "calf")}
+    effects = []
+    for k, joints in enumerate(kinds.values()):
+        stall, no_load = (
+            tuple(float(share * limit[k]) for share in shares)
+            for shares, limit in ((RATED_STALL, TORQUE_LIMIT), (RATED_SPEED, VELOCITY_LIMIT))
+        )
+        middle = {"stall": float(np.mean(stall)), "no_load": float(np.mean(no_load))}
+        ranges = {"stall": stall, "no_load": no_load}
+        effects.append(Effect("torque_speed_limit", joints, middle, intervals=ranges))
+    return attrs.evolve(ActuatorParameters.default(), name="aliengo, rated drives", effects=tuple(effects))
+
+
+ACTUATORS = {
+    "eam": ActuatorParameters.default,
+    "limited": limited,
+    "rated": rated,
+    "ideal": ActuatorParameters.ideal,
+}
 
 
 @attrs.frozen
@@ -153,7 +181,7 @@ class PlantSampler:
 
 
 def actuator(name: str) -> ActuatorParameters:
-    """The joints of a recipe: `eam` is Table 4, `limited` the same with limits, `ideal` plain PD, else an actuator file."""
+    """The joints of a recipe: `eam` (Table 4), `limited` and `rated` (with torque limits), `ideal` (PD), or an actuator file."""
     return ACTUATORS[name]() if name in ACTUATORS else ActuatorParameters.load(name)
 
 

@@ -12,8 +12,9 @@ from . import loop, parallel, recipe
 from .constrained import ConstrainedConfig, ConstrainedRun
 from .dagger import DaggerConfig, DaggerRun, export_policy, policy_of
 from .estimator import EstimatorConfig, EstimatorRun
+from .gait_log import GaitLog
 from .loop import Budget
-from .privileged import Numbered, PrivilegedConfig, PrivilegedRun
+from .privileged import PrivilegedConfig, PrivilegedRun
 from .run_folder import Evaluated, describe, made_of
 
 RECIPES = Path(__file__).parents[1] / "recipes"
@@ -34,7 +35,7 @@ def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -
     """Stage 1; whether its budget is spent. source, here and below: the recipe file, for the record."""
     run = PrivilegedRun(config)
     describe(folder, "privileged", source, config)
-    return loop.train(run, config.budget, folder / TEACHER, Numbered(run, folder))
+    return loop.train(run, config.budget, folder / TEACHER, GaitLog(run, folder))
 
 
 def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:

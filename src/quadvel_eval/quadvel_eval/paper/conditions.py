@@ -9,6 +9,8 @@ import attrs
 import numpy as np
 from matplotlib.axes import Axes
 
+from quadvel_sim.physics import SECOND
+
 from ..grid import DURATION, Cell, CellResult, judge, mass
 from ..walk import Setup, make_loop, record
 from .cells import Command
@@ -16,6 +18,8 @@ from .section import Job, Record, Study, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
 """ahead, sideways, along an arc; m/s, rad/s"""
+LOOSE: Mapping[str, Any] = {"physics": SECOND, "joint_friction": np.zeros(12), "joint_damping": np.zeros(12)}
+"""Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
 PUSH_TIME, PUSH_SECONDS = 1.0, 0.2  # s after the start of a walk, and for how long
 
 
@@ -29,6 +33,8 @@ class Condition:
     """fields of SimulatorConfig"""
     push: tuple[float, float, float] | None = None
     """N on the trunk, world frame, for PUSH_SECONDS"""
+    stood: float = 0.0
+    """s that the robot stands there before its command"""
 
     @property
     def labels(self) -> Record:
@@ -36,9 +42,20 @@ class Condition:
         return {"group": self.group, "level": self.level}
 
 
-def walk_under(setup: Setup, cell: Cell, push: tuple[float, float, float] | None) -> CellResult:
-    """As `grid.run_cell`, without estimators beside, and pushed after PUSH_TIME where there is a push."""
+def walk_under(
+    setup: Setup, cell: Cell, push: tuple[float, float, float] | None, stood: float = 0.0
+) -> CellResult:
+    """As `grid.run_cell`, without other estimators, after standing, and with a push if there is one.
+
+    Args:
+        setup: robot, policy and estimator.
+        cell: the command and the seed.
+        push: force on the trunk, N, world frame, for PUSH_SECONDS from PUSH_TIME on.
+        stood: how long the robot is commanded to stand first, s.
+    """
     loop = make_loop(setup, cell.seed, ())
+    if stood and record(loop, [((0.0, 0.0, 0.0), stood)]) is None:
+        return CellResult(cell)
     if push is not None:
         if record(loop, [(cell.command, PUSH_TIME)]) is None:
             return CellResult(cell)
@@ -50,7 +67,9 @@ def walk_under(setup: Setup, cell: Cell, push: tuple[float, float, float] | None
 def condition_job(study: Study, policy: str, one: Condition, command: Command, seed: int) -> Job:
     """A policy's walk under a condition."""
     setup = study.setup(policy, **one.plant)
-    return Job({"policy": policy, **one.labels}, (walk_under, setup, Cell(command, seed), one.push))
+    return Job(
+        {"policy": policy, **one.labels}, (walk_under, setup, Cell(command, seed), one.push, one.stood)
+    )
 
 
 def survival(records: Sequence[Record]) -> float:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, ClassVar
 
 import attrs
@@ -14,15 +16,38 @@ from scipy.ndimage import median_filter
 
 from quadvel_description import robot
 
+from ..gait_kind import GaitKind, gait_frequency
 from ..robot_loop import PERIOD
 from ..walk import Setup, Walk, make_loop, record_to_the_fall
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
+from .section import (
+    Answers,
+    Job,
+    Record,
+    Row,
+    Section,
+    Study,
+    by_policy,
+    column,
+    distinct,
+    largest,
+    mean,
+    select,
+)
 
 Array = NDArray[np.float64]
 
 WINDOW = 1.0  # s, over which a gait is counted
 STEADY = 5  # ticks: a shorter touch or gap is a bounce
 SHOWN = 4  # ticks from one line of the CSV to the next
+KIND_SPEEDS = (0.5, 1.0, 2.0, 2.75)  # m/s of the ramp, at which the kind of gait is in the table,
+KIND_SPAN = 0.125  # m/s, from so much below to so much above
+KINDS = {  # what the table has of a gait's kind, with units and factors
+    "diagonal": ("diagonal feet alike", "%", 100.0),
+    "side": ("feet of one side alike", "%", 100.0),
+    "frequency": ("gait frequency", "Hz", 1.0),
+    "contact_ratio": ("contact ratio", "", 1.0),
+    "sway": ("sway", "m/s", 1.0),
+}
 SHOWN_LEGS = ("FL", "FR", "RL", "RR")
 
 
@@ -30,18 +55,6 @@ def contacts(raw: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Contacts (n, 4) at 200 Hz without bounces: what half of `STEADY` ticks around say."""
     steady: NDArray[np.bool_] = median_filter(raw, size=(STEADY, 1), mode="nearest")
     return steady
-
-
-def touchdowns(contact: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Ticks at which one foot, (n,), comes down."""
-    return np.flatnonzero(~contact[:-1] & contact[1:]) + 1
-
-
-def gait_frequency(contact: NDArray[np.bool_]) -> float:
-    """Steps of a foot a second (Hz), from the times between touchdowns, mean over the feet (n, 4); 0 without any."""
-    downs = [touchdowns(contact[:, foot]) for foot in range(4)]
-    rates = [(len(d) - 1) / ((d[-1] - d[0]) * PERIOD) for d in downs if len(d) > 1]
-    return float(np.mean(rates)) if len(rates) == 4 else 0.0
 
 
 def ramp(setup: Setup, seed: int, top: float, slope: float, hold: float) -> tuple[Walk | None, bool]:
@@ -62,7 +75,10 @@ class Gait(Section):
     method: ClassVar[str] = (
         "From standing the command vx rises by 0.25 m/s each second to 3.5 m/s. Foot contacts are the simulator's. "
         "Gait frequency (steps of a foot a second) and contact ratio (share of the time on the ground) are counted over "
-        "windows of 1 s, mean of the four feet. A policy follows commands up to the limit in its file, no further."
+        "windows of 1 s, mean of the four feet. A policy follows commands up to the limit in its file, no further. The kind of "
+        "gait is the mean over the part of the ramp within 0.125 m/s of a speed: share of the time that two diagonal feet, and "
+        "two feet of one side, are both on the ground or both in the air (a trot: diagonal feet near 100 %; a pace: feet of one "
+        "side near 100 %), from contacts as they are; sway is the standard deviation of the sideways velocity."
     )
     top: float = 3.5
     slope: float = 0.25
@@ -85,15 +101,20 @@ class Gait(Section):
         contact, half = contacts(walk.contact), round(0.5 * WINDOW / PERIOD)
         lines = []
         for i in range(0, len(walk.time), SHOWN):
-            window = contact[max(0, i - half) : i + half]
+            part = slice(max(0, i - half), i + half)
+            window = contact[part]
+            kind = GaitKind.of(walk.contact[part], walk.velocity[part, 1], PERIOD)
             feet = {leg: int(contact[i, robot.LEGS.index(leg)]) for leg in SHOWN_LEGS}
             lines.append(
                 {
                     "time": round(float(walk.time[i]), 3),
                     "command": float(np.clip(self.slope * (walk.time[i] - self.hold), 0.0, self.top)),
-                    "vx": float(walk.velocity[max(0, i - half) : i + half, 0].mean()),
-                    "frequency": gait_frequency(window),
+                    "vx": float(walk.velocity[part, 0].mean()),
+                    "frequency": gait_frequency(window, PERIOD),
                     "contact_ratio": float(window.mean()),
+                    "diagonal": kind.diagonal,
+                    "side": kind.side,
+                    "sway": kind.sway,
                     **feet,
                     "fell": int(not stood),
                 }
@@ -144,7 +165,24 @@ class Gait(Section):
             Row("contact ratio, standing", "", 1.0, by_policy(records, lambda r: r[0]["contact_ratio"]), 2),
             Row("contact ratio at the end", "", 0.39, by_policy(records, last("contact_ratio")), 2, key=True),
             Row("fell during the ramp", "", 0.0, by_policy(records, lambda r: r[0]["fell"]), 0),
+            *_kind_rows(records),
         ]
+
+
+def _mean_near(records: Sequence[Record], speed: float, name: str) -> float:
+    """Mean of a column over the part of the ramp within KIND_SPAN of a speed (m/s); nan where there is none."""
+    return mean([r for r in records if abs(r["command"] - speed) < KIND_SPAN], name)
+
+
+def _kind_rows(records: Sequence[Record]) -> list[Row]:
+    """The kind of gait at each of KIND_SPEEDS; nothing where the ramp ends before."""
+    rows = []
+    for speed, (name, (what, unit, factor)) in itertools.product(KIND_SPEEDS, KINDS.items()):
+        ours = by_policy(records, partial(_mean_near, speed=speed, name=name))
+        scaled = {policy: None if value is None else factor * value for policy, value in ours.items()}
+        digits, key = (0, speed == 1.0) if unit == "%" else (2, False)
+        rows.append(Row(f"{speed:g} m/s: {what}", unit, None, scaled, digits, key=key))
+    return rows
 
 
 def _draw_contacts(panel: Axes, time: Array, records: Sequence[Record]) -> None:

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from quadvel_description.state import JointCommand
 
+from ..gait_kind import touchdowns
 from ..grid import STANCE_WALK, drift
 from ..robot_loop import PERIOD, STEPS, RobotLoop
 from ..walk import Setup, make_loop, record
-from .gait import contacts, touchdowns
+from .gait import contacts
 from .section import (
     Answers,
     Job,

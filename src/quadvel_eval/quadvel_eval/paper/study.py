@@ -25,6 +25,7 @@ from .jitter import Jitter
 from .letters import Letters
 from .robustness import Robustness
 from .section import Section, Study
+from .slopes import Slopes
 from .stance import Stance
 from .sustained import Sustained
 from .symmetry import Symmetry
@@ -40,6 +41,7 @@ SECTIONS: tuple[Section, ...] = (
     Letters(),
     Energy(),
     Robustness(),
+    Slopes(),
     Gap(),
     Stance(),
     Estimator(),

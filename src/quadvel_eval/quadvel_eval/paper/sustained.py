@@ -3,9 +3,10 @@ ask of the drives."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import attrs
 import numpy as np
@@ -13,9 +14,11 @@ from matplotlib.figure import Figure
 
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 
+from ..grid import PLANTS
 from ..robot_loop import PERIOD
 from ..walk import Setup, make_loop, record_to_the_fall
 from .cells import Command, falls, limits, reach
+from .conditions import LOOSE
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
 
 ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
@@ -29,6 +32,8 @@ DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s
     "spin left": ((0.0, 0.0, 1.0), 6.0),
     "spin right": ((0.0, 0.0, -1.0), 6.0),
 }
+HARD_PLANTS: dict[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE}
+_PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
 DRIVES = {
     "joint_speed": "fastest joint, share of its drive's speed",
     "torque": "largest torque, share of its drive's",
@@ -65,9 +70,10 @@ class Sustained(Section):
     method: ClassVar[str] = (
         "The command rises at 0.7 m/s² (spins: 1.4 rad/s²) to 60, 80, 90 and 100 % of the policy's own limit in that "
         "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and is held for 5 s. What counts is the "
-        "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table. Beside it stands what "
+        "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table. With it stands what "
         "the command asks of the drives: the largest speed and torque of any joint, as shares of what its drive can do. The "
-        "supervisor stops a robot whose joints move at 1.25 times that speed."
+        "supervisor stops a robot whose joints move at 1.25 times that speed, which counts as a fall. The second plant is that of "
+        "Figure 10; with loose joints it has neither friction nor damping in its joints, and their speeds are the largest."
     )
     shares: tuple[float, ...] = (0.6, 0.8, 0.9, 1.0)
     directions: tuple[str, ...] = tuple(DIRECTIONS)
@@ -79,15 +85,23 @@ class Sustained(Section):
             for name in self.directions:
                 direction, paper = DIRECTIONS[name]
                 top = min(reach(direction, bounds), 1.1 * paper)
-                for speed in (round(share * top, 3) for share in self.shares):
-                    labels = {"policy": policy, "direction": name, "command": speed, "limit": top}
-                    jobs.append(Job(labels, (sustain, study.setup(policy), 0, direction, speed)))
+                speeds = [round(share * top, 3) for share in self.shares]
+                for (plant, fields), speed in itertools.product(HARD_PLANTS.items(), speeds):
+                    labels = {
+                        "policy": policy,
+                        "plant": plant,
+                        "direction": name,
+                        "command": speed,
+                        "limit": top,
+                    }
+                    jobs.append(Job(labels, (sustain, study.setup(policy, **fields), 0, direction, speed)))
         return jobs
 
     def judge(self, answers: Answers) -> list[Record]:
         return [{**labels, **became} for labels, became in answers]
 
     def figure(self, records: Sequence[Record]) -> Figure:
+        records = select(records, plant="usual")
         policies = distinct(records, "policy")
         names = distinct(records, "direction")
         figure = Figure(figsize=(12.5, 3.8), layout="constrained")
@@ -115,16 +129,33 @@ class Sustained(Section):
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
+        usual = select(records, plant="usual")
         for name in distinct(records, "direction"):
-            mine = select(records, direction=name)
+            mine = select(usual, direction=name)
             unit, paper = "rad/s" if name.startswith("spin") else "m/s", DIRECTIONS[name][1]
             reached, tried = (by_policy(mine, partial(largest, name=what)) for what in ("reached", "command"))
             rows += [
                 Row(f"{name}: reached", unit, paper, reached, 2, key=True),
                 Row(f"{name}: largest command that was tried", unit, None, tried, 2),
-                *(
-                    Row(f"{name}: {what}", "", None, by_policy(mine, partial(largest, name=key)), 2)
-                    for key, what in DRIVES.items()
-                ),
+                *_drive_rows(name, mine),
             ]
-        return [*rows, Row("falls", "", 0.0, by_policy(records, falls), 0)]
+        rows.append(Row("falls", "", 0.0, by_policy(usual, falls), 0))
+        for plant in distinct(records, "plant"):
+            if plant != "usual":
+                rows += _plant_rows(plant, select(records, plant=plant))
+        return rows
+
+
+def _drive_rows(what: str, records: Sequence[Record]) -> list[Row]:
+    return [
+        Row(f"{what}: {drive}", "", None, by_policy(records, partial(largest, name=key)), 2)
+        for key, drive in DRIVES.items()
+    ]
+
+
+def _plant_rows(plant: str, records: Sequence[Record]) -> list[Row]:
+    """What another plant's drives are asked for, in each direction, and where robots fell or were stopped."""
+    rows = []
+    for name in distinct(records, "direction"):
+        rows += _drive_rows(f"{_PLANT_NAMES[plant]}, {name}", select(records, direction=name))
+    return [*rows, Row(f"{_PLANT_NAMES[plant]}: falls", "", None, by_policy(records, falls), 0)]

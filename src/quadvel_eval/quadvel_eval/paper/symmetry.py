@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from quadvel_description import robot
 from quadvel_description.symmetry import JOINTS as MIRROR
 
+from ..gait_kind import touchdowns
 from ..walk import Setup, Walk, make_loop, record
 from .cells import limits
-from .gait import contacts, touchdowns
+from .gait import contacts
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, select
 
 Array = NDArray[np.float64]

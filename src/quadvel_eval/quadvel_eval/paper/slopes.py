@@ -1,0 +1,96 @@
+"""Slopes: who survives and who also follows, started and stood on them, each angle and direction by itself, on two plants."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import ClassVar
+
+import attrs
+import numpy as np
+from matplotlib.figure import Figure
+
+from quadvel_sim.terrain import Terrain
+
+from ..grid import PLANTS
+from .cells import Command, cell_record, largest_error, mean_error
+from .conditions import COMMANDS, Condition, condition_job, draw, survival
+from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
+
+SLOPES = {-15.0: "15 degrees down", -7.5: "7.5 degrees down", 7.5: "7.5 degrees up", 15.0: "15 degrees up"}
+"""Slopes (degrees, rising ahead of the robot at the start) and their names."""
+STOOD = 2.0  # s that a robot stands on a slope before it is commanded to walk
+FOLLOWED = 0.15  # m/s: a robot whose error over the judged 4 s is larger is stuck: it does not follow
+
+
+def survival_and_following(records: Sequence[Record]) -> float:
+    """Share of the robots that neither fell nor were off their command by more than FOLLOWED, %; nan without any."""
+    good = [not r["fell"] and r["error_xy"] <= FOLLOWED for r in records]
+    return 100.0 * float(np.mean(good)) if good else float("nan")
+
+
+def conditions(plant: str) -> list[Condition]:
+    """All slopes on one of PLANTS; the robot stands on them first."""
+    return [
+        Condition(
+            plant,
+            f"{degrees:g}",
+            {**PLANTS[plant], "terrain": Terrain(kind="slope", slope=float(np.radians(degrees)))},
+            stood=STOOD,
+        )
+        for degrees in SLOPES
+    ]
+
+
+@attrs.frozen
+class Slopes(Section):
+    """Every slope with every command and seed on each plant."""
+
+    name: ClassVar[str] = "slopes"
+    title: ClassVar[str] = "Robustness: slopes"
+    method: ClassVar[str] = (
+        "Slopes that rise (up) or fall (down) ahead of the robot at the start. It stands there for 2 s, then walks for 6 s ahead "
+        "(1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, 0.6 rad/s), which turns it across the slope. Survival: share of "
+        "the robots that did not fall. A robot that does not fall, but is off its command by more than 0.15 m/s on the mean of the "
+        "last 4 s, is stuck: it does not follow. The second plant is that of Figure 10. The paper gives no figures."
+    )
+    plants: tuple[str, ...] = tuple(PLANTS)
+    commands: tuple[Command, ...] = COMMANDS
+
+    def jobs(self, study: Study) -> list[Job]:
+        return [
+            condition_job(study, policy, one, command, seed)
+            for policy, plant, seed in itertools.product(study.policies, self.plants, range(study.seeds))
+            for one in conditions(plant)
+            for command in self.commands
+        ]
+
+    def judge(self, answers: Answers) -> list[Record]:
+        return [cell_record(labels, result) for labels, result in answers]
+
+    def figure(self, records: Sequence[Record]) -> Figure:
+        plants = distinct(records, "group")
+        figure = Figure(figsize=(4.2 * len(plants), 4.6), layout="constrained")
+        panels = figure.subplots(2, len(plants), sharey="row", squeeze=False)
+        for (error, stood), plant in zip(panels.T, plants, strict=True):
+            draw(error, stood, select(records, group=plant))
+            error.set_title(f"{plant} plant")
+            stood.set_xlabel("slope, degrees")
+        panels[0, 0].set_ylabel("mean error, m/s")
+        panels[1, 0].set_ylabel("survival, %")
+        panels[0, 0].legend()
+        return figure
+
+    def rows(self, records: Sequence[Record]) -> list[Row]:
+        rows = []
+        for plant, degrees in itertools.product(distinct(records, "group"), SLOPES):
+            mine = [r for r in select(records, group=plant) if float(r["level"]) == degrees]
+            what = SLOPES[degrees] if plant == "usual" else f"{plant} plant, {SLOPES[degrees]}"
+            following = by_policy(mine, survival_and_following)
+            rows += [
+                Row(f"{what}: survive and follow", "%", None, following, 1, key=True),
+                Row(f"{what}: survival", "%", None, by_policy(mine, survival), 1),
+                Row(f"{what}: mean error", "m/s", None, by_policy(mine, mean_error)),
+                Row(f"{what}: largest error", "m/s", None, by_policy(mine, largest_error)),
+            ]
+        return rows

@@ -1,0 +1,186 @@
+"""Stage 1: the terms that make the teacher trot, each against its formula, and what is logged of its gait."""
+
+from __future__ import annotations
+
+import attrs
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch", reason="training needs torch: pip install 'quadvel[train]'")
+
+from quadvel_description import robot  # noqa: E402
+from quadvel_eval.gait_kind import GaitKind  # noqa: E402
+from quadvel_training import gait_log, privileged  # noqa: E402
+from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
+from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.privileged import Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.randomisation import RATED_SPEED, RATED_STALL, Randomisation, rated  # noqa: E402
+from quadvel_training.walking_rewards import (  # noqa: E402
+    FAST,
+    LIFTING,
+    PAIRED,
+    WalkingRewards,
+    WalkingWeights,
+    alike,
+    lifting,
+    one_diagonal_in_the_air,
+)
+
+N = 3
+CALM = EnvConfig(n=N, threads=1, period=0.02, timestep=0.004, randomisation=Randomisation.none())
+STANDING, TROT, PACE = (True,) * 4, (True, False, False, True), (True, False, True, False)  # FR, FL, RR, RL
+
+
+@pytest.fixture
+def env():
+    return VelocityEnv(CALM)
+
+
+@pytest.fixture
+def past(env):
+    return Past(env)
+
+
+def terms(env, past, command=(0.5, 0.0, 0.0, 0.0), lifted=1.0):
+    rewards = WalkingRewards(env, WalkingWeights())
+    rewards.lifting = lifted
+    return rewards.terms(np.tile(command, (N, 1)).astype(float), past, past.air, np.zeros((3, N, 12)))
+
+
+def test_lifting_grows_with_the_share_of_the_time_in_the_air():
+    low, high = LIFTING
+    assert [lifting(share) for share in (0.0, low, 0.5 * (low + high), high, 0.9)] == pytest.approx(
+        [0.0, 0.0, 0.5, 1.0, 1.0]
+    )
+
+
+def test_diagonal_feet_are_alike_in_a_trot_and_differ_in_a_pace():
+    contact = np.array([STANDING, TROT, PACE, (True, False, False, False)])
+    assert alike(contact) == pytest.approx([1.0, 1.0, 0.0, 0.5])
+    assert one_diagonal_in_the_air(contact).tolist() == [False, True, False, False]
+    assert not one_diagonal_in_the_air(np.zeros((1, 4), bool)).any()
+
+
+def test_diagonal_pairs_are_paid_where_one_of_them_is_in_the_air_again_and_again(env, past):
+    env.contact[:] = [STANDING, TROT, PACE]
+    past.paired[:] = [0.0, 0.5 * PAIRED, 2 * PAIRED]
+    weight = WalkingWeights().diagonal
+    for lifted in (0.0, 1.0):
+        assert terms(env, past, lifted=lifted)["diagonal"] == pytest.approx([0.0, 0.5 * weight, 0.0])
+    env.contact[:] = TROT
+    assert terms(env, past)["diagonal"][2] == pytest.approx(weight)
+    assert not terms(env, past, command=(0.0, 0.0, 0.0, 1.0))["diagonal"].any()
+
+
+def test_a_robot_that_trots_is_known_by_its_paired_feet_within_a_second(env, past):
+    command = np.zeros((N, 4))
+    other = tuple(not foot for foot in TROT)
+    for tick in range(50):
+        first = tick // 10 % 2 == 0
+        env.contact[:] = [STANDING, TROT if first else other, PACE]
+        past.advance(command)
+    assert past.paired == pytest.approx([0.0, 1.0 - (1.0 - 0.02 / privileged.PAIRING) ** 50, 0.0])
+    assert past.paired[1] > 2 * PAIRED
+
+
+def test_stance_is_fined_at_lift_off_by_how_far_its_middle_is_from_the_hip(env, past):
+    ahead = 0.2 * np.array([[1, 0, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]])
+    left = np.array([-0.2, -0.3, -0.1])
+    env.contact[:] = True
+    env.contact[:, 0] = False
+    past.advance(np.zeros((N, 4)))
+    env.foot_position[..., 0] = privileged.HIPS_AHEAD + ahead
+    env.contact[:, 0] = True
+    past.advance(np.zeros((N, 4)))
+    assert not past.off_hip.any()
+    env.foot_position[:, 0, 0] = privileged.HIPS_AHEAD[0] + left
+    past.advance(np.zeros((N, 4)))
+    env.foot_position[:, 0, 0] = 9.9  # in the air it counts no more
+    env.contact[:, 0] = False
+    past.advance(np.zeros((N, 4)))
+    assert past.off_hip[:, 0] == pytest.approx([0.0, -0.05, 0.05])
+    assert not past.off_hip[:, 1:].any()
+    weight = WalkingWeights().off_hip
+    assert terms(env, past)["off_hip"] == pytest.approx([0.0, -0.05 * weight, -0.05 * weight])
+    past.advance(np.zeros((N, 4)))
+    assert not past.off_hip.any()
+
+
+def test_sway_is_the_sideways_velocity_off_its_mean_over_a_stride(env, past):
+    env.velocity[:, 1] = [0.1, 0.1, 2.0]
+    past.stride[:, 1] = [-0.1, 0.0, 0.0]  # the mean over a stride is minus that, as the command is 0
+    weight = WalkingWeights().sway
+    assert terms(env, past)["sway"] == pytest.approx([0.0, -weight * 0.01, -weight * 0.1])
+
+
+def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fined(env, past):
+    env.angular_velocity[:, 0] = [0.0, 2.0, 100.0]
+    env.fastest[:] = 0.0
+    env.fastest[1] = FAST * robot.VELOCITY_LIMIT
+    env.fastest[1, 2] += 1.5
+    env.fastest[2, 0] = 1e3
+    w = WalkingWeights()
+    assert terms(env, past)["roll"] == pytest.approx([0.0, -4 * w.roll, -10 * w.roll])
+    assert terms(env, past)["overspeed"] == pytest.approx([0.0, -1.5 * w.overspeed, -5 * w.overspeed])
+
+
+def test_what_fines_first_steps_waits_until_feet_lift(env, past):
+    env.velocity[:, 1], env.angular_velocity[:, 0], env.fastest[:], past.off_hip[:] = 0.3, 1.0, 20.0, 0.1
+    for name in ("off_hip", "sway", "roll", "overspeed"):
+        waiting, half, full = (terms(env, past, lifted=share)[name] for share in (0.0, 0.5, 1.0))
+        assert not waiting.any()
+        assert (full < 0.0).all()
+        assert half == pytest.approx(0.5 * full)
+
+
+def test_power_and_short_swings_weigh_five_times_as_much_at_rest_and_as_ever_from_1_m_s_on(env, past):
+    env.power[:], past.air[:], env.contact[:] = 100.0, 0.05, True
+    for speed, factor in ((0.0, 5.0), (0.5, 4.0), (1.0, 1.0), (2.0, 1.0)):
+        light, heavy = (terms(env, past, (speed, 0, 0, 0), lifted) for lifted in (0.0, 1.0))
+        for name in ("power", "swing"):
+            assert heavy[name] == pytest.approx(factor * light[name])
+            assert (light[name] < 0.0).all()
+
+
+def test_the_fastest_speed_of_a_sample_is_that_of_all_its_steps(env):
+    env._qvel[1, 8] = 12.0
+    env.tick(np.tile(env.stand_q, (N, 1)))
+    assert env.fastest[1, 2] > abs(env.dq[1, 2]) + 1.0
+    assert (env.fastest >= np.abs(env.dq) - 1e-9).all()
+
+
+@pytest.mark.parametrize("commands", [None, CommandGrid(GridConfig())])
+def test_commands_reverse_where_the_contrary_may_be_drawn(commands):
+    env = VelocityEnv(
+        attrs.evolve(CALM, n=200, reversed=1.0, commands=CommandRange(vx=(-0.5, 2.0), stance=0.0)), commands
+    )
+    before = env._goal.copy()
+    env._new_commands(np.arange(200))
+    allowed = env.commands.contains(-before[:, :3]) & before[:, :3].any(axis=1)
+    assert allowed.sum() > 20
+    assert np.array_equal(env._goal[allowed, :3], -before[allowed, :3])
+    assert not env._goal[allowed, 3].any()
+    other = env._goal[~allowed, :3]
+    assert not (other == -before[~allowed, :3]).all(axis=1)[before[~allowed, :3].any(axis=1)].any()
+
+
+def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
+    stall, no_load = (
+        np.concatenate([[effect.intervals[name]] * len(effect.joints) for effect in rated().effects])
+        for name in ("stall", "no_load")
+    )
+    names = [joint for effect in rated().effects for joint in effect.joints]
+    order = robot.joint_index(names)
+    assert sorted(order) == list(range(12))
+    assert stall == pytest.approx(np.outer(robot.TORQUE_LIMIT[order], RATED_STALL))
+    assert no_load == pytest.approx(np.outer(robot.VELOCITY_LIMIT[order], RATED_SPEED))
+
+
+def test_the_kind_of_gait_is_logged_at_each_speed_with_each_numbered_checkpoint(tmp_path, capsys):
+    run = PrivilegedRun(PrivilegedConfig(n=6, threads=1, length=4, keep=1000.0))
+    figures = gait_log.GaitLog(run, tmp_path).keep()
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split(":")[0] for line in lines] == [f"gait at {s:g} m/s" for s in gait_log.SPEEDS]
+    fell = [line.endswith("fell") for line in lines]
+    assert len(figures) == len(attrs.fields(GaitKind)) * fell.count(False)
+    assert (tmp_path / "kept" / "000000k.pt").is_file()
