@@ -118,7 +118,9 @@ def identify(
     ] = None,
     command_topic: Annotated[
         str | None,
-        typer.Option(metavar="<topic>", help="Commands in recordings.", show_default="found by type and name"),
+        typer.Option(
+            metavar="<topic>", help="Commands in recordings.", show_default="found by type and name"
+        ),
     ] = None,
     cores: Annotated[
         int | None,
