@@ -20,6 +20,7 @@ ROSDEP = {
     "attrs": "python3-attr",
     "evdev": "python3-evdev",
     "google": "python3-protobuf",
+    "lz4": "python3-lz4",
     "matplotlib": "python3-matplotlib",
     "numba": "python3-numba",
     "numpy": "python3-numpy",
@@ -37,9 +38,11 @@ PIP = {
     **dict.fromkeys(
         ("matplotlib", "numba", "numpy", "onnxscript", "rich", "rosbags", "scipy", "tensorboard"), ""
     ),
+    **dict.fromkeys(("h5py", "lz4", "msgspec", "pyarrow"), ""),
     **dict.fromkeys(
         ("attrs", "evdev", "threadpoolctl", "torch", "trimesh", "typer", "viser", "websockets"), ""
     ),
+    "backports": "backports.zstd",
     "foxglove": "foxglove-sdk",
     "google": "protobuf",
     "imageio_ffmpeg": "imageio-ffmpeg",

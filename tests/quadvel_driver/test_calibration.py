@@ -125,7 +125,7 @@ def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
         (OFF.text().replace("roll: 0.03491", "roll: .nan"), "imu_mounting is"),
         (OFF.text().replace("roll: 0.03491", "roll: 1.5"), "expected 2 angles within 0.35 rad"),
         (OFF.text().replace("roll: 0.03491", "roll: [1]"), "TypeError"),
-        ("{", "ParserError"),
+        ("{", "calibration.yaml: no valid YAML"),
     ],
 )
 def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, text: str, sentence: str) -> None:

@@ -73,7 +73,7 @@ def test_a_folder_stands_for_the_evaluation_in_it(
 @pytest.mark.parametrize("content", ["no json", '{"schema": 2, "cells": []}', "[]"])
 def test_a_file_that_is_no_evaluation_is_refused_by_its_name(tmp_path: Path, content: str) -> None:
     (tmp_path / "eval.json").write_text(content)
-    with pytest.raises(ValueError, match=r"eval\.json: no "):
+    with pytest.raises(ValueError, match=r"eval\.json: "):
         read_evaluation(tmp_path)
 
 

@@ -97,7 +97,7 @@ def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None
         ("imu off stance", 1),
         ("clock wrong stance", 0),
     ]
-    assert "| imu off stance | 1 of 1 | state_stale |" in markdown(kept["cases"])
+    assert "| imu off stance | 1 of 1 | attitude_not_unit |" in markdown(kept["cases"])
     assert (tmp_path / "faults.png").stat().st_size > 1000
 
 

@@ -214,6 +214,6 @@ def test_a_bad_parameter_ends_the_start_with_one_sentence(
     start: Start, parameters: dict, sentence: str
 ) -> None:
     status, text = start(**parameters).end()
-    assert status == 1
+    assert status == 2
     assert sentence in text
     assert len(text.strip().splitlines()) == 1

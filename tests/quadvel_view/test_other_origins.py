@@ -25,7 +25,7 @@ import yaml
 
 from quadvel_bringup.stack import PARAMETERS
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[1] / "helpers"))
 
 from sockets import family_of, sockets_of, unix_listeners
 

@@ -56,7 +56,7 @@ def load_yaml(text: str, loader: type[BoundedLoader] = BoundedLoader) -> Any:
     if len(text) > LARGEST:
         raise ValueError(f"found more than {LARGEST} characters, expected fewer")
     try:
-        return yaml.load(text, loader)
+        return loader(text).get_single_data()
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise ValueError(" ".join(str(error).split())) from None
 

@@ -22,7 +22,8 @@ from typing import Any
 
 import attrs
 import numpy as np
-import yaml
+
+from quadvel_description.bounded_yaml import read_yaml
 
 from . import files
 from .findings import some
@@ -92,9 +93,9 @@ class ColumnMap:
     def load(cls, path: Path) -> ColumnMap:
         """Read a map file. Raises LogError, which names the entry, and OSError."""
         try:
-            given = yaml.safe_load(path.read_text())
-        except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-            raise LogError(f"{path}: no valid YAML: {' '.join(str(error).split())[:200]}") from None
+            given = read_yaml(path, "a YAML file of column names")
+        except ValueError as error:
+            raise LogError(str(error)) from None
         if not isinstance(given, dict):
             raise LogError(
                 f"{path}: found {str(given)[:60]!r}, expected a line for each field, such as q: dof_pos"

@@ -23,6 +23,8 @@ FAR = 8.0
 """Standard deviations: normal noise exceeds them in none of 10^14 rows."""
 LARGE = 2.0
 """Standard deviations of the torque itself that a spike has at least: what friction and a coarse speed do in one row is less."""
+FEWEST = 3
+"""Rows of a joint: one or two that stand far off may be a foot that strikes between two samples of a slow log."""
 FITTED = 4000
 """Rows that a law is fitted to."""
 ROUNDS = 4
@@ -73,7 +75,7 @@ def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
         if not found.any():
             break
         level, hit = np.where(found, around, level), hit | found
-    return level, hit
+    return (level, hit) if hit.sum() >= FEWEST else (tau, np.zeros(len(tau), bool))
 
 
 def _asked(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
