@@ -9,13 +9,13 @@ from quadvel_actuator import ActuatorModel, ActuatorParameters
 from quadvel_eval.grid import Cell, CellResult
 from quadvel_eval.paper import conditions as paper_conditions
 from quadvel_eval.paper import slopes
-from quadvel_eval.paper.conditions import walk_under
+from quadvel_eval.paper.conditions import HARD_PLANTS, walk_under
 from quadvel_eval.paper.energy import Energy
 from quadvel_eval.paper.gap import Gap, plants
 from quadvel_eval.paper.jitter import Jitter
 from quadvel_eval.paper.robustness import Robustness, conditions
 from quadvel_eval.paper.section import Study
-from quadvel_eval.paper.slopes import FOLLOWED, STOOD, Slopes
+from quadvel_eval.paper.slopes import FOLLOWED, STARTS, TITLES, Slopes
 from quadvel_eval.segments import Segment
 from quadvel_sim.physics import SECOND
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -32,7 +32,7 @@ def answer(labels: dict, command: tuple[float, float, float], error: float | Non
 def test_every_condition_is_a_plant_that_stands() -> None:
     found = conditions(seed=1)
     assert {one.group for one in found} == {"friction", "payload", "rough ground", "push"}
-    found += slopes.conditions("usual") + slopes.conditions("second")
+    found += [c for plant in HARD_PLANTS for c in slopes.conditions(plant, "")]
     for one in found:
         simulator = Simulator(SimulatorConfig(**one.plant))
         simulator.reset("stand")
@@ -71,7 +71,7 @@ def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled(
     records = section.judge(
         [
             answer({"policy": "mine", "group": plant, "level": level}, command, error)
-            for plant in ("usual", "second")
+            for plant in TITLES
             for level, some in errors.items()
             for error in some
         ]
@@ -82,17 +82,26 @@ def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled(
         ("7.5 degrees up", 100.0, 100.0),
         ("15 degrees down", 100 / 3, 100 / 3),
     ):
-        for where in (what, f"second plant, {what}"):
+        for where in (
+            what,
+            f"second plant, {what}",
+            f"started at once, {what}",
+            f"second plant, loose joints, started at once, {what}",
+        ):
             assert ours[f"{where}: survival"] == pytest.approx(survive)
             assert ours[f"{where}: survive and follow"] == pytest.approx(follow)
     section.figure(records)
 
 
-def test_robots_stand_on_slopes_before_they_walk() -> None:
+def test_robots_walk_on_slopes_after_standing_and_at_once_on_every_plant() -> None:
     jobs = Slopes().jobs(Study(seeds=1))
-    assert len(jobs) == 2 * 4 * 3
-    assert {job.call[-1] for job in jobs} == {STOOD}
-    assert {job.call[1].plant.get("physics") for job in jobs} == {None, SECOND}
+    assert len(jobs) == 2 * 3 * 4 * 3
+    stood = {(job.labels["group"].endswith("at once"), job.call[-1]) for job in jobs}
+    assert stood == {(False, STARTS[""]), (True, 0.0)}
+    plants = {
+        (plant.get("physics"), "joint_friction" in plant) for plant in (job.call[1].plant for job in jobs)
+    }
+    assert plants == {(None, False), (SECOND, False), (SECOND, True)}
 
 
 def test_a_robot_that_falls_while_it_stands_has_fallen(monkeypatch: pytest.MonkeyPatch) -> None:

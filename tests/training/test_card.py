@@ -82,6 +82,39 @@ def test_a_policys_card_has_what_the_papers_sections_measured_of_it(evaluation, 
         card(SHIPPED_POLICY, [evaluation], tmp_path)
 
 
+GAIT = {"feet of one side alike": 97.0, "diagonal feet alike": 6.0, "gait frequency": 3.8}
+JOINT = "fastest joint, share of its drive's speed"
+
+
+def section(folder, name, rows):
+    digest = hashlib.sha256(SHIPPED_POLICY.read_bytes()).hexdigest()[:12]
+    rows = [{"what": what, "unit": "", "ours": {"mine": value}} for what, value in rows.items()]
+    (folder / name).write_text(json.dumps({"made_with": {"policies": {"mine": digest}}, "rows": rows}))
+
+
+@pytest.mark.parametrize(
+    ("gait", "kind"), [(GAIT, "a pace"), (GAIT | {"diagonal feet alike": 98.0}, "a trot")]
+)
+def test_a_policys_known_limits_follow_from_the_papers_sections(evaluation, tmp_path, gait, kind):
+    section(tmp_path, "gait.json", {f"0.5 m/s: {name}": value for name, value in gait.items()})
+    joints = {f"forward: {JOINT}": 0.9, f"left: {JOINT}": 0.8, f"second plant, left: {JOINT}": 1.04,
+              f"second plant, loose joints, left: {JOINT}": 1.21}  # fmt: skip
+    section(tmp_path, "sustained.json", joints)
+    slopes = {"15 degrees up: survive and follow": 100.0, "started at once, 15 degrees down: survive and follow": 66.7,
+              "started at once, 15 degrees down: survival": 77.8}  # fmt: skip
+    section(tmp_path, "slopes.json", slopes)
+    limits = [
+        line for line in card(SHIPPED_POLICY, [evaluation], tmp_path).splitlines() if line.startswith("- ")
+    ]
+    assert f"Its gait is {kind}" in limits[0]
+    shares = [[plant in line and share in line for line in limits].count(True)
+              for plant, share in (("usual plant", "0.90"), ("second plant,", "1.04"), ("loose joints", "1.21"))]  # fmt: skip
+    assert shares == [1, 1, 1]
+    assert [line for line in limits if "stuck" in line] == [
+        "- Slopes, started at once, 15 degrees down: 33 % of the robots fall or are stuck."
+    ]
+
+
 def test_limits_of_commands_are_narrowed_in_the_file_and_the_network_stays(tmp_path):
     path = tmp_path / "policy.onnx"
     path.write_bytes(SHIPPED_POLICY.read_bytes())

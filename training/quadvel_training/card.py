@@ -51,6 +51,7 @@ def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) 
             *(line for name in SECTIONS if paper for line in (*_section(network, paper / name), "")),
             "Known limits:",
             "",
+            *(f"- {limit}" for limit in (_paper_limits(network, paper) if paper else ())),
             *(f"- {limit}" for limit in limits(metadata, found)),
             "- Trained and evaluated in simulation alone.",
             "",
@@ -119,20 +120,69 @@ def _measured(found: Json, estimator: bool) -> list[str]:
 
 
 SECTIONS = ("gait.json", "sustained.json", "slopes.json")
+Rows = Sequence[tuple[str, str, float | None]]
+"""What was measured, its unit, and the figure."""
 
 
-def _section(network: Path, file: Path) -> list[str]:
-    """The table of a section of `quadvel paper`. Raises ValueError where it was not made with this network."""
+def _read_section(network: Path, file: Path) -> Rows:
+    """The rows of a section of `quadvel paper`. Raises ValueError where it was not made with this network."""
     content = json.loads(file.read_text())
     digest = hashlib.sha256(network.read_bytes()).hexdigest()
     names = [name for name, made in content["made_with"]["policies"].items() if digest.startswith(made)]
     if not names:
         raise ValueError(f"{file}: made with {content['made_with']['policies']}, expected {digest[:12]}")
+    return [(row["what"], row["unit"], row["ours"][names[0]]) for row in content["rows"]]
+
+
+def _section(network: Path, file: Path) -> list[str]:
+    """The table of a section of `quadvel paper`."""
     rows = [
-        (f"{row['what']}, {row['unit']}" if row["unit"] else row["what"], _number(row["ours"][names[0]]))
-        for row in content["rows"]
+        (f"{what}, {unit}" if unit else what, _number(value))
+        for what, unit, value in _read_section(network, file)
     ]
     return _table(f"`quadvel paper`: {file.stem}", "measured", rows)
+
+
+def _paper_limits(network: Path, paper: Path) -> Iterable[str]:
+    """Limits that sections of `quadvel paper` show: the kind of gait, the drives' speed, slopes."""
+    gait, sustained, slopes = (_read_section(network, paper / name) for name in SECTIONS)
+    yield from _gait_limit(gait)
+    yield from _drive_limits(sustained)
+    yield from _slope_limits(slopes)
+
+
+def _gait_limit(rows: Rows) -> Iterable[str]:
+    """The kind of gait at 0.5 m/s."""
+    found = {what: value for what, _, value in rows}
+    names = ("feet of one side alike", "diagonal feet alike", "gait frequency")
+    side, diagonal, steps = (found.get(f"0.5 m/s: {name}") for name in names)
+    if side is None or diagonal is None or steps is None:
+        return
+    kind = "pace, not a trot" if side > diagonal else "trot"
+    yield (
+        f"Its gait is a {kind}: at 0.5 m/s feet of one side are alike in contact {side:.0f} % of the time, "
+        f"diagonal feet {diagonal:.0f} %, at {steps:.1f} steps a second."
+    )
+
+
+def _drive_limits(rows: Rows) -> Iterable[str]:
+    """The fastest joint of each plant, at the commands of the section."""
+    fastest: dict[str, float] = {}
+    for what, _, value in rows:
+        where, _, drive = what.rpartition(": ")
+        if drive.startswith("fastest joint") and value is not None:
+            plant = where.rpartition(", ")[0] or "usual plant"
+            fastest[plant] = max(fastest.get(plant, 0.0), value)
+    for plant, share in fastest.items():
+        yield f"On the {plant}, on straight walks and spins, joints reach {share:.2f} of their drives' speed."
+
+
+def _slope_limits(rows: Rows) -> Iterable[str]:
+    """Slopes on which a robot fell or was stuck."""
+    for what, _, value in rows:
+        where, _, measured = what.rpartition(": ")
+        if measured == "survive and follow" and value is not None and value < 100.0:
+            yield f"Slopes, {where}: {100.0 - value:.0f} % of the robots fall or are stuck."
 
 
 def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from quadvel_sim.physics import SECOND
 
-from ..grid import DURATION, Cell, CellResult, judge, mass
+from ..grid import DURATION, PLANTS, Cell, CellResult, judge, mass
 from ..walk import Setup, make_loop, record
 from .cells import Command
 from .section import Job, Record, Study, distinct, mean, select
@@ -20,6 +20,9 @@ COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.
 """ahead, sideways, along an arc; m/s, rad/s"""
 LOOSE: Mapping[str, Any] = {"physics": SECOND, "joint_friction": np.zeros(12), "joint_damping": np.zeros(12)}
 """Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
+HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE}
+PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
+"""As rows name those of HARD_PLANTS that are not the usual one."""
 PUSH_TIME, PUSH_SECONDS = 1.0, 0.2  # s after the start of a walk, and for how long
 
 

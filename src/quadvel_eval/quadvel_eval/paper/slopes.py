@@ -1,4 +1,4 @@
-"""Slopes: who survives and who also follows, started and stood on them, each angle and direction by itself, on two plants."""
+"""Slopes: who survives and who also follows, after standing there or started at once, each angle by itself, on three plants."""
 
 from __future__ import annotations
 
@@ -12,14 +12,15 @@ from matplotlib.figure import Figure
 
 from quadvel_sim.terrain import Terrain
 
-from ..grid import PLANTS
 from .cells import Command, cell_record, largest_error, mean_error
-from .conditions import COMMANDS, Condition, condition_job, draw, survival
+from .conditions import COMMANDS, HARD_PLANTS, PLANT_NAMES, Condition, condition_job, draw, survival
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
 
 SLOPES = {-15.0: "15 degrees down", -7.5: "7.5 degrees down", 7.5: "7.5 degrees up", 15.0: "15 degrees up"}
 """Slopes (degrees, rising ahead of the robot at the start) and their names."""
 STOOD = 2.0  # s that a robot stands on a slope before it is commanded to walk
+STARTS = {"": STOOD, "started at once": 0.0}
+"""Names of the starts, and how long the robot stands before it walks, s."""
 FOLLOWED = 0.15  # m/s: a robot whose error over the judged 4 s is larger is stuck: it does not follow
 
 
@@ -29,14 +30,26 @@ def survival_and_following(records: Sequence[Record]) -> float:
     return 100.0 * float(np.mean(good)) if good else float("nan")
 
 
-def conditions(plant: str) -> list[Condition]:
-    """All slopes on one of PLANTS; the robot stands on them first."""
+def group(plant: str, start: str) -> str:
+    """Name of the walks on one of HARD_PLANTS with one of STARTS."""
+    return f"{plant}, {start}" if start else plant
+
+
+TITLES = {
+    group(plant, start): "".join(f"{name}, " for name in (PLANT_NAMES.get(plant), start) if name)
+    for plant, start in itertools.product(HARD_PLANTS, STARTS)
+}
+"""What the rows of a group begin with."""
+
+
+def conditions(plant: str, start: str) -> list[Condition]:
+    """All slopes on one of HARD_PLANTS with one of STARTS."""
     return [
         Condition(
-            plant,
+            group(plant, start),
             f"{degrees:g}",
-            {**PLANTS[plant], "terrain": Terrain(kind="slope", slope=float(np.radians(degrees)))},
-            stood=STOOD,
+            {**HARD_PLANTS[plant], "terrain": Terrain(kind="slope", slope=float(np.radians(degrees)))},
+            stood=STARTS[start],
         )
         for degrees in SLOPES
     ]
@@ -44,24 +57,27 @@ def conditions(plant: str) -> list[Condition]:
 
 @attrs.frozen
 class Slopes(Section):
-    """Every slope with every command and seed on each plant."""
+    """Every slope with every command and seed on each plant, after standing and at once."""
 
     name: ClassVar[str] = "slopes"
     title: ClassVar[str] = "Robustness: slopes"
     method: ClassVar[str] = (
-        "Slopes that rise (up) or fall (down) ahead of the robot at the start. It stands there for 2 s, then walks for 6 s ahead "
-        "(1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, 0.6 rad/s), which turns it across the slope. Survival: share of "
-        "the robots that did not fall. A robot that does not fall, but is off its command by more than 0.15 m/s on the mean of the "
-        "last 4 s, is stuck: it does not follow. The second plant is that of Figure 10. The paper gives no figures."
+        "Slopes that rise (up) or fall (down) ahead of the robot at the start. It stands there for 2 s, or starts at once, 0.5 s "
+        "after it was put there, and walks for 6 s ahead (1 m/s), sideways (0.5 m/s) or along an arc (0.6 m/s, 0.6 rad/s), which "
+        "turns it across the slope. Survival: share of the robots that did not fall. A robot that does not fall, but is off its "
+        "command by more than 0.15 m/s on the mean of the last 4 s, is stuck: it does not follow. The second plant is that of "
+        "Figure 10; its loose joints have neither friction nor damping. The paper gives no figures."
     )
-    plants: tuple[str, ...] = tuple(PLANTS)
+    plants: tuple[str, ...] = tuple(HARD_PLANTS)
+    starts: tuple[str, ...] = tuple(STARTS)
     commands: tuple[Command, ...] = COMMANDS
 
     def jobs(self, study: Study) -> list[Job]:
         return [
             condition_job(study, policy, one, command, seed)
-            for policy, plant, seed in itertools.product(study.policies, self.plants, range(study.seeds))
-            for one in conditions(plant)
+            for policy, plant, start in itertools.product(study.policies, self.plants, self.starts)
+            for seed in range(study.seeds)
+            for one in conditions(plant, start)
             for command in self.commands
         ]
 
@@ -69,12 +85,12 @@ class Slopes(Section):
         return [cell_record(labels, result) for labels, result in answers]
 
     def figure(self, records: Sequence[Record]) -> Figure:
-        plants = distinct(records, "group")
-        figure = Figure(figsize=(4.2 * len(plants), 4.6), layout="constrained")
-        panels = figure.subplots(2, len(plants), sharey="row", squeeze=False)
-        for (error, stood), plant in zip(panels.T, plants, strict=True):
-            draw(error, stood, select(records, group=plant))
-            error.set_title(f"{plant} plant")
+        groups = distinct(records, "group")
+        figure = Figure(figsize=(3.2 * len(groups), 4.6), layout="constrained")
+        panels = figure.subplots(2, len(groups), sharey="row", squeeze=False)
+        for (error, stood), name in zip(panels.T, groups, strict=True):
+            draw(error, stood, select(records, group=name))
+            error.set_title(name)
             stood.set_xlabel("slope, degrees")
         panels[0, 0].set_ylabel("mean error, m/s")
         panels[1, 0].set_ylabel("survival, %")
@@ -83,9 +99,9 @@ class Slopes(Section):
 
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
-        for plant, degrees in itertools.product(distinct(records, "group"), SLOPES):
-            mine = [r for r in select(records, group=plant) if float(r["level"]) == degrees]
-            what = SLOPES[degrees] if plant == "usual" else f"{plant} plant, {SLOPES[degrees]}"
+        for name, degrees in itertools.product(distinct(records, "group"), SLOPES):
+            mine = [r for r in select(records, group=name) if float(r["level"]) == degrees]
+            what = TITLES[name] + SLOPES[degrees]
             following = by_policy(mine, survival_and_following)
             rows += [
                 Row(f"{what}: survive and follow", "%", None, following, 1, key=True),

@@ -4,9 +4,9 @@ ask of the drives."""
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import attrs
 import numpy as np
@@ -14,11 +14,10 @@ from matplotlib.figure import Figure
 
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 
-from ..grid import PLANTS
 from ..robot_loop import PERIOD
 from ..walk import Setup, make_loop, record_to_the_fall
 from .cells import Command, falls, limits, reach
-from .conditions import LOOSE
+from .conditions import HARD_PLANTS, PLANT_NAMES
 from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
 
 ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
@@ -32,8 +31,6 @@ DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s
     "spin left": ((0.0, 0.0, 1.0), 6.0),
     "spin right": ((0.0, 0.0, -1.0), 6.0),
 }
-HARD_PLANTS: dict[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE}
-_PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
 DRIVES = {
     "joint_speed": "fastest joint, share of its drive's speed",
     "torque": "largest torque, share of its drive's",
@@ -157,5 +154,5 @@ def _plant_rows(plant: str, records: Sequence[Record]) -> list[Row]:
     """What another plant's drives are asked for, in each direction, and where robots fell or were stopped."""
     rows = []
     for name in distinct(records, "direction"):
-        rows += _drive_rows(f"{_PLANT_NAMES[plant]}, {name}", select(records, direction=name))
-    return [*rows, Row(f"{_PLANT_NAMES[plant]}: falls", "", None, by_policy(records, falls), 0)]
+        rows += _drive_rows(f"{PLANT_NAMES[plant]}, {name}", select(records, direction=name))
+    return [*rows, Row(f"{PLANT_NAMES[plant]}: falls", "", None, by_policy(records, falls), 0)]
