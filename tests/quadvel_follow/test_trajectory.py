@@ -237,6 +237,14 @@ def test_files_that_are_no_way_are_refused_by_name(tmp_path: Path, text: str, wo
         load(file, 0.5)
 
 
+@pytest.mark.parametrize("name", ["missing.csv", "missing.gpx", "."])
+def test_a_file_that_cannot_be_read_is_refused_with_the_shipped_names(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="eight, zju") as refused:
+        load(tmp_path / name, 0.5)
+    assert str(refused.value).startswith(f"{tmp_path / name}: ")
+    assert "Errno" not in str(refused.value)
+
+
 def test_a_gpx_with_entities_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "way.gpx"
     file.write_text('<!DOCTYPE gpx [<!ENTITY a "b">]><gpx/>')

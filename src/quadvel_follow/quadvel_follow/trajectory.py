@@ -153,7 +153,10 @@ def load(path: Path, speed: float) -> Trajectory:
             raise ValueError(f"has more than {LARGEST} bytes")
         read = _gpx if path.suffix.lower() == ".gpx" else _csv
         return read(path, speed)
-    except (OSError, ValueError, csv.Error, ElementTree.ParseError) as error:
+    except OSError as error:
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.csv")))
+        raise ValueError(f"{path}: {error.strerror}, expected a CSV or GPX file or one of {shipped}") from None
+    except (ValueError, csv.Error, ElementTree.ParseError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
