@@ -9,10 +9,12 @@ import sys
 from pathlib import Path
 from xml.etree import ElementTree
 
+import attrs
 import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
+from quadvel_actuator import ActuatorParameters
 from quadvel_bringup import cli
 from quadvel_recordings.reading import read_messages
 
@@ -48,6 +50,17 @@ def test_a_short_demo_walks_without_a_fall_and_judges_itself(out: Path) -> None:
     assert (out / "notes.txt").read_text() == "mine"
     assert not (out / "demo.mp4").exists()
     assert {"demo.mcap", "summary.json", "demo.png", "loop.png"} <= {path.name for path in out.iterdir()}
+
+
+def test_a_demo_whose_robot_cannot_stand_up_ends_with_its_cause_and_exit_code_1(tmp_path: Path) -> None:
+    weak = tmp_path / "weak.yaml"
+    attrs.evolve(ActuatorParameters.default(), torque_limit=2.0).save(weak)
+    command = [*QUADVEL, "demo", "--quick", "--lockstep", "--no-video", "--out", str(tmp_path / "out")]
+    ended = subprocess.run([*command, "--actuator", str(weak)], capture_output=True, text=True, timeout=240)
+    assert ended.returncode == 1, ended.stdout + ended.stderr
+    assert "planner: the controller is in fault" in ended.stdout
+    assert ended.stderr == ""
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["demo.mcap"]
 
 
 def test_its_recording_holds_every_state_and_the_answer_to_it(out: Path) -> None:

@@ -223,9 +223,10 @@ def test_a_gpx_beyond_the_poles_is_refused_by_its_point(tmp_path: Path) -> None:
     [
         ("", "has the head '', expected"),
         ("a,b\n1,2\n", "has the head 'a,b'"),
-        ("x,y\n1,two\n", "could not convert"),
-        ("x,y\n1\n", "inhomogeneous|rows that are not"),
-        ("x,y\n1,nan\n2,2\n", "rows that are not 2 finite numbers"),
+        ("x,y\n1,1\n1,two\n", "row 3 is '1,two'"),
+        ("x,y\n1,1\n1\n", "row 3 is '1'"),
+        ("x,y\n", "no row"),
+        ("x,y\n1,nan\n2,2\n", "row 2 is '1,nan', expected 2 finite numbers"),
         ("x,y\n1,1\n", "one place"),
         ("seconds,vx,vy,wz\n-1,0,0,0\n", "seconds that are not above 0"),
     ],
@@ -235,6 +236,14 @@ def test_files_that_are_no_way_are_refused_by_name(tmp_path: Path, text: str, wo
     file.write_text(text)
     with pytest.raises(ValueError, match=rf"way\.csv: .*({words})"):
         load(file, 0.5)
+
+
+@pytest.mark.parametrize("name", ["missing.csv", "missing.gpx", "."])
+def test_a_file_that_cannot_be_read_is_refused_with_the_shipped_names(tmp_path: Path, name: str) -> None:
+    with pytest.raises(ValueError, match="eight, zju") as refused:
+        load(tmp_path / name, 0.5)
+    assert str(refused.value).startswith(f"{tmp_path / name}: ")
+    assert "Errno" not in str(refused.value)
 
 
 def test_a_gpx_with_entities_is_refused(tmp_path: Path) -> None:

@@ -7,6 +7,8 @@ import math
 import numpy as np
 import pytest
 
+from quadvel_dds.messages import deserialize, serialize
+from quadvel_msgs.msg import ControllerState
 from quadvel_policy.loop_stats import Histogram, LoopStats
 
 PERIOD = 0.005
@@ -52,3 +54,12 @@ def test_missed_deadlines_in_a_row_end_with_one_that_is_kept() -> None:
     assert (stats.overruns, stats.in_a_row) == (4, 4)
     stats.add(1.0, compute=1e-3, inference=math.nan, missed=0)
     assert (stats.overruns, stats.in_a_row) == (4, 0)
+
+
+def test_a_clock_that_leaps_by_decades_still_gives_a_state_that_can_be_sent() -> None:
+    """As where a simulator in lockstep and one in real time report to the same controller."""
+    stats = LoopStats()
+    for _ in range(2):
+        stats.add(0.0, 1e-4, math.nan, 359_157_296_662)
+    message = ControllerState(overruns=stats.summary(0.0).overruns)
+    assert deserialize(serialize(message), message.TYPENAME).overruns == stats.overruns == 2**32 - 1

@@ -40,6 +40,7 @@ OPTIONS = {
 """Options that not every kind of demo has, and those which have them"""
 MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
 """What is made of the recording; what is left of an earlier one goes."""
+TOO_SLOW = "if this machine is slow or busy: with --lockstep simulated time waits for the nodes"
 
 
 def demo_command(
@@ -115,11 +116,14 @@ def demo_command(
         (folder / name).unlink(missing_ok=True)
     if problem:
         console.print(f"[bold red]{problem}")
+        if not lockstep:
+            console.print(TOO_SLOW)
     try:
         recording = read_recording(recorded)
         summary = demo_summary.summarise(recording)
     except ValueError as error:
-        raise ValueError(f"the walk can't be judged: {error}") from None
+        console.print(f"no summary of the walk: {error}", markup=False, highlight=False)
+        raise typer.Exit(1) from None
     write_json(folder / "summary.json", summary)
     _report(summary, console)
     _draw(recording, folder, video, console)

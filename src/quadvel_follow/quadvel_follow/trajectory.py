@@ -153,7 +153,10 @@ def load(path: Path, speed: float) -> Trajectory:
             raise ValueError(f"has more than {LARGEST} bytes")
         read = _gpx if path.suffix.lower() == ".gpx" else _csv
         return read(path, speed)
-    except (OSError, ValueError, csv.Error, ElementTree.ParseError) as error:
+    except OSError as error:
+        shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.csv")))
+        raise ValueError(f"{path}: {error.strerror}, expected a CSV or GPX file or one of {shipped}") from None
+    except (ValueError, csv.Error, ElementTree.ParseError) as error:
         raise ValueError(f"{path}: {error}") from None
 
 
@@ -164,10 +167,20 @@ def read_table(path: Path) -> tuple[list[str], Array]:
     head = [name.strip() for name in rows[0]] if rows else []
     if head not in (["seconds", "vx", "vy", "wz"], ["x", "y"]):
         raise ValueError(f"has the head {','.join(head)!r}, expected seconds,vx,vy,wz or x,y")
-    numbers = np.array([[float(cell) for cell in row] for row in rows[1:] if row])
-    if numbers.ndim != 2 or numbers.shape[1] != len(head) or not np.isfinite(numbers).all():
-        raise ValueError(f"has rows that are not {len(head)} finite numbers")
-    return head, numbers
+    numbers = [_numbers(row, line, len(head)) for line, row in enumerate(rows[1:], 2) if row]
+    if not numbers:
+        raise ValueError(f"has no row below its head, expected {len(head)} finite numbers in each")
+    return head, np.array(numbers)
+
+
+def _numbers(row: list[str], line: int, count: int) -> list[float]:
+    try:
+        numbers = [float(cell) for cell in row]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise ValueError(f"row {line} is {','.join(row)[:80]!r}, expected {count} finite numbers")
+    return numbers
 
 
 def _csv(path: Path, speed: float) -> Trajectory:

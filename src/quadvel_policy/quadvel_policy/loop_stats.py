@@ -12,6 +12,9 @@ import attrs
 import numpy as np
 
 
+MOST_OVERRUNS = 2**32 - 1  # what a uint32 of quadvel_msgs/ControllerState holds; the count stays there
+
+
 class Histogram:
     """Durations from 1 us to 10 s in bins 1 % wide: percentiles since the start in constant memory."""
 
@@ -68,7 +71,7 @@ class LoopStats:
         self._compute.add(compute)
         if not math.isnan(inference):
             self._inference.add(inference)
-        self.overruns += missed
+        self.overruns = min(self.overruns + missed, MOST_OVERRUNS)
         self.in_a_row = self.in_a_row + missed if missed else 0
 
     def summary(self, now: float) -> LoopSummary:
