@@ -10,7 +10,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Annotated, Any
 
@@ -23,12 +23,14 @@ import quadvel_dds
 quadvel_dds.install()  # before anything imports rclpy
 
 # ruff: noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
 from quadvel_description.robot import TORQUE_LIMIT, UPPER
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
 from quadvel_msgs.srv import ResetSim, SetMode
+from quadvel_policy.command_limits import LIMITS
 
 from .processes import ProcessGroup
 from .session import Session
@@ -81,6 +83,7 @@ class Relay:
         self.states: list[Message] = []
         self.asked: Message | None = None
         self.memory: dict[str, Any] = {}  # of the fault that there is
+        self.limits: dict[str, str] = {}  # what /diagnostics shows of each limit of commands
         self._fault: TopicFault | None = None
         self._senders = {topic: node.create_publisher(kind, topic, 10) for topic, kind in KINDS.items()}
         for topic, kind in KINDS.items():
@@ -88,6 +91,7 @@ class Relay:
                 kind, f"before/{topic}", partial(self._pass_on, topic), QoSProfile(depth=10)
             )
         node.create_subscription(LowCmd, "low_cmd", self._hear, 1)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._read_limits, 10)
         node.create_subscription(ControllerState, "controller/state", self.states.append, 10)
         self._drive = node.create_publisher(Twist, "cmd_vel_teleop", 1)
         node.create_timer(0.05, self._command)
@@ -107,6 +111,10 @@ class Relay:
 
     def _hear(self, message: Message) -> None:
         self.asked = message
+
+    def _read_limits(self, message: Message) -> None:
+        values = {pair.key: pair.value for status in message.status for pair in status.values}
+        self.limits |= {name: values[f"limit {name}"] for name in LIMITS if f"limit {name}" in values}
 
     def _command(self) -> None:
         twist = Twist()
@@ -154,9 +162,15 @@ class TopicRobot:
         AssertionError, with what it said instead, where it is not within PATIENCE.
         """
         self.prepare(fault.mode)
+        before = self.relay.limits.get(fault.name)
         self.relay.begin(fault)
         fault.begin(self)
         try:
+            if fault.name in LIMITS:
+                return self.until(
+                    lambda state: self.relay.limits.get(fault.name) != before,
+                    f"{fault.name} is not counted: {self.relay.limits}",
+                )
             return self.until(lambda state: is_named(fault, state), f"{fault.name} is not named")
         finally:
             self.relay.end()
@@ -221,6 +235,10 @@ def is_named(fault: TopicFault, state: ControllerState) -> bool:
     return (
         any(fault.says in finding for finding in state.findings) if fault.says else state.fault == fault.name
     )
+
+
+def _told(fault: TopicFault, state: ControllerState) -> str:
+    return next((f for f in state.findings if fault.says in f), "") if fault.says else state.reason
 
 
 def _summary(states: list[Any]) -> str:
@@ -299,17 +317,28 @@ def _earlier(seconds: float) -> Change:
     return change
 
 
-def _led(joint: int, by: float, within: float) -> Change:
-    """A joint moves by so many rad in `within` s of the robot's time, then stays there, whatever it is asked for.
+Path = Callable[[float], tuple[float, float]]
+"""How far a joint has moved (rad), and how fast it moves (rad/s), at a time (s)"""
 
-    Encoder and drive agree about it.
-    """
+
+def _ramp(by: float, within: float) -> Path:
+    return lambda t: (by * min(t / within, 1.0), by / within if t < within else 0.0)
+
+
+def _swing(t: float) -> tuple[float, float]:
+    """Bent by 0.8 rad in 0.4 s, and back faster than a drive can."""
+    return (-2.0 * t, -2.0) if t < 0.4 else (min(17.0 * (t - 0.4) - 0.8, 0.0), 17.0 if t < 0.447 else 0.0)
+
+
+def _led(joints: Sequence[int], path: Path) -> Change:
+    """Joints that move along a path in the robot's time, whatever they are asked for; encoders and drives agree about it."""
+    there = np.isin(np.arange(12), joints)
 
     def change(relay: Relay, message: Message) -> Message:
-        first, began = relay.memory.setdefault("first", (message.q[joint], message.tick))
-        share, there = min(1e-3 * (message.tick - began) / within, 1.0), np.arange(12) == joint
-        q = np.where(there, first + by * share, np.array(message.q))
-        dq = np.where(there, by / within if share < 1.0 else 0.0, np.array(message.dq))
+        first, began = relay.memory.setdefault("first", (np.array(message.q), message.tick))
+        moved, speed = path(1e-3 * (message.tick - began))
+        q = np.where(there, first + moved, np.array(message.q))
+        dq = np.where(there, speed, np.array(message.dq))
         tau = np.array(message.tau)
         if (command := relay.asked) is not None:
             asked = np.array(command.tau) + np.array(command.kp) * (np.array(command.q) - q)
@@ -363,6 +392,7 @@ def _too_fast(robot: TopicRobot) -> None:
     robot.relay.velocity = 4.4
 
 
+CALVES = (2, 5, 8, 11)
 TILTED = (np.cos(0.65), 0.0, np.sin(0.65), 0.0)
 FAULTS = (
     TopicFault("obstacle", begin=_second_publisher),
@@ -381,8 +411,8 @@ FAULTS = (
         "imu_inconsistent", change=_set(angular_velocity=lambda before: before + np.array([0.0, 0.0, 1.5]))
     ),
     TopicFault("drive_does_not_answer", change=_set(tau=_plus(JOINT, 25.0))),
-    TopicFault("joint_stuck", change=_led(JOINT, -0.29, within=0.3)),
-    TopicFault("stand_up_failed", change=_led(JOINT, 0.4, within=2.0), mode="stand_up"),
+    TopicFault("joint_stuck", change=_led([JOINT], _ramp(-0.29, within=0.3))),
+    TopicFault("stand_up_failed", change=_led([JOINT], _ramp(0.4, within=2.0)), mode="stand_up"),
     TopicFault("imu_frozen", change=_stuck("orientation_wxyz", "angular_velocity"), mode="walk"),
     TopicFault("accelerometer_implausible", change=_set(linear_acceleration=lambda before: before + 15.0)),
     TopicFault("estimate_stale", "velocity_estimate", _lost, mode="walk", says="no fresh velocity estimate"),
@@ -395,6 +425,11 @@ FAULTS = (
         "command_out_of_range", begin=_too_fast, mode="walk", says="beyond what the policy can follow"
     ),
     TopicFault("foot_force_frozen", change=_stuck("foot_force"), mode="walk", says="the force of foot"),
+    TopicFault("target_out_of_range", begin=_too_fast, mode="walk"),
+    *(
+        TopicFault(name, change=_led(CALVES, _swing))
+        for name in ("torque_jumps", "torque_too_large", "joint_at_speed_limit", "power_too_large")
+    ),
 )
 """Of a simulated robot"""
 BOARD_FAULTS = (
@@ -428,11 +463,7 @@ def main(
             for fault in chosen:
                 try:
                     state = robot.provoke(fault)
-                    told = (
-                        next((f for f in state.findings if fault.says in f), "")
-                        if fault.says
-                        else state.reason
-                    )
+                    told = robot.relay.limits.get(fault.name) or _told(fault, state)
                 except AssertionError as error:
                     told, missed = f"MISSED: {error}", missed + 1
                 print(f"{fault.name}: {told}", flush=True)
