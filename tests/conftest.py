@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import random
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from functools import wraps
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import pytest
 
@@ -30,7 +32,24 @@ HELPERS = ("multiprocessing.resource_tracker", "multiprocessing.forkserver")
 # test starts join it; above 100, DDS would need ports that the system hands out.
 DOMAIN_STEP = 4
 WORKER = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
-RUN = os.environ.setdefault("QUADVEL_TEST_RUN", str(random.SystemRandom().randrange(1, 25)))
+RUNS = range(1, 25)
+
+
+def _claim() -> tuple[str, IO[str]]:
+    """A number that no other run on this machine has, and the file whose lock holds it until this run ends."""
+    for number in random.SystemRandom().sample(RUNS, len(RUNS)):
+        try:
+            lock = (Path(tempfile.gettempdir()) / f"quadvel-test-run-{number}").open("a")
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:  # another run has it
+            continue
+        return str(number), lock
+    raise RuntimeError(f"{len(RUNS)} runs of the tests have all DDS domains, expected a free one")
+
+
+if "QUADVEL_TEST_RUN" not in os.environ:  # a worker has that of its run
+    os.environ["QUADVEL_TEST_RUN"], LOCK = _claim()
+RUN = os.environ["QUADVEL_TEST_RUN"]
 os.environ["ROS_DOMAIN_ID"] = str(DOMAIN_STEP * int(RUN) + WORKER % DOMAIN_STEP)
 
 # Left out where they cannot run: tests of ROS 2's tools without ROS 2, and of both middlewares beside each other

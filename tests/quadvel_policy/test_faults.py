@@ -470,3 +470,12 @@ def test_the_table_has_a_row_for_each_guard_limit_and_other_fault() -> None:
 def test_the_page_of_faults_is_what_the_code_prints() -> None:
     printed = Path(__file__).parents[2] / "docs" / "faults.md"
     assert printed.read_text() == page(), "write it anew: python -m quadvel_policy.faults > docs/faults.md"
+
+
+def test_a_simulated_robot_goes_on_after_states_that_were_lost(policy: Any) -> None:
+    """Nobody had time to read them on a loaded machine: only a silence of `max_standstill` is a fault there."""
+    rig = Rig(policy, robot_waits=True).stand()
+    rig.tick(step=0.075)
+    assert rig.mode == "stance", rig.supervisor.reason
+    rig.tick(step=1.1)
+    assert rig.supervisor.fault == "state_stale"

@@ -10,32 +10,35 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Annotated, Any
 
 import attrs
 import numpy as np
+import typer
 
 import quadvel_dds
 
 quadvel_dds.install()  # before anything imports rclpy
 
 # ruff: noqa: E402
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import Twist, TwistWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
 from quadvel_description.robot import TORQUE_LIMIT, UPPER
 from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, VelocityCommand
 from quadvel_msgs.srv import ResetSim, SetMode
+from quadvel_policy.command_limits import LIMITS
 
 from .processes import ProcessGroup
 from .session import Session
 from .stack import Stack
 
 Message = Any
-Change = Callable[["Relay", Message, float], Message | None]
-"""What becomes of a message on its way, `age` s after the fault began; None: it is lost"""
+Change = Callable[["Relay", Message], Message | None]
+"""What becomes of a message on its way; None: it is lost"""
 
 KINDS = {
     "low_state": LowState,
@@ -80,13 +83,15 @@ class Relay:
         self.states: list[Message] = []
         self.asked: Message | None = None
         self.memory: dict[str, Any] = {}  # of the fault that there is
-        self._fault: tuple[TopicFault, float] | None = None
+        self.limits: dict[str, str] = {}  # what /diagnostics shows of each limit of commands
+        self._fault: TopicFault | None = None
         self._senders = {topic: node.create_publisher(kind, topic, 10) for topic, kind in KINDS.items()}
         for topic, kind in KINDS.items():
             node.create_subscription(
                 kind, f"before/{topic}", partial(self._pass_on, topic), QoSProfile(depth=10)
             )
         node.create_subscription(LowCmd, "low_cmd", self._hear, 1)
+        node.create_subscription(DiagnosticArray, "/diagnostics", self._read_limits, 10)
         node.create_subscription(ControllerState, "controller/state", self.states.append, 10)
         self._drive = node.create_publisher(Twist, "cmd_vel_teleop", 1)
         node.create_timer(0.05, self._command)
@@ -94,7 +99,7 @@ class Relay:
     def begin(self, fault: TopicFault) -> None:
         """From now on the fault is there."""
         self.memory.clear()
-        self._fault = fault, time.monotonic()
+        self._fault = fault
 
     def end(self) -> None:
         """All is well again."""
@@ -107,15 +112,19 @@ class Relay:
     def _hear(self, message: Message) -> None:
         self.asked = message
 
+    def _read_limits(self, message: Message) -> None:
+        values = {pair.key: pair.value for status in message.status for pair in status.values}
+        self.limits |= {name: values[f"limit {name}"] for name in LIMITS if f"limit {name}" in values}
+
     def _command(self) -> None:
         twist = Twist()
         twist.linear.x = self.velocity
         self._drive.publish(twist)
 
     def _pass_on(self, topic: str, message: Message | None) -> None:
-        fault, began = self._fault or (None, 0.0)
+        fault = self._fault
         if fault is not None and fault.topic == topic and fault.change is not None:
-            message = fault.change(self, message, time.monotonic() - began)
+            message = fault.change(self, message)
         if message is not None:
             self.send(topic, message)
 
@@ -153,9 +162,15 @@ class TopicRobot:
         AssertionError, with what it said instead, where it is not within PATIENCE.
         """
         self.prepare(fault.mode)
+        before = self.relay.limits.get(fault.name)
         self.relay.begin(fault)
         fault.begin(self)
         try:
+            if fault.name in LIMITS:
+                return self.until(
+                    lambda state: self.relay.limits.get(fault.name) != before,
+                    f"{fault.name} is not counted: {self.relay.limits}",
+                )
             return self.until(lambda state: is_named(fault, state), f"{fault.name} is not named")
         finally:
             self.relay.end()
@@ -222,6 +237,10 @@ def is_named(fault: TopicFault, state: ControllerState) -> bool:
     )
 
 
+def _told(fault: TopicFault, state: ControllerState) -> str:
+    return next((f for f in state.findings if fault.says in f), "") if fault.says else state.reason
+
+
 def _summary(states: list[Any]) -> str:
     if not states:
         return "controller/state: nothing came"
@@ -235,7 +254,7 @@ def _summary(states: list[Any]) -> str:
 def _set(**values: Any) -> Change:
     """Fields whose numbers are replaced, by others or by what a function makes of them."""
 
-    def change(relay: Relay, message: Message, age: float) -> Message:
+    def change(relay: Relay, message: Message) -> Message:
         for field, value in values.items():
             before = np.array(getattr(message, field), np.float32)
             after = value(before) if callable(value) else np.broadcast_to(np.asarray(value), before.shape)
@@ -253,11 +272,11 @@ def _plus(joint: int, value: float) -> Callable[[Any], Any]:
     return lambda before: before + value * (np.arange(12) == joint)
 
 
-def _lost(relay: Relay, message: Message, age: float) -> None:
+def _lost(relay: Relay, message: Message) -> None:
     return None
 
 
-def _kept(relay: Relay, message: Message, age: float) -> None:
+def _kept(relay: Relay, message: Message) -> None:
     relay.memory.setdefault("state", message)
 
 
@@ -278,7 +297,7 @@ def _repeat(robot: TopicRobot) -> None:
 def _stuck(*fields: str, joint: int | None = None) -> Change:
     """Fields, or one joint of them, that repeat what they held first."""
 
-    def change(relay: Relay, message: Message, age: float) -> Message:
+    def change(relay: Relay, message: Message) -> Message:
         for field in fields:
             now = getattr(message, field)
             first = relay.memory.setdefault(field, np.array(now) if np.ndim(now) else now)
@@ -290,7 +309,7 @@ def _stuck(*fields: str, joint: int | None = None) -> Change:
 
 
 def _earlier(seconds: float) -> Change:
-    def change(relay: Relay, message: Message, age: float) -> Message:
+    def change(relay: Relay, message: Message) -> Message:
         nanoseconds = message.stamp.sec * 10**9 + message.stamp.nanosec - round(1e9 * seconds)
         message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 10**9)
         return message
@@ -298,19 +317,30 @@ def _earlier(seconds: float) -> Change:
     return change
 
 
-def _yields(joint: int, by: float, after: float, within: float) -> Change:
-    """A joint gives way by so many rad in `within` s; encoder and drive agree about it, and it does not come back."""
+Path = Callable[[float], tuple[float, float]]
+"""How far a joint has moved (rad), and how fast it moves (rad/s), at a time (s)"""
 
-    def change(relay: Relay, message: Message, age: float) -> Message:
-        share, there = min(max(age - after, 0.0) / within, 1.0), np.arange(12) == joint
-        first = relay.memory.setdefault("q", np.array(message.q, np.float64))
-        q = np.array(message.q) if age < after else np.where(there, first + by * share, np.array(message.q))
-        relay.memory["q"] = np.array(message.q, np.float64) if age < after else first
-        speed = by / within if 0.0 < share < 1.0 else 0.0
-        dq = np.where(there, speed, np.array(message.dq)) if age >= after else np.array(message.dq)
+
+def _ramp(by: float, within: float) -> Path:
+    return lambda t: (by * min(t / within, 1.0), by / within if t < within else 0.0)
+
+
+def _swing(t: float) -> tuple[float, float]:
+    """Bent by 0.8 rad in 0.4 s, and back faster than a drive can."""
+    return (-2.0 * t, -2.0) if t < 0.4 else (min(17.0 * (t - 0.4) - 0.8, 0.0), 17.0 if t < 0.447 else 0.0)
+
+
+def _led(joints: Sequence[int], path: Path) -> Change:
+    """Joints that move along a path in the robot's time, whatever they are asked for; encoders and drives agree about it."""
+    there = np.isin(np.arange(12), joints)
+
+    def change(relay: Relay, message: Message) -> Message:
+        first, began = relay.memory.setdefault("first", (np.array(message.q), message.tick))
+        moved, speed = path(1e-3 * (message.tick - began))
+        q = np.where(there, first + moved, np.array(message.q))
+        dq = np.where(there, speed, np.array(message.dq))
         tau = np.array(message.tau)
-        if relay.asked is not None and age >= after:
-            command = relay.asked
+        if (command := relay.asked) is not None:
             asked = np.array(command.tau) + np.array(command.kp) * (np.array(command.q) - q)
             asked += np.array(command.kd) * (np.array(command.dq) - dq)
             tau = np.where(there, np.clip(asked, -TORQUE_LIMIT, TORQUE_LIMIT), tau)
@@ -320,13 +350,13 @@ def _yields(joint: int, by: float, after: float, within: float) -> Change:
     return change
 
 
-def _not_a_velocity(relay: Relay, message: Message, age: float) -> Message:
+def _not_a_velocity(relay: Relay, message: Message) -> Message:
     message.twist.linear.x = float("nan")
     return message
 
 
 def _faster(by: float) -> Change:
-    def change(relay: Relay, message: Message, age: float) -> Message:
+    def change(relay: Relay, message: Message) -> Message:
         message.twist.twist.linear.x += by
         return message
 
@@ -334,19 +364,19 @@ def _faster(by: float) -> Change:
 
 
 def _late(seconds: float) -> Change:
-    def change(relay: Relay, message: Message, age: float) -> Message:
+    def change(relay: Relay, message: Message) -> Message:
         time.sleep(seconds)
         return message
 
     return change
 
 
-def _hot(relay: Relay, message: Message, age: float) -> Message:
+def _hot(relay: Relay, message: Message) -> Message:
     message.temperature = np.full(12, 95.0, np.float32)
     return message
 
 
-def _dropped_out(relay: Relay, message: Message, age: float) -> Message:
+def _dropped_out(relay: Relay, message: Message) -> Message:
     message.dropped_out = [joint == JOINT for joint in range(12)]
     return message
 
@@ -362,6 +392,7 @@ def _too_fast(robot: TopicRobot) -> None:
     robot.relay.velocity = 4.4
 
 
+CALVES = (2, 5, 8, 11)
 TILTED = (np.cos(0.65), 0.0, np.sin(0.65), 0.0)
 FAULTS = (
     TopicFault("obstacle", begin=_second_publisher),
@@ -380,8 +411,8 @@ FAULTS = (
         "imu_inconsistent", change=_set(angular_velocity=lambda before: before + np.array([0.0, 0.0, 1.5]))
     ),
     TopicFault("drive_does_not_answer", change=_set(tau=_plus(JOINT, 25.0))),
-    TopicFault("joint_stuck", change=_yields(JOINT, -0.29, after=0.0, within=0.3)),
-    TopicFault("stand_up_failed", change=_yields(JOINT, -0.3, after=1.5, within=0.6), mode="stand_up"),
+    TopicFault("joint_stuck", change=_led([JOINT], _ramp(-0.29, within=0.3))),
+    TopicFault("stand_up_failed", change=_led([JOINT], _ramp(0.4, within=2.0)), mode="stand_up"),
     TopicFault("imu_frozen", change=_stuck("orientation_wxyz", "angular_velocity"), mode="walk"),
     TopicFault("accelerometer_implausible", change=_set(linear_acceleration=lambda before: before + 15.0)),
     TopicFault("estimate_stale", "velocity_estimate", _lost, mode="walk", says="no fresh velocity estimate"),
@@ -394,6 +425,11 @@ FAULTS = (
         "command_out_of_range", begin=_too_fast, mode="walk", says="beyond what the policy can follow"
     ),
     TopicFault("foot_force_frozen", change=_stuck("foot_force"), mode="walk", says="the force of foot"),
+    TopicFault("target_out_of_range", begin=_too_fast, mode="walk"),
+    *(
+        TopicFault(name, change=_led(CALVES, _swing))
+        for name in ("torque_jumps", "torque_too_large", "joint_at_speed_limit", "power_too_large")
+    ),
 )
 """Of a simulated robot"""
 BOARD_FAULTS = (
@@ -404,8 +440,20 @@ BOARD_FAULTS = (
 """What a board alone can report, or that a simulated robot waits for"""
 
 
-def main(names: Iterable[str] = ()) -> None:
-    """Provoke all faults, or those named, and print how each was told. Exit code 1 where one was not."""
+def _known(names: list[str]) -> list[str]:
+    known = [fault.name for fault in (*FAULTS, *BOARD_FAULTS)]
+    for name in names:
+        if name not in known:
+            raise typer.BadParameter(f"'{name}', expected names out of: {', '.join(known)}")
+    return names
+
+
+def main(
+    names: Annotated[
+        list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (none: all of them).")
+    ] = [],  # noqa: B006 typer copies it
+) -> None:
+    """Provoke faults on the topics of a running robot, and print how each was named. Exit code 1 where one was not."""
     wanted, missed = set(names), 0
     for low_level, faults in (("sim", FAULTS), ("board", BOARD_FAULTS)):
         chosen = [fault for fault in faults if not wanted or fault.name in wanted]
@@ -415,11 +463,7 @@ def main(names: Iterable[str] = ()) -> None:
             for fault in chosen:
                 try:
                     state = robot.provoke(fault)
-                    told = (
-                        next((f for f in state.findings if fault.says in f), "")
-                        if fault.says
-                        else state.reason
-                    )
+                    told = robot.relay.limits.get(fault.name) or _told(fault, state)
                 except AssertionError as error:
                     told, missed = f"MISSED: {error}", missed + 1
                 print(f"{fault.name}: {told}", flush=True)
@@ -427,4 +471,4 @@ def main(names: Iterable[str] = ()) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    typer.run(main)

@@ -18,8 +18,12 @@ class SystemTime:
 
     def stamp(self, instant: float) -> Any:
         """An instant of the monotonic clock, s, as a builtin_interfaces/Time."""
-        shift = time.time_ns() - time.monotonic_ns()
-        if abs(shift - self._shift) > TOLERANCE:
+        before = time.monotonic_ns()
+        shift = time.time_ns() - before
+        at_once = (
+            time.monotonic_ns() - before < 0.5 * TOLERANCE
+        )  # else a pause may look like a clock that was set
+        if at_once and abs(shift - self._shift) > TOLERANCE:
             self._shift = shift
         return as_time(round(instant * 1e9) + self._shift)
 

@@ -46,7 +46,7 @@ LOCKSTEP_PATIENCE = 2.0
 """s of real time that a robot in lockstep waits for a node that is behind"""
 
 CLOCK_STEP = 0.02
-"""s by which a clock has to run away from the steady one at once to have been set"""
+"""s by which a clock has to run away from the steady one at once to have been set; both have to be read within half of it"""
 
 Stamped = tuple[float, Array]
 """Time (s) and value"""
@@ -196,9 +196,9 @@ class ControlLoop:
 
     def _now(self, stamp: float = 0.0) -> float:
         """The clock of the stamps, s. Simulated time may reach this node after what was stamped with it."""
-        now = self._clock()
-        ahead = now - self._steady()
-        if abs(ahead - self._ahead_of_steady) > CLOCK_STEP:
+        before, now = self._steady(), self._clock()
+        ahead = now - before
+        if abs(ahead - self._ahead_of_steady) > CLOCK_STEP and self._steady() - before < 0.5 * CLOCK_STEP:
             self._robot_time.clock_was_set(ahead - self._ahead_of_steady)
             self._ahead_of_steady = ahead
         return max(now, stamp) if self._sim_time else now

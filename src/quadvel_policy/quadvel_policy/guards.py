@@ -91,7 +91,6 @@ class StateStale(Guard):
         limit = see.config.max_silence
         if see.age > limit:
             return f"the state is {1e3 * see.age:.0f} ms old, limit {1e3 * limit:.0f} ms"
-        limit = see.config.max_state_age
         if see.gap > limit:
             return f"no state came for {1e3 * see.gap:.0f} ms, limit {1e3 * limit:.0f} ms"
         return None

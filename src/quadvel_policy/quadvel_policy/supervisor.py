@@ -248,7 +248,7 @@ class Supervisor:
         if self.mode == "walk" and self._speed > STEPPING_SPEED:
             self.command[3] = 0.0
         seen = self._seen(state, velocity)
-        if self.config.reset_gap < sight.gap <= self.config.max_state_age:
+        if self.config.reset_gap < sight.gap <= self.config.max_silence:
             self._walk.forget()
         if self.mode in self._after and (following := self._after[self.mode](seen)):
             self._switch(*following)
