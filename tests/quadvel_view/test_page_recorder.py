@@ -13,7 +13,9 @@ import pytest
 from quadvel_view import recording
 from quadvel_view.recording import Recording
 
-FINISHES_SLOWLY = "import signal, time; signal.signal(signal.SIGINT, lambda *_: None); print(flush=True); time.sleep(600)"
+FINISHES_SLOWLY = (
+    "import signal, time; signal.signal(signal.SIGINT, lambda *_: None); print(flush=True); time.sleep(600)"
+)
 
 
 @pytest.fixture

@@ -84,7 +84,9 @@ class PageServer:
         on_leave: Callable[[int], None],
     ) -> None:
         if not host:
-            raise AddressError("host is '', expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces")
+            raise AddressError(
+                "host is '', expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces"
+            )
         self._host, self._port, self._scene = host, port, scene
         self._on_word, self._on_leave = on_word, on_leave
         self._guard = Guard("" if is_loopback(host) else secrets.token_urlsafe(18))
