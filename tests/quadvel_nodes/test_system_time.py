@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("builtin_interfaces.msg")
 
-from quadvel_nodes import system_time  # noqa: E402
-from quadvel_nodes.system_time import SystemTime  # noqa: E402
+from quadvel_nodes import system_time
+from quadvel_nodes.system_time import SystemTime
 
 STARTED = 1_700_000_000_000_000_000  # ns, of the system's clock when the steady one was at 0
 
