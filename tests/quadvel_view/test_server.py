@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import logging
 import struct
 import time
 from collections.abc import Iterator
@@ -12,11 +13,11 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidMessage, InvalidStatus
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
-from quadvel_view.server import MOST_FRAGMENTS, MOST_SOCKETS, AddressError, PageServer
+from quadvel_view.server import LOG, MOST_FRAGMENTS, MOST_SOCKETS, AddressError, PageServer
 from quadvel_view.words import LARGEST_WORD, LetGo, Stop
 
 NOWHERE = Path("/nowhere")
@@ -102,6 +103,12 @@ def test_many_pages_are_refused_and_those_that_are_open_go_on(here: PageServer, 
     assert heard[0] == Stop()
     with socket(here, ours) as page:
         page.ping().wait(10.0)
+
+
+@pytest.mark.parametrize("error", [InvalidMessage("no HTTP"), ConnectionClosedError(None, None)])
+def test_handshakes_that_fail_by_the_visitor_leave_no_trace_in_the_log(error: Exception) -> None:
+    record = logging.LogRecord("", logging.ERROR, "", 0, "", None, (type(error), error, None))
+    assert not LOG.filter(record)
 
 
 def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:

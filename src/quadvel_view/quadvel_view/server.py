@@ -60,8 +60,8 @@ class AddressError(ValueError):
 
 
 def _is_own_fault(record: logging.LogRecord) -> bool:
-    """Whether a line of the log is about more than a request that is no HTTP or no handshake, which anybody may send."""
-    return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake))
+    """Whether a line of the log is about more than a handshake that makes no sense or is left, which anybody may do."""
+    return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake | ConnectionClosed))
 
 
 LOG = logging.getLogger("quadvel_view.page")
