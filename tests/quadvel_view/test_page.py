@@ -364,3 +364,19 @@ def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     page.page.close()
     assert view.end() == 0
     assert page.complaints == []
+
+
+@pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
+def test_with_a_token_the_scene_is_drawn_under_each_name_of_this_host(
+    browser: Any, walked: Path, tmp_path: Path, name: str
+) -> None:
+    view = Served(tmp_path / "view.log", "view", str(walked), "--port", "0", "--host", "0.0.0.0")
+    url = view.said(r"open (http://0\.0\.0\.0:\d+/\S+)").replace("0.0.0.0", name)
+    page = Page(browser, url, 800, 600, scene=True)
+    page.page.frame_locator("#scene").locator("canvas").first.wait_for()
+    page.until("state.playback.time > 0")
+    page.page.goto(url.partition("?")[0])  # by the cookie alone
+    page.page.frame_locator("#scene").locator("canvas").first.wait_for()
+    page.page.close()
+    assert view.end() == 0
+    assert page.complaints == []

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import http.client
+import logging
 import struct
 import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
-from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, InvalidMessage, InvalidStatus
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
-from quadvel_view.server import MOST_FRAGMENTS, AddressError, PageServer
+from quadvel_view.server import LOG, MOST_FRAGMENTS, MOST_SOCKETS, AddressError, PageServer
 from quadvel_view.words import LARGEST_WORD, LetGo, Stop
 
 NOWHERE = Path("/nowhere")
@@ -90,6 +92,25 @@ def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
     assert heard == [Stop(), LetGo(), "left"]
 
 
+def test_many_pages_are_refused_and_those_that_are_open_go_on(here: PageServer, heard: list[Any]) -> None:
+    ours = f"http://127.0.0.1:{urlsplit(here.url).port}"
+    with ExitStack() as open_pages:
+        pages = [open_pages.enter_context(socket(here, ours)) for _ in range(MOST_SOCKETS)]
+        with pytest.raises(InvalidStatus, match="503"):
+            socket(here, ours)
+        pages[0].send('{"do":"stop"}')
+        pages[0].ping().wait(10.0)
+    assert heard[0] == Stop()
+    with socket(here, ours) as page:
+        page.ping().wait(10.0)
+
+
+@pytest.mark.parametrize("error", [InvalidMessage("no HTTP"), ConnectionClosedError(None, None)])
+def test_handshakes_that_fail_by_the_visitor_leave_no_trace_in_the_log(error: Exception) -> None:
+    record = logging.LogRecord("", logging.ERROR, "", 0, "", None, (type(error), error, None))
+    assert not LOG.filter(record)
+
+
 def test_what_makes_no_sense_ends_the_connection(here: PageServer, heard: list[Any]) -> None:
     for nonsense in ("[1]", "{", "[" * 4000, '{"do":' * 600, b"\xff\xfe"):
         with socket(here, f"http://127.0.0.1:{urlsplit(here.url).port}") as page:
@@ -152,7 +173,7 @@ def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
         PageServer("127.0.0.1", port, NOWHERE, lambda page, word: None, lambda page: None)
 
 
-@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 99999), ("127.0.0.1", -1), ("a" * 300, 0)])
+@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 99999), ("127.0.0.1", -1), ("a" * 300, 0), ("", 0)])
 def test_an_address_that_does_not_exist_is_told_and_not_waited_for(host: str, port: int) -> None:
-    with pytest.raises(AddressError, match="the page can't be served there"):
+    with pytest.raises(AddressError):
         PageServer(host, port, NOWHERE, lambda page, word: None, lambda page: None)

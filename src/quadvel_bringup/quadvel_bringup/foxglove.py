@@ -12,7 +12,6 @@ from typing import Any
 from quadvel_nodes.scheduling import run_after_others
 from quadvel_recordings.definitions import STORE
 from quadvel_view.foxglove_live import FoxgloveServer
-from quadvel_view.view_node import NICENESS
 
 from .processes import StopSignals
 from .recorder import ANY_QOS, HIDDEN, LATCHED_QOS
@@ -20,6 +19,8 @@ from .recording_file import LATCHED
 from .session import Session
 
 LOOK = 0.5  # s, between two looks for new topics
+NICENESS = 5
+"""a third of the processor time of each of the robot's processes where it is short: nothing is commanded from here"""
 
 
 def serve(host: str, port: int) -> None:

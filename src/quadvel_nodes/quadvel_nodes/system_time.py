@@ -14,18 +14,24 @@ class SystemTime:
     """Follows how far the system's clock is from the monotonic one, without taking over its jitter."""
 
     def __init__(self) -> None:
-        self._shift = time.time_ns() - time.monotonic_ns()
+        self._shift, self._error = _shift()
 
     def stamp(self, instant: float) -> Any:
         """An instant of the monotonic clock, s, as a builtin_interfaces/Time."""
-        before = time.monotonic_ns()
-        shift = time.time_ns() - before
-        at_once = (
-            time.monotonic_ns() - before < 0.5 * TOLERANCE
-        )  # else a pause may look like a clock that was set
-        if at_once and abs(shift - self._shift) > TOLERANCE:
-            self._shift = shift
+        shift, error = _shift()
+        was_set = abs(shift - self._shift) > TOLERANCE + self._error + error
+        if was_set or error + TOLERANCE < self._error:
+            self._shift, self._error = shift, error
         return as_time(round(instant * 1e9) + self._shift)
+
+
+def _shift() -> tuple[int, int]:
+    """How far the system's clock is ahead of the monotonic one, ns, and by how much that may be wrong.
+
+    The process may be paused between two readings, for tens of ms on a loaded machine.
+    """
+    before, now, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return now - before, after - before
 
 
 def as_time(nanoseconds: int) -> Any:

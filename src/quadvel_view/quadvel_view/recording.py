@@ -17,38 +17,57 @@ class Recording:
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder)
         self._name = ""
-        self._running: subprocess.Popen[bytes] | None = None
-        self._finishing: list[subprocess.Popen[bytes]] = []
+        self._recorder: subprocess.Popen[bytes] | None = None
+        self._is_finishing = False
 
     @property
     def file(self) -> str | None:
         """The file that is being written now."""
-        return self._name if self._running is not None and self._running.poll() is None else None
+        return self._name if self._is_running and not self._is_finishing else None
 
     def toggle(self) -> str:
-        """Begin, or have the file finished, for which nobody waits here; what to tell of it."""
-        if self._running is not None and self.file:
-            self._running.send_signal(signal.SIGINT)
-            self._finishing.append(self._running)
-            self._running = None
+        """Begin, or have the file finished, for which nobody waits here; what to tell of it.
+
+        The next file begins after the last one is finished, so that there is one process, however often a page asks.
+        """
+        if self.file:
+            self._finish()
             return f"recorded to {self._name}"
+        if self._is_running:
+            return f"{self._name} is still being finished"
+        self._is_finishing = False
         self._name = str(self._folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}.mcap")
-        self._running = subprocess.Popen(
+        try:
+            self._recorder = self._start()
+        except OSError as error:  # no process or no file descriptor is left
+            return f"no recording: {error}"
+        return f"records to {self._name}"
+
+    def _start(self) -> subprocess.Popen[bytes]:
+        return subprocess.Popen(
             [sys.executable, "-m", "quadvel_bringup", "record", "--out", self._name],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,
         )
-        return f"records to {self._name}"
 
     def close(self) -> None:
-        """End what runs, and wait until the files are whole."""
+        """End what runs, and wait until its file is whole."""
         if self.file:
-            self.toggle()
-        for process in self._finishing:
+            self._finish()
+        if self._recorder is not None:
             try:
-                process.wait(PATIENCE)
+                self._recorder.wait(PATIENCE)
             except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+                self._recorder.kill()
+                self._recorder.wait()
+
+    @property
+    def _is_running(self) -> bool:
+        return self._recorder is not None and self._recorder.poll() is None
+
+    def _finish(self) -> None:
+        assert self._recorder is not None
+        self._recorder.send_signal(signal.SIGINT)
+        self._is_finishing = True

@@ -3,7 +3,8 @@
 The scene goes one way: what viser draws is passed on to the browser, and what the browser says to viser ends here.
 
 Where the page is called 127.0.0.1 its scene is called localhost, and the other way round: to the browser these are two sites,
-each with a process of its own, so that drawing never keeps pad and STOP waiting.
+each with a process of its own, so that drawing never keeps pad and STOP waiting. Where there is a token both have one name, as
+the cookie with the token stays with the name that it was set for.
 """
 
 from __future__ import annotations
@@ -38,8 +39,12 @@ COOKIE = "quadvel_view"
 KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE, WORDS = "/scene", "/words"
+SCENE_FRAME, WITH_TOKEN = b'<iframe id="scene"', b" data-with-token"
+"""how the page is told that there is a token, which it cannot see itself"""
 MOST_FRAGMENTS = 16
 """of one message: browsers send one of LARGEST_WORD whole, and an empty fragment costs memory, too"""
+MOST_SOCKETS = 32
+"""at a time, of which a page has two: each takes time from the words of the others, STOP among them"""
 # viser's own panel and notes have no place beside ours: of its page there is the picture alone. It looks for its server while
 # it has the focus, which stays with our page.
 PICTURE_ALONE = (
@@ -55,8 +60,8 @@ class AddressError(ValueError):
 
 
 def _is_own_fault(record: logging.LogRecord) -> bool:
-    """Whether a line of the log is about more than a request that is no HTTP or no handshake, which anybody may send."""
-    return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake))
+    """Whether a line of the log is about more than a handshake that makes no sense or is left, which anybody may do."""
+    return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake | ConnectionClosed))
 
 
 LOG = logging.getLogger("quadvel_view.page")
@@ -78,6 +83,10 @@ class PageServer:
         on_word: Callable[[int, Word], None],
         on_leave: Callable[[int], None],
     ) -> None:
+        if not host:
+            raise AddressError(
+                "host is '', expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces"
+            )
         self._host, self._port, self._scene = host, port, scene
         self._on_word, self._on_leave = on_word, on_leave
         self._guard = Guard("" if is_loopback(host) else secrets.token_urlsafe(18))
@@ -146,18 +155,29 @@ class PageServer:
         except RequestError as error:
             return _sentence(error.status, str(error))
         if visitor.wants_socket:
-            known = visitor.path in (SCENE, WORDS)
-            return None if known else _sentence(HTTPStatus.NOT_FOUND, "there is no such socket")
+            return self._refusal_of_socket(connection, visitor)
         if visitor.path == f"{SCENE}/":
             return _page("text/html", self._scene_page, visitor)
         if visitor.path not in PAGE:
             return _sentence(HTTPStatus.NOT_FOUND, "there is no such page")
         return self._file(PAGE[visitor.path], visitor)
 
+    @staticmethod
+    def _refusal_of_socket(connection: ServerConnection, visitor: Visitor) -> Response | None:
+        if visitor.path not in (SCENE, WORDS):
+            return _sentence(HTTPStatus.NOT_FOUND, "there is no such socket")
+        if len(connection.server.connections) >= MOST_SOCKETS:
+            reason = f"{MOST_SOCKETS} connections are open: close another page of this robot"
+            return _sentence(HTTPStatus.SERVICE_UNAVAILABLE, reason)
+        return None
+
     def _file(self, name: str, visitor: Visitor) -> Response:
         body = files("quadvel_view").joinpath("page", name).read_bytes()
+        with_token = visitor.path == "/" and self._guard.token
+        if with_token:
+            body = body.replace(SCENE_FRAME, SCENE_FRAME + WITH_TOKEN)
         response = _page(KINDS[name.rpartition(".")[2]], body, visitor)
-        if visitor.path == "/" and self._guard.token:
+        if with_token:
             keep = f"{COOKIE}_{self._port}={self._guard.token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers["Set-Cookie"] = keep
         return response

@@ -21,7 +21,6 @@ from std_srvs.srv import SetBool, Trigger
 
 from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
-from quadvel_nodes.scheduling import run_after_others
 from quadvel_recordings.definitions import STORE
 
 from .operator import PERIOD, Operator
@@ -32,8 +31,6 @@ from .viewer import FRAME, LARGEST_PORT, PORT, Viewer
 from .words import Allow, Hold, LetGo, ModeRequest, Record, Release, Reset, Stop, Word
 from .words import Push as PushWord
 
-NICENESS = 5
-"""a third of the processor time of each of the robot's processes where it is short: STOP comes through this one"""
 KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 SIMULATIONS = ("sim_node", "board")
@@ -218,6 +215,5 @@ def _ready(clients: list[Any]) -> Any:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node. The robot's own nodes come first where the machine is short of time."""
-    run_after_others(NICENESS)
+    """Entry point of the node. It has the priority of the robot's own nodes, as STOP comes through it."""
     run(View, args)

@@ -251,7 +251,8 @@ setInterval(drawReadings, 100);
 addEventListener("message", (event) => { if (event.source === $("scene").contentWindow && event.data === "drawn") $("loading").hidden = true; });
 setTimeout(() => { $("loading").textContent = "no 3-D view yet: this browser may lack WebGL, or be short of time"; }, SLOW);
 
-// Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours.
-const OTHER_NAME = { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
+// Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours. A
+// token's cookie stays with the name that it was set for.
+const OTHER_NAME = "withToken" in $("scene").dataset ? {} : { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
 $("scene").src = `${location.protocol}//${OTHER_NAME[location.hostname] || location.hostname}:${location.port}/scene/?darkMode`;
 connect();
