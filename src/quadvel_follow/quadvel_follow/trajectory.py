@@ -155,7 +155,9 @@ def load(path: Path, speed: float) -> Trajectory:
         return read(path, speed)
     except OSError as error:
         shipped = ", ".join(sorted(file.stem for file in SHIPPED.glob("*.csv")))
-        raise ValueError(f"{path}: {error.strerror}, expected a CSV or GPX file or one of {shipped}") from None
+        raise ValueError(
+            f"{path}: {error.strerror}, expected a CSV or GPX file or one of {shipped}"
+        ) from None
     except (ValueError, csv.Error, ElementTree.ParseError) as error:
         raise ValueError(f"{path}: {error}") from None
 

@@ -11,7 +11,6 @@ from collections import deque
 import attrs
 import numpy as np
 
-
 MOST_OVERRUNS = 2**32 - 1  # what a uint32 of quadvel_msgs/ControllerState holds; the count stays there
 
 
