@@ -101,7 +101,7 @@ def identify(
         typer.Option(
             metavar="<file>",
             help="YAML file that says what the logs call the fields.",
-            show_default="as below, or as PACE and JointState do",
+            show_default="names as in docs/identification.md",
         ),
     ] = None,
     robot: Annotated[

@@ -73,7 +73,11 @@ def campaign(
     """
     cases = [case for case in CASES if only is None or only in case.name]
     if not cases:
-        raise ValueError(f"no case holds '{only}'; there are {', '.join(case.name for case in CASES)}")
+        words = [dict.fromkeys(case.name.split()[i] for case in CASES) for i in range(3)]
+        components, kinds_of_fault, modes = (", ".join(column) for column in words)
+        raise ValueError(
+            f"no case holds '{only}'; components: {components}; kinds: {kinds_of_fault}; modes: {modes}"
+        )
     kinds: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
         kinds.setdefault((case.component, case.kind), []).append(case)
