@@ -134,6 +134,19 @@ def test_a_receiver_that_stood_for_minutes_leads_along_the_way_alone(rate: int, 
     assert way.noise == pytest.approx(0.4, rel=0.2)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("rate", [1, 5])
+def test_errors_that_neighbours_share_are_not_taken_for_turns(rate: int, seed: int) -> None:
+    before, after = np.split(line(72.0, 1.2 / rate), [30 * rate])
+    track = np.vstack([before, np.tile([36.0, 0.0], (60 * rate, 1)), after])
+    random, wander = np.random.default_rng(seed), np.zeros_like(track)
+    for k in range(1, len(track)):
+        wander[k] = 0.9 * wander[k - 1] + 0.4 * np.sqrt(1.0 - 0.9**2) * random.normal(size=2)
+    way = Trajectory.of_places(track + wander, 1.0, RECEIVER_NOISE)
+    assert way.velocity[:, 0].sum() * STEP == pytest.approx(72.0, abs=5.0)
+    assert turned(way) < 3.0
+
+
 @pytest.mark.parametrize(
     "corners",
     [

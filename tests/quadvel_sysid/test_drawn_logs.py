@@ -74,6 +74,18 @@ def test_a_log_whose_commands_rest_while_all_joints_move_is_refused(command: flo
     assert one.field == "q_des"
 
 
+@pytest.mark.parametrize(("dither", "rows"), [(1e-3, 0), (0.0, 5), (1e-3, 5)])
+def test_commands_that_rest_but_for_noise_and_a_few_rows_are_refused_as_resting(
+    dither: float, rows: int
+) -> None:
+    log = of_torque_commands(as_log(drawn(1)), np.array([True, True, True]), 0.02, seed=0)
+    q_des = log.q_des + dither * np.random.default_rng(0).normal(size=log.q_des.shape)
+    q_des[:rows] += 0.4
+    (one,) = [one for one in found(inspect(attrs.evolve(log, q_des=q_des))) if one.kind == "refusal"]
+    assert one.field == "q_des"
+    assert one.joints == log.joints
+
+
 def test_joints_whose_commands_rest_while_they_move_are_left_out() -> None:
     rests = np.array([False, True, False])
     inspection = inspect(of_torque_commands(as_log(drawn(1)), rests, 0.0, seed=0))

@@ -43,11 +43,15 @@ STIFFNESS = (-4.0, 12.0)
 
 @attrs.frozen
 class NoiseLimits:
-    """Noise (m, one axis) that a kind of file may have: at least, at most with few points, and at most with many."""
+    """Noise (m, one axis) that a kind of file may have: at least, at most with few points, and at most with many.
+
+    `shared` is the share of it that neighbours have in common, which no mean over them takes away.
+    """
 
     least: float
     few: float
     many: float
+    shared: float = 0.0
 
 
 @attrs.frozen
@@ -69,10 +73,11 @@ def smooth_path(points: Array, limits: NoiseLimits) -> SmoothPath:
     dense = len(points) >= FEW_POINTS
     believed = dense and found <= (limits.many if len(points) >= MANY_POINTS else limits.few)
     noise = max(found, limits.least) if believed else EXACT_M
-    places, counts = _merged(points, noise)
+    shared = limits.shared * noise if believed else 0.0
+    places, counts = _merged(points, noise, shared)
     if len(places) < 2:
         places, counts = points[[0, -1]], np.ones(2)
-    errors = noise / np.sqrt(counts)
+    errors = np.hypot(noise / np.sqrt(counts), shared)
     corners = _corners(places, errors)
     errors[corners] *= PINNED
     ends = [0, *corners, len(places) - 1]
@@ -123,15 +128,17 @@ def _chords(points: Array) -> Array:
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
-def _merged(points: Array, noise: float) -> tuple[Array, Array]:
+def _merged(points: Array, noise: float, shared: float) -> tuple[Array, Array]:
     """Means of neighbours that noise alone may separate (k, 2), and how many points each is made of (k,).
+
+    `noise` is the error of a point, `shared` (m, one axis) what a mean of points keeps of it.
 
     The nearest pairs merge first. A robot that stood is one place, whatever its receiver said meanwhile.
     """
     places, counts, same = points, np.ones(len(points)), _furthest(len(points))
     while len(places) > 1:
         apart = np.hypot(*np.diff(places, axis=0).T)
-        apart /= noise * np.sqrt(1.0 / counts[:-1] + 1.0 / counts[1:])
+        apart /= np.sqrt(noise**2 * (1.0 / counts[:-1] + 1.0 / counts[1:]) + 2.0 * shared**2)
         padded = np.concatenate([[np.inf], apart, [np.inf]])
         first = np.flatnonzero((apart < same) & (apart <= padded[:-2]) & (apart < padded[2:]))
         if not len(first):

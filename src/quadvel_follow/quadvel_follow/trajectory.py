@@ -27,8 +27,8 @@ LEAP_STEPS, LEAP_M = 20.0, 20.0
 """Usual steps and metres from which a step of a recorded path is a leap"""
 TABLE_NOISE = NoiseLimits(least=EXACT_M, few=0.1, many=0.5)
 """Of x and y in a CSV file: odometry, a map, motion capture, radio beacons"""
-RECEIVER_NOISE = NoiseLimits(least=0.3, few=1.0, many=5.0)
-"""Of the points of a GPX track; a receiver's error wanders by some 0.3 m even where neighbours agree"""
+RECEIVER_NOISE = NoiseLimits(least=0.3, few=1.0, many=5.0, shared=1.0)
+"""Of the points of a GPX track; a receiver's error wanders by some 0.3 m even where neighbours agree, and by no less in a mean"""
 CORRECTS = np.array([1.0, 1.0, 1.5])  # 1/s, of what the robot is off: ahead, to the left, turned
 CORRECTS_AT_MOST = np.array([0.3, 0.3, 0.5])  # m/s, m/s, rad/s
 LOST = 1.0  # m, off the way, from which a robot stops

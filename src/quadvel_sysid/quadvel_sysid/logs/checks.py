@@ -100,14 +100,14 @@ OF_ROWS = (
           "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),
     Check(angles.units, "slope of q over dq, and their correlation",
           f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
+    Check(commands.constant, "where q_des spans next to nothing of what q spans: share of the torque that a "
+          "PD law about it leaves; share of the rest that the angle explains",
+          f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints, or without torque, a refusal"),
     Check(angles.degrees, "size of q_des over that of q; size of q, rad", f"25 to 130; {angles.TURNS:g}", "refusal"),
     Check(channels.copies, "joints whose q or tau is the same to the bit", "all rows", "warning"),
     Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
     Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
     Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
-    Check(commands.constant, "where q_des never changes though q does: share of the torque that a "
-          "PD law about it leaves; share of the rest that the angle explains",
-          f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints, or without torque, a refusal"),
     Check(clocks.clock, "lag from command to torque (without torque, to the acceleration) that leaves least, s; what it leaves "
           f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
           f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; "

@@ -15,6 +15,10 @@ from .response import motion
 
 SWINGS = 0.5
 """rad, span of q from which a joint whose command rests is looked at: less may be what a drive gives way to a load."""
+HARDLY = 0.01
+"""Share of the span of q below which that of q_des is noise; a unit mistaken (57 degrees a radian) makes 0.017 of it."""
+ALL_BUT = (1.0, 99.0)
+"""Per cent of the rows between which a span is taken: the first rows often hold another value."""
 HELD = 0.3
 """Share of the torque that a PD law about a resting command, with friction and an offset, leaves at most."""
 ANSWERED = 0.5
@@ -23,7 +27,8 @@ ANSWERED = 0.5
 
 def constant(log: Log) -> Iterator[Finding | Log]:
     """Commands that never change on joints that move and that no drive holds there: nothing follows a position."""
-    resting = (np.ptp(log.q_des, axis=0) < REACHES) & (np.ptp(log.q, axis=0) > SWINGS)
+    swings, asked = _span(log.q), _span(log.q_des)
+    resting = (asked < np.maximum(REACHES, HARDLY * swings)) & (swings > SWINGS)
     if log.tau is None:
         resting &= (
             resting.all()
@@ -42,6 +47,11 @@ def constant(log: Log) -> Iterator[Finding | Log]:
     else:
         yield Finding("warning", "q_des", joints, f"{text}; left out there")
         yield attrs.evolve(log, valid=log.valid & ~hit)
+
+
+def _span(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """How far each column goes, rad, but for a few rows."""
+    return np.asarray(np.ptp(np.percentile(angles, ALL_BUT, axis=0), axis=0))
 
 
 def _holds(log: Log, j: int) -> bool:
