@@ -49,7 +49,7 @@ def constant(log: Log) -> Iterator[Finding | Log]:
         yield attrs.evolve(log, valid=log.valid & ~hit)
 
 
-def _span(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def _span(angles: NDArray[np.floating]) -> NDArray[np.float64]:
     """How far each column goes, rad, but for a few rows."""
     return np.asarray(np.ptp(np.percentile(angles, ALL_BUT, axis=0), axis=0))
 
