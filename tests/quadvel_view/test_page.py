@@ -318,7 +318,7 @@ CUT_OFF = """(() => {
 })()"""
 
 
-@pytest.mark.parametrize("ground", ["slope", "rough"])
+@pytest.mark.parametrize("ground", ["slope", pytest.param("rough", marks=pytest.mark.long)])
 def test_a_walking_robot_that_is_reset_lies_in_passive_and_is_seen_on_its_ground(
     browser: Any, robot: str, ground: str
 ) -> None:
