@@ -242,7 +242,8 @@ NODES = ("sim_node", "estimator", "controller", "command_mux")
 VIEW_PORT = ("--ros-args", "-p", "port:=0")
 
 
-@pytest.mark.parametrize("rounds", [1, pytest.param(10, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("rounds", [1, 10])
 def test_the_page_stays_before_during_and_after_the_start_of_each_node(
     browser: Any, tmp_path: Path, rounds: int
 ) -> None:
@@ -318,7 +319,8 @@ CUT_OFF = """(() => {
 })()"""
 
 
-@pytest.mark.parametrize("ground", ["slope", pytest.param("rough", marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("ground", ["slope", "rough"])
 def test_a_walking_robot_that_is_reset_lies_in_passive_and_is_seen_on_its_ground(
     browser: Any, robot: str, ground: str
 ) -> None:
