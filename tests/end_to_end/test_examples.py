@@ -47,9 +47,9 @@ ROBOT = [
     Step("quadvel status"),
     Step("quadvel drive --vx 0.5 --wz 0.3 --seconds 5", more="--seconds 3"),
     Step("quadvel drive --vx 0.5"),
-    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 15", served=True),
-    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 6"),
-    Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel drive --vx 0.5 --seconds 40 &", more="--seconds 8", served=True),
+    Step("quadvel record low_state low_cmd --out walk.mcap --seconds 30", more="--seconds 3"),
+    Step("quadvel identify walk.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel push --fy 60"),
     Step("quadvel record low_state low_cmd --out walk.mcap", more="--seconds 1 --out other.mcap"),
     Step("quadvel reset"),
@@ -59,10 +59,10 @@ ROBOT = [
 ]
 EXCITE = [
     Step("quadvel excite foot-lifting --out lift.mcap", more="--seconds 0.5"),
-    Step("quadvel identify lift.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel identify lift.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel excite --after out/identify/report.json"),
     Step("quadvel excite sweep --out sweep.mcap", more="--seconds 0.5"),
-    Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_hip FR_thigh FR_calf"),
+    Step("quadvel identify sweep.mcap --out out/identify", more="--joints FR_calf"),
     Step("quadvel up --actuator out/identify/actuator.yaml", served=True, then=READY),
 ]
 LOGS = [  # of one leg each
@@ -72,9 +72,12 @@ LOGS = [  # of one leg each
     Step("quadvel identify out/loop/walk.npz --out out/loop/identified"),
 ]
 NODES = [
+    Step("quadvel world campus --out out/campus.png"),
+    Step("quadvel people --out out/people", more="--runs 1"),
+    Step("quadvel demo follow --tour --out out/tour", more="--world corridor --metres 3 --no-video"),
+    Step("python -m quadvel_training --help"),
     Step("quadvel run sim_node --ros-args -p terrain:=rough", served=True),
     Step("quadvel run sim_node --ros-args -p world:=park", served=True),
-    Step("quadvel world campus --out out/campus.png"),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r low_cmd:=/test/low_cmd", served=True),
     Step("quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel", served=True),
     Step("quadvel run driver --ros-args -p dry_run:=true", served=True),
@@ -82,10 +85,7 @@ NODES = [
     Step("quadvel run person_tracker --ros-args -p laser_x:=0.25", served=True),
     Step("quadvel run follow_planner --ros-args -p laser_x:=0.25 -p side:=left", served=True),
     Step("quadvel run trajectory_planner --ros-args -p file:=eight -p closed_loop:=true", served=True),
-    Step("quadvel people --out out/people", more="--runs 1"),
-    Step("quadvel demo follow --tour --out out/tour", more="--world corridor --metres 3 --no-video"),
     Step("quadvel doctor"),
-    Step("python -m quadvel_training --help"),
 ]
 SESSIONS = {"robot": ROBOT, "excite": EXCITE, "logs": LOGS, "nodes": NODES}
 

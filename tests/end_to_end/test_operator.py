@@ -242,7 +242,13 @@ def test_lying_down_ends_passive(up: Robot) -> None:
     assert quadvel("mode", "stand_up")[0] == 0
 
 
-@pytest.mark.parametrize("starved", ["sim_node", "controller", "estimator", "command_mux"])
+@pytest.mark.parametrize(
+    "starved",
+    [
+        "controller",
+        *(pytest.param(node, marks=pytest.mark.long) for node in ("sim_node", "estimator", "command_mux")),
+    ],
+)
 def test_a_walking_robot_waits_for_a_node_that_gets_no_time(up: Robot, starved: str) -> None:
     """On a loaded machine a process may stand still for a while; a simulated robot must not fall for that."""
     up.forget()

@@ -127,7 +127,13 @@ def walked(simulator: Any, velocity: tuple[float, float, float]) -> np.ndarray:
     return np.mean(truths, axis=0)
 
 
-@pytest.mark.parametrize("velocity", [(0.5, 0.0, 0.0), (1.0, 0.0, 0.5), (0.0, 0.4, 0.0)])
+@pytest.mark.parametrize(
+    "velocity",
+    [
+        (0.5, 0.0, 0.0),
+        *(pytest.param(one, marks=pytest.mark.long) for one in ((1.0, 0.0, 0.5), (0.0, 0.4, 0.0))),
+    ],
+)
 def test_with_2_percent_loss_and_2_ms_jitter_tracking_is_within_2_cm_per_s(
     velocity: tuple[float, float, float],
 ) -> None:

@@ -17,7 +17,9 @@ RUN = "from quadvel_bringup.__main__ import main; main()"
 ALONE = {  # nothing goes out to a robot's address, and no port is taken that somebody else may have
     "board": ("--ros-args", "-p", "port:=0"),
     "driver": ("--ros-args", "-p", "dry_run:=true"),
+    "view": ("--ros-args", "-p", "port:=0"),
 }
+USUAL = ("sim_node", "controller", "view")
 INTERRUPTED_AT_THE_END = (
     f"import atexit, os, signal; atexit.register(os.kill, os.getpid(), signal.SIGINT); {RUN}"
 )
@@ -35,7 +37,10 @@ def interrupt_first() -> None:
         ("up",),
         ("drive", "--vx", "0.5"),
         ("record", "--out", "walk.mcap"),
-        *(("run", name, *ALONE.get(name, ())) for name in NODES),
+        *(
+            pytest.param(("run", name, *ALONE.get(name, ())), marks=() if name in USUAL else pytest.mark.long)
+            for name in NODES
+        ),
     ],
     ids=" ".join,
 )

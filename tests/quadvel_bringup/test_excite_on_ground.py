@@ -89,7 +89,9 @@ def other_plant(seed: int) -> tuple[RobotState, Body]:
     return state(), answer
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize(
+    "seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(4, 20))]
+)
 def test_foot_lifting_goes_through_on_the_ground(seed: int) -> None:
     states, _ = play(FootLifting(), *simulated(seed))
     assert largest_tilt(states) < LEVEL
@@ -100,7 +102,9 @@ def test_foot_lifting_goes_through_on_the_ground(seed: int) -> None:
     np.testing.assert_allclose(np.ptp(height, axis=0), 0.1, atol=0.025)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize(
+    "seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.long) for seed in range(2, 10))]
+)
 def test_foot_lifting_goes_through_on_another_plant(seed: int) -> None:
     states, _ = play(FootLifting(), *other_plant(seed))
     assert largest_tilt(states) < LEVEL
@@ -108,9 +112,8 @@ def test_foot_lifting_goes_through_on_another_plant(seed: int) -> None:
 
 @pytest.mark.parametrize("plant", [simulated, other_plant])
 def test_a_sweep_goes_through_on_the_ground(plant: Callable[[int], tuple[RobotState, Body]]) -> None:
-    for seed in (0, 1):
-        states, _ = play(Sweep(), *plant(seed))
-        assert largest_tilt(states) < LEVEL
+    states, _ = play(Sweep(), *plant(0))
+    assert largest_tilt(states) < LEVEL
 
 
 def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:

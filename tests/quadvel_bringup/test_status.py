@@ -72,7 +72,7 @@ def test_status_of_a_robot_that_has_not_ticked_yet_shows_dashes() -> None:
     assert "nan" not in text
     assert "period – ms, – us" in text
     assert "estimate vx – m/s" in text
-    assert "0.00, 0.00, – m" in text
+    assert "x 0.00, y 0.00 m since" in text
 
 
 def test_the_summary_of_a_demo_shows_dashes() -> None:

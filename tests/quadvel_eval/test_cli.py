@@ -26,7 +26,7 @@ def test_a_missing_policy_is_refused_by_its_name_before_anything_is_made(tmp_pat
 def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(NotADirectoryError, match="is a file"):
-        eval_command(tmp_path / "out", "quick")
+        eval_command("quick", tmp_path / "out")
     assert (tmp_path / "out").read_text() == "mine"
 
 

@@ -38,7 +38,7 @@ def test_without_stamps_a_plot_is_over_the_times_of_receipt(tmp_path: Path, zero
     assert (found.ends, found.begin) == (pytest.approx(SECONDS), pytest.approx(1e-9 * T0))
     assert sum(f"{len(zeros)} of {ROWS} stamps are 0" in text for text in said) == 2
     result = run(plot_command, path, "--out", tmp_path / "out")
-    assert (result.exit_code, "warning: /low_state" in result.stderr) == (0, True)
+    assert (result.exit_code, f"warning: {path}: /low_state" in result.stderr) == (0, True)
 
 
 @pytest.mark.parametrize(

@@ -111,7 +111,10 @@ print(os.nice(0), AUTOGROUP.read_text().split()[-1])
 """
 
 
-@pytest.mark.skipif(not AUTOGROUP.exists(), reason="this kernel does not group processes by session")
+@pytest.mark.skipif(
+    not (AUTOGROUP.exists() and AUTOGROUP.read_text()),
+    reason="this kernel does not group processes by session",
+)
 @pytest.mark.parametrize("own_session", [True, False])
 def test_a_process_that_runs_after_others_does_so_across_sessions_where_it_leads_its_own(
     own_session: bool,

@@ -151,6 +151,52 @@ def page(browser: Any, robot: str) -> Iterator[Page]:
     assert page.complaints == []
 
 
+# Tests with nodes of their own stand first: `robot`, which the others share, stays on the same DDS domain once it is started.
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("rounds", [1, 10])
+def test_the_page_stays_before_during_and_after_the_start_of_each_node(
+    browser: Any, tmp_path: Path, rounds: int
+) -> None:
+    """A page opens on no robot; then each node starts, one after the other, and with each another page opens and reads on."""
+    for turn in range(rounds):
+        view = Served(tmp_path / f"view_{turn}.log", "run", "view", *VIEW_PORT)
+        url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
+        pages, nodes = [Page(browser, url)], []
+        pages[0].until("state.mode === ''")
+        for name in NODES:
+            nodes.append(Served(tmp_path / f"{name}_{turn}.log", "run", name))
+            pages.append(Page(browser, url))
+            pages[-1].until("true")
+            pages[-1].page.wait_for_timeout(500)
+        pages[0].until("state.mode !== '' && state.lamps.length >= 4")
+        for page in pages:
+            assert page.page.evaluate("socket.readyState === WebSocket.OPEN")
+            assert page.page.evaluate("performance.now() - heardAt < 10_000")
+            assert "NaN" not in page.page.inner_text("body")
+            page.page.close()
+            assert page.complaints == []
+        assert [one.end() for one in nodes] == [0] * len(NODES)
+        assert view.end() == 0
+
+
+def test_the_first_second_of_a_controller_shows_dashes(browser: Any, tmp_path: Path) -> None:
+    """No state comes, so that there are no times of a loop yet."""
+    view = Served(tmp_path / "view.log", "run", "view", *VIEW_PORT)
+    url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
+    controller = Served(tmp_path / "controller.log", "run", "controller")
+    page = Page(browser, url)
+    page.until("state.mode === 'passive' && state.loop.compute === null")
+    page.page.wait_for_timeout(300)
+    assert page.page.inner_text("#loop dl").split("\n")[3::2] == ["–", "–", "0"]
+    assert set(page.page.inner_text(".graphs").split()[1::2]) <= {"–", "+0.00"}
+    page.page.close()
+    assert controller.end() == 0
+    assert view.end() == 0
+    assert page.complaints == []
+
+
 @pytest.mark.realtime
 def test_pad_walks_the_robot_and_stop_stops_it(page: Page) -> None:
     page.until("state.mode === 'stance'")
@@ -242,49 +288,6 @@ NODES = ("sim_node", "estimator", "controller", "command_mux")
 VIEW_PORT = ("--ros-args", "-p", "port:=0")
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("rounds", [1, 10])
-def test_the_page_stays_before_during_and_after_the_start_of_each_node(
-    browser: Any, tmp_path: Path, rounds: int
-) -> None:
-    """A page opens on no robot; then each node starts, one after the other, and with each another page opens and reads on."""
-    for turn in range(rounds):
-        view = Served(tmp_path / f"view_{turn}.log", "run", "view", *VIEW_PORT)
-        url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
-        pages, nodes = [Page(browser, url)], []
-        pages[0].until("state.mode === ''")
-        for name in NODES:
-            nodes.append(Served(tmp_path / f"{name}_{turn}.log", "run", name))
-            pages.append(Page(browser, url))
-            pages[-1].until("true")
-            pages[-1].page.wait_for_timeout(500)
-        pages[0].until("state.mode !== '' && state.lamps.length >= 4")
-        for page in pages:
-            assert page.page.evaluate("socket.readyState === WebSocket.OPEN")
-            assert page.page.evaluate("performance.now() - heardAt < 10_000")
-            assert "NaN" not in page.page.inner_text("body")
-            page.page.close()
-            assert page.complaints == []
-        assert [one.end() for one in nodes] == [0] * len(NODES)
-        assert view.end() == 0
-
-
-def test_the_first_second_of_a_controller_shows_dashes(browser: Any, tmp_path: Path) -> None:
-    """No state comes, so that there are no times of a loop yet."""
-    view = Served(tmp_path / "view.log", "run", "view", *VIEW_PORT)
-    url = view.said(r"open (http://127\.0\.0\.1:\d+/)")
-    controller = Served(tmp_path / "controller.log", "run", "controller")
-    page = Page(browser, url)
-    page.until("state.mode === 'passive' && state.loop.compute === null")
-    page.page.wait_for_timeout(300)
-    assert page.page.inner_text("#loop dl").split("\n")[3::2] == ["–", "–", "0"]
-    assert set(page.page.inner_text(".graphs").split()[1::2]) <= {"–", "+0.00"}
-    page.page.close()
-    assert controller.end() == 0
-    assert view.end() == 0
-    assert page.complaints == []
-
-
 @pytest.mark.parametrize(("width", "height"), [(1280, 720), (800, 600)])
 def test_every_control_can_be_pressed_and_every_text_is_whole(
     browser: Any, robot: str, width: int, height: int
@@ -368,7 +371,7 @@ def test_a_recording_plays_and_nothing_comes_from_elsewhere(
     assert page.complaints == []
 
 
-@pytest.mark.parametrize("name", ["127.0.0.1", "localhost"])
+@pytest.mark.parametrize("name", ["127.0.0.1", pytest.param("localhost", marks=pytest.mark.long)])
 def test_with_a_token_the_scene_is_drawn_under_each_name_of_this_host(
     browser: Any, walked: Path, tmp_path: Path, name: str
 ) -> None:

@@ -36,7 +36,7 @@ from .recording_plot import (
     add_legend,
     panels_over,
     read_run,
-    to_stderr,
+    warn_of,
 )
 from .replay import PAST, Joints, joints_of, modelled_torque, read_joints
 from .segments import rounded
@@ -187,7 +187,7 @@ def replay_command(
     model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
     asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
-    run = read_run(recording, state_topic, command_topic, to_stderr)
+    run = read_run(recording, state_topic, command_topic, warn_of(recording))
     if run.foreign is None:
         joints = read_joints(recording, SLOWEST, run.received)
     else:

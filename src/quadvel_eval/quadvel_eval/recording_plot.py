@@ -118,7 +118,7 @@ def read_run(
     missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
     if tell:
         for sentence in missing:
-            tell(f"warning: {sentence}")
+            tell(sentence)
     received = bool(missing)
     lines = {topic: (found.times(received), np.array(found.numbers, float)) for topic, found in rows.items()}
     foreign = None
@@ -152,9 +152,7 @@ def _foreign(
 ) -> JointLog | None:
     """The joints of another robot, or None where other things can be drawn. Raises RecordingError."""
     try:
-        return read_joint_log(
-            path, state, command, tell, None if tell is None else lambda text: tell(f"warning: {text}")
-        )
+        return read_joint_log(path, state, command, tell)
     except RecordingError:
         if others and not (state or command):
             return None
@@ -298,9 +296,9 @@ CommandTopic = Annotated[
 ]
 
 
-def to_stderr(text: str) -> None:
-    """Print what was assumed about a recording."""
-    typer.echo(text, err=True)
+def warn_of(recording: Path) -> Callable[[str], None]:
+    """Print a sentence about a recording as a warning that names its file."""
+    return lambda text: typer.echo(f"quadvel: warning: {recording}: {text}", err=True)
 
 
 def plot_command(
@@ -316,7 +314,7 @@ def plot_command(
     Of another robot its joints: sensor_msgs/JointState, or unitree_go LowState and LowCmd. Colours show the controller's mode.
     """
     output_folder(out)
-    run = read_run(recording, state_topic, command_topic, to_stderr)
+    run = read_run(recording, state_topic, command_topic, warn_of(recording))
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:
