@@ -64,6 +64,17 @@ if find_spec("hypothesis"):
     settings.register_profile("seeded", deadline=None, derandomize=True)
     settings.load_profile("seeded")
 
+# Folders whose tests start whole stacks of processes, which take more than a core: never two stacks at a time.
+STACKS = ("end_to_end", "quadvel_bringup", "quadvel_view")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """With `--dist loadgroup` one worker takes all tests that start stacks; else the tests of a file stay together."""
+    for item in items:
+        group = "stacks" if item.path.parent.name in STACKS else str(item.path)
+        item.add_marker(pytest.mark.xdist_group(group))
+
+
 # A run in the background ignores Ctrl-C, and so would what it starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

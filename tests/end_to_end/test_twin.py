@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorParameters
-from quadvel_bringup.twin import PLANTS, read_walk
+from quadvel_bringup.ground_truth_benchmark import PLANTS, read_walk
 from quadvel_eval.replay import torque_error
 
 PROGRAM = """
@@ -18,7 +18,7 @@ import sys
 from pathlib import Path
 from rich.console import Console
 from quadvel_bringup.scripted_walk import ScriptedWalk
-from quadvel_bringup.twin import plant_nodes
+from quadvel_bringup.ground_truth_benchmark import plant_nodes
 plant, out = map(Path, sys.argv[1:])
 sys.exit(ScriptedWalk(out, "quick", plant_nodes(plant, seed=1), True, Console()).run() or 0)
 """

@@ -12,7 +12,7 @@ import yaml
 
 import quadvel_dds
 from quadvel_bringup.nodes import NODES
-from quadvel_bringup.rehearsal import rehearse
+from quadvel_bringup.preflight import rehearse
 from quadvel_bringup.stack import PARAMETERS, Stack
 from quadvel_sysid.logs.columns import ColumnMap
 

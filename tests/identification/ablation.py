@@ -38,8 +38,8 @@ def _method_same(_: Any, found: Any, *__: Any, **___: Any) -> Any:
 
 
 def _fitted_once(self: Any, one: Any) -> Any:
-    judge = self._judge
-    return judge.narrowed(judge.fitted(one.model), len(one.model.applied) - 1).model
+    evaluator = self._judge
+    return evaluator.restrict_joints(evaluator.fit(one.model), len(one.model.effects) - 1).model
 
 
 SWITCHES: dict[str, dict[str, Any]] = {
@@ -49,17 +49,20 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "terms at nearby delays": {"candidates.Candidates._deeper": _method_same},
     "finer terms": {"candidates._refined": _same},
     "half as many fits": {"candidates.FITTED": 3, "candidates.FITTED_TERMS": 2},
-    "three valleys of delays": {"fit._DEEPEST": 1},
-    "far delays": {"fit._FAR": ()},
-    "laws before terms": {"selection._terms": lambda account: account.criterion},
-    "nesting": {"selection.Search._nested": _method_same},
-    "no repeats": {"selection.repeats": lambda *_: False},
-    "elimination": {"selection.Search.dropped": _method_same},
-    "gains of each joint": {"selection.Search._regrouped": lambda *_: []},
+    "three valleys of delays": {"fit._DELAY_STARTS": 1},
+    "far delays": {"fit._FAR_DELAY_CHANGES_S": ()},
+    "laws before terms": {"selection._regressor_count": lambda account: account.criterion},
+    "nesting": {"selection.Search._replace_by_special_case": _method_same},
+    "no repeats": {"selection.duplicates_effect": lambda *_: False},
+    "elimination": {"selection.Search.eliminate": _method_same},
+    "gains of each joint": {"selection.Search._finer_groups": lambda *_: []},
     "cost of a past": {"library._PAST_COST": 0.0},
-    "grid of a screening": {"screening._SHIFTS": (0.0,), "screening._OUTPUTS": (0.0025,)},
-    "kurtosis": {"account.normality": lambda residual, rows: np.ones(residual.shape[1])},
-    "clusters in motion": {"criterion.STILL": 0.0},
+    "grid of a screening": {
+        "screening._TOTAL_DELAY_CHANGES_S": (0.0,),
+        "screening._OUTPUT_DELAYS_S": (0.0025,),
+    },
+    "kurtosis": {"fitted_model.normality": lambda residual, rows: np.ones(residual.shape[1])},
+    "clusters in motion": {"criterion.CLUSTER_MOTION_RAD": 0.0},
     "averaged encoders": {"preparation._steadied": lambda found, _: (found, 0.0)},
     "even clocks": {"preparation.jitters": lambda _: False},
     "sharp accelerations": {
@@ -67,7 +70,7 @@ SWITCHES: dict[str, dict[str, Any]] = {
     },
     "between rows": {"model.BETWEEN": 1, "signals.BETWEEN": 1},
     "losses at random": {"lost_commands._at_random": lambda *_: True},
-    "latest delays": {"identify.latest": _same, "identify.in_steps": _same},
+    "latest delays": {"identify.longest_equivalent_delay": _same, "identify.quantised_delays": _same},
 }
 """What is replaced in quadvel_sysid, and by what, to take each device out"""
 

@@ -10,15 +10,15 @@ from tests.identification.ablation import SWITCHES, WHOLE, table, without
 
 @pytest.mark.parametrize("switch", SWITCHES)
 def test_a_switch_replaces_what_is_there_and_puts_it_back(switch: str) -> None:
-    before = candidates.FITTED, fit._FAR
+    before = candidates.FITTED, fit._FAR_DELAY_CHANGES_S
     with without(switch):
         pass
-    assert before == (candidates.FITTED, fit._FAR)
+    assert before == (candidates.FITTED, fit._FAR_DELAY_CHANGES_S)
 
 
 def test_switches_joined_are_all_out() -> None:
     with without("half as many fits+far delays"):
-        assert (candidates.FITTED, fit._FAR) == (3, ())
+        assert (candidates.FITTED, fit._FAR_DELAY_CHANGES_S) == (3, ())
 
 
 def test_the_table_counts_what_is_told_otherwise() -> None:

@@ -9,7 +9,7 @@ from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
 from quadvel_actuator.effects.base import of_each
 from quadvel_sysid.logs.log import Log
-from quadvel_sysid.model import DELAY_STEP, Applied, Model, Unknowns, jacobian, pack, with_slots
+from quadvel_sysid.model import DELAY_STEP_S, AppliedEffect, Model, Unknowns, jacobian, pack, with_slots
 from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:3]
@@ -75,7 +75,7 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     zero = np.zeros(4, dtype=int)
     series = Model(
         Samples([log]), 0.001, np.ones((2, 4)), zero, np.zeros((2, 4)), zero,
-        (Applied(law, active, values, np.arange(4)),),
+        (AppliedEffect(law, active, values, np.arange(4)),),
     ).predict()  # fmt: skip
     skip, tolerance = (5, 0.15) if name in LATE else (0, 2e-3 if name == "thermal_drift" else 1e-8)
     np.testing.assert_allclose(steps[skip:], series[skip:], atol=tolerance)
@@ -95,7 +95,7 @@ def test_a_law_of_another_package_needs_its_step_alone_to_be_run_over_a_series(n
     law = registry()[name].configured(settings, NAMES[:4])
     guesses = np.array([0.7, 1.0, 1.6])[:, None, None]
     p = {parameter: TRUTH[name][parameter] * guesses + np.zeros(4) for parameter in law.names}
-    x = (s.q_des - s.q, s.dq_des - s.dq) if law.stage == Stage.ERRORS else s.pull
+    x = (s.q_des - s.q, s.dq_des - s.dq) if law.stage == Stage.ERRORS else s.stiffness_torque
     own, simple = law.series(x, s, p), MemoryLaw.series(law, x, s, p)
     for one, other in zip(own, simple, strict=True) if isinstance(x, tuple) else [(own, simple)]:
         np.testing.assert_allclose(*np.broadcast_arrays(one, other), atol=1e-12)
@@ -105,7 +105,7 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
     t, q, dq, q_des = _motion(300)
     law = registry()["cross_coupling"].configured({"source": [f"{NAMES[1]}/tau"] * 4}, NAMES[:4])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
-    coupled = Applied(law, every, np.full((1, 4), 0.2), np.arange(4))
+    coupled = AppliedEffect(law, every, np.full((1, 4), 0.2), np.arange(4))
     torques = []
     for noise in (0.0, 1.0):
         tau = noise * np.random.default_rng(0).standard_normal(q.shape)
@@ -121,7 +121,7 @@ def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
     law = registry()["cross_coupling"].configured({"source": sources}, NAMES[:4])
     t, q, dq, q_des = _motion(300)
     s = Samples([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
-    torque = law.torque(s.pull, s, {"a": np.zeros(4), "offset": np.ones(4)})
+    torque = law.torque(s.stiffness_torque, s, {"a": np.zeros(4), "offset": np.ones(4)})
     np.testing.assert_array_equal(torque, np.tile([1.0, 0.0, 0.0, 0.0], (len(q), 1)))
     values = np.ones((2, 4))
     np.testing.assert_array_equal(_on(law, values, 0, 1).values, [np.ones(4), [1, 0, 0, 0]])
@@ -140,7 +140,7 @@ def test_a_coupling_that_is_of_no_angle_on_its_joints_is_the_same_in_a_file():
 def _on(law, values, *joints):
     """The law as it stays on these joints after a fit."""
     active = np.isin(np.arange(4), joints)
-    return Applied(law, active, values, np.arange(4)).tidied()
+    return AppliedEffect(law, active, values, np.arange(4)).canonical()
 
 
 @pytest.mark.parametrize("at", ["drive", "joint"])
@@ -156,7 +156,7 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     model = Model(
         samples, 0.0, np.ones((2, 4)), zero, np.repeat([[0.004], [0.002]], 4, axis=1), zero,
-        (Applied(law, every, values, np.arange(4)),),
+        (AppliedEffect(law, every, values, np.arange(4)),),
     )  # fmt: skip
     unknowns = Unknowns.of(model)
     torque, slopes = jacobian(model, unknowns)
@@ -166,9 +166,9 @@ def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
         moved[k] += step
         slope = (with_slots(model, moved).predict() - torque) / step
         np.testing.assert_allclose(slopes[:, k].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
-    for k, late in enumerate(np.eye(2)[:, :, None] * DELAY_STEP):
+    for k, late in enumerate(np.eye(2)[:, :, None] * DELAY_STEP_S):
         after, before = (model.with_delays(model.delays + by).predict() for by in (late, -late))
-        slope = (after - before) / (2.0 * DELAY_STEP)
+        slope = (after - before) / (2.0 * DELAY_STEP_S)
         np.testing.assert_allclose(slopes[:, k - 2].T, slope, atol=1e-9 * max(np.abs(slope).max(), 1.0))
 
 

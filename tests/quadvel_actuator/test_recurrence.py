@@ -12,8 +12,8 @@ import numpy as np
 from quadvel_actuator.effects import recurrence
 
 rows, start, one = np.linspace(0.0, 1.0, 50)[:, None], np.arange(50)[:, None] == 0, np.ones((50, 1))
-print(recurrence.played(rows, start, 0.1)[-1], recurrence.bent(rows, start, 0.5, 0.2)[-1])
-print(recurrence.chased(rows, 0.0 * one, 0.001 * one, start, 1000.0)[-1])
+print(recurrence.backlash_series(rows, start, 0.1)[-1], recurrence.bouc_wen_series(rows, start, 0.5, 0.2)[-1])
+print(recurrence.rate_limit_series(rows, 0.0 * one, 0.001 * one, start, 1000.0)[-1])
 """
 SEVERAL, AGAIN = 3, 2
 

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from quadvel_bringup import up
-from quadvel_bringup.alone import NotAlone, look_for_others
+from quadvel_bringup.exclusivity import NotAlone, look_for_others
 from quadvel_bringup.scripted_walk import ScriptedWalk
 from quadvel_bringup.stack import Stack
 

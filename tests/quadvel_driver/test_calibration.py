@@ -94,11 +94,11 @@ def test_what_is_set_right_is_what_was(standing: Samples) -> None:
     simulator = Simulator()
     simulator.reset("stand")
     state = simulator.state()
-    back = OFF.true(OFF.reported(state))
+    back = OFF.apply(OFF.reported(state))
     for field in ("q", "quaternion", "angular_velocity", "linear_acceleration"):
         np.testing.assert_allclose(getattr(back, field), getattr(state, field), atol=1e-12)
     command = JointCommand(q=np.array(NOMINAL_Q))
-    np.testing.assert_allclose(OFF.carried_out(OFF.sent(command)).q, command.q)
+    np.testing.assert_allclose(OFF.carried_out(OFF.invert(command)).q, command.q)
 
 
 def test_an_imu_that_leans_to_the_right_shows_a_level_robot_rolling_to_the_right() -> None:

@@ -259,7 +259,7 @@ def test_a_stall_of_the_whole_machine_is_no_event_of_the_walk(
 ) -> None:
     walk(robot)
     forgotten: list[bool] = []
-    monkeypatch.setattr(robot.graph.node._supervisor._walk, "forget", lambda: forgotten.append(True))
+    monkeypatch.setattr(robot.graph.node._supervisor._walk, "reset", lambda: forgotten.append(True))
     for _ in range(3):
         robot.graph.pass_time(0.06)
         robot.step(3)  # 5 ms by the robot's own clock

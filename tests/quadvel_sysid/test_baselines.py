@@ -10,8 +10,8 @@ import pytest
 
 from quadvel_sysid.baselines import baselines, explained, torque_variance
 from quadvel_sysid.cli import errors
-from quadvel_sysid.contradictions import contradictions
 from quadvel_sysid.logs.read_log import read_log
+from quadvel_sysid.sanity_checks import contradictions
 
 sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import recorded

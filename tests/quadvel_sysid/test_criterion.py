@@ -5,7 +5,15 @@ import numpy as np
 import pytest
 from simulated_joints import parameters, record
 
-from quadvel_sysid.criterion import LEVEL, WHITE_LEVEL, Parts, clusters, noise_variance, normality, whiteness
+from quadvel_sysid.criterion import (
+    SIGNIFICANCE_LEVEL,
+    WHITENESS_LEVEL,
+    DataSplit,
+    clusters,
+    noise_variance,
+    normality,
+    whiteness,
+)
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.signals import Samples
 
@@ -37,7 +45,7 @@ def test_a_stand_says_once_what_it_says_and_motion_each_tenth_of_a_second() -> N
 def test_what_shakes_all_joints_alike_counts_once() -> None:
     """Of noise that joints share, and a change that has nothing to do with it, a hundredth is called significant."""
     rng, rows = np.random.default_rng(0), np.ones((5000, 6), dtype=bool)
-    parts = Parts(rows, rows, rows, np.arange(0, 5000, 100))
+    parts = DataSplit(rows, rows, rows, np.arange(0, 5000, 100))
 
     def slow() -> np.ndarray:
         return np.repeat(rng.normal(size=(50, 1)), 100, axis=0)
@@ -45,7 +53,7 @@ def test_what_shakes_all_joints_alike_counts_once() -> None:
     called = 0
     for _ in range(400):
         before = slow() + rng.normal(size=(5000, 6))
-        called += parts.compare(before, before - 0.05 * slow(), rows).p < LEVEL
+        called += parts.compare(before, before - 0.05 * slow(), rows).p < SIGNIFICANCE_LEVEL
     assert called <= 12
 
 
@@ -71,8 +79,8 @@ def test_noise_is_white_and_normal_and_what_is_not_is_told_of_its_joint() -> Non
     noise[:, 1] += 0.3 * np.sin(np.arange(3000) / 20.0)
     noise[::150, 2] += 4.0
     rows, start = np.ones(noise.shape, dtype=bool), np.arange(3000) == 0
-    assert (whiteness(noise, rows, start) < WHITE_LEVEL).tolist() == [False, True, False]
-    assert (normality(noise, rows) < WHITE_LEVEL).tolist() == [False, False, True]
+    assert (whiteness(noise, rows, start) < WHITENESS_LEVEL).tolist() == [False, True, False]
+    assert (normality(noise, rows) < WHITENESS_LEVEL).tolist() == [False, False, True]
 
 
 def test_the_noise_of_a_torque_shows_without_a_model() -> None:

@@ -6,9 +6,9 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import ActuatorModel
-from quadvel_sysid.delays import in_steps, latest, running_delays
+from quadvel_sysid.delays import longest_equivalent_delay, quantised_delays, running_delays
 from quadvel_sysid.eam import fit_eam
-from quadvel_sysid.fit import fit, profiled, squared_error
+from quadvel_sysid.fit import fit, fit_delay_profile, squared_error
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.model import Model
@@ -32,13 +32,13 @@ def _fitted(log, input_delay, output_delay):
 def test_a_log_that_tells_little_is_read_as_a_drive_that_works_in_whole_steps():
     fitted, rows = _fitted(_log(2.0), 0.007, 0.001)
     assert abs(fitted.delays[1, 0] - 0.001) > 1e-5
-    told = in_steps(fitted, rows)
+    told = quantised_delays(fitted, rows)
     np.testing.assert_allclose(told.delays[:, 0], [0.007, 0.001], atol=1e-9)
 
 
 def test_delays_that_a_log_tells_clearly_stay_between_the_steps():
     fitted, rows = _fitted(_log(5.0, input_delay=0.0066, output_delay=0.0024, noise=1e-3), 0.0066, 0.0024)
-    assert in_steps(fitted, rows) is fitted
+    assert quantised_delays(fitted, rows) is fitted
 
 
 @pytest.mark.parametrize("heldout", [False, True])
@@ -46,7 +46,7 @@ def test_values_come_from_every_row_but_those_of_a_log_that_is_held_out(heldout)
     log = _log(3.0, seed=4)
     found = identify([log], [_log(3.0, seed=5)] if heldout else []).report["before"]
     whole, _ = _fitted(log, 0.007, 0.001)
-    told = in_steps(whole, whole.samples.judged)
+    told = quantised_delays(whole, whole.samples.judged)
     assert found["delta_kp"] == pytest.approx((told.gains[0, 0] - 1.0) * 30.0, abs=0.002)
 
 
@@ -125,7 +125,7 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     delays = np.stack([eam.input_delay, eam.output_delay])
     model = Model(samples, eam.window, eam.gains, ONE, delays, ONE)
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
-    assert latest(model, samples.judged).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
+    assert longest_equivalent_delay(model, samples.judged).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
 
 
 def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found():
@@ -134,6 +134,6 @@ def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found()
     samples = Samples([log])
     off = np.repeat([[0.0095], [0.0005]], 2, axis=1)
     stuck = fit(Model(samples, 0.0, np.ones((2, 2)), ONE, off, ONE), samples.judged)
-    found = profiled(stuck, samples.judged)
+    found = fit_delay_profile(stuck, samples.judged)
     assert squared_error(found, samples.judged) < 1.05 * 0.04 * samples.judged.sum()
     np.testing.assert_allclose(found.delays.sum(axis=0), 0.008, atol=5e-4)

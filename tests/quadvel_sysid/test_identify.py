@@ -9,10 +9,10 @@ from simulated_joints import NAMES, TABLE_4, parameters, record
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_sysid.eam import fit_eam
+from quadvel_sysid.identification_data import prepare
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.dataset import Dataset
 from quadvel_sysid.logs.excerpts import pieces
-from quadvel_sysid.material import gathered
 from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -91,7 +91,7 @@ def test_pieces_of_a_long_log_at_a_low_rate_hold_enough_rows():
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    material = gathered(Dataset.of([log]), values=3000)
+    material = prepare(Dataset.of([log]), values=3000)
     del log
     assert sum(len(log.t) for log in material.logs) == 1500
     assert [array() for array in alive] == [None] * len(alive)

@@ -11,7 +11,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.excerpts import evened, jitters
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.model import Applied, Model
+from quadvel_sysid.model import AppliedEffect, Model
 from quadvel_sysid.signals import Samples
 
 
@@ -40,7 +40,7 @@ def test_a_slew_limit_is_followed_between_the_rows():
     law = registry()["slew_limit"]()
     one = np.zeros(1, dtype=np.intp)
     gains = np.array([[30.0], [0.0]])
-    limit = Applied(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
+    limit = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[rate]]), one)
     model = Model(Samples([log]), 0.0, gains, one, np.zeros((2, 1)), one, (limit,))
     limited = np.abs(asked - tau) > 0.05
     assert limited.mean() > 0.2
@@ -49,7 +49,7 @@ def test_a_slew_limit_is_followed_between_the_rows():
 
 def _of_one_joint(log, law, value, input_delay=0.0):
     one = np.zeros(1, dtype=np.intp)
-    applied = Applied(law, np.ones(1, dtype=bool), np.array([[value]]), one)
+    applied = AppliedEffect(law, np.ones(1, dtype=bool), np.array([[value]]), one)
     gains = np.array([[30.0], [1.0]])
     delays = np.array([[input_delay], [0.0]])
     return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))

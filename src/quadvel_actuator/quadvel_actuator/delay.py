@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-LONGEST = 0.05  # s
+MAX_DELAY_S = 0.05  # s
 
 _ROUND_OFF = 1e-9  # steps; a delay that is a multiple of the step but for rounding is one
 
@@ -24,7 +24,7 @@ class DelayLine:
     """
 
     def __init__(self, shape: tuple[int, ...], dt: float):
-        self.length = int(np.ceil(LONGEST / dt)) + 2
+        self.length = int(np.ceil(MAX_DELAY_S / dt)) + 2
         self._dt = dt
         self._ring = np.zeros((self.length, *shape))
         self._rows = self._ring.reshape(-1, shape[-1])
@@ -41,8 +41,8 @@ class DelayLine:
     def delay(self, seconds: ArrayLike) -> None:
         lead = self._ring.shape[1:-1]
         delay = np.broadcast_to(np.asarray(seconds, dtype=float), (*lead, 1)).copy()
-        if not np.all((delay >= 0.0) & (delay <= LONGEST)):
-            raise ValueError(f"delay: found {delay.min()} to {delay.max()} s, expected 0 to {LONGEST} s")
+        if not np.all((delay >= 0.0) & (delay <= MAX_DELAY_S)):
+            raise ValueError(f"delay: found {delay.min()} to {delay.max()} s, expected 0 to {MAX_DELAY_S} s")
         steps = delay / self._dt
         whole = np.floor(steps + _ROUND_OFF)
         fraction = np.maximum(steps - whole, 0.0)

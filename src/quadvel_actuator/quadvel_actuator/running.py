@@ -110,7 +110,7 @@ class _Running:
             share = rng.random((*drawn[:-1], drawn[-1] if low.ndim else 1))
             values[ids] = np.where(self.active, low + share * (high - low), values[ids])
             self.values[name] = values
-        self.values = self.law.tidy(self.values)
+        self.values = self.law.canonical(self.values)
 
     def act(self, x: Any, now: Instant, new: NDArray[np.bool_] | None) -> Any:
         """The value instead of `x`; environments that are `new` start from rest."""

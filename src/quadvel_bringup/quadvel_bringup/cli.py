@@ -75,7 +75,7 @@ ELSEWHERE = {
         "Find what the encoders and the IMU of a robot show at zero.",
     ),
     "twin": Elsewhere(
-        "quadvel_bringup.twin:twin_command",
+        "quadvel_bringup.ground_truth_benchmark:twin_command",
         "Close the loop on the stack itself: plants that its model does not know, identified from their walks.",
     ),
     "eval": Elsewhere(
@@ -314,7 +314,7 @@ def mode(
       quadvel mode passive
       quadvel mode stand_up
     """
-    raise typer.Exit(_with_middleware("orders").mode(wanted))
+    raise typer.Exit(_with_middleware("operator_commands").mode(wanted))
 
 
 @app.command()
@@ -322,7 +322,7 @@ def enable(
     on: Annotated[bool, typer.Option("--on/--off", help="Allow walking, or forbid it.")] = True,
 ) -> None:
     """Allow a robot that asks for it to walk; a simulated one needs no permission."""
-    raise typer.Exit(_with_middleware("orders").enable(on))
+    raise typer.Exit(_with_middleware("operator_commands").enable(on))
 
 
 @app.command()
@@ -349,7 +349,7 @@ def reset(
     On a slope of 10 degrees that rises ahead:
       quadvel reset --terrain slope --slope 0.175
     """
-    raise typer.Exit(_with_middleware("orders").reset(keyframe, terrain or "", slope))
+    raise typer.Exit(_with_middleware("operator_commands").reset(keyframe, terrain or "", slope))
 
 
 @app.command()
@@ -357,13 +357,13 @@ def pause(
     on: Annotated[bool, typer.Option("--on/--off", help="Stand still, or go on.")] = True,
 ) -> None:
     """Let simulated time stand still, or go on with --off."""
-    raise typer.Exit(_with_middleware("orders").pause(on))
+    raise typer.Exit(_with_middleware("operator_commands").pause(on))
 
 
 @app.command()
 def step(milliseconds: Annotated[int, typer.Argument(min=1)] = 5) -> None:
     """Let a paused simulation run on for some milliseconds."""
-    raise typer.Exit(_with_middleware("orders").step(milliseconds))
+    raise typer.Exit(_with_middleware("operator_commands").step(milliseconds))
 
 
 @app.command()
@@ -380,7 +380,7 @@ def push(
     For example:
       quadvel push --fy 60
     """
-    raise typer.Exit(_with_middleware("orders").push((fx, fy, fz), seconds, body))
+    raise typer.Exit(_with_middleware("operator_commands").push((fx, fy, fz), seconds, body))
 
 
 @app.command()

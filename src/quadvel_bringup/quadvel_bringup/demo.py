@@ -25,7 +25,7 @@ from quadvel_sim.world import SHIPPED
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
 from .follow_demo import follow
-from .rehearsal import rehearse
+from .preflight import rehearse
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_msgs.msg import ControllerState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 
-from .orders import CONTROLLER, LONGEST, WAY_OUT
+from .operator_commands import CONTROLLER, LONGEST, WAY_OUT
 from .processes import StopSignals
 from .session import PATIENCE, Session
 

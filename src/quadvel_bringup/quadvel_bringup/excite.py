@@ -26,11 +26,11 @@ from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
 
-from .alone import ensure_alone
+from .exclusivity import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import Parameters, arguments, command, enclave
+from .preflight import rehearse_node
 from .processes import ProcessGroup, StopSignals
-from .rehearsal import rehearse_node
 from .stack import PARAMETERS
 
 RAMP = 1.5  # s, from where the robot is to where the motion begins

@@ -17,8 +17,8 @@ from quadvel_eval.output import replacing
 from quadvel_sim.world import World
 
 from .nodes import arguments, command
+from .preflight import rehearse
 from .recorded_run import RecordedRun
-from .rehearsal import rehearse
 from .stack import Stack
 
 FOLLOWED = {

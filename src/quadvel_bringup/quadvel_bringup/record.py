@@ -14,7 +14,7 @@ from rich.console import Console
 import quadvel_dds
 from quadvel_eval.output import output_file, output_folder
 
-from .alone import ros_domain
+from .exclusivity import ros_domain
 from .processes import StopSignals
 
 LOOK = 0.5  # s, between two looks for new topics

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
 
-from .alone import ensure_alone
+from .exclusivity import ensure_alone
 from .node_output import PrefixedOutput
 from .nodes import enclave
 from .page_watch import PageWatch

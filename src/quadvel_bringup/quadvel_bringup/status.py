@@ -19,10 +19,10 @@ from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
 
-from .alone import ros_domain
 from .doctor import FILES
 from .drive import planar, velocity_text
-from .orders import WAY_OUT
+from .exclusivity import ros_domain
+from .operator_commands import WAY_OUT
 from .session import PATIENCE, Session
 from .whereabouts import whereabouts
 

@@ -29,7 +29,7 @@ from quadvel_view.keyboard import Keyboard, strokes
 from quadvel_view.operator import PERIOD, Operator
 
 from .drive import planar, velocity_text
-from .orders import CONTROLLER
+from .operator_commands import CONTROLLER
 from .processes import StopSignals
 from .session import PATIENCE, Session
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from rich.console import Console
 
-from .alone import look_for_others
+from .exclusivity import look_for_others
 from .node_output import PrefixedOutput
 from .nodes import command
 from .page_watch import PageWatch
+from .preflight import rehearse
 from .processes import ProcessGroup, StopSignals
-from .rehearsal import rehearse
 from .stack import VIEW, Stack
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import quadvel_dds
 
-from .alone import robots, ros_domain
+from .exclusivity import robots, ros_domain
 
 PORTS = range(7400, 32651)
 """UDP ports of the ROS domains 0 to 101, by the RTPS standard; above them the system hands out ports of its own"""

@@ -83,7 +83,7 @@ class Calibration:
         share = 0.5 * np.sinc(0.5 * angle / np.pi)
         return np.array([np.cos(0.5 * angle), *(share * self.imu_mounting), 0.0])
 
-    def true(self, reported: RobotState) -> RobotState:
+    def apply(self, reported: RobotState) -> RobotState:
         """The state that a robot is in which reports this one."""
         turn = self.mounting
         return attrs.evolve(
@@ -105,7 +105,7 @@ class Calibration:
             linear_acceleration=rotate_inverse(turn, true.linear_acceleration),
         )
 
-    def sent(self, wanted: JointCommand) -> JointCommand:
+    def invert(self, wanted: JointCommand) -> JointCommand:
         """What the drives have to be told so that they do what is wanted."""
         return attrs.evolve(wanted, q=wanted.q + self.joint_zeros)
 

@@ -28,12 +28,12 @@ from quadvel_nodes.node import end, read_parameters, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
+from .decimator import Decimator
 from .dry_run import DryRun
 from .health import DROPPED_OUT, Health, Level, figures
 from .link import SILENCE, UdpLink
 from .parameters import DriverParameters
 from .remote import Order, RemotePilot
-from .thinning import Thinning
 from .wire import BoardState
 
 OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_teleop
@@ -59,8 +59,8 @@ class Driver(Node):
         self._newest: BoardState | None = None
         self._refusals = Refusals()
         self._system_time = SystemTime()
-        self._thinning, self._view_thinning = Thinning(settings.state_rate), Thinning(VIEW_RATE)
-        self._motor_thinning = Thinning(MOTOR_RATE)
+        self._thinning, self._view_thinning = Decimator(settings.state_rate), Decimator(VIEW_RATE)
+        self._motor_thinning = Decimator(MOTOR_RATE)
         self._operator_ticks = 0
         self._reports = 0
         self._passive_wanted = False

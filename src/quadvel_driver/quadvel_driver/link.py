@@ -233,7 +233,7 @@ class UdpLink:
         instant = self._board_clock.follow(state.robot.tick, self._clock())
         if instant is None:
             return None
-        state.robot = attrs.evolve(self._calibration.true(state.robot), time=instant.time, tick=instant.tick)
+        state.robot = attrs.evolve(self._calibration.apply(state.robot), time=instant.time, tick=instant.tick)
         return state
 
     def _count(self, name: str) -> None:
@@ -241,7 +241,7 @@ class UdpLink:
             self._counts[name] += 1
 
     def _packed(self, command: JointCommand) -> bytes:
-        return wire.encode_command(self._calibration.sent(for_the_board(command)))
+        return wire.encode_command(self._calibration.invert(for_the_board(command)))
 
     # Sending; with the lock held.
 

@@ -28,9 +28,9 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
-from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_nodes.stall_free_clock import StallFreeClock
 
 from . import features
 from .kalman import KalmanEstimator
@@ -83,7 +83,7 @@ class EstimatorNode(Node):
         super().__init__("estimator")
         self._settings = read_parameters(self, EstimatorParameters)
         self._tracker = VelocityTracker(self._settings.make_estimator(), self._settings.reset_gap)
-        self._robot_time = RobotTime()
+        self._robot_time = StallFreeClock()
         self._refusals = Refusals()
         self._reported = _Report()
         self._count = 0

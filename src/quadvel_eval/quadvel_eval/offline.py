@@ -23,7 +23,7 @@ from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_estimator.tracker import Estimator, VelocityTracker
 from quadvel_nodes.messages import MessageError, read_low_state
 from quadvel_nodes.number_text import number_text
-from quadvel_nodes.robot_time import RobotTime
+from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_recordings.reading import RecordingError, read_messages
 
 from .demo_figures import AXES
@@ -78,7 +78,7 @@ def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple
 
     States that it can't use are left out; with `received` the times of receipt count. Raises RecordingError where none can be used.
     """
-    tracker, clock = VelocityTracker(estimator), RobotTime()
+    tracker, clock = VelocityTracker(estimator), StallFreeClock()
     times, found = [], []
     topics = ("/low_state", "/low_cmd")
     for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):

@@ -52,7 +52,7 @@ class Situation:
         return self.rest == 0.0
 
 
-def led_ahead(person: Array) -> Array:
+def predict_target(person: Array) -> Array:
     """Where the person (4,) who is followed will be at `TIMES`, (STEPS, 2)."""
     walked = FADES * (1.0 - np.exp(-TIMES / FADES))
     return person[:2] + walked[:, None] * person[2:]
@@ -107,7 +107,7 @@ class FollowCost:
         return situation.goal + self._beside(situation) if situation.direct else situation.goal
 
     def _following(self, situation: Situation, rollouts: Rollouts) -> Array:
-        far, turn = self.errors(situation, rollouts.poses, led_ahead(situation.person))
+        far, turn = self.errors(situation, rollouts.poses, predict_target(situation.person))
         return (10.0 * (np.sqrt(far**2 + SOFT**2) - SOFT) + 6.0 * (1.0 - np.cos(turn))).mean(1)
 
     def _obstacles(self, clearance: Array, speed: Array) -> Array:
@@ -122,7 +122,7 @@ class FollowCost:
         """Between the outline at poses (K, STEPS, 3) and everybody, who is followed first, (persons, K, STEPS) in m."""
         half = (0.5 * self.length, 0.5 * self.width)
         others = situation.others[:, None, :2] + TIMES[:, None] * situation.others[:, None, 2:]
-        every = [led_ahead(situation.person), *others]
+        every = [predict_target(situation.person), *others]
         return np.array([outline_distance(place, poses, half) - BODY for place in every])
 
     def _persons(self, situation: Situation, rollouts: Rollouts, speed: Array) -> Array:

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from .clearance import Clearance
 from .clusters import Scan
 from .dynamic_window import DynamicWindow
-from .follow_costs import BODY, FollowCost, Situation, led_ahead
+from .follow_costs import BODY, FollowCost, Situation, predict_target
 from .obstacle_memory import ObstacleMemory
 from .pose_history import PoseHistory
 from .pursuit import pursue
@@ -42,7 +42,7 @@ REACTS, BRAKES = (
     0.4,
     1.8,
 )  # s, m/s^2, until it brakes for a person who stops, the tracker's delay included, and how
-AT_EASE = (0.25, 0.5)  # m, rad, errors of a standing robot that it leaves alone
+STAND_TOLERANCE = (0.25, 0.5)  # m, rad, errors of a standing robot that it leaves alone
 ARRIVED = (0.12, 0.2)  # m, rad, those of a walking robot that may stand
 CROWDED = 0.4  # of the distance, by which the robot may stand too near
 STANDS = 0.25  # m/s, below which a person stands
@@ -400,12 +400,12 @@ class FollowPlanner:
         """Whether the robot is where it should be, or nearer, with a person who stands."""
         if np.hypot(*situation.person[2:]) > STANDS or not situation.direct:
             return False
-        far, off = ARRIVED if self._command.any() else AT_EASE
+        far, off = ARRIVED if self._command.any() else STAND_TOLERANCE
         return (abs(error) < far or -CROWDED * self.config.distance < error < 0.0) and abs(turn) < off
 
     def _guesses(self, situation: Situation) -> Array:
         """Towards the goal, as if nothing stood about, (n, STEPS, 3)."""
-        person, pose = led_ahead(situation.person), situation.pose
+        person, pose = predict_target(situation.person), situation.pose
         start = np.broadcast_to(pose, (1, STEPS, 3))
         far = self._cost.errors(situation, start, person)[0][0]
         goal = self._cost.place(situation)

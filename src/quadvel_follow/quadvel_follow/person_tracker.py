@@ -24,7 +24,7 @@ from .scan_motion import ScanOdometry
 Array = NDArray[np.float64]
 
 GATE = 13.8  # squared Mahalanobis distance in the plane that one leg in 1000 exceeds
-NOBODYS = 9.0  # cost at which a leg rather belongs to none
+UNASSIGNED_COST = 9.0  # cost at which a leg rather belongs to none
 PERSONS = 3.0  # by which it costs less that a leg is a person's than that it is something else's
 UNLIKE_IT = 4.0  # cost of a leg that was there before, for one who walks; of one that came, for what stands
 UNSURE = 0.02  # by which a probability may be wrong
@@ -295,7 +295,7 @@ class PersonTracker:
         stands = ~confirmed & np.array([h.taken > h.empty + STANDING for h in self._hypotheses])
         unlike = np.log((1.0 - legs.probability + UNSURE) / (legs.probability + UNSURE))
         rested, came = (legs.taken > 0.0) & (legs.empty == 0.0), legs.empty > legs.taken
-        cost: Array = np.where(confirmed[:, None], unlike - PERSONS, 0.0) - NOBODYS
+        cost: Array = np.where(confirmed[:, None], unlike - PERSONS, 0.0) - UNASSIGNED_COST
         return cost + UNLIKE_IT * (walks[:, None] & rested) + UNLIKE_IT * (stands[:, None] & came)
 
     def _correct(self, time: float, dt: float, theirs: list[list[int]], legs: _Legs) -> None:

@@ -48,9 +48,9 @@ class BackupVelocity:
                 attrs.evolve(state, linear_acceleration=at_rest), np.zeros(12)
             )
         except (ValueError, FloatingPointError, np.linalg.LinAlgError):
-            self.forget()
+            self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Start anew."""
         if self._filter is not None:
             self._filter.reset()

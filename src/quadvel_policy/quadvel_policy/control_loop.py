@@ -22,16 +22,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_nodes.messages import MessageError
-from quadvel_nodes.robot_time import RobotTime
 from quadvel_nodes.scheduling import Scheduling
+from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_nodes.tick_grid import TickGrid
 
 from .guard import FALL_TIME
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
-from .pauses import Pauses
 from .received import StampCheck
 from .settings import setting
+from .stall_detector import StallDetector
 from .supervisor import Supervisor, SupervisorConfig
 
 Array = NDArray[np.float64]
@@ -109,7 +109,7 @@ class ControlLoop:
     ) -> None:
         self.supervisor = supervisor
         self.stats = LoopStats()
-        self.pauses = Pauses(WATCH_PERIOD, PERIOD)
+        self.pauses = StallDetector(WATCH_PERIOD, PERIOD)
         self.state: RobotState | None = None
         self._config, self._publish, self._sim_time = config, answer, sim_time
         self._clock, self._steady = clock, steady or clock
@@ -117,7 +117,7 @@ class ControlLoop:
         self._patience = (
             math.inf if config.robot_waits else 0.0
         )  # s by which a velocity may be late as nobody ran
-        self._robot_time, self._grid = RobotTime(), TickGrid(PERIOD)
+        self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD)
         self._waiting: RobotState | None = None  # for the estimator or the mux
         patience = LOCKSTEP_PATIENCE if sim_time else LONGEST
         self._estimator = _Companion(1.5 * PERIOD, patience)
@@ -141,7 +141,7 @@ class ControlLoop:
         """A state whose `time` is its stamp. Raises MessageError where that is not fit."""
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
-        self.pauses.look(now)
+        self.pauses.poll(now)
         longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_silence)
         state.time = self._robot_time.follow(state.time, state.tick, longest)
         self.supervisor.stopped += self.pauses.lost
@@ -186,7 +186,7 @@ class ControlLoop:
     def watch(self) -> None:
         """Every WATCH_PERIOD: let the supervisor learn when states stop, or when none is fit to use any more."""
         now = self._now()
-        self.pauses.look(now)
+        self.pauses.poll(now)
         if self.state is None:
             return
         refused = "low_state" in self.supervisor.refused

@@ -27,9 +27,9 @@ from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_sta
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
 
-from .announcements import Announcements
 from .control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
 from .guard import MotorStatus as Motors
+from .operator_log import OperatorLog
 from .policy_file import SHIPPED_POLICY, PolicyFile
 from .received import linear_velocity, planar_velocity
 from .settings import setting
@@ -68,7 +68,7 @@ class Controller(Node):
         )
         self._refusals, self._message = Refusals(), LowCmd()
         self._refused_before = self._overruns_before = self._pauses_before = 0
-        self._announcements = Announcements(self._supervisor)
+        self._announcements = OperatorLog(self._supervisor)
         self._reports = self._silent_reports = 0  # the latter since the last message on low_state
         self._create_interfaces()
         if not self._sim_time:  # where time waits for the node there is no hurry

@@ -118,7 +118,7 @@ class MotorStatus:
 
 
 @attrs.define
-class Sight:
+class GuardInput:
     """What a guard sees at one tick."""
 
     config: GuardConfig
@@ -171,7 +171,7 @@ class Guard:
     at_once = True
     modes: tuple[str, ...] = MOVING
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         """What is wrong, in one sentence, or None."""
         raise NotImplementedError
 
@@ -191,7 +191,7 @@ class Finding:
     sentence: str
 
 
-class Watch:
+class GuardSet:
     """Guards over one robot."""
 
     def __init__(self, guards: Iterable[type[Guard]]) -> None:
@@ -200,19 +200,19 @@ class Watch:
         self._later = [guard for guard in made if not guard.at_once]
         self._found_later: list[Finding] = []
 
-    def look(self, see: Sight) -> list[Finding]:
+    def check(self, see: GuardInput) -> list[Finding]:
         """What is wrong now, and what `look_again` found at the tick before, whatever the mode."""
         return _findings(self._at_once, see) + self._found_later
 
-    def look_again(self, see: Sight) -> None:
+    def check_deferred(self, see: GuardInput) -> None:
         """After the answer: let those look at the same tick that take their time."""
         self._found_later = _findings(self._later, see)
 
 
-def _findings(guards: Iterable[Guard], see: Sight) -> list[Finding]:
+def _findings(guards: Iterable[Guard], see: GuardInput) -> list[Finding]:
     found = []
     for guard in guards:
-        sentence = guard.look(see)
+        sentence = guard.check(see)
         if sentence:
             found.append(Finding(guard.name(), guard.level, guard.modes, sentence))
     return found

@@ -16,7 +16,7 @@ from quadvel_description.robot import GRAVITY, JOINT_NAMES, LEGS, LOWER, TORQUE_
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 from quadvel_nodes.messages import QUATERNION_TOLERANCE, BackInTimeError, NotFiniteError, NotUnitError
 
-from .guard import MOVING, WALK, Array, Guard, Level, Sight
+from .guard import MOVING, WALK, Array, Guard, GuardInput, Level
 
 ENCODER_MEMORY = 0.1  # s, over which angles and speeds of the joints have to agree
 GYRO_MEMORY = 0.2  # s, over which orientation and angular velocity have to agree
@@ -26,17 +26,17 @@ STANDSTILL = 0.05  # rad, which a joint that is stuck does not leave
 NOTABLE = 0.02  # rad, by which other joints moved where a sensor that stood still meanwhile is suspect
 
 
-class Obstacle(Guard):
+class DuplicatePublisher(Guard):
     """More than one simulator or driver reports states."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         return see.obstacle
 
 
 class StateNotFinite(Guard):
     """A number of the state is not finite."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if isinstance(refusal := see.refused.get("low_state"), NotFiniteError):
             return f"low_state is refused: {refusal}"
         if see.is_sound:
@@ -50,7 +50,7 @@ class StateNotFinite(Guard):
 class AttitudeNotUnit(Guard):
     """The orientation's quaternion is not of length 1, within 5 %."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if isinstance(refusal := see.refused.get("low_state"), NotUnitError):
             return f"low_state is refused: {refusal}"
         length = math.hypot(*see.state.quaternion.tolist())
@@ -64,7 +64,7 @@ class AttitudeNotUnit(Guard):
 class StateBackInTime(Guard):
     """The time of the states went back."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if isinstance(refusal := see.refused.get("low_state"), BackInTimeError):
             return f"low_state is refused: {refusal}"
         return f"the state's time went back by {-1e3 * see.gap:.0f} ms" if see.gap < 0.0 else None
@@ -73,7 +73,7 @@ class StateBackInTime(Guard):
 class ControllerStopped(Guard):
     """The controller itself did not run for longer than `max_state_age`, and the robot went on without it."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         limit = see.config.max_state_age
         if min(see.stopped, see.gap) <= limit:
             return None
@@ -85,7 +85,7 @@ class StateStale(Guard):
     """The state is older than `max_state_age`, or none fit to use came for so long; `max_standstill` where the process of a
     simulated robot is silent, whose time stands still then."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if refusal := see.refused.get("low_state"):
             return f"low_state is refused: {refusal}"
         limit = see.config.max_silence
@@ -102,7 +102,7 @@ class StateFrozen(Guard):
     def __init__(self) -> None:
         self._time = 0.0
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         repeats = see.before is not None and see.state.tick == see.before.tick and see.gap > 0.0
         self._time = self._time + see.gap if repeats else 0.0
         if self._time < see.config.frozen_tick_time:
@@ -113,7 +113,7 @@ class StateFrozen(Guard):
 class Tilted(Guard):
     """The trunk is tilted by more than `max_tilt`: the robot has fallen or is about to."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         _, x, y, _ = see.state.quaternion.tolist()
         tilt = math.acos(max(-1.0, min(1.0 - 2.0 * (x * x + y * y), 1.0)))
         limit = see.config.max_tilt
@@ -123,7 +123,7 @@ class Tilted(Guard):
 class JointOutOfRange(Guard):
     """A joint is beyond its mechanical range by more than `joint_margin`."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.is_sound:
             return None
         q = see.state.q
@@ -135,7 +135,7 @@ class JointOutOfRange(Guard):
 class JointTooFast(Guard):
     """A joint moves faster than `max_joint_speed` of what its drive can do."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.is_sound:
             return None
         limit = see.config.max_joint_speed * VELOCITY_LIMIT
@@ -153,7 +153,7 @@ class EncoderInconsistent(Guard):
     def __init__(self) -> None:
         self._error = np.zeros(12)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.mode not in MOVING or see.before is None or see.gap <= 0.0 or not see.is_sound:
             self._error[:] = 0.0
             return None
@@ -182,7 +182,7 @@ class EncoderFrozen(Guard):
     def __init__(self) -> None:
         self._time, self._asked, self._others = np.zeros(12), np.zeros(12), np.zeros(12)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.before is None or see.asked.mode == MODE_DAMPING:
             self._time[:] = 0.0
             return None
@@ -206,7 +206,7 @@ class ImuInconsistent(Guard):
     def __init__(self) -> None:
         self._error = np.zeros(3)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.mode not in MOVING or see.before is None or not 0.0 < see.gap <= 0.01 or not see.is_sound:
             self._error[:] = 0.0
             return None
@@ -229,7 +229,7 @@ class ImuFrozen(Guard):
     def __init__(self) -> None:
         self._time = self._way = 0.0
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.before is None:
             return None
         gyro = see.state.angular_velocity
@@ -255,7 +255,7 @@ class AccelerometerImplausible(Guard):
     def __init__(self) -> None:
         self._mean = np.zeros(3)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if not np.isfinite(see.state.linear_acceleration).all():
             return "the state's linear_acceleration is not finite"
         if not see.state.linear_acceleration.any():
@@ -278,7 +278,7 @@ class DriveDoesNotAnswer(Guard):
     def __init__(self) -> None:
         self._asked, self._told = np.zeros(12), np.zeros(12)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.mode not in MOVING or not see.state.tau.any():
             self._asked[:] = self._told[:] = 0.0
             return None
@@ -302,7 +302,7 @@ class JointStuck(Guard):
     def __init__(self) -> None:
         self._time, self._place = np.zeros(12), np.zeros(12)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         q = see.state.q
         pushes = np.abs(see.state.tau) > see.config.stuck_torque * TORQUE_LIMIT
         stays = pushes & (np.abs(q - self._place) < STANDSTILL)
@@ -316,7 +316,7 @@ class JointStuck(Guard):
 class MotorDroppedOut(Guard):
     """The board has switched off a motor."""
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.motors is None or not see.motors.dropped_out.any():
             return None
         return f"{JOINT_NAMES[int(np.argmax(see.motors.dropped_out))]} was switched off by the board"
@@ -327,7 +327,7 @@ class MotorHot(Guard):
 
     level = Level.STANCE
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.motors is None:
             return None
         i, limit = int(np.argmax(see.motors.temperature)), see.config.max_temperature
@@ -346,7 +346,7 @@ class FootForceFrozen(Guard):
     def __init__(self) -> None:
         self._time = np.zeros(4)
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.before is None or not see.moves or see.mode != "walk":
             self._time[:] = 0.0
             return None
@@ -362,7 +362,7 @@ class Overruns(Guard):
 
     level = Level.STANCE
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.overruns <= see.config.max_overruns:
             return None
         return f"{see.overruns} deadlines were missed in a row, limit {see.config.max_overruns}"
@@ -374,7 +374,7 @@ class EstimateStale(Guard):
     level = Level.LIMIT
     modes = WALK
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         return _lost(see)
 
 
@@ -389,7 +389,7 @@ class EstimateWrong(Guard):
         self._right = 0.0
         self._found: str | None = None
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         if see.velocity is None or see.backup is None:
             return self._found
         c, error = see.config, math.dist(see.velocity.tolist(), see.backup.tolist())
@@ -409,13 +409,13 @@ class NoVelocity(Guard):
     level = Level.STANCE
     modes = WALK
 
-    def look(self, see: Sight) -> str | None:
+    def check(self, see: GuardInput) -> str | None:
         lost = _lost(see)
         return f"{lost}, nor has the Kalman filter one" if lost and see.backup is None else None
 
 
 GUARDS: tuple[type[Guard], ...] = (
-    Obstacle,
+    DuplicatePublisher,
     StateNotFinite,
     AttitudeNotUnit,
     StateBackInTime,
@@ -450,7 +450,7 @@ def torque_of(command: JointCommand, state: RobotState) -> Array:
     return torque
 
 
-def _lost(see: Sight) -> str | None:
+def _lost(see: GuardInput) -> str | None:
     """Why the velocity estimate cannot be followed, a sentence, or None."""
     if see.velocity is None:
         refusal = see.refused.get("velocity_estimate")

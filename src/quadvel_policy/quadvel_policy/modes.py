@@ -170,9 +170,9 @@ class Walk:
         self._kp, self._kd = np.array(meta.kp), np.array(meta.kd)
         self._before = JointCommand.damping()
         self.inference_seconds = float("nan")
-        self.forget()
+        self.reset()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Start the policy over: its memory and the action that it is told it took."""
         self._policy.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
@@ -183,7 +183,7 @@ class Walk:
 
     def enter(self, tick: Tick) -> None:
         """Start the policy over, and remember what to fade from."""
-        self.forget()
+        self.reset()
         self._before = tick.previous
 
     def tick(self, tick: Tick) -> JointCommand:

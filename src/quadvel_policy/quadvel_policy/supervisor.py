@@ -19,24 +19,24 @@ from quadvel_nodes.messages import MessageError, NotFiniteError
 
 from .backup_velocity import BackupVelocity, Estimator
 from .command_limits import CommandLimits, CommandLimitsConfig
-from .guard import FALL_TIME, WALK, Finding, Guard, GuardConfig, Level, MotorStatus, Sight, Watch
-from .guards import GUARDS, AccelerometerImplausible, EstimateStale, EstimateWrong, Obstacle
+from .guard import FALL_TIME, WALK, Finding, Guard, GuardConfig, GuardInput, GuardSet, Level, MotorStatus
+from .guards import GUARDS, AccelerometerImplausible, DuplicatePublisher, EstimateStale, EstimateWrong
 from .modes import Array, Damping, Mode, Policy, Posture, Tick, Walk
 from .settings import setting
 
 MODES = ("passive", "stand_up", "stance", "walk", "lie_down", "fault")
 """In the order of the numbers in quadvel_msgs/ControllerState."""
-LIMP = ("passive", "fault")
-FOLLOWS = {
+DAMPED_MODES = ("passive", "fault")
+ALLOWED_FROM = {
     "stand_up": ("passive", "lie_down"),
     "stance": ("passive", "walk"),
     "walk": ("stance",),
     "lie_down": ("stand_up", "stance", "walk"),
 }
 """From which modes each may be requested; passive always may."""
-FOLLOWING = ("stance", "walk")
+POSTURE_AFTER = ("stance", "walk")
 """In which modes a velocity is followed"""
-STILL = np.array([0.0, 0.0, 0.0, 1.0])
+STANCE_COMMAND = np.array([0.0, 0.0, 0.0, 1.0])
 MEMORY_OF_VELOCITY = 0.2  # s, over which a velocity that nobody knows any more fades while the robot brakes
 STEPPING_SPEED = 0.2
 """m/s, above which a robot that is to stand steps on: feet that stop behind a moving trunk trip it"""
@@ -145,15 +145,17 @@ class Supervisor:
             "walk": self._after_walk,
             "lie_down": self._after_lie_down,
         }
-        self._watch = Watch(guards)
+        self._watch = GuardSet(guards)
         self._backup = BackupVelocity(backup)
-        self._sight: Sight | None = None  # of the last tick, while the rest of it is still to be looked at
+        self._sight: GuardInput | None = (
+            None  # of the last tick, while the rest of it is still to be looked at
+        )
         self._limiter = CommandLimits(c)
         self.limits = self._limiter.counts
         self.mode, self.reason, self.fault = "passive", "waits for an order", ""
         self.findings: list[Finding] = []
         self._found: list[Finding] = []  # in whatever mode
-        self.command = STILL.copy()
+        self.command = STANCE_COMMAND.copy()
         self.inference_seconds = float("nan")
         self.obstacle: str | None = None
         self.overruns = 0
@@ -162,7 +164,7 @@ class Supervisor:
         self.stopped = 0.0
         self._auto_stand = c.auto_stand
         self._enabled = False
-        self._zero_seen = False  # a command to stand still came since a velocity could have been followed
+        self.neutral_seen = False  # a command to stand still came since a velocity could have been followed
         self._held: Finding | None = None  # what made the robot stop and stand
         self._held_since = 0.0  # s, on the clock of the states
         self._velocity = np.zeros(3)  # the last that was known
@@ -175,13 +177,13 @@ class Supervisor:
         """Why a velocity that is commanded now is not followed, a sentence; empty where it is."""
         if self.mode == "fault":
             return "the robot is in fault: request passive, then stand_up"
-        if self.mode not in FOLLOWING:
-            return f"the robot is in mode {self.mode}, expected {' or '.join(FOLLOWING)}"
+        if self.mode not in POSTURE_AFTER:
+            return f"the robot is in mode {self.mode}, expected {' or '.join(POSTURE_AFTER)}"
         if self._held:
             return f"the robot was stopped ({self._held.sentence}): request stance when that is mended"
         if not self._operator_agrees:
             return "walking is not allowed yet: call ~/enable_walking"
-        if not self._zero_seen:
+        if not self.neutral_seen:
             return "a zero velocity has to be commanded first"
         return ""
 
@@ -195,7 +197,7 @@ class Supervisor:
         A velocity that is commanded at that moment does not count: a zero one has to come first.
         """
         if enabled and not self._operator_agrees:
-            self._zero_seen = False
+            self.neutral_seen = False
         self._enabled = enabled
         return True, "a command may start walking" if self._operator_agrees else "the robot stands still"
 
@@ -220,7 +222,7 @@ class Supervisor:
 
     def fail(self, reason: str, fault: str) -> None:
         """Latch damping until "passive" is requested. The first reason stays; a limp robot stays as it is."""
-        if self.mode not in LIMP:
+        if self.mode not in DAMPED_MODES:
             self._switch("fault", reason)
             self.fault = fault
 
@@ -249,7 +251,7 @@ class Supervisor:
             self.command[3] = 0.0
         seen = self._seen(state, velocity)
         if self.config.reset_gap < sight.gap <= self.config.max_silence:
-            self._walk.forget()
+            self._walk.reset()
         if self.mode in self._after and (following := self._after[self.mode](seen)):
             self._switch(*following)
         answer = self._answer(seen)
@@ -267,17 +269,17 @@ class Supervisor:
         """What of the last tick could wait until it was answered: the slower guards, and the backup, which rests with the robot."""
         if self._sight is None:
             return
-        self._watch.look_again(self._sight)
-        if self.mode in LIMP:
-            self._backup.forget()
+        self._watch.check_deferred(self._sight)
+        if self.mode in DAMPED_MODES:
+            self._backup.reset()
         else:
             self._backup.follow(self._sight.state)
         self._sight = None
 
-    def _look(self, now: float, state: RobotState, velocity: Array | None) -> Sight:
+    def _look(self, now: float, state: RobotState, velocity: Array | None) -> GuardInput:
         """Let the guards look at this tick; `findings` are those that matter in this mode."""
         before = self._last.state if self._last else None
-        sight = Sight(
+        sight = GuardInput(
             config=self.config,
             mode=self.mode,
             state=state,
@@ -294,7 +296,7 @@ class Supervisor:
             refused=self.refused,
             stopped=self.stopped,
         )
-        self._found = self._watch.look(sight)
+        self._found = self._watch.check(sight)
         self.findings = [finding for finding in self._found if self.mode in finding.modes]
         return sight
 
@@ -308,10 +310,10 @@ class Supervisor:
             if finding.level is Level.STANCE and self._held is None:
                 self._held, self._held_since = finding, time
                 self.reason, self.fault = finding.sentence, finding.name
-                self._zero_seen = False
-                self.command = STILL.copy()
+                self.neutral_seen = False
+                self.command = STANCE_COMMAND.copy()
 
-    def _velocity_in_effect(self, sight: Sight) -> Array | None:
+    def _velocity_in_effect(self, sight: GuardInput) -> Array | None:
         """The estimate, the backup's where that is missing or wrong, and what is left of the last one for a robot that brakes."""
         distrusted = any(finding.name in SPOIL_THE_ESTIMATE for finding in self._found)
         velocity = sight.backup if distrusted else sight.velocity
@@ -353,34 +355,36 @@ class Supervisor:
         """
         if command is None:
             not_finite = isinstance(self.refused.get("command"), NotFiniteError)
-            return STILL.copy(), "command_not_finite" if not_finite else "command_stale"
+            return STANCE_COMMAND.copy(), "command_not_finite" if not_finite else "command_stale"
         numbers = np.asarray(command, float).tolist()
         if not _finite(numbers):
-            return STILL.copy(), "command_not_finite"
+            return STANCE_COMMAND.copy(), "command_not_finite"
         stands = numbers[3] >= 0.5 or not any(numbers[:3])
-        if stands and self._operator_agrees and not self._held and self.mode in FOLLOWING:
-            self._zero_seen = True
-        if numbers[3] >= 0.5 or not (self._zero_seen and self._operator_agrees):
-            return STILL.copy(), ""
+        if stands and self._operator_agrees and not self._held and self.mode in POSTURE_AFTER:
+            self.neutral_seen = True
+        if numbers[3] >= 0.5 or not (self.neutral_seen and self._operator_agrees):
+            return STANCE_COMMAND.copy(), ""
         held = self._command_limits.held(numbers[:3])
         return np.array([*held, 0.0]), "" if np.array_equal(held, numbers[:3]) else "command_out_of_range"
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
         self._entered = None
-        if mode not in FOLLOWING:
-            self._zero_seen = False
-        if mode in LIMP:
+        if mode not in POSTURE_AFTER:
+            self.neutral_seen = False
+        if mode in DAMPED_MODES:
             self._enabled = False
             self._held, self.fault = None, ""
-            self._walk.forget()
+            self._walk.reset()
 
     def _forbids(self, mode: str) -> str | None:
         """What would end `mode` at once, a sentence: the obstacle that is there now, or what the last tick found."""
         found = (
             finding.sentence
             for finding in self._found
-            if finding.level is Level.DAMPING and mode in finding.modes and finding.name != Obstacle.name()
+            if finding.level is Level.DAMPING
+            and mode in finding.modes
+            and finding.name != DuplicatePublisher.name()
         )
         return self.obstacle or next(found, None)
 
@@ -394,8 +398,8 @@ class Supervisor:
             return f"is in fault ({self.reason}), request passive first"
         if self._last is None:
             return "the robot has not reported yet"
-        if self.mode not in FOLLOWS[mode]:
-            return f"{mode} can't follow {self.mode}, expected {' or '.join(FOLLOWS[mode])}"
+        if self.mode not in ALLOWED_FROM[mode]:
+            return f"{mode} can't follow {self.mode}, expected {' or '.join(ALLOWED_FROM[mode])}"
         return self._forbids(mode) or self._refusal_of_move(mode, self._last)
 
     def _refusal_to_go_on(self) -> str | None:

@@ -27,8 +27,8 @@ from .logs.recordings import Topics
 from .memory import give_large_arrays_back, keep_freed_arrays
 
 if TYPE_CHECKING:
-    from .material import Material
-    from .material import Progress as Tell
+    from .identification_data import IdentificationData
+    from .identification_data import Progress as Tell
 
 SEVERAL = ("--holdout", "--joints")
 CORES = 2
@@ -216,7 +216,7 @@ def _material(
     gains: tuple[float, float] | None,
     messages: Console,
     tell: Tell,
-) -> tuple[Material, bool]:
+) -> tuple[IdentificationData, bool]:
     """What of the files is computed on, and whether they hold long logs, which are let go of here."""
     with threadpool_limits(1):
         fitted, heldout = (
@@ -224,9 +224,11 @@ def _material(
         )
         data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
         long = sum(log.q.size for log in data.logs) >= _LONG
-        from .material import gathered  # what is wrong with the files shows before the engine is loaded
+        from .identification_data import (
+            prepare,
+        )  # what is wrong with the files shows before the engine is loaded
 
-        return gathered(data, progress=tell), long
+        return prepare(data, progress=tell), long
 
 
 def errors(report: Mapping[str, Any]) -> str:

@@ -12,35 +12,35 @@ import attrs
 import numpy as np
 
 from .fit import fit, squared_error
-from .model import LONGEST, Model
+from .model import MAX_DELAYS_S, Model
 from .signals import Array, Bools
 
-CLOCK = 0.001
+DRIVE_STEP_S = 0.001
 """s, a step of a drive's clock, and of the models that run with the parameters"""
-_FINE = 5e-5  # s
-_EQUAL = 1e-9  # of the error
-_CHANCE = 9.21
+_DELAY_STEP_S = 5e-5  # s
+_RELATIVE_TOLERANCE = 1e-9  # of the error
+_CHI2_99 = 9.21
 """Of the mean squared error: by so much 99 % of the logs of one truth have a larger sum of squares at the true pair of delays"""
-_REACHES = (0.25 * CLOCK, 0.125 * CLOCK, 0.0625 * CLOCK)
+_REFINEMENT_STEPS_S = (0.25 * DRIVE_STEP_S, 0.125 * DRIVE_STEP_S, 0.0625 * DRIVE_STEP_S)
 _ROUND_OFF = 1e-6  # of a step
 
 
-def latest(model: Model, rows: Bools) -> Model:
+def longest_equivalent_delay(model: Model, rows: Bools) -> Model:
     """The model with the longest input delays with which it says the same of `rows` (N, J): those of a drive on that grid."""
-    return _walked(model, rows, _FINE)
+    return _move_while_equivalent(model, rows, _DELAY_STEP_S)
 
 
-def plateau(model: Model, rows: Bools) -> float:
+def delay_flatness(model: Model, rows: Bools) -> float:
     """By how much (s) the input delays may be shorter and the model says the same of `rows` (N, J)."""
-    return float((model.delays[0] - _walked(model, rows, -5 * _FINE).delays[0]).max())
+    return float((model.delays[0] - _move_while_equivalent(model, rows, -5 * _DELAY_STEP_S).delays[0]).max())
 
 
-def _walked(model: Model, rows: Bools, by: float) -> Model:
-    found, most = model, squared_error(model, rows) * (1.0 + _EQUAL)
+def _move_while_equivalent(model: Model, rows: Bools, by: float) -> Model:
+    found, most = model, squared_error(model, rows) * (1.0 + _RELATIVE_TOLERANCE)
     step = np.array([[by], [0.0]])
     while True:
         delays = found.delays + step
-        if (delays[0] < 0.0).any() or (delays[0] > LONGEST[0]).any():
+        if (delays[0] < 0.0).any() or (delays[0] > MAX_DELAYS_S[0]).any():
             return found
         moved = model.with_delays(delays)
         if squared_error(moved, rows) > most:
@@ -48,11 +48,11 @@ def _walked(model: Model, rows: Bools, by: float) -> Model:
         found = moved
 
 
-def in_steps(model: Model, rows: Bools) -> Model:
+def quantised_delays(model: Model, rows: Bools) -> Model:
     """The model with delays in whole steps of a drive's clock, where `rows` (N, J) do not tell these from its own."""
-    stepped = fit(model.with_delays(np.round(model.delays / CLOCK) * CLOCK), rows, delays=False)
+    stepped = fit(model.with_delays(np.round(model.delays / DRIVE_STEP_S) * DRIVE_STEP_S), rows, delays=False)
     error = squared_error(model, rows)
-    chance = _CHANCE * error / max(int(rows.sum()), 1)
+    chance = _CHI2_99 * error / max(int(rows.sum()), 1)
     return stepped if squared_error(stepped, rows) < error + chance else model
 
 
@@ -62,15 +62,15 @@ def running_delays(model: Model, rows: Bools) -> tuple[float, float]:
     Such a model gives the mean of a command over each of its steps, and after an output delay that is no whole number of
     steps the mean of two of these: both blur what a command makes jump.
     """
-    if model.window > CLOCK:
+    if model.window > DRIVE_STEP_S:
         return _median(model.delays)
-    alone = attrs.evolve(model, window=CLOCK)
-    whole = np.round(model.delays[1] / CLOCK) * CLOCK
-    tried = [_nearest(alone, late, rows) for late in (model.delays[1], whole)]
+    alone = attrs.evolve(model, window=DRIVE_STEP_S)
+    whole = np.round(model.delays[1] / DRIVE_STEP_S) * DRIVE_STEP_S
+    tried = [_best_input_delay(alone, late, rows) for late in (model.delays[1], whole)]
     return _median(min(tried, key=lambda one: one[0])[1].delays)
 
 
-def _nearest(model: Model, late: Array, rows: Bools) -> tuple[float, Model]:
+def _best_input_delay(model: Model, late: Array, rows: Bools) -> tuple[float, Model]:
     """The least sum of squares with output delays `late` (J,), and the model with the input delays that leave it."""
 
     def moved(by: float) -> Model:
@@ -80,19 +80,19 @@ def _nearest(model: Model, late: Array, rows: Bools) -> tuple[float, Model]:
     def error(by: float) -> float:
         return _running_error(moved(by), rows)
 
-    best = 0.5 * CLOCK
-    for reach in _REACHES:
+    best = 0.5 * DRIVE_STEP_S
+    for reach in _REFINEMENT_STEPS_S:
         best = min((best + k * reach for k in (-2, -1, 0, 1, 2)), key=error)
     return error(best), moved(best)
 
 
 def _running_error(model: Model, rows: Bools) -> float:
     """Sum of squares that the running model leaves."""
-    steps = np.floor(model.delays[1] / CLOCK + _ROUND_OFF)
-    share = np.maximum(model.delays[1] / CLOCK - steps, 0.0)
+    steps = np.floor(model.delays[1] / DRIVE_STEP_S + _ROUND_OFF)
+    share = np.maximum(model.delays[1] / DRIVE_STEP_S - steps, 0.0)
 
     def after(count: Array) -> Array:
-        return model.with_delays(np.stack([model.delays[0], count * CLOCK])).predict()
+        return model.with_delays(np.stack([model.delays[0], count * DRIVE_STEP_S])).predict()
 
     torque = after(steps)
     if (share > _ROUND_OFF).any():

@@ -50,7 +50,7 @@ def pd_torque(
 ) -> Array:
     """Eq. 1 without its noise, (N, J), N m."""
     s = samples.at(input_delay, output_delay, window)
-    torque: Array = gains[0] * s.pull + gains[1] * s.drag + s.tau_ff
+    torque: Array = gains[0] * s.stiffness_torque + gains[1] * s.damping_torque + s.tau_ff
     return torque
 
 

@@ -14,13 +14,13 @@ import numpy as np
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
-from .model import LONGEST, Model, Unknowns, jacobian, pack, with_slots
+from .model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
 from .parallel import side_by_side
 from .signals import Array, Bools
 
-_SETTLED = 2e-5
+_CONVERGED = 2e-5
 """Relative fall of the error below which a fit has converged"""
-_DAMPING = (1e-6, 1e-3, 0.1, 10.0)
+_DAMPING_FACTORS = (1e-6, 1e-3, 0.1, 10.0)
 """Shares of the curvature, tried until the error falls"""
 _PIVOTS = 5, 60
 """Of all bounds at once, and at most; one by one in between, as all at once may go round in circles (Murty)"""
@@ -30,7 +30,7 @@ RIDGE = 1e-4
 
 def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) -> Model:
     """The model with its parameters fitted to `rows` (N, J)."""
-    samples, (model, rows) = model.samples, _alone(model, rows)
+    samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     unknowns = Unknowns.of(model, delays)
     error = squared_error(model, rows)
     for _ in range(iterations):
@@ -38,55 +38,60 @@ def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) ->
         if better is None:
             break
         before, (model, error) = error, better
-        if error > before * (1.0 - _SETTLED):
+        if error > before * (1.0 - _CONVERGED):
             break
-    return attrs.evolve(tidied(model), samples=samples)
+    return attrs.evolve(canonical(model), samples=samples)
 
 
-def _alone(model: Model, rows: Bools) -> tuple[Model, Bools]:
+def _fitted_rows_only(model: Model, rows: Bools) -> tuple[Model, Bools]:
     """The model on `rows` (N, J) alone, and which of these each joint has; on all rows where a law of it remembers some before."""
     some: Bools = np.asarray(rows.any(axis=1))
-    if some.all() or any(one.law.remembers for one in model.applied):
+    if some.all() or any(one.law.has_memory for one in model.effects):
         return model, rows
-    return attrs.evolve(model, samples=model.samples.held(some)), rows[some]
+    return attrs.evolve(model, samples=model.samples.select_rows(some)), rows[some]
 
 
-_SUMS = np.arange(-0.003, 0.0031, 0.0005)
-_OUTPUTS = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
+_TOTAL_DELAY_CHANGES_S = np.arange(-0.003, 0.0031, 0.0005)
+_OUTPUT_DELAY_CHANGES_S = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
 """s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
-_FAR = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
+_FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
 """s: changes of the sum alone, as far as what a model lacked may have led its delays astray"""
-_DEEPEST = 3
+_DELAY_STARTS = 3
 """Points of the grid that a fit starts from"""
-_NEARBY = (-0.002, -0.001, 0.001, 0.002)
+_NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
 """s: a coarser grid of the sum of delays alone"""
 
 
-def profiled(model: Model, rows: Bools, cores: int = 1) -> Model:
+def fit_delay_profile(model: Model, rows: Bools, cores: int = 1) -> Model:
     """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
-    samples, (model, rows) = model.samples, _alone(model, rows)
-    shifts = (*product(_SUMS, _OUTPUTS), *product(_FAR, (0.0,)))
-    starts = [model, *_adapted(model, rows, shifts, cores)[:_DEEPEST]]
+    samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
+    shifts = (
+        *product(_TOTAL_DELAY_CHANGES_S, _OUTPUT_DELAY_CHANGES_S),
+        *product(_FAR_DELAY_CHANGES_S, (0.0,)),
+    )
+    starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[:_DELAY_STARTS]]
     tried = side_by_side(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
     return attrs.evolve(min([model, *tried], key=lambda one: squared_error(one, rows)), samples=samples)
 
 
-def from_nearby_delays(model: Model, rows: Bools) -> Model:
+def fit_near_delays(model: Model, rows: Bools) -> Model:
     """The model, or one that leaves less, fitted from input delays that are a millisecond or two off."""
-    samples, (model, rows) = model.samples, _alone(model, rows)
-    found = _adapted(model, rows, product(_NEARBY, (0.0,)))
+    samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
+    found = _one_step_at_each_delay(model, rows, product(_NEAR_DELAY_CHANGES_S, (0.0,)))
     tried = [model, *(fit(one, rows) for one in found[:1])]
     return attrs.evolve(min(tried, key=lambda one: squared_error(one, rows)), samples=samples)
 
 
-def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], cores: int = 1) -> list[Model]:
+def _one_step_at_each_delay(
+    model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], cores: int = 1
+) -> list[Model]:
     """The model at other delays, everything else adapted by a step, the best one first.
 
     shifts: changes (s) of the sum of both delays and of the output delay.
     """
     unknowns = Unknowns.of(model, delays=False)
     every = [model.delays + np.array([[more - later], [later]]) for more, later in shifts]
-    within = [one for one in every if (one >= -1e-9).all() and (one <= LONGEST[:, None] + 1e-9).all()]
+    within = [one for one in every if (one >= -1e-9).all() and (one <= MAX_DELAYS_S[:, None] + 1e-9).all()]
 
     def adapted(k: int) -> tuple[Model, float]:
         at = model.with_delays(within[k])
@@ -97,9 +102,9 @@ def _adapted(model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], c
     return [one for one, _ in sorted(found, key=lambda one: one[1])]
 
 
-def tidied(model: Model) -> Model:
+def canonical(model: Model) -> Model:
     """With every law's parameters in their unique order."""
-    return attrs.evolve(model, applied=tuple(one.tidied() for one in model.applied))
+    return attrs.evolve(model, effects=tuple(one.canonical() for one in model.effects))
 
 
 def squared_error(model: Model, rows: Bools) -> float:
@@ -113,8 +118,8 @@ def normal_equations(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Arr
     predicted, slopes = jacobian(model, unknowns)
     left = np.where(rows, model.samples.tau - predicted, 0.0)
     slopes *= rows.T[:, None]
-    hessian = unknowns.gathered(slopes @ slopes.transpose(0, 2, 1))
-    gradient = unknowns.gathered(np.einsum("jan,nj->ja", slopes, left))
+    hessian = unknowns.accumulate(slopes @ slopes.transpose(0, 2, 1))
+    gradient = unknowns.accumulate(np.einsum("jan,nj->ja", slopes, left))
     return hessian, gradient, slopes, left
 
 
@@ -126,8 +131,8 @@ def _step(model: Model, unknowns: Unknowns, rows: Bools, error: float) -> tuple[
     penalty = _penalty(model, unknowns, hessian)
     hessian, gradient = hessian + penalty, gradient - penalty @ x
     size = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
-    for damping in _DAMPING:
-        change = _bounded(
+    for damping in _DAMPING_FACTORS:
+        change = _bounded_minimum(
             hessian + np.diag(damping * size), gradient, unknowns.low - x, unknowns.high - x, np.sqrt(size)
         )
         after = np.where(unknowns.index >= 0, (x + change)[unknowns.index], theta)
@@ -142,7 +147,7 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
     """The quadratic penalty on the weights of terms, in the unknowns."""
     total = np.zeros_like(hessian)
     first = 2
-    for one in model.applied:
+    for one in model.effects:
         count = len(one.values)
         shape = getattr(one.law, "penalty", None)
         if shape is not None:
@@ -155,7 +160,7 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
     return total
 
 
-def _bounded(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
+def _bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
     """The minimum of x'Ax/2 - g'x within bounds that 0 lies in.
 
     What a step takes beyond a bound is held there for as long as the slope does not lead back inside (block pivoting).

@@ -16,29 +16,29 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .account import Account, Judge
 from .baselines import baselines
 from .confidence import intervals
-from .contradictions import contradictions
-from .corrected import parameters
-from .criterion import Parts, noise_variance
-from .delays import in_steps, latest
+from .criterion import DataSplit, noise_variance
+from .delays import longest_equivalent_delay, quantised_delays
 from .eam import WINDOWS, pd_torque
+from .export_parameters import parameters
 from .fit import fit
+from .fitted_model import FittedModel, ModelEvaluator
 from .identification import Identification
+from .identification_data import VALUES, IdentificationData, Progress, prepare
 from .library import SignalTerm
 from .logs.dataset import Dataset
 from .logs.log import Log, LogError
-from .lost_commands import read_again
-from .material import VALUES, Material, Progress, gathered
+from .lost_commands import reassign_losses
 from .model import Model
 from .motion import STRETCH, Body, Replay, replayed
-from .outcome import Chosen, Outcome, identification
-from .preparation import SHORTEST, Reading, read
+from .outcome import Outcome, SelectedEffect, identification
+from .preparation import SHORTEST, Preprocessed, preprocess
 from .replay import BLOCK as LEG_BLOCK
 from .replay import STRETCH as LEG_STRETCH
 from .replay import TEXT as LEG_TEXT
 from .replay import Legs
+from .sanity_checks import contradictions
 from .selection import Search
 from .signals import Array, Bools, Samples
 
@@ -61,11 +61,11 @@ def identify(
     joints; longer logs are cut to pieces spread over all of each. options: as those of `identified`. Raises LogError where
     the logs cannot be used together.
     """
-    return identified(gathered(Dataset.of(train, heldout, gains), values), **options)
+    return identified(prepare(Dataset.of(train, heldout, gains), values), **options)
 
 
 def identified(
-    material: Material,
+    material: IdentificationData,
     base: ActuatorParameters | None = None,
     cores: int = 1,
     progress: Progress = lambda share, text: None,
@@ -82,26 +82,26 @@ def identified(
     progress(0.02, "gains and delays")
     windows = WINDOWS if body is None else (material.logs[0].period,)
     shortest = SHORTEST if legs is None or material.heldout else LEG_BLOCK
-    reading, notes = read(material, windows, shortest)
+    reading, notes = preprocess(material, windows, shortest)
     steps = iter(range(10**6))
 
     def tick(text: str) -> None:
         progress(min(0.1 + 0.04 * next(steps), 0.85), text)
 
     plain = _plain(reading)
-    noise = noise_variance(reading.samples, reading.parts.chosen_on, plain.residual())
+    noise = noise_variance(reading.samples, reading.parts.fit_or_select, plain.residual())
     samples, rows = _searched(reading)
-    judge = Judge(reading.parts.taken(rows), noise, cores)
+    judge = ModelEvaluator(reading.parts.select_rows(rows), noise, cores)
     plain = attrs.evolve(plain, samples=samples)
-    search, before = Search(judge, tick), judge.fitted(plain)
+    search, before = Search(judge, tick), judge.fit(plain)
     best, of_laws = search.best(plain)
     corrected = base or ActuatorParameters.default()
     replayer = None if body is None and legs is None else _Replayer(body, legs, reading, corrected)
     progress(0.88, "replays" if replayer else "intervals")
     tries = [before, best]
     if replayer:
-        laws = of_laws if of_laws is best else search.simplified(of_laws)
-        tries = [before, laws, best, *search.shorter(laws)]
+        laws = of_laws if of_laws is best else search.prune(of_laws)
+        tries = [before, laws, best, *search.nested_models(laws)]
     refitted = {one: _refitted(one, reading, noise) for one in dict.fromkeys(tries)}
     chosen = replayer.choose(refitted) if replayer else best
     progress(0.93, "intervals")
@@ -109,7 +109,7 @@ def identified(
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
-    report = {**found.report, "baselines": baselines(logs, parts.chosen_on, parts.report)}
+    report = {**found.report, "baselines": baselines(logs, parts.fit_or_select, parts.report)}
     if replayer:
         report |= replayer.section(outcome)
     if body is not None:
@@ -119,7 +119,7 @@ def identified(
     return attrs.evolve(found, report=report)
 
 
-def _legs(robot: str, material: Material) -> Legs:
+def _legs(robot: str, material: IdentificationData) -> Legs:
     """The legs that the logs' commands are replayed on. Raises LogError where the logs do not hold what that takes."""
     for log in material.logs:
         known = {"tau": material.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
@@ -132,63 +132,66 @@ def _legs(robot: str, material: Material) -> Legs:
     return Legs.of(robot, material.logs[0].joints)
 
 
-def _searched(reading: Reading) -> tuple[Samples, NDArray[np.intp]]:
+def _searched(reading: Preprocessed) -> tuple[Samples, NDArray[np.intp]]:
     """The samples that are searched, and which rows these are: none of a log that is held out, and no more than it takes."""
-    samples = reading.samples.reaching(reading.parts.chosen_on)
+    samples = reading.samples.drop_heldout(reading.parts.fit_or_select)
     step = min(round(samples.tau.size / _SEARCHED), round(_COARSEST / samples.period))
     if step > 1:
         return samples.thinned(step)
     return samples, np.arange(len(samples.t))
 
 
-def _plain(reading: Reading) -> Model:
+def _plain(reading: Preprocessed) -> Model:
     """The EAM as a model that effects can be added to."""
     eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
     delays = np.stack([eam.input_delay, eam.output_delay])
     return Model(reading.samples, eam.window, eam.gains, one, delays, one)
 
 
-def _refitted(account: Account, reading: Reading, noise: Array) -> Model:
+def _refitted(account: FittedModel, reading: Preprocessed, noise: Array) -> Model:
     """The model of an account with values of all rows that fit and select."""
     parts, samples = reading.parts, reading.samples
     model = attrs.evolve(account.model, samples=samples)
     if len(samples.t) > len(account.model.samples.t):
-        model = read_again(model, parts, noise)
-    return latest(fit(model, parts.chosen_on), parts.chosen_on)
+        model = reassign_losses(model, parts, noise)
+    return longest_equivalent_delay(fit(model, parts.fit_or_select), parts.fit_or_select)
 
 
 def _outcome(
-    account: Account,
+    account: FittedModel,
     before: Model,
     model: Model,
     search: Search,
-    reading: Reading,
-    material: Material,
+    reading: Preprocessed,
+    material: IdentificationData,
     base: ActuatorParameters,
 ) -> Outcome:
     """The chosen model and the plain one, both refitted, with values of every row, and errors of the rows that chose nothing."""
     parts, samples = reading.parts, reading.samples
-    every = parts.chosen_on if material.heldout else parts.every
-    before_whole, whole = (in_steps(latest(fit(one, every), every), every) for one in (before, model))
-    effects = tuple(
-        Chosen(*_worth(model, k, parts), search.rivals(account, k)) for k in range(len(model.applied))
+    every = parts.fit_or_select if material.heldout else parts.all_rows
+    before_whole, whole = (
+        quantised_delays(longest_equivalent_delay(fit(one, every), every), every) for one in (before, model)
     )
-    has_terms = any(isinstance(one.law, SignalTerm) for one in model.applied)
-    leaning = () if account.white or has_terms else search.leaning(account)
-    names = {one.law.name for one in model.applied}
+    effects = tuple(
+        SelectedEffect(*_worth(model, k, parts), search.indistinguishable_effects(account, k))
+        for k in range(len(model.effects))
+    )
+    has_terms = any(isinstance(one.law, SignalTerm) for one in model.effects)
+    leaning = () if account.is_white or has_terms else search.residual_correlates(account)
+    names = {one.law.name for one in model.effects}
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
     asked = np.ones_like(whole.gains)
     asked[1] = 0.0 if samples.undamped else 1.0
     ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
     return Outcome(
-        before, before_whole, model, whole, effects, rejected, account.white, leaning,
-        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.judge.noise, parts, base,
+        before, before_whole, model, whole, effects, rejected, account.is_white, leaning,
+        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.evaluator.noise, parts, base,
     )  # fmt: skip
 
 
-def _worth(model: Model, index: int, parts: Parts) -> tuple[float, float]:
+def _worth(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
     """What an effect takes off the error of the rows that chose nothing, and its p-value there."""
-    without = fit(model.without(index), parts.chosen_on)
+    without = fit(model.without_effect(index), parts.fit_or_select)
     worth = parts.compare(without.residual(), model.residual(), parts.report)
     return worth.gain, worth.p
 
@@ -199,10 +202,10 @@ class _Replayer:
 
     body: Body | None
     legs: Legs | None
-    reading: Reading
+    reading: Preprocessed
     base: ActuatorParameters
 
-    def choose(self, tries: Mapping[Account, Model]) -> Account:
+    def choose(self, tries: Mapping[FittedModel, Model]) -> FittedModel:
         """The account with whose model the commands replay the motion best.
 
         A later one has to replay clearly better than those before it on the rows that fit and select: the laws than the plain
@@ -212,7 +215,7 @@ class _Replayer:
         """
         best, least = next(iter(tries)), np.inf
         for account, model in tries.items():
-            error = self._replay(model, self.reading.parts.chosen_on)["dq_rms_rad_s"]
+            error = self._replay(model, self.reading.parts.fit_or_select)["dq_rms_rad_s"]
             if error < _MOVES * least:
                 best, least = account, error
         return best

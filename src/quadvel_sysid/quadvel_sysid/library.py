@@ -31,9 +31,9 @@ from quadvel_actuator.effects.terms import (
 )
 from quadvel_actuator.running import SLOPE
 
-from .criterion import Parts
+from .criterion import DataSplit
 from .lost_commands import lost_commands
-from .model import Applied, Model
+from .model import AppliedEffect, Model
 from .signals import Array, Bools, Signals
 
 _KEPT = 12
@@ -102,7 +102,7 @@ class SignalTerm(AddedLaw):
         return self.reads_total or self.of in _COMMANDED
 
     @property
-    def remembers(self) -> bool:  # type: ignore[override]
+    def has_memory(self) -> bool:  # type: ignore[override]
         return self.shape.history
 
     @property
@@ -144,7 +144,7 @@ class SignalTerm(AddedLaw):
             each = list(np.broadcast_arrays(*each))
         if x.ndim > 2 and (len(x) == 1 or not self.reads_total):
             x = x[0]
-        if x.ndim == 2 and each[0].ndim == 1 and not self.remembers:
+        if x.ndim == 2 and each[0].ndim == 1 and not self.has_memory:
             total, _ = self.shape.advance(self._read(x, s), 0.0, np.array(each), ())
             return np.broadcast_to(total * factor(self.times, s, x), s.q.shape)
         weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
@@ -154,7 +154,7 @@ class SignalTerm(AddedLaw):
         batch: Array = np.einsum("...kj,...knj->...nj", weights.reshape(-1, *weights.shape[-2:]), columns)
         return batch
 
-    def term(self, one: Applied, bound: Array) -> Term:
+    def term(self, one: AppliedEffect, bound: Array) -> Term:
         """As a running model has it; its torque stays within `bound` (J,), N m."""
         return Term(self.of, self.times, self.shape, one.active, one.values, bound, self.at)
 
@@ -171,14 +171,14 @@ def _past_only(s: Signals) -> Signals:
 
 def complexity(law: EffectLaw) -> float:
     """What a law says, in parameters a joint; one that reaches back in time says more than one of the moment."""
-    past = _PAST_COST if law.shifts or law.remembers else 0.0
+    past = _PAST_COST if law.shifts or law.has_memory else 0.0
     return float(getattr(law, "complexity", len(law.parameters) + past))
 
 
 class Context:
     """What a law may ask of the model that it is to be added to, when it makes its variants and starting values."""
 
-    def __init__(self, model: Model, parts: Parts, noise: Array) -> None:
+    def __init__(self, model: Model, parts: DataSplit, noise: Array) -> None:
         self.model, self.parts, self.noise = model, parts, noise
         self.samples, self.signals = model.samples, model.signals
         self.torque = model.predict()
@@ -215,7 +215,7 @@ class Context:
 
 def laws(context: Context) -> Iterator[EffectLaw]:
     """Every law of the registry that is not on the model yet, in all its variants."""
-    taken = {one.law.name for one in context.model.applied}
+    taken = {one.law.name for one in context.model.effects}
     for name, law in registry().items():
         if name not in taken:
             yield from law.variants(context)

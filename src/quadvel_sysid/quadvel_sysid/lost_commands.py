@@ -11,11 +11,11 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_actuator.effects.commands import MOST, CommandHold
+from quadvel_actuator.effects.commands import MAX_BACKLOG, CommandHold
 
-from .criterion import Parts
+from .criterion import DataSplit
 from .fit import fit, squared_error
-from .model import Applied, Model
+from .model import AppliedEffect, Model
 from .signals import Array, Bools
 
 LOST = 6.0
@@ -39,7 +39,7 @@ _NEVER = 1e-100  # a chance, so that two accounts that contradict each other lea
 
 
 @attrs.frozen
-class Chances:
+class LossProbabilities:
     """Of a new command to be lost, of one more to be, and of a command that was held back to arrive at a row."""
 
     lost: float = 0.02
@@ -61,7 +61,7 @@ class Chances:
         return np.array(steps)
 
     @classmethod
-    def of(cls, counts: Array) -> Chances:
+    def of(cls, counts: Array) -> LossProbabilities:
         """The likeliest ones where moves were so frequent, `counts` (D, M, M)."""
         sent = counts[1:].sum(axis=0)
         held = counts[0]
@@ -77,7 +77,7 @@ def _share(part: float, whole: float) -> float:
     return float(np.clip(part / (whole + 1e-12), _RARE, 1.0 - _RARE))
 
 
-def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array, Array]]:
+def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Array, Array]]:
     """How likely the drive lags by 0 to MOST commands: at each row, (N, J, MOST + 1), and at any; none if it rarely does.
 
     For each joint without a look at its torque where that selects or is reported.
@@ -85,22 +85,22 @@ def lost_commands(model: Model, parts: Parts, noise: Array) -> list[tuple[Array,
     noise = _usual_error(model, parts, noise)
     if len(noise) < 2 or not _suspicious(model, noise):
         return []
-    odds = backlog(model, noise, MOST, ~parts.fit)
+    odds = backlog(model, noise, MAX_BACKLOG, ~parts.fit)
     usual = odds[parts.fit].mean(axis=0)
     if 1.0 - usual[0] < _LEAST_SHARE or not _at_random(model, odds, usual, parts):
         return []
     return [(_of_every_row(odds, model.samples.row), usual)]
 
 
-def _losing(model: Model, odds: Array, usual: Array, parts: Parts) -> Model:
+def _losing(model: Model, odds: Array, usual: Array, parts: DataSplit) -> Model:
     """The model with losses of these odds, fitted."""
     every = np.ones(odds.shape[1], dtype=bool)
     law = CommandHold(_of_every_row(odds, model.samples.row), usual)
-    one = Applied(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))
-    return fit(model.plus(one), parts.fit, 3)
+    one = AppliedEffect(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))
+    return fit(model.with_effect(one), parts.fit, 3)
 
 
-def _at_random(model: Model, odds: Array, usual: Array, parts: Parts) -> bool:
+def _at_random(model: Model, odds: Array, usual: Array, parts: DataSplit) -> bool:
     """Does the model with losses tell much more than one whose losses follow from the time since the command arrived?"""
     losing = _losing(model, odds, usual, parts)
     fitted = parts.fit.any(axis=1)
@@ -109,9 +109,9 @@ def _at_random(model: Model, odds: Array, usual: Array, parts: Parts) -> bool:
     total = np.zeros((since.max() + 1, *odds.shape[1:]))
     np.add.at(total, since[fitted], odds[fitted])
     mean = total / np.maximum(total.sum(axis=-1, keepdims=True), 1.0)
-    bare = losing.without(len(model.applied))
+    bare = losing.without_effect(len(model.effects))
     tried = (model, fit(bare, parts.fit, 3), losing, _losing(bare, mean[since], usual, parts))
-    *without, read, foreseen = (squared_error(one, parts.chosen_on) for one in tried)
+    *without, read, foreseen = (squared_error(one, parts.fit_or_select) for one in tried)
     return foreseen - read > _AT_RANDOM * (min(without) - read) > 0.0
 
 
@@ -121,17 +121,17 @@ def _of_every_row(odds: Array, rows: NDArray[np.intp]) -> Array:
     return odds[at]
 
 
-def read_again(model: Model, parts: Parts, noise: Array) -> Model:
+def reassign_losses(model: Model, parts: DataSplit, noise: Array) -> Model:
     """The model, whose samples reach further than those that its lost commands were read off, with these read off them all."""
-    for k, one in enumerate(model.applied):
+    for k, one in enumerate(model.effects):
         if isinstance(one.law, CommandHold):
-            odds = backlog(model.without(k), noise, MOST, ~parts.fit)
+            odds = backlog(model.without_effect(k), noise, MAX_BACKLOG, ~parts.fit)
             law = CommandHold(odds, odds[parts.fit].mean(axis=0))
-            model = model.replacing(k, attrs.evolve(one, law=law))
+            model = model.with_replaced_effect(k, attrs.evolve(one, law=law))
     return model
 
 
-def _usual_error(model: Model, parts: Parts, noise: Array) -> Array:
+def _usual_error(model: Model, parts: DataSplit, noise: Array) -> Array:
     """Variance (J,) of what the model leaves of most rows, N^2 m^2: what a row says of losses is held against that."""
     size = [np.median(np.abs(one[keep])) for one, keep in zip(model.residual().T, parts.fit.T, strict=True)]
     usual: Array = np.maximum((_NORMAL * np.array(size)) ** 2, noise)
@@ -159,9 +159,9 @@ def backlog(model: Model, noise: Array, most: int, unread: Bools) -> Array:
     new = np.minimum(np.diff(packet, prepend=packet[0]), most + 1)
     hidden = np.where(unread[..., None], costs, 0.0)
     read = (costs - hidden).sum(axis=1, keepdims=True)
-    chances = Chances()
+    chances = LossProbabilities()
     for _ in range(_ROUNDS):
-        before, chances = chances, Chances.of(_odds(read, new, chances)[1])
+        before, chances = chances, LossProbabilities.of(_odds(read, new, chances)[1])
         if np.allclose(attrs.astuple(chances), attrs.astuple(before), rtol=_SETTLED):
             break
     return _odds(costs.sum(axis=1, keepdims=True) - hidden, new, chances)[0]
@@ -181,7 +181,7 @@ def _costs(model: Model, noise: Array, most: int) -> Array:
     return np.stack(cost, axis=-1)
 
 
-def _odds(costs: Array, new: NDArray[np.intp], chances: Chances) -> tuple[Array, Array]:
+def _odds(costs: Array, new: NDArray[np.intp], chances: LossProbabilities) -> tuple[Array, Array]:
     """Chances (N, G, M) of each state given the costs (N, G, M), and how often which move was made, (D, M, M).
 
     `new` (N,) commands arrive before each row. Computed in pieces of the rows, side by side, each with some rows more

@@ -24,12 +24,12 @@ from .signals import BETWEEN, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
 
-LONGEST = np.array([0.020, 0.006])
+MAX_DELAYS_S = np.array([0.020, 0.006])
 """s, input and output delay at most"""
 
 
 @attrs.frozen(eq=False)
-class Applied:
+class AppliedEffect:
     """A law at work on some joints. A term of named signals is a law whose torque is linear in its weights."""
 
     law: EffectLaw
@@ -38,11 +38,11 @@ class Applied:
     groups: Groups  # (J,), joints with the same number share the values
 
     @property
-    def last(self) -> bool:
+    def reads_total_torque(self) -> bool:
         """Does it read the torque of all other laws, so that it comes after them?"""
         return bool(getattr(self.law, "reads_total", False))
 
-    def part(self, values: Array) -> dict[str, Array]:
+    def parameters_by_name(self, values: Array) -> dict[str, Array]:
         """Parameters by name; `values` (B, P, J) becomes (B, 1, J) each, or (J,) where the batch has one value."""
         found = {}
         for k, name in enumerate(self.law.names):
@@ -50,21 +50,21 @@ class Applied:
             found[name] = one[0] if len(one) == 1 or (one == one[0]).all() else one[:, None]
         return found
 
-    def shown(self, s: Signals) -> bool:
+    def is_excited(self, s: Signals) -> bool:
         """Does the motion of one at least of the joints that share values show the law?"""
-        joints = self.law.shown(dict(zip(self.law.names, self.values, strict=True)), s) & self.active
+        joints = self.law.excited_joints(dict(zip(self.law.names, self.values, strict=True)), s) & self.active
         return set(self.groups[joints]) == set(self.groups[self.active])
 
-    def formed(self, law: EffectLaw) -> Applied:
+    def with_form(self, law: EffectLaw) -> AppliedEffect:
         """With another form of its law; parameters that this one had not start from zero."""
         known = dict(zip(self.law.names, self.values, strict=True))
         none = np.zeros_like(self.values[0])
         return attrs.evolve(self, law=law, values=np.array([known.get(name, none) for name in law.names]))
 
-    def tidied(self) -> Applied:
+    def canonical(self) -> AppliedEffect:
         """With the form of its law that its joints need, and parameters in their unique order."""
-        mine = self.formed(self.law.among(self.active))
-        p = mine.law.tidy(dict(zip(mine.law.names, mine.values, strict=True)))
+        mine = self.with_form(self.law.restricted_to(self.active))
+        p = mine.law.canonical(dict(zip(mine.law.names, mine.values, strict=True)))
         return attrs.evolve(mine, values=np.array([p[name] for name in mine.law.names]))
 
 
@@ -80,14 +80,14 @@ class Model:
     delays: Array
     """(2, J) s, input and output"""
     delay_groups: Groups  # (J,)
-    applied: tuple[Applied, ...] = ()
+    effects: tuple[AppliedEffect, ...] = ()
 
     @property
     def signals(self) -> Signals:
         """The signals at this model's delays."""
         return self.samples.at(self.delays[0], self.delays[1], self.window)
 
-    def seen(self, at: str) -> Signals:
+    def signals_at(self, at: str) -> Signals:
         """The signals for torques that are added by the drive, or at the joint: these do not come an output delay late."""
         if at == DRIVE:
             return self.signals
@@ -95,7 +95,7 @@ class Model:
 
     def predict(self) -> Array:
         """Torque of every row, (N, J), N m."""
-        torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.applied])[0]
+        torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.effects])[0]
         return torque
 
     def residual(self) -> Array:
@@ -108,30 +108,30 @@ class Model:
 
         A drive that computes in steps does nothing between them; one that does not is followed between the rows.
         """
-        if self.window == 0.0 and any(one.law.between for one in self.applied):
-            finer = attrs.evolve(self, samples=self.samples.finer)
+        if self.window == 0.0 and any(one.law.acts_between_rows for one in self.effects):
+            finer = attrs.evolve(self, samples=self.samples.upsampled)
             return finer._evaluate(gains, values)[..., BETWEEN - 1 :: BETWEEN, :]
         return self._evaluate(gains, values)
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
         """The same at the instants of `samples` alone."""
         x = self._drive(gains, values)
-        total, added = x, [pair for pair in zip(self.applied, values, strict=True) if _adds(pair[0])]
+        total, added = x, [pair for pair in zip(self.effects, values, strict=True) if _is_added(pair[0])]
         for one, value in added:
-            if not one.last:
-                total = total + self.added(one, x, value)
+            if not one.reads_total_torque:
+                total = total + self.added_torque(one, x, value)
         whole = total
         for one, value in added:
-            if one.last:
-                total = total + self.added(one, whole, value)
+            if one.reads_total_torque:
+                total = total + self.added_torque(one, whole, value)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *self.signals.q.shape))
 
     def _drive(self, gains: Array, values: Sequence[Array]) -> Array:
         """Torque of the drive, without what is added to it."""
         s = self.signals
-        pull, drag = s.pull, s.drag
-        todo = sorted(zip(self.applied, values, strict=True), key=lambda pair: pair[0].law.stage)
+        pull, drag = s.stiffness_torque, s.damping_torque
+        todo = sorted(zip(self.effects, values, strict=True), key=lambda pair: pair[0].law.stage)
         on_errors = [pair for pair in todo if pair[0].law.stage == Stage.ERRORS]
         if on_errors:
             error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
@@ -146,48 +146,52 @@ class Model:
         return x
 
     def _errors(
-        self, one: Applied, error: tuple[Array, Array], s: Signals, value: Array
+        self, one: AppliedEffect, error: tuple[Array, Array], s: Signals, value: Array
     ) -> tuple[Array, Array]:
         """The errors after a law."""
         after = _series(one, error, s, value)
         new, speed = (_where(one.active, new, old) for new, old in zip(after, error, strict=True))
         return new, speed
 
-    def driven(self, beside: Applied) -> Array:
+    def drive_torque(self, beside: AppliedEffect) -> Array:
         """What a law that is added is given, (N, J): the torque of the drive, of all laws where it reads that."""
-        kept = tuple(one for one in self.applied if not _adds(one) or (beside.last and not one.last))
-        return attrs.evolve(self, applied=kept).predict()
+        kept = tuple(
+            one
+            for one in self.effects
+            if not _is_added(one) or (beside.reads_total_torque and not one.reads_total_torque)
+        )
+        return attrs.evolve(self, effects=kept).predict()
 
-    def added(self, one: Applied, x: Array, value: Array) -> Array:
+    def added_torque(self, one: AppliedEffect, x: Array, value: Array) -> Array:
         """The torque (B, N, J) that a law of the stage ADDED adds to `x`, with a batch of its values (B, P, J)."""
-        extra: Array = _series(one, x, self.seen(one.law.at), value)
+        extra: Array = _series(one, x, self.signals_at(one.law.at), value)
         return extra if one.active.all() else extra * one.active
 
     def with_delays(self, delays: Array) -> Model:
         """The same model with other delays (2, J)."""
-        within = np.asarray(np.clip(delays, 0.0, LONGEST[:, None]), dtype=float).round(7)
+        within = np.asarray(np.clip(delays, 0.0, MAX_DELAYS_S[:, None]), dtype=float).round(7)
         return attrs.evolve(self, delays=within)
 
-    def plus(self, applied: Applied) -> Model:
+    def with_effect(self, applied: AppliedEffect) -> Model:
         """With one more effect."""
-        return attrs.evolve(self, applied=(*self.applied, applied))
+        return attrs.evolve(self, effects=(*self.effects, applied))
 
-    def replacing(self, index: int, applied: Applied) -> Model:
+    def with_replaced_effect(self, index: int, applied: AppliedEffect) -> Model:
         """With another effect in the place of this index."""
-        return attrs.evolve(self, applied=(*self.applied[:index], applied, *self.applied[index + 1 :]))
+        return attrs.evolve(self, effects=(*self.effects[:index], applied, *self.effects[index + 1 :]))
 
-    def without(self, index: int) -> Model:
+    def without_effect(self, index: int) -> Model:
         """Without the effect of this index."""
-        return attrs.evolve(self, applied=(*self.applied[:index], *self.applied[index + 1 :]))
+        return attrs.evolve(self, effects=(*self.effects[:index], *self.effects[index + 1 :]))
 
-    def foretold(self) -> Model:
+    def predictive(self) -> Model:
         """With laws that say no more than could be known before the torque was measured."""
         return attrs.evolve(
-            self, applied=tuple(attrs.evolve(one, law=one.law.foretold()) for one in self.applied)
+            self, effects=tuple(attrs.evolve(one, law=one.law.predictive()) for one in self.effects)
         )
 
 
-def _adds(one: Applied) -> bool:
+def _is_added(one: AppliedEffect) -> bool:
     return one.law.stage == Stage.ADDED
 
 
@@ -195,26 +199,26 @@ def _where(active: Bools, new: Array, old: Array) -> Array:
     return new if active.all() else np.where(active, new, old)
 
 
-def _series(one: Applied, x: Any, s: Signals, value: Array) -> Any:
+def _series(one: AppliedEffect, x: Any, s: Signals, value: Array) -> Any:
     """What a law makes of `x`."""
-    law, p = one.law, one.part(value)
+    law, p = one.law, one.parameters_by_name(value)
     if isinstance(law, ErrorLaw):
         if max(part.ndim for part in x) > 2:
             return law.errors(x, s, p)
         first, which = distinct(value)
-        after = law.errors(x, s, one.part(value[first]))
+        after = law.errors(x, s, one.parameters_by_name(value[first]))
         return tuple(part[which] if part.ndim > 2 else part for part in after)
     if isinstance(law, MemoryLaw):
         return law.series(x, s, p)
     return law.torque(x, s, p)  # type: ignore[attr-defined]
 
 
-def linear_columns(model: Model, one: Applied, x: Array | None = None) -> Array:
+def linear_columns(model: Model, one: AppliedEffect, x: Array | None = None) -> Array:
     """What a unit of each linear parameter of an added law gives, (L, N, J), the others being as they are.
 
     `x` (N, J) is what the law is given, `model.driven(one)`, where that is known.
     """
-    x, s = model.driven(one) if x is None else x, model.seen(one.law.at)
+    x, s = model.drive_torque(one) if x is None else x, model.signals_at(one.law.at)
     columns = getattr(one.law, "regressors", None)
     if columns is not None:
         found: Array = columns(x, s)
@@ -223,7 +227,7 @@ def linear_columns(model: Model, one: Applied, x: Array | None = None) -> Array:
     unit = np.repeat(one.values[None], len(linear), axis=0)
     unit[:, linear] = 0.0
     unit[np.arange(len(linear)), linear] = 1.0
-    return np.broadcast_to(model.added(one, x, unit), (len(linear), *x.shape))
+    return np.broadcast_to(model.added_torque(one, x, unit), (len(linear), *x.shape))
 
 
 @attrs.frozen(eq=False)
@@ -254,7 +258,7 @@ class Unknowns:
             step.append(size)
         return cls(np.array(rows), np.array(low, dtype=float), np.array(high, dtype=float), np.array(step))
 
-    def gathered(self, local: Array) -> Array:
+    def accumulate(self, local: Array) -> Array:
         """Per-joint vectors (J, A) or matrices (J, A, A) summed into the common unknowns."""
         fitted = self.index.T >= 0
         at = np.where(fitted, self.index.T, 0)
@@ -275,11 +279,11 @@ class Unknowns:
         return found
 
 
-_MOST_GAIN = 4.0
+_MAX_GAIN_RATIO = 4.0
 """Times the commanded gain: what a drive gives of it at most"""
-SLOPE = 0.01
+RELATIVE_STEP = 0.01
 """Step of numerical slopes, of a parameter's usual size"""
-DELAY_STEP = 0.0003
+DELAY_STEP_S = 0.0003
 """s, between the predictions that a slope along a delay is taken from, to either side: commands come in steps"""
 
 
@@ -288,31 +292,31 @@ def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[fl
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
     known = model.samples.commanded and not model.samples.undamped
     for _ in model.gains:
-        yield model.gain_groups, everywhere, (0.0, _MOST_GAIN if known else 1e6), SLOPE
-    for one in model.applied:
+        yield model.gain_groups, everywhere, (0.0, _MAX_GAIN_RATIO if known else 1e6), RELATIVE_STEP
+    for one in model.effects:
         for parameter in one.law.parameters:
-            yield one.groups, one.active, (parameter.low, parameter.high), SLOPE * parameter.scale
-    for longest in LONGEST:
-        yield model.delay_groups, everywhere & delays, (0.0, float(longest)), DELAY_STEP
+            yield one.groups, one.active, (parameter.low, parameter.high), RELATIVE_STEP * parameter.scale
+    for longest in MAX_DELAYS_S:
+        yield model.delay_groups, everywhere & delays, (0.0, float(longest)), DELAY_STEP_S
 
 
 def pack(model: Model) -> Array:
     """All slots (A, J) of a model."""
-    return np.concatenate([model.gains, *(one.values for one in model.applied), model.delays])
+    return np.concatenate([model.gains, *(one.values for one in model.effects), model.delays])
 
 
 def with_slots(model: Model, theta: Array) -> Model:
     """The model with the slots (A, J)."""
     gains, values = _unpack(model, theta[None])
     applied = tuple(
-        attrs.evolve(one, values=value[0]) for one, value in zip(model.applied, values, strict=True)
+        attrs.evolve(one, values=value[0]) for one, value in zip(model.effects, values, strict=True)
     )
-    return attrs.evolve(model, gains=gains[0], applied=applied).with_delays(theta[-2:])
+    return attrs.evolve(model, gains=gains[0], effects=applied).with_delays(theta[-2:])
 
 
 def _unpack(model: Model, theta: Array) -> tuple[Array, list[Array]]:
     values, first = [], 2
-    for one in model.applied:
+    for one in model.effects:
         values.append(theta[:, first : first + len(one.values)])
         first += len(one.values)
     return theta[:, :2], values
@@ -329,23 +333,23 @@ def jacobian(model: Model, unknowns: Unknowns) -> tuple[Array, Array]:
     slopes = np.zeros((theta.shape[1], len(theta), len(model.samples.t)))
     numeric, first, read = free.copy(), 2, np.zeros(model.samples.tau.shape)
     numeric[-2:] = False
-    for one in model.applied:
+    for one in model.effects:
         mine = first + np.arange(len(one.values))
         first += len(mine)
-        if _adds(one):
+        if _is_added(one):
             columns = linear_columns(model, one)
             linear = mine[[one.law.names.index(name) for name in one.law.linear]]  # type: ignore[attr-defined]
             slopes[:, linear] = columns.transpose(2, 0, 1)
             numeric[linear] = False
-            if one.last:
+            if one.reads_total_torque:
                 numeric[mine] = False
                 read = read + np.einsum("kj,knj->nj", theta[mine], columns)
     rest = np.flatnonzero(numeric)
     batch = np.repeat(theta[None], len(rest) + 1, axis=0)
     batch[1 + np.arange(len(rest)), rest] += steps[rest]
-    laws = attrs.evolve(model, applied=tuple(one for one in model.applied if not one.last))
+    laws = attrs.evolve(model, effects=tuple(one for one in model.effects if not one.reads_total_torque))
     gains, values = _unpack(model, batch[:, :-2])
-    kept = [value for one, value in zip(model.applied, values, strict=True) if not one.last]
+    kept = [value for one, value in zip(model.effects, values, strict=True) if not one.reads_total_torque]
     torque = laws.evaluate(gains, kept)
     slopes[:, rest] = ((torque[1:] - torque[0]) / steps[rest][:, None, :]).transpose(2, 0, 1)
     for k in np.flatnonzero(free[-2:]):
@@ -355,16 +359,16 @@ def jacobian(model: Model, unknowns: Unknowns) -> tuple[Array, Array]:
 
 def _delay_slope(model: Model, which: int) -> Array:
     """Slope (N, J) of the torque along the input delay (0) or the output delay (1)."""
-    felt = tuple(one for one in model.applied if _feels(one.law, which))
-    moved = attrs.evolve(model, applied=felt)
+    felt = tuple(one for one in model.effects if _depends_on_delay(one.law, which))
+    moved = attrs.evolve(model, effects=felt)
     step = np.zeros((2, 1))
-    step[which] = DELAY_STEP
+    step[which] = DELAY_STEP_S
     high, low = moved.with_delays(model.delays + step), moved.with_delays(model.delays - step)
     slope: Array = (high.predict() - low.predict()) / (high.delays - low.delays)[which]
     return slope
 
 
-def _feels(law: EffectLaw, which: int) -> bool:
+def _depends_on_delay(law: EffectLaw, which: int) -> bool:
     """Does its torque change with the input delay (0), or the output delay (1)? An acceleration is read as commands move it."""
     if not isinstance(law, AddedLaw) or law.of_drive or law.signal == "ddq":
         return True

@@ -13,7 +13,8 @@ from quadvel_actuator.parameters import ActuatorParameters
 
 from .baselines import explained, torque_variance
 from .confidence import Intervals
-from .corrected import (
+from .criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, DataSplit, normality, whiteness
+from .export_parameters import (
     acting_joints,
     gain_deviations,
     law_settings,
@@ -23,14 +24,13 @@ from .corrected import (
     parameters,
     with_interval,
 )
-from .criterion import LEVEL, WHITE_LEVEL, Parts, normality, whiteness
-from .decision import decision
 from .identification import Identification, Shape, Trace
 from .library import SignalTerm
 from .logs.findings import Finding as LogFinding
-from .model import Applied, Model
+from .model import AppliedEffect, Model
 from .preparation import reference_gains
 from .signals import Array
+from .summary_text import decision
 
 SCHEMA = 1
 _DELTAS = "delta_kp", "delta_kd"
@@ -53,13 +53,13 @@ _SIGNAL_UNITS = {
 
 
 @attrs.frozen(eq=False)
-class Chosen:
+class SelectedEffect:
     """An effect that was chosen, of the corrected model the one of the same index, on the rows that are reported."""
 
     gain: float
     """error without it, everything else fitted anew, less that with it, N^2 m^2"""
     p: float
-    rivals: tuple[str, ...]
+    indistinguishable: tuple[str, ...]
     """laws that say the same"""
 
 
@@ -71,28 +71,28 @@ class Outcome:
     before_whole: Model
     model: Model
     whole: Model
-    effects: tuple[Chosen, ...]
+    effects: tuple[SelectedEffect, ...]
     rejected: tuple[tuple[str, float, str], ...]
     """law, gain on the rows that select, reason"""
-    white: bool
+    is_white: bool
     """is what is left nothing but noise?"""
-    leaning: tuple[str, ...]
+    residual_correlates: tuple[str, ...]
     """the signals that what is left goes with most, where it is not white and no term says more of it"""
     widths: Intervals
     ideal: Array  # (N, J), torque of the PD law as commanded
     noise: Array  # (J,)
-    parts: Parts
+    parts: DataSplit
     base: ActuatorParameters
 
     @property
-    def after(self) -> Array:
+    def predicted(self) -> Array:
         """Torque that the corrected model foretells, (N, J)."""
-        return self.model.foretold().predict()
+        return self.model.predictive().predict()
 
     @property
-    def terms(self) -> list[tuple[int, Applied]]:
+    def terms(self) -> list[tuple[int, AppliedEffect]]:
         """The terms of named signals, and which of the effects they are."""
-        return [(k, one) for k, one in enumerate(self.model.applied) if isinstance(one.law, SignalTerm)]
+        return [(k, one) for k, one in enumerate(self.model.effects) if isinstance(one.law, SignalTerm)]
 
 
 def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
@@ -107,11 +107,11 @@ def _report(o: Outcome) -> dict[str, Any]:
     samples, parts = o.model.samples, o.parts
     errors = {
         name: samples.tau - torque
-        for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.after))
+        for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.predicted))
     }
     mses: dict[str, dict[str, Any]] = {
         name: {
-            "train_mse": mean_square(error, parts.chosen_on),
+            "train_mse": mean_square(error, parts.fit_or_select),
             "heldout_mse": mean_square(error, parts.report),
         }
         for name, error in errors.items()
@@ -161,18 +161,20 @@ def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[
     """What no law explains: terms of named signals, or a residual that is not white."""
     parts, samples = o.parts, o.model.samples
     left = samples.tau - o.model.predict()
-    p = np.minimum(whiteness(left, parts.every, samples.start, parts.overlap), normality(left, parts.every))
-    coloured = p < WHITE_LEVEL
+    p = np.minimum(
+        whiteness(left, parts.all_rows, samples.start, parts.overlap), normality(left, parts.all_rows)
+    )
+    coloured = p < WHITENESS_LEVEL
     names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
     joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
     removable = before - floor
-    structured = bool(names) or not o.white
+    structured = bool(names) or not o.is_white
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
         if removable > _REMOVABLE * floor
         else 0.0,
-        "depends_on": list(dict.fromkeys(names or o.leaning)),
+        "depends_on": list(dict.fromkeys(names or o.residual_correlates)),
         "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
     }
 
@@ -181,8 +183,8 @@ def _unconfirmed(o: Outcome) -> list[str]:
     """Effects that the rows which chose nothing do not show."""
     return [
         f"{one.law.name} is not confirmed by the rows that are reported (p = {found.p:.2g} there)"
-        for one, found in zip(o.model.applied, o.effects, strict=True)
-        if found.p > LEVEL
+        for one, found in zip(o.model.effects, o.effects, strict=True)
+        if found.p > SIGNIFICANCE_LEVEL
     ]
 
 
@@ -243,7 +245,7 @@ def _effects(o: Outcome) -> list[dict[str, Any]]:
     joints = o.model.samples.joints
     found = [
         _effect(of_it, one, half, joints)
-        for of_it, one, half in zip(o.effects, o.whole.applied, o.widths.effects, strict=True)
+        for of_it, one, half in zip(o.effects, o.whole.effects, o.widths.effects, strict=True)
         if not isinstance(one.law, SignalTerm)
     ]
     if o.terms:
@@ -276,27 +278,27 @@ def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
     }
 
 
-def _effect(of_it: Chosen, one: Applied, half: Array, joints: Sequence[str]) -> dict[str, Any]:
+def _effect(of_it: SelectedEffect, one: AppliedEffect, half: Array, joints: Sequence[str]) -> dict[str, Any]:
     settings = law_settings(one)
     entry: dict[str, Any] = {
         "name": one.law.name,
         "joints": acting_joints(one.active, joints),
         "params": parameter_entries(one, half),
-        "indistinguishable": list(of_it.rivals),
+        "indistinguishable": list(of_it.indistinguishable),
         "heldout_gain": of_it.gain,
         "p_value": of_it.p,
         **one.law.observed(),
     }
     if settings:
         entry["form"] = settings
-    if of_it.rivals:
+    if of_it.indistinguishable:
         entry["separated_by"] = one.law.motion
     return entry
 
 
 def _traces(o: Outcome) -> dict[str, Trace]:
     samples, reported = o.model.samples, o.parts.report
-    series = (samples.tau, o.ideal, o.before.predict(), o.after)
+    series = (samples.tau, o.ideal, o.before.predict(), o.predicted)
     rows = np.flatnonzero(reported.any(axis=1))[:_SHOWN]
     return {
         joint: Trace(samples.t[rows], *(np.where(reported[rows, j], x[rows, j], np.nan) for x in series))
@@ -307,11 +309,11 @@ def _traces(o: Outcome) -> dict[str, Trace]:
 def _shapes(o: Outcome) -> tuple[Shape, ...]:
     """The residual over the signal that explains it, of up to three joints an effect."""
     samples = o.model.samples
-    before, after = samples.tau - o.before.predict(), samples.tau - o.after
+    before, after = samples.tau - o.before.predict(), samples.tau - o.predicted
     rows = np.flatnonzero(o.parts.report.any(axis=1))
     rows = rows[:: max(1, len(rows) // _SHOWN)]
     found = []
-    for one in o.model.applied:
+    for one in o.model.effects:
         for j in np.flatnonzero(one.active)[:3]:
             x, unit = _signal(o, one.law.signal, int(j))
             x, e0, e1 = x[rows], before[rows, j], after[rows, j]

@@ -11,12 +11,12 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from .criterion import Parts, clusters, encoder_variance, noise_variance
+from .criterion import DataSplit, clusters, encoder_variance, noise_variance
 from .eam import Eam, fit_eam
+from .identification_data import IdentificationData
 from .logs.excerpts import evened, jitters
 from .logs.findings import Finding
 from .logs.log import Log, LogError
-from .material import Material
 from .signals import Samples
 
 _BLOCKS = 20  # of a log, at least
@@ -38,23 +38,23 @@ _STEADIER = 0.005
 
 
 @attrs.frozen(eq=False)
-class Reading:
+class Preprocessed:
     """Samples, which of their rows are for what, and the plain model on them."""
 
     samples: Samples
-    parts: Parts
+    parts: DataSplit
     eam: Eam
 
 
-def read(
-    material: Material, windows: Sequence[float], shortest: float = SHORTEST
-) -> tuple[Reading, list[tuple[str, Finding]]]:
+def preprocess(
+    material: IdentificationData, windows: Sequence[float], shortest: float = SHORTEST
+) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
     """The reading that explains the torque best, and what was chosen. shortest: s, blocks at least."""
 
-    def tried(logs: Sequence[Log], steady: float = 0.0) -> Reading:
+    def tried(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
         samples = Samples(logs, steady)
-        parts = divided(samples, material, shortest)
-        return Reading(samples, parts, fit_eam(samples, parts.fit, windows=windows))
+        parts = split_rows(samples, material, shortest)
+        return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
     logs: Sequence[Log] = material.logs
     found, notes = tried(logs), []
@@ -72,7 +72,7 @@ def read(
     return found, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
 
 
-def divided(samples: Samples, material: Material, shortest: float) -> Parts:
+def split_rows(samples: Samples, material: IdentificationData, shortest: float) -> DataSplit:
     """Blocks of the logs in turn: two are fitted, two select, one is reported; a log that is held out is the only one reported."""
     spans = [one.log.duration for one in samples.logs]
     length = float(np.clip(min(spans) / _BLOCKS, shortest, _LONGEST))
@@ -93,7 +93,7 @@ def divided(samples: Samples, material: Material, shortest: float) -> Parts:
                 f"expected {_LEAST_ROWS} or more"
             )
     overlap = 0 if material.body is None else 1
-    return Parts(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
+    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
 
 
 def reference_gains(samples: Samples) -> tuple[float, float]:
@@ -105,14 +105,14 @@ def reference_gains(samples: Samples) -> tuple[float, float]:
     return max(kp, 1e-6), max(kd, 1e-6)
 
 
-def _steadied(found: Reading, tried: Callable[[float], Reading]) -> tuple[Reading, float]:
+def _steadied(found: Preprocessed, tried: Callable[[float], Preprocessed]) -> tuple[Preprocessed, float]:
     """The reading with q and dq averaged over so long (s) to either side as it pays; `tried` makes one."""
     samples, parts, eam = found.samples, found.parts, found.eam
-    rows, gains = parts.chosen_on, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
+    rows, gains = parts.fit_or_select, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
     noise = noise_variance(samples, rows, samples.tau - eam.predict(samples)).mean()
     noisy = encoder_variance(samples, rows, *gains * reference_gains(samples)).mean() >= _NOISY * noise
 
-    def left(one: Reading) -> float:
+    def left(one: Preprocessed) -> float:
         """Error beside dry friction, or how much more than without where the PD law itself is hardly blurred."""
         return _beside_friction(one) - (0.0 if noisy else one.eam.mse)
 
@@ -128,7 +128,7 @@ def _steadied(found: Reading, tried: Callable[[float], Reading]) -> tuple[Readin
     return found, chosen
 
 
-def _beside_friction(one: Reading) -> float:
+def _beside_friction(one: Preprocessed) -> float:
     """Mean squared error of the EAM with dry friction, whose steps noisy speeds blur most, on each joint beside it."""
     samples, eam, rows = one.samples, one.eam, one.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq

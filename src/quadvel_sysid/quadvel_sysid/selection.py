@@ -14,244 +14,257 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
-from .account import Account, Judge, groupings
 from .candidates import LAWS, TERMS, Candidates, key
-from .criterion import LEVEL, WORTH
+from .criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
+from .fitted_model import FittedModel, ModelEvaluator, joint_groupings
 from .library import SignalTerm
-from .model import Applied, Model
+from .model import AppliedEffect, Model
 from .signals import Array
 
-MOST = 5
+MAX_EFFECTS = 5
 """Effects of one log at most"""
-NEAR = 0.5
+RIVAL_FRACTION = 0.5
 """Of the best candidate's worth: what is worth so much is its rival, which may say the same"""
-TIE = 0.02
+EQUIVALENCE_MARGIN = 0.02
 """Of a joint's error: laws whose errors differ by less cannot be told apart"""
 
-Tick = Callable[[str], None]
+ProgressText = Callable[[str], None]
 
 
 class Search:
     """Searches on one set of data."""
 
-    def __init__(self, judge: Judge, tick: Tick = lambda text: None) -> None:
-        self.judge, self._tick = judge, tick
+    def __init__(self, judge: ModelEvaluator, tick: ProgressText = lambda text: None) -> None:
+        self.evaluator, self._on_progress = judge, tick
         self.rejected: dict[str, tuple[float, str]] = {}
-        self._tried = 1
-        self._near: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
-        self._known: dict[tuple[object, ...], Candidates] = {}
+        self._tested_count = 1
+        self._rivals: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
+        self._candidate_cache: dict[tuple[object, ...], Candidates] = {}
 
-    def best(self, start: Model) -> tuple[Account, Account]:
+    def best(self, start: Model) -> tuple[FittedModel, FittedModel]:
         """The account of the data with the least criterion, and the best one without terms.
 
         Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these
         laws leave more than noise, terms alone come into question; and where those do so, too, or cost more, further laws,
         and terms on top of the laws.
         """
-        plain = self.judge.profiled(self.judge.fitted(start))
-        if plain.white:
+        plain = self.evaluator.refine_delays(self.evaluator.fit(start))
+        if plain.is_white:
             return plain, plain
-        laws = self.run(plain, LAWS, most=1)
-        if laws.white:
-            laws = self.simplified(laws)
+        laws = self.extend(plain, LAWS, most=1)
+        if laws.is_white:
+            laws = self.prune(laws)
             return laws, laws
-        terms = self.run(plain, TERMS, most=1)
-        laws = self.run(laws, LAWS, most=2, bound=terms.criterion)
-        if not laws.white:
-            terms = self.run(terms, TERMS)
+        terms = self.extend(plain, TERMS, most=1)
+        laws = self.extend(laws, LAWS, most=2, bound=terms.criterion)
+        if not laws.is_white:
+            terms = self.extend(terms, TERMS)
         accounts = [terms]
-        if laws.white or not terms.white or laws.criterion < terms.criterion:
-            laws = self.simplified(self.run(laws, LAWS, bound=terms.criterion))
-            accounts += [laws] if laws.white else [laws, self.run(laws, TERMS, bound=terms.criterion)]
+        if laws.is_white or not terms.is_white or laws.criterion < terms.criterion:
+            laws = self.prune(self.extend(laws, LAWS, bound=terms.criterion))
+            accounts += [laws] if laws.is_white else [laws, self.extend(laws, TERMS, bound=terms.criterion)]
         least = min(one.criterion for one in accounts)
-        alike = [one for one in accounts if one.criterion < least + TIE * len(self.judge.noise)]
-        return self.simplified(min(alike, key=_terms)), laws
+        alike = [
+            one for one in accounts if one.criterion < least + EQUIVALENCE_MARGIN * len(self.evaluator.noise)
+        ]
+        return self.prune(min(alike, key=_regressor_count)), laws
 
-    def leaning(self, account: Account) -> tuple[str, ...]:
+    def residual_correlates(self, account: FittedModel) -> tuple[str, ...]:
         """The signals that what is left goes with most, whether or not a term of them would pay."""
-        terms, _ = self._pool(account).found(TERMS)
+        terms, _ = self._candidates_of(account).found(TERMS)
         best = min(terms, key=lambda one: one.criterion, default=None)
-        return () if best is None else best.last.law.inputs  # type: ignore[attr-defined]
+        return () if best is None else best.last_effect.law.inputs  # type: ignore[attr-defined]
 
-    def simplified(self, account: Account) -> Account:
+    def prune(self, account: FittedModel) -> FittedModel:
         """Without what costs more than it is worth: effects, joints of effects, values and gains of each joint."""
-        account = self.dropped(account)
-        for k in range(len(account.model.applied)):
-            account = self._nested(self.judge.narrowed(self._nested(account, k), k), k)
-        model, one = account.model, np.zeros(len(self.judge.noise), dtype=np.intp)
+        account = self.eliminate(account)
+        for k in range(len(account.model.effects)):
+            account = self._replace_by_special_case(
+                self.evaluator.restrict_joints(self._replace_by_special_case(account, k), k), k
+            )
+        model, one = account.model, np.zeros(len(self.evaluator.noise), dtype=np.intp)
         if model.gain_groups.any():
-            shared = self.judge.fitted(attrs.evolve(model, gains=_shared(model.gains), gain_groups=one))
+            shared = self.evaluator.fit(
+                attrs.evolve(model, gains=_mean_over_joints(model.gains), gain_groups=one)
+            )
             account = min(account, shared, key=lambda each: each.criterion)
         if model.delay_groups.any():
-            same = attrs.evolve(account.model, delay_groups=one).with_delays(_shared(model.delays))
-            account = min(account, self.judge.fitted(same), key=lambda each: each.criterion)
-        for k in range(len(account.model.applied)):
-            account = self.judge.tied(account, k)
+            same = attrs.evolve(account.model, delay_groups=one).with_delays(_mean_over_joints(model.delays))
+            account = min(account, self.evaluator.fit(same), key=lambda each: each.criterion)
+        for k in range(len(account.model.effects)):
+            account = self.evaluator.share_across_joints(account, k)
         return account
 
-    def shorter(self, account: Account) -> list[Account]:
+    def nested_models(self, account: FittedModel) -> list[FittedModel]:
         """The account with fewer of its effects, those that were found first, the most of them first."""
         model = account.model
-        return self.judge.each_fitted(
-            [attrs.evolve(model, applied=model.applied[:k]) for k in range(len(model.applied) - 1, 0, -1)]
+        return self.evaluator.fit_each(
+            [attrs.evolve(model, effects=model.effects[:k]) for k in range(len(model.effects) - 1, 0, -1)]
         )
 
-    def _nested(self, account: Account, index: int) -> Account:
+    def _replace_by_special_case(self, account: FittedModel, index: int) -> FittedModel:
         """With the effect's law replaced by its special case, as Stribeck friction by Coulomb's, unless selecting rows need it."""
-        one = account.model.applied[index]
-        less = one.law.simpler(dict(zip(one.law.names, one.values, strict=True)))
+        one = account.model.effects[index]
+        less = one.law.special_case(dict(zip(one.law.names, one.values, strict=True)))
         if less is None:
             return account
         law, start = less
         values = np.array([start[name] for name in law.names])
-        other = self.judge.fitted(account.model.replacing(index, attrs.evolve(one, law=law, values=values)))
-        return account if self._needed(other, account) else other
+        other = self.evaluator.fit(
+            account.model.with_replaced_effect(index, attrs.evolve(one, law=law, values=values))
+        )
+        return account if self._is_needed(other, account) else other
 
-    def run(self, best: Account, kinds: str, most: int = MOST, bound: float = np.inf) -> Account:
+    def extend(
+        self, best: FittedModel, kinds: str, most: int = MAX_EFFECTS, bound: float = np.inf
+    ) -> FittedModel:
         """The account with candidates of these kinds added while it pays and may come below `bound`.
 
         Effects are taken to gain less one by one, so that what the last one gained tells how far the others may get.
         """
-        while len(best.model.applied) < most and not best.white:
-            self._tick(f"effect {len(best.model.applied) + 1}")
-            before, more = best, self._added(best, kinds)
+        while len(best.model.effects) < most and not best.is_white:
+            self._on_progress(f"effect {len(best.model.effects) + 1}")
+            before, more = best, self._add_best(best, kinds)
             if more is None:
                 break
-            best = self.judge.profiled(self.dropped(more, kept=1))
-            gained, left = before.criterion - best.criterion, most - len(best.model.applied)
+            best = self.evaluator.refine_delays(self.eliminate(more, kept=1))
+            gained, left = before.criterion - best.criterion, most - len(best.model.effects)
             if best.criterion - left * gained > bound:
                 break
         return best
 
-    def _added(self, before: Account, kinds: str) -> Account | None:
+    def _add_best(self, before: FittedModel, kinds: str) -> FittedModel | None:
         """The account with the candidate more that has the least criterion; None where none passes."""
-        candidates = [*self._candidates(before, kinds), *self._regrouped(before)]
+        candidates = [*self._candidates(before, kinds), *self._finer_groups(before)]
         candidates.sort(key=lambda one: one.criterion)
-        self._note_rivals(before, candidates)
+        self._record_rivals(before, candidates)
         for one in candidates:
-            reason = self._reason(before, one)
+            reason = self._rejection_reason(before, one)
             if not reason:
                 return one
-            if len(one.model.applied) > len(before.model.applied):
-                self.rejected.setdefault(one.last.law.name, (one.against(before).gain, reason))
+            if len(one.model.effects) > len(before.model.effects):
+                self.rejected.setdefault(one.last_effect.law.name, (one.compare_with(before).gain, reason))
         return None
 
-    def _note_rivals(self, before: Account, candidates: Sequence[Account]) -> None:
+    def _record_rivals(self, before: FittedModel, candidates: Sequence[FittedModel]) -> None:
         """Keep in mind what is worth nearly as much as the best candidate: it may say the same."""
         fall = [before.criterion - one.criterion for one in candidates]
         if fall:
             near = {
-                key(one.last.law)
+                key(one.last_effect.law)
                 for one, by in zip(candidates, fall, strict=True)
-                if len(one.model.applied) > len(before.model.applied) and by > NEAR * fall[0]
+                if len(one.model.effects) > len(before.model.effects) and by > RIVAL_FRACTION * fall[0]
             }
             for name in near:
-                self._near.setdefault(name, set()).update(near)
+                self._rivals.setdefault(name, set()).update(near)
 
-    def _reason(self, before: Account, after: Account) -> str:
+    def _rejection_reason(self, before: FittedModel, after: FittedModel) -> str:
         """Why what was added does not count; nothing where it does."""
-        grown = len(after.model.applied) > len(before.model.applied)
-        if grown and repeats(after.last, before.model.applied):
+        grown = len(after.model.effects) > len(before.model.effects)
+        if grown and duplicates_effect(after.last_effect, before.model.effects):
             return "a law that it contains, or that contains it, is on the same joints already"
-        if grown and not after.last.shown(after.model.signals):
+        if grown and not after.last_effect.is_excited(after.model.signals):
             return "the joints moved too little to tell it from other laws"
-        found = after.against(before)
-        p = found.p * self._tried
+        found = after.compare_with(before)
+        p = found.p * self._tested_count
         worth = float(np.max(found.share))
-        if p >= LEVEL:
-            return (
-                f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self._tried} candidates)"
-            )
-        if worth <= WORTH:
-            return f"takes {100 * worth:.1f} % off the error of a joint, below {100 * WORTH:.0f} %"
+        if p >= SIGNIFICANCE_LEVEL:
+            return f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self._tested_count} candidates)"
+        if worth <= MIN_EFFECT_SIZE:
+            return f"takes {100 * worth:.1f} % off the error of a joint, below {100 * MIN_EFFECT_SIZE:.0f} %"
         return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
 
-    def _pool(self, before: Account) -> Candidates:
+    def _candidates_of(self, before: FittedModel) -> Candidates:
         """The candidates on top of an account; kept, as several searches come by."""
-        model = _described(before.model)
-        if model not in self._known:
-            self._known[model] = Candidates(before)
-        return self._known[model]
+        model = _structure_key(before.model)
+        if model not in self._candidate_cache:
+            self._candidate_cache[model] = Candidates(before)
+        return self._candidate_cache[model]
 
-    def _candidates(self, before: Account, kinds: str) -> list[Account]:
+    def _candidates(self, before: FittedModel, kinds: str) -> list[FittedModel]:
         """The most promising candidates of these kinds on top of an account, fitted."""
-        found, self._tried = self._pool(before).found(kinds)
+        found, self._tested_count = self._candidates_of(before).found(kinds)
         return found
 
-    def _regrouped(self, before: Account) -> list[Account]:
+    def _finer_groups(self, before: FittedModel) -> list[FittedModel]:
         """The account with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
-        for groups in groupings(joints):
+        for groups in joint_groupings(joints):
             finer = len(np.unique(groups))
             if finer > len(np.unique(model.gain_groups)):
                 found.append(attrs.evolve(model, gain_groups=groups))
             if finer > len(np.unique(model.delay_groups)):
                 found.append(attrs.evolve(model, delay_groups=groups))
-        return self.judge.each_fitted(found)
+        return self.evaluator.fit_each(found)
 
-    def dropped(self, account: Account, kept: int = 0) -> Account:
+    def eliminate(self, account: FittedModel, kept: int = 0) -> FittedModel:
         """Without the effects that the others made needless (backward elimination), but with the last `kept` ones."""
-        while len(account.model.applied) > max(kept, 1):
+        while len(account.model.effects) > max(kept, 1):
             model = account.model
-            among = range(len(model.applied) - kept)
+            among = range(len(model.effects) - kept)
             least = min(
-                self.judge.each_fitted([model.without(k) for k in among]), key=lambda one: one.criterion
+                self.evaluator.fit_each([model.without_effect(k) for k in among]),
+                key=lambda one: one.criterion,
             )
-            if self._needed(least, account):
+            if self._is_needed(least, account):
                 return account
             account = least
         return account
 
-    def _needed(self, without: Account, account: Account) -> bool:
-        found = account.against(without)
+    def _is_needed(self, without: FittedModel, account: FittedModel) -> bool:
+        found = account.compare_with(without)
         worth = float(np.max(found.share))
-        return account.criterion < without.criterion and worth > WORTH and found.p < LEVEL
+        return (
+            account.criterion < without.criterion and worth > MIN_EFFECT_SIZE and found.p < SIGNIFICANCE_LEVEL
+        )
 
-    def rivals(self, account: Account, index: int) -> tuple[str, ...]:
+    def indistinguishable_effects(self, account: FittedModel, index: int) -> tuple[str, ...]:
         """The laws that say the same in the place of an effect, to what rows that select can tell."""
-        one = account.model.applied[index].law
+        one = account.model.effects[index].law
         if isinstance(one, SignalTerm):
             return ()
-        rest = self.judge.fitted(account.model.without(index))
-        alone = len(account.model.applied) == 1
-        pool = self._pool(rest) if alone else Candidates(rest, self._near.get(key(one), set()))
+        rest = self.evaluator.fit(account.model.without_effect(index))
+        alone = len(account.model.effects) == 1
+        pool = self._candidates_of(rest) if alone else Candidates(rest, self._rivals.get(key(one), set()))
         found = []
         for other in pool.found(LAWS)[0]:
-            lost = account.against(other)
-            if other.last.law.name != one.name and (lost.share < TIE).all():
-                found.append(other.last.law.name)
+            lost = account.compare_with(other)
+            if other.last_effect.law.name != one.name and (lost.share < EQUIVALENCE_MARGIN).all():
+                found.append(other.last_effect.law.name)
         return tuple(dict.fromkeys(found))
 
 
-def _terms(account: Account) -> tuple[int, float]:
+def _regressor_count(account: FittedModel) -> tuple[int, float]:
     """How many terms of named signals there are in an account, whose laws say more to who reads them; and its criterion."""
-    return sum(isinstance(one.law, SignalTerm) for one in account.model.applied), account.criterion
+    return sum(isinstance(one.law, SignalTerm) for one in account.model.effects), account.criterion
 
 
-def repeats(one: Applied, others: Iterable[Applied]) -> bool:
+def duplicates_effect(one: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
     """Does a law act where a law is at work that it contains as an end of its parameters, or that contains it?"""
-    mine = _contained(one.law)
-    return any(not (one.active & ~other.active).any() and mine & _contained(other.law) for other in others)
+    mine = _effect_family(one.law)
+    return any(
+        not (one.active & ~other.active).any() and mine & _effect_family(other.law) for other in others
+    )
 
 
-def _contained(law: EffectLaw) -> set[str]:
+def _effect_family(law: EffectLaw) -> set[str]:
     """The names of a law and of that which it becomes at the end of one of its parameters; none of a term."""
     if isinstance(law, SignalTerm):
         return set()
-    less = law.simpler({p.name: np.array([p.scale]) for p in law.parameters})
+    less = law.special_case({p.name: np.array([p.scale]) for p in law.parameters})
     return {law.name} | ({less[0].name} if less else set())
 
 
-def _described(model: Model) -> tuple[object, ...]:
+def _structure_key(model: Model) -> tuple[object, ...]:
     """What tells two fitted models apart: their laws, forms and joints, and what is shared."""
     effects = [
         (one.law.name, str(one.law.settings), one.active.tobytes(), one.groups.tobytes())
-        for one in model.applied
+        for one in model.effects
     ]
     return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes())
 
 
-def _shared(values: Array) -> Array:
+def _mean_over_joints(values: Array) -> Array:
     """The mean over the joints, for each of them."""
     return np.repeat(values.mean(axis=-1, keepdims=True), values.shape[-1], axis=-1)

@@ -81,12 +81,12 @@ class Signals:
         return self.slope("ddq_smooth")
 
     @cached_property
-    def pull(self) -> Array:
+    def stiffness_torque(self) -> Array:
         """kp times the error of position, N m."""
         return self.kp * (self.q_des - self.q)
 
     @cached_property
-    def drag(self) -> Array:
+    def damping_torque(self) -> Array:
         """kd times the error of velocity, N m."""
         return self.kd * (self.dq_des - self.dq)
 
@@ -171,7 +171,7 @@ class Samples:
         known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
         return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
 
-    def reaching(self, rows: Bools) -> Samples:
+    def drop_heldout(self, rows: Bools) -> Samples:
         """These samples without the logs at the end that hold none of `rows` (N, J)."""
         count = int(self.log_of_row[np.flatnonzero(rows.any(axis=1))[-1]]) + 1 if rows.any() else 1
         if count == len(self.logs):
@@ -191,7 +191,7 @@ class Samples:
         return part, rows
 
     @property
-    def finer(self) -> Samples:
+    def upsampled(self) -> Samples:
         """These rows, each with BETWEEN - 1 instants before it, evenly over the time since the row before."""
         if self._finer is None:
             part = self.taken(np.repeat(np.arange(len(self.t)), BETWEEN))
@@ -202,7 +202,7 @@ class Samples:
             self._finer = part
         return self._finer
 
-    def held(self, rows: Bools) -> Samples:
+    def select_rows(self, rows: Bools) -> Samples:
         """The rows (N,) that are true, alone; made but once, as fits come by again and again."""
         key = rows.tobytes()
         if key not in self._held:

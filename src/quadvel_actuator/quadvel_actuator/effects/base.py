@@ -30,7 +30,7 @@ class Stage(enum.IntEnum):
     """on the errors of position and velocity that the PD law is given"""
     LIMIT = 1
     """on the asked torque, as a bound"""
-    FLOW = 2
+    DYNAMICS = 2
     """on how fast the torque follows"""
     GAIN = 3
     """on what the drive's current gives, as a gain: the motor's constant and the gear come after bounds and lags"""
@@ -120,15 +120,15 @@ class EffectLaw(ABC):
     """the signal over which its residual shows its shape"""
     shifts: ClassVar[bool] = False
     """looks like a delay"""
-    remembers: ClassVar[bool] = False
+    has_memory: ClassVar[bool] = False
     """looks at other rows than the one that it acts on"""
-    between: ClassVar[bool] = False
+    acts_between_rows: ClassVar[bool] = False
     """has to follow what happens between the rows of a log, too"""
-    gainlike: ClassVar[bool] = False
+    confounded_with_gain: ClassVar[bool] = False
     """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
-    at_once: ClassVar[bool] = False
+    all_joints_together: ClassVar[bool] = False
     """happens to all joints of a robot at once"""
-    common: ClassVar[bool] = False
+    shared_by_joints: ClassVar[bool] = False
     """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
     """what to record so that it can be told from others"""
@@ -145,7 +145,7 @@ class EffectLaw(ABC):
         """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""
         return ()
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
         """The law with fewer parameters that this one becomes at the end of one of them, and its parameters (J,)."""
         return None
 
@@ -196,23 +196,23 @@ class EffectLaw(ABC):
         0 where it is not to be explained.
         """
 
-    def among(self, active: Bools) -> EffectLaw:
+    def restricted_to(self, active: Bools) -> EffectLaw:
         """The form that is left of it on these joints, (J,)."""
         return self
 
-    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+    def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         """Parameters (J,) brought into the order that makes them unique, within the bounds."""
         return p
 
-    def shown(self, p: Params, s: View) -> Bools:
+    def excited_joints(self, p: Params, s: View) -> Bools:
         """Joints (J,) whose motion shows the law with these parameters (J,); on the others it passes for another one."""
         return np.ones(s.q.shape[-1], dtype=bool)
 
-    def chance(self, p: Params, s: View) -> dict[str, Array]:
+    def sampling_error(self, p: Params, s: View) -> dict[str, Array]:
         """Half widths (J,) of the 95 % intervals of parameters that count what happened at random."""
         return {}
 
-    def foretold(self) -> EffectLaw:
+    def predictive(self) -> EffectLaw:
         """The law without what it read off the measured torque: all that it can say before that is known."""
         return self
 
@@ -270,7 +270,7 @@ class MemoryLaw(EffectLaw):
     At stage ERRORS `x` is the pair of errors, and so is what comes back; at ADDED it is the torque to add.
     """
 
-    remembers = True
+    has_memory = True
     inputs: ClassVar[tuple[str, ...]] = ()
     """the signals that `advance` is given, by name"""
 

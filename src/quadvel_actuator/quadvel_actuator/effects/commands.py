@@ -10,7 +10,7 @@ import numpy as np
 
 from .base import Array, ErrorLaw, Errors, Memory, MemoryLaw, Parameter, Params, Stage, Start, View
 
-MOST = 6
+MAX_BACKLOG = 6
 """commands lost in a row that are looked for"""
 
 
@@ -27,7 +27,7 @@ class CommandHold(ErrorLaw):
     parameters = (Parameter("share", "1", 0.0, 1.0, 0.05),)
     signal = "q_des@history"
     shifts = True
-    at_once = True
+    all_joints_together = True
     motion = "commands that change at every sending, with the sender's sequence number logged"
     odds: Array | None = attrs.field(default=None, repr=False)
     usual: Array | None = attrs.field(default=None, repr=False)
@@ -40,7 +40,7 @@ class CommandHold(ErrorLaw):
     def variants(cls, about: Any) -> Sequence[CommandHold]:
         return tuple(cls(*odds) for odds in about.lost_commands)
 
-    def foretold(self) -> CommandHold:
+    def predictive(self) -> CommandHold:
         if self.odds is None or self.usual is None:
             return self
         return attrs.evolve(self, odds=np.broadcast_to(self.usual, self.odds.shape))
@@ -66,7 +66,7 @@ class CommandHold(ErrorLaw):
         )
         return e[0] + late, e[1]
 
-    def chance(self, p: Params, s: View) -> dict[str, Array]:
+    def sampling_error(self, p: Params, s: View) -> dict[str, Array]:
         """As of as many tosses as there were commands."""
         share, count = p["share"], len(np.unique(s.packet))
         return {"share": 2.0 * np.sqrt(share * (1.0 - share) / count) + 1.0 / count}

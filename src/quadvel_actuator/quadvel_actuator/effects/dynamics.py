@@ -65,7 +65,7 @@ class FirstOrderLag(MemoryLaw):
     """T dtau/dt = tau* - tau"""
 
     name = "first_order_lag"
-    stage = Stage.FLOW
+    stage = Stage.DYNAMICS
     parameters = (_TIME,)
     signal = "tau@history"
     shifts = True
@@ -166,7 +166,7 @@ class TimestampSkew(ErrorLaw):
         return f"{self.channel}@history"
 
     @property
-    def gainlike(self) -> bool:  # type: ignore[override]
+    def confounded_with_gain(self) -> bool:  # type: ignore[override]
         """A position that is off on all joints is two other delays."""
         return self.channel == "q"
 

@@ -73,7 +73,7 @@ class ParallelSpring(AddedLaw):
         q, r = (s.q * weight).sum(axis=0) / n, residual.sum(axis=0) / n
         return [{"q0": q}, *({"q0": np.clip(q + r / k, -25.0, 25.0)} for k in _STIFFNESSES)]
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
         """A weak spring that rests far away is a constant."""
         return TorqueOffset(at=self.at), {"offset": p["k"] * p["q0"]}
 
@@ -120,11 +120,11 @@ class Cogging(AddedLaw):
             found.append({"n": turns, "phi": np.remainder(phase + np.pi, 2.0 * np.pi) - np.pi})
         return found
 
-    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+    def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         phi = p["phi"] + np.where(p["a"] < 0.0, np.pi, 0.0)
         return p | {"a": np.abs(p["a"]), "phi": np.remainder(phi + np.pi, 2.0 * np.pi) - np.pi}
 
-    def shown(self, p: Params, s: View) -> Bools:
+    def excited_joints(self, p: Params, s: View) -> Bools:
         """Joints that moved through a whole period: a part of one is any curve over the angle."""
         whole: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi
         return whole
@@ -162,7 +162,7 @@ class Backlash(MemoryLaw):
     """Play: the drive sees `on` (the position q, the error q_des - q, or the torque) through a gap of +-`gap`"""
 
     name = "backlash"
-    stage = staged("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.FLOW)
+    stage = staged("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.DYNAMICS)
     on: str = attrs.field(default="error", validator=one_of("error", "q", "torque"))
 
     @property
@@ -198,11 +198,11 @@ class Backlash(MemoryLaw):
         return (self._seen(x, u) + 0.0 * p["gap"],)
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        follows = recurrence.play(memory[0], self._seen(x, u), p["gap"])
+        follows = recurrence.backlash_step(memory[0], self._seen(x, u), p["gap"])
         return self._given(x, u, follows), (follows,)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return self._given(x, (s.q,), recurrence.played(self._seen(x, (s.q,)), s.start, p["gap"]))
+        return self._given(x, (s.q,), recurrence.backlash_series(self._seen(x, (s.q,)), s.start, p["gap"]))
 
 
 class Hysteresis(MemoryLaw):
@@ -230,16 +230,18 @@ class Hysteresis(MemoryLaw):
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         z, before = memory
-        z = recurrence.bend(z, (u[0] - before) / p["reach"], p["beta"])
+        z = recurrence.bouc_wen_step(z, (u[0] - before) / p["reach"], p["beta"])
         return -p["F"] * z, (z, u[0])
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
         """In proportion to F: computed once for all guesses with the same curve."""
         reach, beta = np.broadcast_arrays(p["reach"], p["beta"])
         if reach.ndim == 1:
-            return -p["F"] * recurrence.bent(s.q, s.start, reach, beta)
+            return -p["F"] * recurrence.bouc_wen_series(s.q, s.start, reach, beta)
         curves, which = np.unique(np.concatenate([reach, beta], axis=-1), axis=0, return_inverse=True)
-        return -p["F"] * recurrence.bent(s.q, s.start, *np.split(curves, 2, axis=-1))[which.ravel()]
+        return (
+            -p["F"] * recurrence.bouc_wen_series(s.q, s.start, *np.split(curves, 2, axis=-1))[which.ravel()]
+        )
 
 
 LAWS = (TorqueOffset, ParallelSpring, Cogging, Deadband, Backlash, Hysteresis)

@@ -58,7 +58,7 @@ class ViscousFriction(AddedLaw):
     parameters = (Parameter("b", "N m s/rad", 0.0, 10.0, 0.05),)
     linear = ("b",)
     of_drive = False
-    gainlike = True
+    confounded_with_gain = True
     signal = "dq"
     motion = _SLOW
 
@@ -86,10 +86,10 @@ class StribeckFriction(_Rubbing):
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return [{"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08)]
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
         return CoulombFriction(at=self.at, turn=self.turn), {"c": p["c"], "v_0": p["v_0"]}
 
-    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+    def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         return p | {"c_s": np.maximum(p["c_s"], p["c"])}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:

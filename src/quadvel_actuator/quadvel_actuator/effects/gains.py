@@ -112,7 +112,7 @@ class SupplySag(TorqueLaw):
     stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = "tau"
     motion = "hard accelerations of all joints together, with the supply voltage logged"
-    common = _OF_ONE_SUPPLY
+    shared_by_joints = _OF_ONE_SUPPLY
     what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
     full: float = 1.0
     of: str = attrs.field(default="voltage", validator=one_of("voltage", "power"))
@@ -137,7 +137,7 @@ class SupplySag(TorqueLaw):
     def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
         return _sags(self.what, self._strain(s), torque)
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
         return _unsagged(p)
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
@@ -156,7 +156,7 @@ class PowerSag(MemoryLaw):
     stage = staged("what", gain=Stage.GAIN, bound=Stage.LIMIT)
     signal = SupplySag.signal
     motion = SupplySag.motion
-    common = _OF_ONE_SUPPLY
+    shared_by_joints = _OF_ONE_SUPPLY
     inputs = ("dq",)
     what: str = attrs.field(default="gain", validator=one_of("gain", "bound"))
 
@@ -173,7 +173,7 @@ class PowerSag(MemoryLaw):
         sags = _sags(self.what, _power(torque, s.dq), torque)
         return [{**sag, "T": late} for sag in sags for late in (0.002, 0.012)]
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
         return _unsagged(p)
 
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
@@ -257,7 +257,7 @@ class CrossCoupling(AddedLaw):
     def _kind(columns: Iterable[tuple[str, int]]) -> type[CrossCoupling]:
         return _PositionCoupling if any(signal == "q" for signal, _ in columns) else CrossCoupling
 
-    def among(self, active: Bools) -> CrossCoupling:
+    def restricted_to(self, active: Bools) -> CrossCoupling:
         kind = self._kind(one for one, acts in zip(self.columns, active, strict=True) if acts)
         return self if type(self) is kind else kind(self.source, self.columns, at=self.at)
 
@@ -290,7 +290,7 @@ class _PositionCoupling(CrossCoupling):
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return super().torque(x, s, p) + self._own(p["offset"])
 
-    def tidy(self, p: dict[str, Array]) -> dict[str, Array]:
+    def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         return p | {"offset": self._own(p["offset"])}
 
     def _own(self, offset: Any) -> Any:

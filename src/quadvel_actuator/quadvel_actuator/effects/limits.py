@@ -51,7 +51,7 @@ class TorqueSpeedLimit(TorqueLaw):
             for fast in (0.6, 0.9, 1.3, 2.0, 4.0)
         ]
 
-    def simpler(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
+    def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
         return TorqueSaturation(), {"limit": p["stall"]}
 
     def torque(self, x: Array, s: View, p: Params) -> Array:
@@ -65,8 +65,8 @@ class SlewLimit(MemoryLaw):
     """|dtau/dt| held to `rate`; until a new command comes in the middle of a step, the torque goes on as it went before"""
 
     name = "slew_limit"
-    stage = Stage.FLOW
-    between = True
+    stage = Stage.DYNAMICS
+    acts_between_rows = True
     inputs = ("age",)
     parameters = (Parameter("rate", "N m/s", 5.0, 50000.0, 300.0),)
     signal = "tau@history"
@@ -84,11 +84,11 @@ class SlewLimit(MemoryLaw):
 
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         given, before, slope = memory
-        given, slope = recurrence.chase(given, before, slope, x, u[0], dt, p["rate"])
+        given, slope = recurrence.rate_limit_step(given, before, slope, x, u[0], dt, p["rate"])
         return given, (given, x, slope)
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return recurrence.chased(x, s.age, s.dt, s.start, p["rate"])
+        return recurrence.rate_limit_series(x, s.age, s.dt, s.start, p["rate"])
 
 
 LAWS = (TorqueSaturation, TorqueSpeedLimit, SlewLimit)

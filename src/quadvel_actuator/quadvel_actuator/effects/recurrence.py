@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 
 
-def play(follows: Any, seen: Any, gap: Any) -> Any:
+def backlash_step(follows: Any, seen: Any, gap: Any) -> Any:
     """What follows `seen` through a gap of +-`gap`."""
     return np.minimum(np.maximum(follows, seen - gap), seen + gap)
 
 
-def bend(z: Any, way: Any, beta: Any) -> Any:
+def bouc_wen_step(z: Any, way: Any, beta: Any) -> Any:
     """The bristles' bending (-1 to 1) after a `way` in units of their reach, by Bouc-Wen's law."""
     back = z * way < 0.0
     z = z + way * (1.0 - (1.0 - 2.0 * (1.0 - beta) * back) * np.abs(z))
     return np.minimum(np.maximum(z, -1.0), 1.0)
 
 
-def chase(given: Any, before: Any, slope: Any, now: Any, age: Any, dt: Any, rate: Any) -> Any:
+def rate_limit_step(given: Any, before: Any, slope: Any, now: Any, age: Any, dt: Any, rate: Any) -> Any:
     """What chases a torque at `rate` at most over `dt`, and that torque's slope; it went from `before` to `now`.
 
     Until a new command came, `age` ago, the torque went on with the slope that it had.
@@ -46,17 +46,17 @@ def _nearer(given: Any, target: Any, slope: Any, time: Any, rate: Any) -> Any:
     return given - side * rate * chased + np.minimum(np.maximum(slope, -rate), rate) * (time - chased)
 
 
-def played(seen: Any, start: Any, gap: Any) -> Any:
+def backlash_series(seen: Any, start: Any, gap: Any) -> Any:
     """`play` along the rows of `seen` (..., N, J), from rest where a stretch starts; `gap` (..., 1, J) or less."""
     return _along(_compiled()["played"], (seen, start), (gap,))
 
 
-def bent(q: Any, start: Any, reach: Any, beta: Any) -> Any:
+def bouc_wen_series(q: Any, start: Any, reach: Any, beta: Any) -> Any:
     """`bend` along the rows of `q` (..., N, J) rad."""
     return _along(_compiled()["bent"], (q, start), (reach, beta))
 
 
-def chased(torque: Any, age: Any, dt: Any, start: Any, rate: Any) -> Any:
+def rate_limit_series(torque: Any, age: Any, dt: Any, start: Any, rate: Any) -> Any:
     """`chase` along the rows of `torque` (..., N, J)."""
     return _along(_compiled()["chased"], (torque, age, dt, start), (rate,))
 
@@ -81,14 +81,16 @@ def _compiled() -> dict[str, Callable[..., Any]]:
     import numba  # takes time and memory that a running model need not spend
     from numba.extending import register_jitable
 
-    for step in (play, bend, _nearer, chase):
+    for step in (backlash_step, bouc_wen_step, _nearer, rate_limit_step):
         register_jitable(step)
 
     def played(seen: Any, start: Any, gap: Any, out: Any) -> None:
         for b, j in np.ndindex(gap.shape):
             follows = seen[b, 0, j]
             for n in range(seen.shape[1]):
-                follows = seen[b, n, j] if start[b, n, j] else play(follows, seen[b, n, j], gap[b, j])
+                follows = (
+                    seen[b, n, j] if start[b, n, j] else backlash_step(follows, seen[b, n, j], gap[b, j])
+                )
                 out[b, n, j] = follows
 
     def bent(q: Any, start: Any, reach: Any, beta: Any, out: Any) -> None:
@@ -96,7 +98,11 @@ def _compiled() -> dict[str, Callable[..., Any]]:
             z = 0.0
             for n in range(q.shape[1]):
                 fresh = n == 0 or start[b, n, j]
-                z = 0.0 if fresh else bend(z, (q[b, n, j] - q[b, n - 1, j]) / reach[b, j], beta[b, j])
+                z = (
+                    0.0
+                    if fresh
+                    else bouc_wen_step(z, (q[b, n, j] - q[b, n - 1, j]) / reach[b, j], beta[b, j])
+                )
                 out[b, n, j] = z
 
     def chased(torque: Any, age: Any, dt: Any, start: Any, rate: Any, out: Any) -> None:
@@ -108,7 +114,9 @@ def _compiled() -> dict[str, Callable[..., Any]]:
                     given, slope = now, 0.0
                 else:
                     before = torque[b, n - 1, j]
-                    given, slope = chase(given, before, slope, now, age[b, n, j], dt[b, n, j], rate[b, j])
+                    given, slope = rate_limit_step(
+                        given, before, slope, now, age[b, n, j], dt[b, n, j], rate[b, j]
+                    )
                 out[b, n, j] = given
 
     rows, on = (numba.types.Array(kind, 3, "A", readonly=True) for kind in (numba.float64, numba.boolean))

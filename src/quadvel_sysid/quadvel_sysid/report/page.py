@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from ..decision import UNTRACED
 from ..excitation import propose
 from ..identification import Identification
+from ..summary_text import UNTRACED
 from . import figures
 from .figures import short
 

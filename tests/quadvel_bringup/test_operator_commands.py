@@ -16,7 +16,7 @@ quadvel_dds.install()
 
 from std_srvs.srv import SetBool  # noqa: E402
 
-from quadvel_bringup import orders, session  # noqa: E402
+from quadvel_bringup import session  # noqa: E402
 from quadvel_bringup.nodes import command  # noqa: E402
 
 

@@ -7,13 +7,13 @@ import time
 from collections.abc import Callable, Iterator
 
 from .guard import Level
-from .supervisor import FOLLOWING, Supervisor
+from .supervisor import POSTURE_AFTER, Supervisor
 
 AGAIN = 5.0
 """s for which something has to be right before it is told again that it is wrong"""
 
 
-class Announcements:
+class OperatorLog:
     """Remembers what was told; the sentences are for a log."""
 
     def __init__(self, supervisor: Supervisor, clock: Callable[[], float] = time.monotonic) -> None:
@@ -30,7 +30,7 @@ class Announcements:
             self._mode = mode, reason
             yield bool(self._supervisor.fault), f"{mode}: {reason}{self._way_out()}"
         yield from self._new_findings()
-        if mode not in FOLLOWING:
+        if mode not in POSTURE_AFTER:
             self._refusal = None
         elif self._refusal != "" and not self._supervisor.walk_refusal:
             self._refusal = ""
@@ -56,6 +56,6 @@ class Announcements:
     def waiting(self) -> Iterator[str]:
         """Now and then: why a standing robot follows no velocity, once for each reason."""
         refusal = self._supervisor.walk_refusal
-        if self._supervisor.mode in FOLLOWING and refusal not in ("", self._refusal):
+        if self._supervisor.mode in POSTURE_AFTER and refusal not in ("", self._refusal):
             self._refusal = refusal
             yield f"follows no velocity: {refusal}"

@@ -7,7 +7,7 @@ from typing import Any
 
 from quadvel_actuator.effects.terms import NAME as TERMS
 
-from .criterion import LEVEL
+from .criterion import SIGNIFICANCE_LEVEL
 
 UNTRACED = "it goes with no signal of the log, whose cause may be too rare in what is fitted"
 """Of what a model leaves that is not white"""
@@ -43,7 +43,7 @@ def _nothing_added(report: Mapping[str, Any]) -> str:
 def _added(report: Mapping[str, Any]) -> str:
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
     effects, rest = report["effects"], report["unexplained"]
-    shown = [one for one in effects if one["p_value"] <= LEVEL]
+    shown = [one for one in effects if one["p_value"] <= SIGNIFICANCE_LEVEL]
     named = ", ".join(dict.fromkeys(one["name"] for one in shown or effects))
     cut = 100.0 * (1.0 - after / before) if before > 0.0 else 0.0
     way = f"{'falls' if cut >= 0.0 else 'rises'} by {abs(cut):.0f} %"

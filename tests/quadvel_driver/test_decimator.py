@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_driver.thinning import Thinning
+from quadvel_driver.decimator import Decimator
 from quadvel_nodes.tick_grid import TickGrid
 
 
 def passed(ticks: list[int], rate: int = 200) -> list[int]:
-    thinning = Thinning(rate)
+    thinning = Decimator(rate)
     return [tick for tick in ticks if thinning.passes(tick % 2**32)]
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 
-class Thinning:
+class Decimator:
     """Lets one sample pass in each period of the stream's own counter: the first that comes in it.
 
     The periods are fixed on the counter, so that what passes keeps its phase: where a sample was lost, the next one passes

@@ -8,7 +8,7 @@ import numpy as np
 
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import RobotState
-from quadvel_policy.announcements import Announcements
+from quadvel_policy.operator_log import OperatorLog
 from quadvel_policy.supervisor import Supervisor, SupervisorConfig
 
 STILL, FORWARD = (0.0, 0.0, 0.0, 1.0), (0.5, 0.0, 0.0, 0.0)
@@ -19,7 +19,7 @@ class Run:
 
     def __init__(self, policy: Any) -> None:
         self.supervisor = Supervisor(policy, SupervisorConfig())
-        self.announcements = Announcements(self.supervisor)
+        self.announcements = OperatorLog(self.supervisor)
         self._ticks = 0
 
     def tick(self, command: Any, count: int = 1) -> list[tuple[bool, str]]:

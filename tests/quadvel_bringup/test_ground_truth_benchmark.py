@@ -16,9 +16,9 @@ from rich.console import Console
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup import plant as plant_module
+from quadvel_bringup.ground_truth_benchmark import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
+from quadvel_bringup.ground_truth_page import decision, twin_page
 from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
-from quadvel_bringup.twin import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
-from quadvel_bringup.twin_page import decision, twin_page
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_sim import SimulatorConfig

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from quadvel_bringup import up
-from quadvel_bringup.rehearsal import PARTS, rehearse
+from quadvel_bringup.preflight import PARTS, rehearse
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 

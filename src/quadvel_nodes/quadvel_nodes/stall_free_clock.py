@@ -14,7 +14,7 @@ _WRAP = 2**32
 _LONGEST_LIFE = 1e-3 * _WRAP / 2  # s from state to state; a tick that is further on went back
 
 
-class RobotTime:
+class StallFreeClock:
     """Follows the states of one robot. stalled: s that it stood still and that were left out, since the start."""
 
     def __init__(self) -> None:

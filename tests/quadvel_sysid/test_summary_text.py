@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from quadvel_sysid.decision import decision
+from quadvel_sysid.summary_text import decision
 
 
 def report(*effects: tuple[str, float]) -> dict[str, Any]:

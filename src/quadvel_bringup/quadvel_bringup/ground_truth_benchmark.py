@@ -29,12 +29,12 @@ from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 
+from .ground_truth_page import ROWS, decision, twin_page
 from .plant import read_plant
 from .processes import ProcessGroup, StopSignals
 from .recorded_run import LOOK
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
-from .twin_page import ROWS, decision, twin_page
 
 PLANTS = Path(__file__).parent / "config" / "plants"
 SHIPPED = ("dry_gears", "slow_current", "chafing_cable")

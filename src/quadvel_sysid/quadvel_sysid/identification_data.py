@@ -20,7 +20,7 @@ VALUES = 60_000
 
 
 @attrs.frozen(eq=False)
-class Material:
+class IdentificationData:
     """Logs, of long ones pieces that hold no more than they show, so that these can be let go of."""
 
     logs: tuple[Log, ...]
@@ -37,11 +37,11 @@ class Material:
         return self.fitted < len(self.logs)
 
 
-def gathered(
+def prepare(
     data: Dataset,
     values: int = VALUES,
     progress: Progress = lambda share, text: None,
-) -> Material:
+) -> IdentificationData:
     """Of the logs to fit and to judge on as many `values` of torque in all. Raises LogError where they can't be used together."""
     logs, train = data.logs, len(data.fitted)
     body = None
@@ -54,4 +54,4 @@ def gathered(
     parts = [pieces(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
     chosen = tuple(log for part in parts for log in part)
     fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)
-    return Material(chosen, fitted, body, data.findings)
+    return IdentificationData(chosen, fitted, body, data.findings)

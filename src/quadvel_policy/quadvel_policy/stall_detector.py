@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 
 
-class Pauses:
+class StallDetector:
     """Notices when this process did not run, and excuses silence for a period after that, once.
 
     count: how often it did not, since the start. lost: s in which it did not, since the last message.
@@ -24,7 +24,7 @@ class Pauses:
         self._looked: float | None = None
         self._waits_until: float | None = None  # None: no pause since the last message
 
-    def look(self, now: float) -> None:
+    def poll(self, now: float) -> None:
         """This process runs at `now` (s)."""
         if self._looked is not None and now - self._looked > self._period + self._tolerance:
             self.count += 1

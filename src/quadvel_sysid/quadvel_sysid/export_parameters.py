@@ -12,24 +12,24 @@ from quadvel_actuator.effects.terms import NAME as TERMS
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
-from .criterion import Parts
+from .criterion import DataSplit
 from .delays import running_delays
 from .library import SignalTerm
-from .model import Applied, Model, linear_columns
+from .model import AppliedEffect, Model, linear_columns
 from .preparation import reference_gains
 from .signals import Array, Bools
 
 
 def parameters(
-    model: Model, parts: Parts, base: ActuatorParameters, widths: Sequence[Array] = ()
+    model: Model, parts: DataSplit, base: ActuatorParameters, widths: Sequence[Array] = ()
 ) -> ActuatorParameters:
     """A fitted model as parameters; the torque limits are those of `base`.
 
     widths: half of the 95 % interval of each effect's values, (P, J) each; without them the effects tell no ranges.
     """
     joints = model.samples.joints
-    error = mean_square(model.foretold().residual(), parts.chosen_on)
-    pair = DelayPair(*running_delays(model, parts.chosen_on), error)
+    error = mean_square(model.predictive().residual(), parts.fit_or_select)
+    pair = DelayPair(*running_delays(model, parts.fit_or_select), error)
     deltas, own = _deviations(model)
     return attrs.evolve(
         base,
@@ -51,7 +51,7 @@ def mean_square(error: Array, rows: Bools) -> float:
 
 def _laws(model: Model, widths: Sequence[Array]) -> list[Effect]:
     found = []
-    for k, one in enumerate(model.applied):
+    for k, one in enumerate(model.effects):
         if isinstance(one.law, SignalTerm):
             continue
         params = parameter_entries(one, widths[k] if widths else np.zeros_like(one.values))
@@ -66,7 +66,7 @@ def _laws(model: Model, widths: Sequence[Array]) -> list[Effect]:
 def _terms(model: Model, rows: Bools) -> list[Effect]:
     """All terms as one effect; on `rows` (N, J) it is looked how large their torque becomes."""
     joints = model.samples.joints
-    terms = [one for one in model.applied if isinstance(one.law, SignalTerm)]
+    terms = [one for one in model.effects if isinstance(one.law, SignalTerm)]
     if not terms:
         return []
     saved = [one.law.term(one, _largest(model, one, rows)).saved(joints) for one in terms]  # type: ignore[attr-defined]
@@ -74,7 +74,7 @@ def _terms(model: Model, rows: Bools) -> list[Effect]:
     return [Effect(TERMS, tuple(acts), {"terms": saved})]
 
 
-def _largest(model: Model, one: Applied, rows: Bools) -> Array:
+def _largest(model: Model, one: AppliedEffect, rows: Bools) -> Array:
     """The largest torque (J,) that a term had on `rows` (N, J): a running model's stays within it."""
     torque = np.einsum("kj,knj->nj", one.values, linear_columns(model, one))
     return np.max(np.abs(torque) * rows, axis=0)
@@ -111,7 +111,7 @@ def limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[flo
     return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
 
 
-def parameter_entries(one: Applied, half: Array) -> dict[str, dict[str, Any]]:
+def parameter_entries(one: AppliedEffect, half: Array) -> dict[str, dict[str, Any]]:
     """The parameters of an effect on its joints, by name: value, interval and unit."""
     params = {}
     for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
@@ -135,7 +135,7 @@ def acting_joints(active: Bools, joints: Sequence[str]) -> list[str]:
     return [name for name, acts in zip(joints, active, strict=True) if acts]
 
 
-def law_settings(one: Applied) -> dict[str, Any]:
+def law_settings(one: AppliedEffect) -> dict[str, Any]:
     """The settings of a law; what it has for each joint, for those that it acts on."""
     return {
         name: [v for v, acts in zip(value, one.active, strict=True) if acts]
