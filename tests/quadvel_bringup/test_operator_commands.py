@@ -16,7 +16,7 @@ quadvel_dds.install()
 
 from std_srvs.srv import SetBool  # noqa: E402
 
-from quadvel_bringup import session  # noqa: E402
+from quadvel_bringup import operator_commands, session  # noqa: E402
 from quadvel_bringup.nodes import command  # noqa: E402
 
 
@@ -33,10 +33,10 @@ def test_a_robot_behind_the_board_takes_the_same_orders_as_any_simulated_one(
     board: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(session, "PATIENCE", 40.0)  # it is only starting
-    assert orders.pause(True) == 0
-    assert orders.step(20) == 0
-    assert orders.push((0.0, 60.0, 0.0), 0.2, "trunk") == 0
-    assert orders.reset("stand") == 0
+    assert operator_commands.pause(True) == 0
+    assert operator_commands.step(20) == 0
+    assert operator_commands.push((0.0, 60.0, 0.0), 0.2, "trunk") == 0
+    assert operator_commands.reset("stand") == 0
     done = ["paused", "advances by 20 ms", "trunk is pushed", "the robot is back in posture stand"]
     assert capsys.readouterr().out.splitlines() == done
 
@@ -45,7 +45,7 @@ def test_without_a_simulator_it_is_said_how_to_start_one(monkeypatch: pytest.Mon
     monkeypatch.setattr(session, "PATIENCE", 0.2)
     text = "sim_node/reset or board/reset: nobody answers; there is no simulator; start one: quadvel up"
     with pytest.raises(session.NobodyThere, match=re.escape(text)):
-        orders.reset("lie")
+        operator_commands.reset("lie")
 
 
 DRIVER = """
@@ -71,7 +71,7 @@ def test_a_robot_that_nobody_simulates_is_not_pushed(monkeypatch: pytest.MonkeyP
     assert driver.stdout.readline() == "ready\n"
     try:
         with pytest.raises(session.NobodyThere, match="a real one can not be given this order"):
-            orders.push((0.0, 60.0, 0.0), 0.2, "trunk")
+            operator_commands.push((0.0, 60.0, 0.0), 0.2, "trunk")
     finally:
         driver.communicate("\n", timeout=40.0)
 

@@ -149,7 +149,7 @@ def cool(rig: Rig) -> None:
 
 
 CASES: dict[str, Case] = {
-    "obstacle": Case(attribute("obstacle", "low_state has 2 publishers")),
+    "duplicate_publisher": Case(attribute("duplicate_publisher", "low_state has 2 publishers")),
     "state_not_finite": Case(lambda rig, k: {"dq": NOT_A_NUMBER}),
     "state_stale": Case(lambda rig, k: {"age": 0.06}),
     "controller_stopped": Case(lambda rig, k: stopped(rig, 0.2)),
@@ -231,7 +231,7 @@ def check_damping(rig: Rig, case: Case, name: str) -> None:
     rig.run(0.3, FORWARD)
     assert (rig.mode, rig.supervisor.reason) == ("fault", reason)
     assert rig.supervisor.request("stand_up") == (False, f"is in fault ({reason}), request passive first")
-    rig.supervisor.obstacle = rig.supervisor.motors = None
+    rig.supervisor.duplicate_publisher = rig.supervisor.motors = None
     assert rig.supervisor.request("passive")[0]
     rig.policy.action = np.zeros(12, np.float32)
     rig.walk()

@@ -333,14 +333,14 @@ def test_an_action_that_is_not_finite_is_a_fault(rig: Rig) -> None:
 
 def test_while_somebody_finds_an_obstacle_nothing_moves(policy: Any) -> None:
     rig = Rig(policy, auto_stand=True)
-    rig.supervisor.obstacle = "low_state has 2 publishers"
+    rig.supervisor.duplicate_publisher = "low_state has 2 publishers"
     rig.run(0.1)
     assert rig.mode == "passive"
     assert rig.supervisor.request("stand_up") == (False, "low_state has 2 publishers")
-    rig.supervisor.obstacle = None
+    rig.supervisor.duplicate_publisher = None
     rig.run(2.5)
     assert rig.mode == "stance"
-    rig.supervisor.obstacle = "low_state has 2 publishers"
+    rig.supervisor.duplicate_publisher = "low_state has 2 publishers"
     rig.tick()
     assert (rig.mode, rig.supervisor.reason) == ("fault", "low_state has 2 publishers")
 

@@ -384,7 +384,7 @@ def _dropped_out(relay: Relay, message: Message) -> Message:
 def _second_publisher(robot: TopicRobot) -> None:
     node = robot.relay.node
     other = node.create_publisher(LowState, "low_state", 1)
-    robot.until(lambda state: state.fault == "obstacle", "a second robot is not noticed")
+    robot.until(lambda state: state.fault == "duplicate_publisher", "a second robot is not noticed")
     node.destroy_publisher(other)
 
 
@@ -395,7 +395,7 @@ def _too_fast(robot: TopicRobot) -> None:
 CALVES = (2, 5, 8, 11)
 TILTED = (np.cos(0.65), 0.0, np.sin(0.65), 0.0)
 FAULTS = (
-    TopicFault("obstacle", begin=_second_publisher),
+    TopicFault("duplicate_publisher", begin=_second_publisher),
     TopicFault("state_not_finite", change=_set(q=np.nan)),
     TopicFault("attitude_not_unit", change=_set(orientation_wxyz=lambda before: 1.2 * before)),
     TopicFault("state_back_in_time", change=_earlier(0.1)),

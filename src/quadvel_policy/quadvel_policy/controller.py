@@ -188,7 +188,7 @@ class Controller(Node):
 
     def _report(self) -> None:
         """Once a second: /diagnostics, and a look whether the robot is alone."""
-        self._supervisor.obstacle = self._rival()
+        self._supervisor.duplicate_publisher = self._rival()
         self._silent_reports += 1
         if self._sim_time and self._loop.state is not None and self._silent_reports > PATIENCE:
             self._supervisor.fail(f"no state came for {PATIENCE} s: the simulator is silent", "state_stale")
@@ -216,8 +216,8 @@ class Controller(Node):
         self._reports += 1
         for sentence in self._announcements.waiting():
             log.info(sentence)
-        if self._supervisor.obstacle:
-            log.error(self._supervisor.obstacle, throttle_duration_sec=QUIET)
+        if self._supervisor.duplicate_publisher:
+            log.error(self._supervisor.duplicate_publisher, throttle_duration_sec=QUIET)
         elif self._loop.state is None:
             if self._reports == PATIENCE:
                 log.warning(f"{self._no_state()} in {PATIENCE} s: is a simulator or a driver running?")
@@ -249,8 +249,8 @@ class Controller(Node):
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.fault:
             return DiagnosticStatus.ERROR, status
-        if self._supervisor.obstacle:
-            return DiagnosticStatus.ERROR, self._supervisor.obstacle
+        if self._supervisor.duplicate_publisher:
+            return DiagnosticStatus.ERROR, self._supervisor.duplicate_publisher
         if self._loop.state is None:
             return DiagnosticStatus.WARN, f"{self._no_state()} yet"
         if self._supervisor.findings:

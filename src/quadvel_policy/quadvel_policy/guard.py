@@ -141,7 +141,7 @@ class GuardInput:
     overruns: int
     """deadlines missed in a row"""
     motors: MotorStatus | None
-    obstacle: str | None
+    duplicate_publisher: str | None
     """what somebody else found that forbids moving, a sentence"""
     refused: Mapping[str, MessageError] = attrs.field(factory=dict)
     """by topic, why the messages that came since the last fit one were refused"""

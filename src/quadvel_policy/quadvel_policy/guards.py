@@ -30,7 +30,7 @@ class DuplicatePublisher(Guard):
     """More than one simulator or driver reports states."""
 
     def check(self, see: GuardInput) -> str | None:
-        return see.obstacle
+        return see.duplicate_publisher
 
 
 class StateNotFinite(Guard):

@@ -106,13 +106,20 @@ class SupervisorConfig(GuardConfig, CommandLimitsConfig):
 class Supervisor:
     """Runs one mode at a time and answers the faults that its guards find.
 
-    policy: what drives in walk; its metadata gives limits and the nominal posture. backup: filter whose velocity is followed
-    where the estimator's is missing or wrong. guards: all of them but in tests. After each tick: `mode` (one of MODES),
-    `reason` (one sentence), `fault` (the name of what made the robot stop, "" where nothing did), `findings` (what is wrong
-    now), `limits` (how often each limit of commands acted), `command` (4,) in effect, `walk_refusal`, `inference_seconds` (nan
-    where no network ran). Set from outside: `obstacle` (what forbids moving, a sentence, or None), `overruns` (deadlines missed
-    in a row), `motors`, `refused` (by topic, why the messages since the last fit one were refused), `stopped` (s that the
-    controller did not run before the state that is to be answered).
+    Attributes:
+        mode: the present mode, one of MODES.
+        reason: why it is in this mode, one sentence.
+        fault: name of the guard that made the robot stop, "" if none did.
+        findings: what is wrong now.
+        limits: how often each limit of commands acted.
+        command: the command in effect, (4,): vx, vy (m/s), wz (rad/s), 1 to stand and 0 to walk.
+        walk_refusal: why the robot may not walk now, "" if it may.
+        inference_seconds: duration of the network's last run, s; NaN where no network ran.
+        duplicate_publisher: set from outside; the second source of states, a sentence, or None.
+        overruns: set from outside; deadlines missed in a row.
+        motors: set from outside; temperatures and errors of the motors.
+        refused: set from outside; by topic, why the messages since the last accepted one were refused.
+        stopped: set from outside; time that the controller did not run before the present state, s.
     """
 
     def __init__(
@@ -157,7 +164,7 @@ class Supervisor:
         self._found: list[Finding] = []  # in whatever mode
         self.command = STANCE_COMMAND.copy()
         self.inference_seconds = float("nan")
-        self.obstacle: str | None = None
+        self.duplicate_publisher: str | None = None
         self.overruns = 0
         self.motors: MotorStatus | None = None
         self.refused: dict[str, MessageError] = {}
@@ -292,7 +299,7 @@ class Supervisor:
             moves=self.mode == "walk" and not self.command[3],
             overruns=self.overruns,
             motors=self.motors,
-            obstacle=self.obstacle,
+            duplicate_publisher=self.duplicate_publisher,
             refused=self.refused,
             stopped=self.stopped,
         )
@@ -378,7 +385,7 @@ class Supervisor:
             self._walk.reset()
 
     def _forbids(self, mode: str) -> str | None:
-        """What would end `mode` at once, a sentence: the obstacle that is there now, or what the last tick found."""
+        """What would end `mode` at once, a sentence: the second publisher that is there now, or what the last tick found."""
         found = (
             finding.sentence
             for finding in self._found
@@ -386,7 +393,7 @@ class Supervisor:
             and mode in finding.modes
             and finding.name != DuplicatePublisher.name()
         )
-        return self.obstacle or next(found, None)
+        return self.duplicate_publisher or next(found, None)
 
     def _refusal(self, mode: str) -> str | None:
         """Why this mode can't be had now; None where it can."""
