@@ -44,9 +44,10 @@ ros-tests: $(ROS_VENV)/.test
 test-ros: $(ROS_VENV)/.test  ## run the tests of the nodes on ROS 2's own rclpy, and beside embedded nodes
 	$(ROS_PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder @tests/on_rclpy.txt
 
-lint: $(VENV)/.lint  ## ruff and mypy
+lint: $(VENV)/.lint  ## ruff, codespell and mypy
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
+	$(VENV)/bin/codespell
 	$(VENV)/bin/mypy
 
 format: $(VENV)/.lint  ## let ruff repair what it can
