@@ -37,7 +37,7 @@ paper: setup  ## measure what the paper's figures show; goes on where it was sto
 ros: $(ROS_VENV)/.run  ## create .venv-ros, where all runs on ROS 2's own rclpy, without a ROS 2 installation
 
 test: $(VENV)/.test  ## install what testing needs (torch too) and run the tests
-	$(PY) -m pytest -n 2 --dist loadgroup
+	$(PY) -m pytest -n 2 --dist loadfile
 
 ros-tests: $(ROS_VENV)/.test
 

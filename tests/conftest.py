@@ -68,11 +68,16 @@ if find_spec("hypothesis"):
 STACKS = ("end_to_end", "quadvel_bringup", "quadvel_view")
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """With `--dist loadgroup` one worker takes all tests that start stacks; else the tests of a file stay together."""
-    for item in items:
-        group = "stacks" if item.path.parent.name in STACKS else str(item.path)
-        item.add_marker(pytest.mark.xdist_group(group))
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """One worker takes all tests that start stacks; of the others, those of a file stay together."""
+    from xdist.scheduler import LoadFileScheduling
+
+    class Scheduling(LoadFileScheduling):
+        def _split_scope(self, nodeid: str) -> str:
+            folder = Path(nodeid.partition("::")[0]).parent.name
+            return "stacks" if folder in STACKS else super()._split_scope(nodeid)
+
+    return Scheduling(config, log) if config.getvalue("dist") == "loadfile" else None
 
 
 # A run in the background ignores Ctrl-C, and so would what it starts.
