@@ -44,9 +44,10 @@ ros-tests: $(ROS_VENV)/.test
 test-ros: $(ROS_VENV)/.test  ## run the node tests on ROS 2's own rclpy, also together with embedded nodes
 	$(ROS_PY) -m pytest -n 2 --dist loadfile --no-loadscope-reorder @tests/on_rclpy.txt
 
-lint: $(VENV)/.lint  ## check the code with ruff and mypy
+lint: $(VENV)/.lint  ## check code and documents with ruff, codespell and mypy
 	$(VENV)/bin/ruff check
 	$(VENV)/bin/ruff format --check
+	$(VENV)/bin/codespell
 	$(VENV)/bin/mypy
 
 format: $(VENV)/.lint  ## format the code with ruff and apply its automatic fixes
