@@ -148,7 +148,6 @@ LEFT_OUT_KINDS = {
     r"python -m quadvel_training (?!--help).*": "minutes to hours; tests/training runs each stage for some steps",
     r"torchrun .*": "the same",
     r"mkdir -p out/checkpoints .*": "takes a checkpoint out of the history",
-    r"(description|dds|recordings|driver's|view|eval|all of these) .*": "docs/architecture.md: no command, but who may import whom",
     r"((driver|controller|command_mux|ros__parameters):|(stick_velocity|max_tilt|max_velocity): .*)": "a part of a parameter "
     "file; test_yaml_examples.py loads it",
     r"(t|q|dq|tau|kp|q_des|t_cmd|q_des_cmd|joint_names): .*": "a part of a map file for --columns",
@@ -169,7 +168,8 @@ def examples() -> dict[str, str]:
 
 
 def _blocks(text: str) -> Iterator[str]:
-    """The lines of indented blocks, which follow an empty line, and of fenced ones; lines that go on are joined."""
+    """The lines of indented blocks, which follow an empty line, and of fenced ones but diagrams; continued lines are joined."""
+    text = re.sub(r"^```mermaid\n.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
     text = re.sub(r" *\\\n *", " ", text)
     inside = fenced = False
     before = ""

@@ -1,0 +1,44 @@
+"""The diagram of packages in docs/architecture.md has the imports of the source, and no others."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+FOLDERS = (*sorted((ROOT / "src").glob("quadvel_*/quadvel_*")), ROOT / "training" / "quadvel_training")
+EVERYWHERE = "quadvel_msgs"  # imported by all packages with nodes, as the text says
+ONLY_BENCH = ("quadvel_eval", "quadvel_training")  # dotted in the diagram
+
+
+def imports(folder: Path) -> set[str]:
+    """The other packages of quadvel that modules in `folder` import, at their top or inside functions."""
+    names = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                names |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                names.add(node.module)
+    packages = {name.partition(".")[0] for name in names}
+    return {name for name in packages if name.startswith("quadvel_")} - {folder.name, EVERYWHERE}
+
+
+def arrows() -> set[tuple[str, str]]:
+    """Importing and imported package of each solid arrow."""
+    text = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    first = text.partition("```mermaid")[2].partition("```")[0]
+    return {
+        (f"quadvel_{a}", f"quadvel_{b}") for a, b in re.findall(r"^ *(\w+) --> (\w+)$", first, re.MULTILINE)
+    }
+
+
+def test_the_diagram_of_packages_shows_the_imports() -> None:
+    found = {(folder.name, other) for folder in FOLDERS for other in imports(folder)} - {ONLY_BENCH}
+    drawn = arrows()
+    assert drawn - found == set()
+    reachable = set(drawn)
+    while more := {(a, c) for a, b in reachable for b_, c in drawn if b == b_} - reachable:
+        reachable |= more
+    assert found - reachable == set()
