@@ -116,7 +116,7 @@ def check(log: Log) -> None:
     assert log.joints == ("knee_joint",)
     np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-6)
     assert log.tau is not None
-    assert "dq" not in log.made
+    assert "dq" not in log.derived
     for values, column in ((log.q, 1), (log.dq, 2), (log.q_des, 3), (log.tau, 4)):
         np.testing.assert_allclose(values[:, 0], ROWS[:, column], atol=1e-12)
 
@@ -171,7 +171,7 @@ def test_a_table_that_is_none_is_refused_by_line_and_column(tmp_path: Path, text
 def test_a_packed_table_that_grows_is_refused_within_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: bytes
 ) -> None:
-    monkeypatch.setattr(csv_table, "LARGEST_TEXT", 3_000_000)
+    monkeypatch.setattr(csv_table, "MAX_TEXT_CHARS", 3_000_000)
     path = tmp_path / "log.csv.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:
         file.write(b"t,q/knee,q_des/knee\n")

@@ -10,7 +10,7 @@ import pytest
 from quadvel_description import robot
 from quadvel_description.kinematics import HIPS, foot_positions
 from quadvel_sysid import excitation
-from quadvel_sysid.excitation import EXCITATIONS, PERIOD, TORQUE_SHARE, FootLifting, propose
+from quadvel_sysid.excitation import EXCITATIONS, MAX_TORQUE_SHARE, PERIOD_S, FootLifting, propose
 
 
 def eq9(t: float, leg: int) -> float:
@@ -27,7 +27,7 @@ def test_foot_lifting_moves_the_feet_as_equation_9_says() -> None:
     targets = FootLifting(seconds=1.2).targets()
     for row in (0, 37, 125, 180, 250, 333, 501, 870, 1199):
         feet = foot_positions(targets[row]) - HIPS
-        np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD, leg) for leg in range(4)], atol=1e-9)
+        np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD_S, leg) for leg in range(4)], atol=1e-9)
         np.testing.assert_allclose(feet[:, 0], 0.0, atol=1e-9)
 
 
@@ -37,7 +37,7 @@ def test_every_motion_stays_within_the_joints_range_and_speed(name: str) -> None
     assert targets.shape == (6000, 12)
     assert (targets >= robot.COMMAND_LOWER).all()
     assert (targets <= robot.COMMAND_UPPER).all()
-    assert (np.abs(np.diff(targets, axis=0)) <= robot.VELOCITY_LIMIT * PERIOD + 1e-12).all()
+    assert (np.abs(np.diff(targets, axis=0)) <= robot.VELOCITY_LIMIT * PERIOD_S + 1e-12).all()
 
 
 @pytest.mark.parametrize("name", ["chirp", "steps", "creep", "solo"])
@@ -58,11 +58,11 @@ def test_a_target_never_asks_for_more_than_its_share_of_the_torque_limit() -> No
     rng = np.random.default_rng(0)
     for _ in range(50):
         q, dq, target = rng.normal(0, 1, 12), rng.normal(0, 10, 12), rng.normal(0, 3, 12)
-        asked = 30.0 * (excitation.within_torque(target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
-        assert (np.abs(asked) <= TORQUE_SHARE * robot.TORQUE_LIMIT + 1e-9).all()
+        asked = 30.0 * (excitation.limit_torque(target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
+        assert (np.abs(asked) <= MAX_TORQUE_SHARE * robot.TORQUE_LIMIT + 1e-9).all()
     calm = robot.NOMINAL_Q + 0.1
     np.testing.assert_array_equal(
-        excitation.within_torque(calm, robot.NOMINAL_Q, np.zeros(12), 30.0, 0.5), calm
+        excitation.limit_torque(calm, robot.NOMINAL_Q, np.zeros(12), 30.0, 0.5), calm
     )
 
 

@@ -279,7 +279,7 @@ def test_a_mat_file_that_grows_is_refused_within_little_memory(
 ) -> None:
     from quadvel_sysid.logs import matlab
 
-    monkeypatch.setattr(matlab, "LARGEST_UNPACKED", 20_000_000)
+    monkeypatch.setattr(matlab, "MAX_UNPACKED_BYTES", 20_000_000)
     packer = zlib.compressobj(1)
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(200)) + packer.flush()
     head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49)
@@ -295,7 +295,7 @@ def test_a_parquet_file_of_billions_of_rows_is_refused_unread(
 ) -> None:
     from quadvel_sysid.logs import raw
 
-    monkeypatch.setattr(raw, "LARGEST", 400)
+    monkeypatch.setattr(raw, "MAX_VALUES", 400)
     parquet(tmp_path / "log.parquet")
     with pytest.raises(LogError, match=r"log\.parquet: .* expected 400 at most"):
         read_log(tmp_path / "log.parquet")

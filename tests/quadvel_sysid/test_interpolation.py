@@ -33,10 +33,10 @@ def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -
     at = ORDERS[order]
     expected = np.stack([np.interp(at, TIMES, one) for one in VALUES.T], axis=1)
     np.testing.assert_allclose(
-        interpolation.read(VALUES, *interpolation.between(TIMES, at)), expected, atol=1e-12
+        interpolation.interpolate(VALUES, *interpolation.locate(TIMES, at)), expected, atol=1e-12
     )
     late = np.array([[0.0, 0.001, -0.002], [0.02, 0.5, 2.0]])
-    found = interpolation.read_late(VALUES, TIMES, at, late)
+    found = interpolation.interpolate_shifted(VALUES, TIMES, at, late)
     assert found.shape == (2, len(at), 3)
     for b, j in np.ndindex(late.shape):
         np.testing.assert_allclose(
@@ -58,4 +58,4 @@ def test_an_integral_of_held_values_is_the_sum_of_values_times_how_long_they_hel
         ]
         for t in at
     ]
-    np.testing.assert_allclose(interpolation.integral(VALUES, sums, TIMES, at), expected, atol=1e-12)
+    np.testing.assert_allclose(interpolation.hold_integral(VALUES, sums, TIMES, at), expected, atol=1e-12)

@@ -101,7 +101,7 @@ def test_joints_are_matched_by_name_with_or_without_its_ending(tmp_path: Path) -
     given = {name: fields()[name][:, order] for name in ("q", "dq", "q_des", "tau")}
     log = read_log(npz(tmp_path / "a.npz", **given, joint_names=[PLAIN[k] for k in order]))
     assert log.joints == tuple(JOINT_NAMES[k] for k in order)
-    picked = log.select([PLAIN[11], JOINT_NAMES[5]])
+    picked = log.select_joints([PLAIN[11], JOINT_NAMES[5]])
     np.testing.assert_array_equal(picked.q, given["q"][:, [2, 0]])
     assert picked.kp is not None
     assert picked.kp.shape == (2000, 2)
@@ -297,8 +297,8 @@ def test_a_file_of_nothing_but_zeros_is_refused_within_little_memory(tmp_path: P
 
 
 def test_a_long_log_is_kept_in_single_precision() -> None:
-    assert raw.precision(raw.LONG + 1) == np.float32
-    assert raw.precision(raw.LONG) == np.float64
+    assert raw.storage_dtype(raw.MAX_DOUBLE_VALUES + 1) == np.float32
+    assert raw.storage_dtype(raw.MAX_DOUBLE_VALUES) == np.float64
 
 
 def test_a_command_counts_from_its_time_whatever_rounding_makes_of_it(tmp_path: Path) -> None:

@@ -20,12 +20,12 @@ def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
     rng = np.random.default_rng(0)
     costs = 5.0 * (behind[:, None, None] != np.arange(3)) + rng.exponential(0.3, (3000, 1, 3))
     new = (np.arange(3000) % 5 == 0).astype(int)
-    several, moves = lost_commands._odds(costs, new, lost_commands.LossProbabilities())
+    several, moves = lost_commands._forward_backward(costs, new, lost_commands.LossProbabilities())
     np.testing.assert_array_equal(several[:, 0].argmax(axis=1), behind)
-    assert lost_commands.LossProbabilities.of(moves).lost == pytest.approx(3 / 600, rel=0.05)
-    monkeypatch.setattr(lost_commands, "_PIECE", 3000)
+    assert lost_commands.LossProbabilities.estimate(moves).lost == pytest.approx(3 / 600, rel=0.05)
+    monkeypatch.setattr(lost_commands, "_PIECE_ROWS", 3000)
     np.testing.assert_allclose(
-        several, lost_commands._odds(costs, new, lost_commands.LossProbabilities())[0], atol=1e-9
+        several, lost_commands._forward_backward(costs, new, lost_commands.LossProbabilities())[0], atol=1e-9
     )
 
 

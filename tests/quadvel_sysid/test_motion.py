@@ -16,7 +16,7 @@ from quadvel_sim.simulator import Simulator
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.motion import implied
+from quadvel_sysid.motion import imply_torque
 
 JOINTS = NAMES[:2]
 
@@ -107,7 +107,7 @@ def test_friction_of_a_hung_leg_is_found_on_the_joint_that_has_it():
 def test_a_leg_that_swings_is_carried_as_one_body():
     """The torque that the motion implies is the one that the drives gave, though the joints push each other."""
     log = _hung(np.zeros(12), 3.0)
-    coarse, body = implied(log)
+    coarse, body = imply_torque(log)
     assert np.all(body.inertia > 0.0)
     given = np.array([np.interp(coarse.t, log.t, tau) for tau in log.tau.T]).T
     assert np.all(np.std(coarse.tau - given, axis=0) < 0.2 * np.std(given, axis=0))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from quadvel_sysid.logs.checks import Inspection, inspect, table
+from quadvel_sysid.logs.checks import Inspection, inspect, markdown_table
 from quadvel_sysid.logs.columns import ColumnMap
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
@@ -216,7 +216,7 @@ def test_a_document_is_read_by_columns_and_by_records(tmp_path: Path, form: str,
     np.testing.assert_allclose(read.q, log["q"])
     np.testing.assert_allclose(read.q_des, log["q_des"])
     assert "q: read from 'dof_pos'" in read.remarks
-    assert read.made == ("dq",)
+    assert read.derived == ("dq",)
 
 
 def test_a_table_may_hold_lists_in_its_cells_and_its_commands_in_another_file(tmp_path: Path) -> None:
@@ -305,4 +305,4 @@ def test_measured_logs_of_servos_are_refused_for_what_they_lack(
 
 
 def test_the_table_of_checks_is_in_the_documents() -> None:
-    assert table() in (Path(__file__).parents[2] / "docs" / "identification.md").read_text()
+    assert markdown_table() in (Path(__file__).parents[2] / "docs" / "identification.md").read_text()

@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects import registry
-from quadvel_sysid.signals import Samples, scattered
+from quadvel_sysid.signals import Samples, scattered_rows
 
 JOINTS = NAMES[:2]
 
@@ -29,7 +29,7 @@ def test_signals_of_few_rows_are_those_of_all():
 @pytest.mark.parametrize("every", [2, 5, 10])
 def test_few_rows_lie_at_all_places_between_two_commands(every):
     """Commands at 200 Hz, rows at 500 or 1000 Hz: even steps would show few of the places, and hide a wrong delay."""
-    rows = scattered(4000, every)
+    rows = scattered_rows(4000, every)
     assert len(rows) == pytest.approx(4000 / every, abs=1)
     assert np.diff(rows).min() > 0
     counts = np.bincount(rows % 10)
@@ -60,6 +60,6 @@ def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
 def test_a_log_that_is_slower_than_its_companion_is_judged_as_well():
     fast, slow = _log(seconds=2.0), _log(seconds=2.0, seed=3)
     every = np.arange(len(slow.t)) % 4 == 0
-    samples = Samples([fast, slow.of_rows(every)])
+    samples = Samples([fast, slow.select_rows(every)])
     assert samples.judged[samples.log_of_row == 1].mean() > 0.9
     assert samples.start[samples.log_of_row == 1].sum() == 1

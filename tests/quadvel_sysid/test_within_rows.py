@@ -8,7 +8,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects import registry
 from quadvel_sysid.identify import identify
-from quadvel_sysid.logs.excerpts import evened, jitters
+from quadvel_sysid.logs.excerpts import has_jitter, restore_even_clock
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.model import AppliedEffect, Model
@@ -118,8 +118,8 @@ def test_of_commands_that_stand_in_the_rows_the_instants_of_an_even_sender_are_r
     sending = np.floor(rows["t"] * 97.0 + 1e-9)
     rows["q_des"] = rows["q_des"][np.searchsorted(sending, sending)]
     log = read_log(npz(tmp_path / "log.npz", q_des=rows["q_des"]))
-    assert jitters(log)
-    even = evened(log).t_cmd
+    assert has_jitter(log)
+    even = restore_even_clock(log).t_cmd
     assert len(even) == len(np.unique(sending))
     assert np.abs(np.diff(even)[2:-2] - 1.0 / 97.0).max() < 5e-4
     assert 0.0 < (even - np.unique(sending) / 97.0)[2:-2].mean() < 0.002

@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HALF_WIDTHS = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
+HALF_WIDTHS_S = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
 """By signal: the slope is taken over so long to either side, s; `ddq` is left smeared, for torques that rise slowly"""
 
-_BEND = 0.002
+_BEND_S = 0.002
 """Bends are differences of slopes over so long before and after, s"""
 
 
-def lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
+def local_lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
     """Level at and slope of the line through `values` (N, J) at most `half_width` s off, near ones counting more; by rows."""
     n, period = len(t), float(np.median(np.diff(t)))
     wide = max(half_width, period)
@@ -41,23 +41,25 @@ def lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
     return values + square * sums[0] - late * sums[1], one * sums[1] - late * sums[0]
 
 
-def slope(t: Array, values: Array, half_width: float) -> Array:
+def local_slope(t: Array, values: Array, half_width: float) -> Array:
     """The slope of `lines`."""
-    return lines(t, values, half_width)[1]
+    return local_lines(t, values, half_width)[1]
 
 
-def _bend(t: Array, values: Array) -> Array:
+def _slope_change(t: Array, values: Array) -> Array:
     """Slope of `values` (N, J) after each row less the one before; (N - 2 reach, J)."""
-    reach = max(1, round(_BEND / float(np.median(np.diff(t)))))
+    reach = max(1, round(_BEND_S / float(np.median(np.diff(t)))))
     steps: Array = (values[reach:] - values[:-reach]) / (t[reach:] - t[:-reach])[:, None]
     bend: Array = steps[reach:] - steps[:-reach]
     return bend
 
 
-def smooth_part(name: str, t: Array, dq: Array, slope_of_dq: Array, come: Array) -> tuple[Array, Array]:
+def split_acceleration(
+    name: str, t: Array, dq: Array, slope_of_dq: Array, come: Array
+) -> tuple[Array, Array]:
     """Of ddq (N, J), as `name` says, what is left without B q_des, D dq - B D come, and B (J, J), transposed."""
-    half_width, cause, outcome = HALF_WIDTHS[name], _bend(t, come), _bend(t, dq)
+    half_width, cause, outcome = HALF_WIDTHS_S[name], _slope_change(t, come), _slope_change(t, dq)
     answer: Array = np.asarray(
         np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float
     )
-    return slope_of_dq - slope(t, come, half_width) @ answer, answer
+    return slope_of_dq - local_slope(t, come, half_width) @ answer, answer

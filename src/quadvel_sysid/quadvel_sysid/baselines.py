@@ -11,17 +11,17 @@ import numpy as np
 
 from .logs.log import Array, Bools, Log
 
-SPAN = 0.016
+FILTER_SPAN_S = 0.016
 """s of the past that the filter sees"""
-STEP = 0.001
+LAG_STEP_S = 0.001
 """s between the instants that it sees, a row of the log at least; and between the delays of the PD law"""
-LONGEST = 0.02
+MAX_DELAY_S = 0.02
 """s, delay of the PD law"""
-RIDGE = 1e-4
+RIDGE_PENALTY = 1e-4
 """Penalty on the weights of signals of unit variance, in times the number of rows"""
 
 
-def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
+def baseline_errors(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
     """Held-out mean squared errors (N^2 m^2) of a PD law of each joint, and of a ridge regression over SPAN.
 
     `fitted` and `judged` (N, J) are the rows of all logs, one after the other, as wide as their joints.
@@ -31,24 +31,27 @@ def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, di
     for j in range(fitted.shape[1]):
         tau = np.concatenate([torque[:, j] for torque in torques])
         fit, judge = fitted[:, j], judged[:, j]
-        laws = [_together(logs, j, (delay,), (0.0,)) for delay in np.arange(0.0, LONGEST + STEP / 2, STEP)]
+        laws = [
+            _regressors(logs, j, (delay,), (0.0,))
+            for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S)
+        ]
         best = min(
-            (_fitted(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
+            (_residual(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
         )
         squares["joint_pd"] += float(np.sum(best[judge] ** 2))
-        step = max(STEP, float(np.median([log.period for log in logs])))
-        past = tuple(step * np.arange(max(1, round(SPAN / step)) + 1))
-        miss = _fitted(_together(logs, j, past, past), tau, fit, RIDGE)
+        step = max(LAG_STEP_S, float(np.median([log.period for log in logs])))
+        past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
+        miss = _residual(_regressors(logs, j, past, past), tau, fit, RIDGE_PENALTY)
         squares["ridge"] += float(np.sum(miss[judge] ** 2))
     count = max(int(judged.sum()), 1)
-    variance = torque_variance(torques_of(logs), judged)
+    variance = torque_variance(measured_torque(logs), judged)
     return {
-        name: {"heldout_mse": total / count, "heldout_explained": explained(total / count, variance)}
+        name: {"heldout_mse": total / count, "heldout_explained": explained_share(total / count, variance)}
         for name, total in squares.items()
     }
 
 
-def torques_of(logs: Sequence[Log]) -> Array:
+def measured_torque(logs: Sequence[Log]) -> Array:
     """Measured torque of all logs (N, J), N m, one after the other."""
     return np.concatenate([np.asarray(log.tau, dtype=float) for log in logs])
 
@@ -60,7 +63,7 @@ def torque_variance(torque: Array, rows: Bools) -> float:
     return float(np.sum(centred**2, where=rows) / count.sum())
 
 
-def explained(mse: float, variance: float) -> float | None:
+def explained_share(mse: float, variance: float) -> float | None:
     """Share of the torque's `variance` that a mean squared error of `mse` leaves nothing of, below 0 where it is larger.
 
     None of a torque that does not vary.
@@ -68,12 +71,12 @@ def explained(mse: float, variance: float) -> float | None:
     return 1.0 - mse / variance if variance > 0.0 else None
 
 
-def _together(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
+def _regressors(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
     """Commands, angles and speeds of joint `j`, so many seconds ago, and 1, (N, K)."""
-    return np.concatenate([np.stack([*_signals(log, j, commands, states)], axis=1) for log in logs])
+    return np.concatenate([np.stack([*_log_regressors(log, j, commands, states)], axis=1) for log in logs])
 
 
-def _signals(log: Log, j: int, commands: Sequence[float], states: Sequence[float]) -> Iterator[Array]:
+def _log_regressors(log: Log, j: int, commands: Sequence[float], states: Sequence[float]) -> Iterator[Array]:
     for late in commands:
         yield np.asarray(log.q_des[log.command_rows(log.t - late), j], dtype=float)
     for values in (log.q, log.dq):
@@ -82,7 +85,7 @@ def _signals(log: Log, j: int, commands: Sequence[float], states: Sequence[float
     yield np.ones(len(log.t))
 
 
-def _fitted(signals: Array, tau: Array, rows: Bools, penalty: float) -> Array:
+def _residual(signals: Array, tau: Array, rows: Bools, penalty: float) -> Array:
     """What is left of the torque (N,) with weights fitted to `rows`, the last one, of 1, without a penalty."""
     x = signals[rows, :-1]
     centre, size = x.mean(axis=0), x.std(axis=0) + 1e-12

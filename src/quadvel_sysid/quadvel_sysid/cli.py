@@ -18,22 +18,22 @@ from typer.core import TyperCommand
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import SPAN
+from .baselines import FILTER_SPAN_S
 from .logs.checks import Inspection
 from .logs.columns import ColumnMap
 from .logs.dataset import Dataset
 from .logs.read_log import read_log
 from .logs.recordings import Topics
-from .memory import give_large_arrays_back, keep_freed_arrays
+from .memory import keep_freed_arrays, return_large_arrays
 
 if TYPE_CHECKING:
     from .identification_data import IdentificationData
     from .identification_data import Progress as Tell
 
-SEVERAL = ("--holdout", "--joints")
-CORES = 2
+MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
+DEFAULT_CORES = 2
 """Unless more are asked for: each takes some 200 MB"""
-_LONG = 1_000_000
+_LONG_LOG_VALUES = 1_000_000
 """Values of q in all logs, from which memory counts for more than time: ten minutes of twelve joints take less than 1 GB"""
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
 
@@ -42,15 +42,15 @@ class _SeveralValues(TyperCommand):
     """An option in SEVERAL takes all values up to the next option: a log named after --holdout is never fitted."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, list(_repeated(args)))
+        return super().parse_args(ctx, list(_repeat_options(args)))
 
 
-def _repeated(arguments: Iterable[str]) -> Iterable[str]:
+def _repeat_options(arguments: Iterable[str]) -> Iterable[str]:
     """`--holdout a b` as click reads it: `--holdout a --holdout b`."""
     option = ""
     for argument in arguments:
         if argument.startswith("--"):
-            option = argument if argument in SEVERAL else ""
+            option = argument if argument in MULTI_VALUE_OPTIONS else ""
             if not option:
                 yield argument
         elif option:
@@ -125,7 +125,7 @@ def identify(
     cores: Annotated[
         int | None,
         typer.Option(
-            min=1, help="How many share the work.", show_default=f"those there are, {CORES} at most"
+            min=1, help="How many share the work.", show_default=f"those there are, {DEFAULT_CORES} at most"
         ),
     ] = None,
 ) -> None:
@@ -177,7 +177,7 @@ def _run(
 ) -> None:
     _check_folder(out)
     names = ColumnMap() if columns is None else ColumnMap.load(columns)
-    give_large_arrays_back()
+    return_large_arrays()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
     parts = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*parts, console=messages, transient=True) as bar:
@@ -186,12 +186,12 @@ def _run(
         def tell(share: float, text: str) -> None:
             bar.update(task, completed=share, description=text)
 
-        material, long = _material(logs, holdout, joints, names, topics, gains, messages, tell)
+        material, long = _load_data(logs, holdout, joints, names, topics, gains, messages, tell)
         if not long:
             keep_freed_arrays()
         from .identify import identified
 
-        cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
+        cores = cores or (1 if long else min(DEFAULT_CORES, len(os.sched_getaffinity(0))))
         with threadpool_limits(1):  # of each copy of this process: they share the cores
             found = identified(material, parameters, cores, tell, robot)
     from .report.report import write
@@ -199,15 +199,15 @@ def _run(
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
-    console.print(errors(found.report), soft_wrap=True, highlight=False)
+    console.print(error_line(found.report), soft_wrap=True, highlight=False)
     if "replay" in found.report:
-        console.print(replays(found.report["replay"]), soft_wrap=True, highlight=False)
+        console.print(replay_line(found.report["replay"]), soft_wrap=True, highlight=False)
     for text in found.report["warnings"]:
         messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
 
 
-def _material(
+def _load_data(
     logs: Sequence[Path],
     holdout: Sequence[Path],
     joints: Sequence[str] | None,
@@ -222,8 +222,8 @@ def _material(
         fitted, heldout = (
             [read_log(one, joints, names, topics) for one in paths] for paths in (logs, holdout)
         )
-        data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
-        long = sum(log.q.size for log in data.logs) >= _LONG
+        data = Dataset.inspect_all(fitted, heldout, gains, lambda one: print_findings(one, messages))
+        long = sum(log.q.size for log in data.logs) >= _LONG_LOG_VALUES
         from .identification_data import (
             prepare,
         )  # what is wrong with the files shows before the engine is loaded
@@ -231,26 +231,26 @@ def _material(
         return prepare(data, progress=tell), long
 
 
-def errors(report: Mapping[str, Any]) -> str:
+def error_line(report: Mapping[str, Any]) -> str:
     """The held-out errors in a line with the shares that they explain, those of what needs no model among them."""
     entries = (
         ("PD as commanded", report["pd"]),
         ("a PD law of each joint", report["baselines"]["joint_pd"]),
-        (f"a linear filter over {1e3 * SPAN:.0f} ms", report["baselines"]["ridge"]),
+        (f"a linear filter over {1e3 * FILTER_SPAN_S:.0f} ms", report["baselines"]["ridge"]),
         ("plain EAM", report["before"]),
         ("corrected model", report["after"]),
     )
-    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_share(entry)}" for name, entry in entries)
+    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_explained_text(entry)}" for name, entry in entries)
     return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
 
 
-def _share(entry: Mapping[str, Any]) -> str:
+def _explained_text(entry: Mapping[str, Any]) -> str:
     """How much of the torque's variance an account explains; nothing where the torque does not vary."""
     found = entry.get("heldout_explained")
     return "" if found is None else f" (explains {100.0 * found:.3g} % of the variance)"
 
 
-def replays(replay: Mapping[str, Any]) -> str:
+def replay_line(replay: Mapping[str, Any]) -> str:
     """How far the legs leave their measured track, in a line."""
     before, after = replay["before"], replay["after"]
     return (
@@ -259,7 +259,7 @@ def replays(replay: Mapping[str, Any]) -> str:
     )
 
 
-def say(inspection: Inspection, messages: Console) -> None:
+def print_findings(inspection: Inspection, messages: Console) -> None:
     """Print what was found in a log."""
     messages.print(escape(inspection.log.name), style="bold", soft_wrap=True, highlight=False)
     for finding in inspection.findings:

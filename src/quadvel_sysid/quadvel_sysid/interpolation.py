@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-_STEPS = 16
+_MAX_LINEAR_STEPS = 16
 """Rows that are looked at one after the other before the rest is halved"""
 
 
@@ -23,21 +23,21 @@ def rows_at(times: Array, at: Array) -> Rows:
     return found
 
 
-def between(times: Array, at: Array) -> tuple[Rows, Array]:
+def locate(times: Array, at: Array) -> tuple[Rows, Array]:
     """Of each of `at` (N,): the row before it, of which there is a next one, and how far it is towards that, 0 to 1."""
     found, share = np.empty(len(at), dtype=np.intp), np.empty(len(at))
     _compiled()["between"](times, at, found, share)
     return found, share
 
 
-def read(values: Array, row: Rows, share: Array) -> Array:
+def interpolate(values: Array, row: Rows, share: Array) -> Array:
     """Values (K, J), linear between rows, where `between` says (N,): (N, J)."""
     found = np.empty((len(row), values.shape[1]))
     _compiled()["read"](values, row, share, found)
     return found
 
 
-def read_late(values: Array, times: Array, at: Array, late: Array) -> Array:
+def interpolate_shifted(values: Array, times: Array, at: Array, late: Array) -> Array:
     """Each joint's values (K, J) at its own times, `late` (..., J) before `at` (N,): (..., N, J)."""
     each = late.reshape(-1, values.shape[1])
     found = np.empty((len(each), len(at), values.shape[1]))
@@ -45,16 +45,16 @@ def read_late(values: Array, times: Array, at: Array, late: Array) -> Array:
     return found.reshape(*late.shape[:-1], *found.shape[1:])
 
 
-def integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
+def hold_integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
     """What values (K, J), each held from its time to the next, add up to until `at` (N,), with `sums` (K + 1, J) at their times."""
     found = np.empty((len(at), values.shape[1]))
     _compiled()["integral"](values, sums, times, at, found)
     return found
 
 
-def _last(times: Any, at: float, row: int) -> Any:
+def _last_row(times: Any, at: float, row: int) -> Any:
     """The last row whose time is not after `at`, sought from `row` on; -1 where none is."""
-    for _ in range(_STEPS):
+    for _ in range(_MAX_LINEAR_STEPS):
         if row >= 0 and times[row] > at:
             row -= 1
         elif row + 1 < len(times) and times[row + 1] <= at:
@@ -70,18 +70,18 @@ def _compiled() -> dict[str, Callable[..., None]]:
     import numba
     from numba.extending import register_jitable
 
-    register_jitable(_last)
+    register_jitable(_last_row)
 
     def rows_at(times: Any, at: Any, found: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             found[n] = max(row, 0)
 
     def between(times: Any, at: Any, found: Any, share: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             here = min(max(row, 0), len(times) - 2)
             found[n] = here
             share[n] = min(max((at[n] - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
@@ -97,7 +97,7 @@ def _compiled() -> dict[str, Callable[..., None]]:
             row = 0
             for n in range(len(at)):
                 when = at[n] - late[b, j]
-                row = _last(times, when, row)
+                row = _last_row(times, when, row)
                 here = min(max(row, 0), len(times) - 2)
                 share = min(max((when - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
                 early = values[here, j]
@@ -106,7 +106,7 @@ def _compiled() -> dict[str, Callable[..., None]]:
     def integral(values: Any, sums: Any, times: Any, at: Any, found: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             here = max(row, 0)
             for j in range(values.shape[1]):
                 found[n, j] = sums[here, j] + values[here, j] * (at[n] - times[here])

@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import interpolation
-from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
-from .logs.log import ALMOST, Log
+from .acceleration import HALF_WIDTHS_S, local_lines, local_slope, split_acceleration
+from .logs.log import TIME_TOLERANCE_S, Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]
-ALL = slice(None)
+ALL_JOINTS = slice(None)
 
-_KEPT_SLOPES = 4
+_MAX_CACHED_SLOPES = 4
 """accelerations that a log keeps: two kinds at a few delays"""
 
 
@@ -27,24 +27,26 @@ class LogSignals:
     """
 
     def __init__(self, log: Log, steady: float, known: Collection[str]) -> None:
-        self.log, self.origin = log, float(log.t[0]) if log.began is None else log.began
-        self.t, self.t_cmd = double(log.t), double(log.t_cmd)
-        self.states = {"q": double(log.q), "dq": double(log.dq)}
+        self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
+        self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
+        self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
         if steady > 0.0:
-            self.states = {k: lines(double(log.t), values, steady)[0] for k, values in self.states.items()}
+            self.states = {
+                k: local_lines(as_double(log.t), values, steady)[0] for k, values in self.states.items()
+            }
         if log.temperature is not None:
-            self.states["temperature"] = double(log.temperature)
+            self.states["temperature"] = as_double(log.temperature)
         if log.voltage is not None:
-            self.states["voltage"] = double(log.voltage)[:, None]
+            self.states["voltage"] = as_double(log.voltage)[:, None]
         shape = log.q_des.shape
         zero = np.zeros(shape)
         self.commands = {
-            "q_des": double(log.q_des),
-            "dq_des": zero if log.dq_des is None else double(log.dq_des),
-            "tau_ff": zero if log.tau_ff is None else double(log.tau_ff),
+            "q_des": as_double(log.q_des),
+            "dq_des": zero if log.dq_des is None else as_double(log.dq_des),
+            "tau_ff": zero if log.tau_ff is None else as_double(log.tau_ff),
         }
         self.gains = {
-            name: double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
+            name: as_double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
             for name in ("kp", "kd")
         }
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
@@ -53,44 +55,50 @@ class LogSignals:
             for name, values in self.commands.items()
             if values.any()
         }
-        self.all: dict[str, Array] = {**self.states, **self.commands, **self.gains}
+        self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
-    def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+    def locate(self, at: Array) -> tuple[NDArray[np.intp], Array]:
         """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
-        return interpolation.between(self.t, at)
+        return interpolation.locate(self.t, at)
 
-    def state(
-        self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
+    def state_at(
+        self,
+        name: str,
+        at: Array,
+        joints: Joints = ALL_JOINTS,
+        found: tuple[NDArray[np.intp], Array] | None = None,
     ) -> Array:
         """A state signal, linear between rows; `found` is `between(at)` where that is known."""
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        return interpolation.read(values, *(self.between(at) if found is None else found))
+        return interpolation.interpolate(values, *(self.locate(at) if found is None else found))
 
-    def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
+    def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
         """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
         if name == "ddq":
-            return interpolation.read(self._slope_of_dq(name)[:, joints], *self.between(at))
+            return interpolation.interpolate(self._slope_of_dq(name)[:, joints], *self.locate(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
-            if len(self._smooth) >= _KEPT_SLOPES:
+            if len(self._smooth) >= _MAX_CACHED_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
-            come = self._acting(self.t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, self.t, double(self.log.dq), self._slope_of_dq(name), come)
+            come = self._read_targets(self.t, delays, self._integral)
+            self._smooth[key] = split_acceleration(
+                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), come
+            )
         smooth, answer = self._smooth[key]
-        jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
-        return interpolation.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
+        jumps = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
+        return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + jumps @ answer[:, joints]
 
     def _slope_of_dq(self, name: str) -> Array:
         """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
-        width = HALF_WIDTHS[name]
+        width = HALF_WIDTHS_S[name]
         if width not in self._slopes:
-            self._slopes[width] = slope(self.t, double(self.log.dq), width)
+            self._slopes[width] = local_slope(self.t, as_double(self.log.dq), width)
         return self._slopes[width]
 
-    def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
+    def _read_targets(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
         """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
         found = np.zeros((len(at), len(delays)))
         if "q_des" in self.sums:
@@ -100,35 +108,35 @@ class LogSignals:
                 found[:, joints] = read(values, sums, at - delay)
         return found
 
-    def shifted(self, name: str, at: Array, late: Array) -> Array:
+    def state_shifted(self, name: str, at: Array, late: Array) -> Array:
         """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
-        return interpolation.read_late(self.states[name], self.t, at, late)
+        return interpolation.interpolate_shifted(self.states[name], self.t, at, late)
 
-    def in_force(self, at: Array) -> NDArray[np.intp]:
+    def command_rows(self, at: Array) -> NDArray[np.intp]:
         """The command row that counts at the times `at` (N,), s."""
-        return interpolation.rows_at(self.t_cmd, at + ALMOST)
+        return interpolation.rows_at(self.t_cmd, at + TIME_TOLERANCE_S)
 
-    def command(
+    def command_at(
         self,
         name: str,
         at: Array,
         window: float,
-        joints: Joints = ALL,
+        joints: Joints = ALL_JOINTS,
         row: NDArray[np.intp] | None = None,
     ) -> Array:
-        """A command signal: the mean over `at` to `at + window`; `row` is `in_force(at)` where that is known."""
+        """A command signal: the mean over `at` to `at + window`; `row` is `command_rows(at)` where that is known."""
         values = self.commands[name][:, joints]
         if name not in self.sums:
             return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
-            return values[self.in_force(at) if row is None else row]
+            return values[self.command_rows(at) if row is None else row]
         sums = self.sums[name][:, joints]
         late, early = (self._integral(values, sums, end) for end in (at + window, at))
         return (late - early) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
-        return interpolation.integral(values, sums, self.t_cmd, at)
+        return interpolation.hold_integral(values, sums, self.t_cmd, at)
 
 
-def double(values: NDArray[np.floating]) -> Array:
+def as_double(values: NDArray[np.floating]) -> Array:
     return np.asarray(values, dtype=np.float64)

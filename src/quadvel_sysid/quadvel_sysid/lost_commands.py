@@ -18,24 +18,24 @@ from .fit import fit, squared_error
 from .model import AppliedEffect, Model
 from .signals import Array, Bools
 
-LOST = 6.0
+SUSPICION_NATS = 6.0
 """nats by which a command has to look lost or late on its own"""
-_LEAST_SHARE = 0.003
+_MIN_LOST_SHARE = 0.003
 """Of the commands: they are not looked at as lost where fewer lag behind"""
-_AT_RANDOM = 0.5
+_MIN_UNPREDICTABLE_SHARE = 0.5
 """Of what the reading takes off the error: what has to come of its telling one command from another. A lag answers late, too,
 but after each command alike; losses at random cannot be foretold."""
 
-_PIECE, _AROUND = 600, 150
+_PIECE_ROWS, _OVERLAP_ROWS = 600, 150
 """Rows that are searched one after the other, and how many more at either end"""
 
-_NORMAL = 1.4826
+_MAD_TO_STD = 1.4826
 """Standard deviation of normal numbers over the median of their sizes"""
-_ROUNDS, _SETTLED = 8, 1e-3
-_RARE = 1e-6
-_SURE = 50.0
+_EM_ROUNDS, _EM_TOLERANCE = 8, 1e-3
+_MIN_PROBABILITY = 1e-6
+_MAX_ROW_NATS = 50.0
 """nats that one row can say at most: it may be an outlier"""
-_NEVER = 1e-100  # a chance, so that two accounts that contradict each other leave one
+_PROBABILITY_FLOOR = 1e-100  # a chance, so that two accounts that contradict each other leave one
 
 
 @attrs.frozen
@@ -43,15 +43,17 @@ class LossProbabilities:
     """Of a new command to be lost, of one more to be, and of a command that was held back to arrive at a row."""
 
     lost: float = 0.02
-    still: float = 0.3
-    late: float = 0.02
+    lost_again: float = 0.3
+    delivered_late: float = 0.02
 
-    def steps(self, most: int) -> Array:
+    def transition_matrices(self, most: int) -> Array:
         """Chances (D, M, M) from so far behind to so far behind, as D = 0 to `most` + 1 commands were sent."""
         count = most + 1
-        held = np.tril(np.full((count, count), self.late) / np.maximum(np.arange(count), 1)[:, None], -1)
+        held = np.tril(
+            np.full((count, count), self.delivered_late) / np.maximum(np.arange(count), 1)[:, None], -1
+        )
         held += np.diag(1.0 - held.sum(axis=1))
-        loses = np.where(np.arange(count) == 0, self.lost, self.still)
+        loses = np.where(np.arange(count) == 0, self.lost, self.lost_again)
         steps = [held]
         for sent in range(1, count + 1):
             step = np.zeros((count, count))
@@ -61,7 +63,7 @@ class LossProbabilities:
         return np.array(steps)
 
     @classmethod
-    def of(cls, counts: Array) -> LossProbabilities:
+    def estimate(cls, counts: Array) -> LossProbabilities:
         """The likeliest ones where moves were so frequent, `counts` (D, M, M)."""
         sent = counts[1:].sum(axis=0)
         held = counts[0]
@@ -74,7 +76,7 @@ class LossProbabilities:
 
 
 def _share(part: float, whole: float) -> float:
-    return float(np.clip(part / (whole + 1e-12), _RARE, 1.0 - _RARE))
+    return float(np.clip(part / (whole + 1e-12), _MIN_PROBABILITY, 1.0 - _MIN_PROBABILITY))
 
 
 def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Array, Array]]:
@@ -82,27 +84,27 @@ def lost_commands(model: Model, parts: DataSplit, noise: Array) -> list[tuple[Ar
 
     For each joint without a look at its torque where that selects or is reported.
     """
-    noise = _usual_error(model, parts, noise)
-    if len(noise) < 2 or not _suspicious(model, noise):
+    noise = _residual_variance(model, parts, noise)
+    if len(noise) < 2 or not _has_suspects(model, noise):
         return []
-    odds = backlog(model, noise, MAX_BACKLOG, ~parts.fit)
+    odds = backlog_probabilities(model, noise, MAX_BACKLOG, ~parts.fit)
     usual = odds[parts.fit].mean(axis=0)
-    if 1.0 - usual[0] < _LEAST_SHARE or not _at_random(model, odds, usual, parts):
+    if 1.0 - usual[0] < _MIN_LOST_SHARE or not _at_random(model, odds, usual, parts):
         return []
-    return [(_of_every_row(odds, model.samples.row), usual)]
+    return [(_expand_rows(odds, model.samples.row), usual)]
 
 
-def _losing(model: Model, odds: Array, usual: Array, parts: DataSplit) -> Model:
+def _with_losses(model: Model, odds: Array, usual: Array, parts: DataSplit) -> Model:
     """The model with losses of these odds, fitted."""
     every = np.ones(odds.shape[1], dtype=bool)
-    law = CommandHold(_of_every_row(odds, model.samples.row), usual)
+    law = CommandHold(_expand_rows(odds, model.samples.row), usual)
     one = AppliedEffect(law, every, np.full((1, len(every)), 0.05), np.arange(len(every)))
     return fit(model.with_effect(one), parts.fit, 3)
 
 
 def _at_random(model: Model, odds: Array, usual: Array, parts: DataSplit) -> bool:
     """Does the model with losses tell much more than one whose losses follow from the time since the command arrived?"""
-    losing = _losing(model, odds, usual, parts)
+    losing = _with_losses(model, odds, usual, parts)
     fitted = parts.fit.any(axis=1)
     since = np.rint(losing.signals.age[:, 0] / losing.samples.period).astype(int)
     since = np.minimum(since, since[fitted].max())
@@ -110,12 +112,12 @@ def _at_random(model: Model, odds: Array, usual: Array, parts: DataSplit) -> boo
     np.add.at(total, since[fitted], odds[fitted])
     mean = total / np.maximum(total.sum(axis=-1, keepdims=True), 1.0)
     bare = losing.without_effect(len(model.effects))
-    tried = (model, fit(bare, parts.fit, 3), losing, _losing(bare, mean[since], usual, parts))
+    tried = (model, fit(bare, parts.fit, 3), losing, _with_losses(bare, mean[since], usual, parts))
     *without, read, foreseen = (squared_error(one, parts.fit_or_select) for one in tried)
-    return foreseen - read > _AT_RANDOM * (min(without) - read) > 0.0
+    return foreseen - read > _MIN_UNPREDICTABLE_SHARE * (min(without) - read) > 0.0
 
 
-def _of_every_row(odds: Array, rows: NDArray[np.intp]) -> Array:
+def _expand_rows(odds: Array, rows: NDArray[np.intp]) -> Array:
     """The odds (N, J, M) of some `rows` (N,) of the logs as those of every row up to the last."""
     at = np.searchsorted(rows, np.arange(rows[-1] + 1))
     return odds[at]
@@ -125,49 +127,49 @@ def reassign_losses(model: Model, parts: DataSplit, noise: Array) -> Model:
     """The model, whose samples reach further than those that its lost commands were read off, with these read off them all."""
     for k, one in enumerate(model.effects):
         if isinstance(one.law, CommandHold):
-            odds = backlog(model.without_effect(k), noise, MAX_BACKLOG, ~parts.fit)
+            odds = backlog_probabilities(model.without_effect(k), noise, MAX_BACKLOG, ~parts.fit)
             law = CommandHold(odds, odds[parts.fit].mean(axis=0))
             model = model.with_replaced_effect(k, attrs.evolve(one, law=law))
     return model
 
 
-def _usual_error(model: Model, parts: DataSplit, noise: Array) -> Array:
+def _residual_variance(model: Model, parts: DataSplit, noise: Array) -> Array:
     """Variance (J,) of what the model leaves of most rows, N^2 m^2: what a row says of losses is held against that."""
     size = [np.median(np.abs(one[keep])) for one, keep in zip(model.residual().T, parts.fit.T, strict=True)]
-    usual: Array = np.maximum((_NORMAL * np.array(size)) ** 2, noise)
+    usual: Array = np.maximum((_MAD_TO_STD * np.array(size)) ** 2, noise)
     return usual
 
 
-def _suspicious(model: Model, noise: Array) -> bool:
+def _has_suspects(model: Model, noise: Array) -> bool:
     """Do some of the commands look lost or late, each on its own? If not, the search finds nothing."""
     s = model.signals
-    gain = np.where(model.samples.judged, -np.diff(_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
+    gain = np.where(model.samples.judged, -np.diff(_row_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
     gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all together
     first = np.flatnonzero(np.diff(s.packet[:, 0], prepend=-1))
     total = np.cumsum(gain, axis=0)
     most = np.maximum.reduceat(total, first) - total[first] + gain[first]
-    return bool(((most > LOST).mean(axis=0) > _LEAST_SHARE).any())
+    return bool(((most > SUSPICION_NATS).mean(axis=0) > _MIN_LOST_SHARE).any())
 
 
-def backlog(model: Model, noise: Array, most: int, unread: Bools) -> Array:
+def backlog_probabilities(model: Model, noise: Array, most: int, unread: Bools) -> Array:
     """Chances (N, J, most + 1) that the drive is 0 to `most` commands behind at each row.
 
     Those of a joint do not look at its own torque in the rows `unread` (N, J), the chances of a loss at nobody's there.
     """
-    costs = _costs(model, noise, most)
+    costs = _row_costs(model, noise, most)
     packet = model.signals.packet[:, 0]
     new = np.minimum(np.diff(packet, prepend=packet[0]), most + 1)
     hidden = np.where(unread[..., None], costs, 0.0)
     read = (costs - hidden).sum(axis=1, keepdims=True)
     chances = LossProbabilities()
-    for _ in range(_ROUNDS):
-        before, chances = chances, LossProbabilities.of(_odds(read, new, chances)[1])
-        if np.allclose(attrs.astuple(chances), attrs.astuple(before), rtol=_SETTLED):
+    for _ in range(_EM_ROUNDS):
+        before, chances = chances, LossProbabilities.estimate(_forward_backward(read, new, chances)[1])
+        if np.allclose(attrs.astuple(chances), attrs.astuple(before), rtol=_EM_TOLERANCE):
             break
-    return _odds(costs.sum(axis=1, keepdims=True) - hidden, new, chances)[0]
+    return _forward_backward(costs.sum(axis=1, keepdims=True) - hidden, new, chances)[0]
 
 
-def _costs(model: Model, noise: Array, most: int) -> Array:
+def _row_costs(model: Model, noise: Array, most: int) -> Array:
     """How little each row agrees with a drive that is 0 to `most` commands behind, nats, (N, J, most + 1)."""
     s = model.signals
     left = np.where(model.samples.judged, model.samples.tau - model.predict(), 0.0)
@@ -181,38 +183,38 @@ def _costs(model: Model, noise: Array, most: int) -> Array:
     return np.stack(cost, axis=-1)
 
 
-def _odds(costs: Array, new: NDArray[np.intp], chances: LossProbabilities) -> tuple[Array, Array]:
+def _forward_backward(costs: Array, new: NDArray[np.intp], chances: LossProbabilities) -> tuple[Array, Array]:
     """Chances (N, G, M) of each state given the costs (N, G, M), and how often which move was made, (D, M, M).
 
     `new` (N,) commands arrive before each row. Computed in pieces of the rows, side by side, each with some rows more
     at either end, from where the start no longer counts.
     """
     rows = len(costs)
-    first = np.arange(-(-rows // _PIECE)) * _PIECE - _AROUND
-    at = np.clip(first + np.arange(_PIECE + 2 * _AROUND)[:, None], 0, rows - 1)  # (R, pieces)
+    first = np.arange(-(-rows // _PIECE_ROWS)) * _PIECE_ROWS - _OVERLAP_ROWS
+    at = np.clip(first + np.arange(_PIECE_ROWS + 2 * _OVERLAP_ROWS)[:, None], 0, rows - 1)  # (R, pieces)
     inside = first + np.arange(len(at))[:, None] == at
-    likely = np.exp(np.maximum(np.min(costs, axis=-1, keepdims=True) - costs, -_SURE))[at]
+    likely = np.exp(np.maximum(np.min(costs, axis=-1, keepdims=True) - costs, -_MAX_ROW_NATS))[at]
     likely = np.where(inside[..., None, None], likely, 1.0)  # (R, S, G, M)
-    moves = chances.steps(costs.shape[-1] - 1)
+    moves = chances.transition_matrices(costs.shape[-1] - 1)
     which = np.where(inside, new[at], 0)
     forward, backward = np.empty_like(likely), np.empty_like(likely)
     state = np.zeros(likely.shape[1:])
     state[..., 0] = 1.0
     for n in range(len(at)):
         state = (state @ moves[which[n]]) * likely[n]
-        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _NEVER)
+        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _PROBABILITY_FLOOR)
         forward[n] = state
     state = np.ones(likely.shape[1:])
     back = moves.swapaxes(-1, -2)
     for n in range(len(at) - 1, -1, -1):
         backward[n] = state
         state = (state * likely[n]) @ back[which[n]]
-        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _NEVER)
+        state = np.maximum(state / state.sum(axis=-1, keepdims=True), _PROBABILITY_FLOOR)
     odds = forward * backward
     odds /= odds.sum(axis=-1, keepdims=True)
-    own = slice(_AROUND, _AROUND + _PIECE)
+    own = slice(_OVERLAP_ROWS, _OVERLAP_ROWS + _PIECE_ROWS)
     counts = np.zeros_like(moves)
-    before, after = forward[_AROUND - 1 : _AROUND + _PIECE - 1], (backward * likely)[own]
+    before, after = forward[_OVERLAP_ROWS - 1 : _OVERLAP_ROWS + _PIECE_ROWS - 1], (backward * likely)[own]
     for d, step in enumerate(moves):
         here = (which[own] == d) & inside[own]
         made = before[here][..., :, None] * step * after[here][..., None, :]

@@ -11,7 +11,7 @@ M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
 _LARGE, _LARGEST, _FREED = 1 << 22, 1 << 25, 1 << 27  # bytes
 
 
-def give_large_arrays_back() -> None:
+def return_large_arrays() -> None:
     """Have large arrays returned as soon as they are free: left to itself glibc keeps ever larger ones, with gaps."""
     _set(M_MMAP_THRESHOLD, _LARGE)
 
@@ -27,7 +27,7 @@ def _set(option: int, size: int) -> None:
         mallopt(option, size)
 
 
-def give_gaps_back() -> None:
+def trim_heap() -> None:
     """Return what is free now between smaller arrays: what a copy of this process puts there it would hold besides."""
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)

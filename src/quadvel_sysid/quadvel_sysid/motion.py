@@ -22,13 +22,13 @@ from .eam import LONGEST_INPUT
 from .logs.log import Log, LogError
 from .signals import Array, Bools, Samples
 
-STRETCH = 0.05
+STRETCH_S = 0.05
 """s that are replayed from a measured state before the next one is taken"""
 
-_SPAN = 0.008  # s over which an acceleration is taken: encoders are too coarse for less
-_DELAY_STEP = 0.0005  # s
-_STEP = 0.001  # s of the replay, at most
-_LARGEST = 4  # joints that may carry each other
+_AVERAGING_S = 0.008  # s over which an acceleration is taken: encoders are too coarse for less
+_DELAY_STEP_S = 0.0005  # s
+_MAX_STEP_S = 0.001  # s of the replay, at most
+_MAX_LIMB_JOINTS = 4  # joints that may carry each other
 _RIDGE = 1e-5
 
 
@@ -45,13 +45,13 @@ class Limb:
     drift: Array  # (D, K): acceleration without torque, of `_drifting`
 
     @classmethod
-    def of(
+    def fit(
         cls, joints: NDArray[np.intp], q: Array, dq: Array, torque: Array, ddq: Array
     ) -> tuple[Limb, float]:
         """Fitted to rows (N, K), and the share of the acceleration that is left."""
         middle = q.mean(axis=0)
         pushed = np.concatenate([torque, *(torque * one[:, None] for one in (q - middle).T)], axis=1)
-        drifting, rubbing = _drifting(q - middle, dq), np.concatenate([dq, np.tanh(dq / 0.05)], axis=1)
+        drifting, rubbing = _load_regressors(q - middle, dq), np.concatenate([dq, np.tanh(dq / 0.05)], axis=1)
         x = np.concatenate([pushed, drifting, rubbing], axis=1)
         size = np.sqrt(np.mean(x * x, axis=0)) + 1e-12
         gram = (x / size).T @ (x / size) + _RIDGE * len(x) * np.eye(x.shape[1])
@@ -64,12 +64,12 @@ class Limb:
     def accelerations(self, q: Array, dq: Array, torque: Array) -> Array:
         """What joints (N, K) at `q`, `dq` do under `torque`, rad/s^2."""
         pushed: Array = (self._mobility(q) @ torque[..., None])[..., 0]
-        drift: Array = _drifting(q - self.middle, dq) @ self.drift
+        drift: Array = _load_regressors(q - self.middle, dq) @ self.drift
         return pushed + drift
 
     def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
         """The torques (N, K) under which they accelerate so, N m."""
-        moved = ddq - _drifting(q - self.middle, dq) @ self.drift
+        moved = ddq - _load_regressors(q - self.middle, dq) @ self.drift
         return np.asarray(np.linalg.solve(self._mobility(q), moved[..., None])[..., 0], dtype=np.float64)
 
     def _mobility(self, q: Array) -> Array:
@@ -77,7 +77,7 @@ class Limb:
         return turned
 
 
-def _drifting(q: Array, dq: Array) -> Array:
+def _load_regressors(q: Array, dq: Array) -> Array:
     """What loads and inertial forces are sums of: 1, angles, and products of angles and of speeds, (N, D)."""
     k = q.shape[1]
     pairs = [(a, b) for a in range(k) for b in range(a, k)]
@@ -121,12 +121,12 @@ class Body:
         return found
 
 
-def spans(log: Log) -> tuple[Log, Array]:
+def average_over_steps(log: Log) -> tuple[Log, Array]:
     """The log in steps of _SPAN, each row the mean over a step, and the accelerations in them (N, J).
 
     Commands are stamped half a step later, so that their mean over a step from a row on is that over the row's own step.
     """
-    count = max(1, round(_SPAN / log.period))
+    count = max(1, round(_AVERAGING_S / log.period))
     first = np.arange(0, len(log.t) - count, count)
     last = first + count
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
@@ -144,20 +144,20 @@ def spans(log: Log) -> tuple[Log, Array]:
         temperature=temperature,
         voltage=voltage,
         tau=None,
-        q=_mean(q, first, count),
-        dq=_mean(dq, first, count),
+        q=_trapezoid_mean(q, first, count),
+        dq=_trapezoid_mean(dq, first, count),
     )
     return coarse, (dq[last] - dq[first]) / dt
 
 
-def _mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
+def _trapezoid_mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
     """Over rows `first` to `first + count`, the outer two for half."""
     rows = [x[first + k] for k in range(count + 1)]
     mean: Array = (0.5 * (rows[0] + rows[-1]) + sum(rows[1:-1], start=np.zeros_like(rows[0]))) / count
     return mean
 
 
-def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
+def imply_torque(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     """The log with the torque that its motion implies, and the body that carries it, fitted unless it is known.
 
     Raises LogError where the gains are not known: without torque the scale of everything hangs on them.
@@ -166,11 +166,11 @@ def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
         raise LogError(
             f"{log.name}: tau, kp: both are missing, expected the torque or the gains (--gains KP KD)"
         )
-    coarse, ddq = spans(log)
+    coarse, ddq = average_over_steps(log)
     samples = Samples([coarse])
     if body is None:
-        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP)
-        body = min((_fitted(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
+        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP_S)
+        body = min((_fit_body(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
         for joint, inertia in zip(log.joints, body.inertia, strict=True):
             if inertia <= 0.0:
                 raise LogError(
@@ -181,42 +181,42 @@ def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     return attrs.evolve(coarse, tau=tau), body
 
 
-def _fitted(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
+def _fit_body(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
     """The body that explains the accelerations best with this delay, and what it leaves of them."""
     s = samples.at(delay, 0.0, samples.period)
     torque = s.kp * (s.q_des - s.q) + s.kd * (s.dq_des - s.dq) + s.tau_ff
     keep = samples.judged.all(axis=1)
     limbs, share = [], 0.0
-    for joints in _limbs(samples.joints):
+    for joints in _group_limbs(samples.joints):
         rows = (x[keep][:, joints] for x in (s.q, s.dq, torque, ddq))
-        limb, left = Limb.of(joints, *rows)
+        limb, left = Limb.fit(joints, *rows)
         limbs.append(limb)
         share += left * len(joints)
     return Body(tuple(limbs)), share
 
 
-def _limbs(joints: Sequence[str]) -> list[NDArray[np.intp]]:
+def _group_limbs(joints: Sequence[str]) -> list[NDArray[np.intp]]:
     """Joints whose names begin alike, FR_hip_joint and FR_calf_joint; each on its own where these are too many."""
     names = [name.partition("_")[0] for name in joints]
     groups = [np.flatnonzero([one == name for one in names]) for name in dict.fromkeys(names)]
     return [
         part
         for group in groups
-        for part in ([group] if len(group) <= _LARGEST else np.split(group, len(group)))
+        for part in ([group] if len(group) <= _MAX_LIMB_JOINTS else np.split(group, len(group)))
     ]
 
 
-def replayed(logs: Sequence[Log], parameters: ActuatorParameters, body: Body, rows: Bools) -> Replay:
+def replay_errors(logs: Sequence[Log], parameters: ActuatorParameters, body: Body, rows: Bools) -> Replay:
     """Root mean square errors of q (rad) and dq (rad/s) over `rows` (N, J) of all logs, replaying STRETCH at a time."""
-    errors = np.concatenate([_replay(log, parameters, body) for log in logs], axis=1)
+    errors = np.concatenate([_replay_log(log, parameters, body) for log in logs], axis=1)
     count = max(int(rows.sum()), 1)
     sizes = np.sqrt(np.sum(np.where(rows, errors, 0.0) ** 2, axis=(1, 2)) / count)
     return {"q_rms_rad": float(sizes[0]), "dq_rms_rad_s": float(sizes[1])}
 
 
-def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
+def _replay_log(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
     """Errors (2, N, J) of q and dq."""
-    count = max(1, int(np.ceil(log.period / _STEP - 1e-9)))
+    count = max(1, int(np.ceil(log.period / _MAX_STEP_S - 1e-9)))
     dt = log.period / count
     model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), (len(log.joints),), dt)
     packets = log.command_rows((log.t[:, None] + 0.5 * log.period + dt * np.arange(count)).ravel()).reshape(
@@ -228,7 +228,7 @@ def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
     )
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
     errors = np.zeros((2, *log.q.shape))
-    every = max(2, round(STRETCH / log.period))
+    every = max(2, round(STRETCH_S / log.period))
     after_gap = log.after_gap
     place, speed = q[0], dq[0]
     for n, commands in enumerate(packets):

@@ -17,28 +17,28 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .log_signals import ALL, Joints, LogSignals, double
+from .log_signals import ALL_JOINTS, Joints, LogSignals, as_double
 from .logs.log import Log
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Made = TypeVar("Made")
 
-SETTLING = 0.03
+SETTLING_S = 0.03
 """Rows so soon (s) after a gap are not judged: what was commanded before is not known."""
 
-_CACHED = 2, 64
+_CACHE_LIMITS = 2, 64
 """sets of signals that are kept, at least and at most;"""
-_CACHED_VALUES = 400_000
+_MAX_CACHED_VALUES = 400_000
 """as many as have about so many values in each of their signals together"""
 
-_OF_ROWS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
+_ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
 
-BETWEEN = 2
+INSTANTS_PER_ROW = 2
 """Instants of a row, itself the last, for what has to be followed between the rows"""
-_OF_JOINTS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
+_JOINT_FIELDS = ("q", "dq", "q_des", "dq_des", "tau_ff", "kp", "kd", "temperature")
 
-_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+_GOLDEN_RATIO = 0.5 * (np.sqrt(5.0) - 1.0)
 """Its multiples' fractions fill the unit interval evenly, in no period."""
 
 
@@ -95,28 +95,30 @@ class Signals:
         return self.elsewhere(name, late)
 
 
-def scattered(count: int, every: int) -> NDArray[np.intp]:
+def scattered_rows(count: int, every: int) -> NDArray[np.intp]:
     """One row of `every` of so many, at changing places: even steps and an even sender's commands would meet alike each time."""
     first = np.arange(0, count, every)
-    rows: NDArray[np.intp] = first + (every * np.modf(_GOLDEN * np.arange(len(first)))[0]).astype(np.intp)
+    rows: NDArray[np.intp] = first + (every * np.modf(_GOLDEN_RATIO * np.arange(len(first)))[0]).astype(
+        np.intp
+    )
     return rows[rows < count]
 
 
-def _one_row(values: Array) -> Array:
+def _collapse_constant(values: Array) -> Array:
     """`values` (N, J), as a view of one row where all are the same: long logs have many such signals."""
     some = values[:: max(1, len(values) // 10)]  # these tell nearly always, and quickly
     same = (some == values[0]).all() and (values == values[0]).all()
     return np.broadcast_to(values[0].copy(), values.shape) if same else values
 
 
-def _constant(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
+def _constant_signals(logs: Sequence[Mapping[str, Array]]) -> dict[str, Array]:
     """The signals, of those of all `logs`, that are the same in every row, as that row."""
     rows = {name: values[0] for name, values in logs[0].items()}
     return {
         name: row.copy()
         for name, row in rows.items()
         if all(
-            name in one and _one_row(one[name]).strides[0] == 0 and (one[name][0] == row).all()
+            name in one and _collapse_constant(one[name]).strides[0] == 0 and (one[name][0] == row).all()
             for one in logs
         )
     }
@@ -144,9 +146,9 @@ class Samples:
         self.joints = logs[0].joints
         lengths = [len(log.t) for log in logs]
         self.log_of_row = np.repeat(np.arange(len(logs)), lengths)
-        self.t = np.concatenate([double(log.t) for log in logs])
+        self.t = np.concatenate([as_double(log.t) for log in logs])
         self.period = float(np.median(np.concatenate([np.diff(log.t) for log in logs])))
-        self.tau = np.concatenate([double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
+        self.tau = np.concatenate([as_double(log.q * 0.0 if log.tau is None else log.tau) for log in logs])
         starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
         self.start: Bools = np.concatenate(starts)
         self.dt = np.concatenate(steps)
@@ -158,7 +160,7 @@ class Samples:
         self._held: dict[bytes, Samples] = {}
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
         self._first_row = np.cumsum([0, *lengths])
-        self._constant = _constant([one.all for one in self.logs])
+        self._constant = _constant_signals([one.signals for one in self.logs])
         self._cache: dict[tuple[Any, ...], Signals] = {}
         self._states: dict[tuple[Any, ...], dict[str, Array]] = {}
 
@@ -168,7 +170,7 @@ class Samples:
         start[0] = True
         steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))
         began = np.maximum.accumulate(np.where(start, log.t, -np.inf))
-        known = (log.t - began >= SETTLING) & (log.t - SETTLING >= log.t_cmd[0])
+        known = (log.t - began >= SETTLING_S) & (log.t - SETTLING_S >= log.t_cmd[0])
         return np.asarray(start), np.asarray(steps, dtype=float), np.asarray(known)
 
     def drop_heldout(self, rows: Bools) -> Samples:
@@ -194,11 +196,11 @@ class Samples:
     def upsampled(self) -> Samples:
         """These rows, each with BETWEEN - 1 instants before it, evenly over the time since the row before."""
         if self._finer is None:
-            part = self.taken(np.repeat(np.arange(len(self.t)), BETWEEN))
-            before = np.tile(np.arange(BETWEEN)[::-1], len(self.t)) / BETWEEN
+            part = self.taken(np.repeat(np.arange(len(self.t)), INSTANTS_PER_ROW))
+            before = np.tile(np.arange(INSTANTS_PER_ROW)[::-1], len(self.t)) / INSTANTS_PER_ROW
             part.early = np.where(part.start, 0.0, before * part.dt)
-            part.dt = part.dt / BETWEEN
-            part.start = part.start & (np.arange(len(part.t)) % BETWEEN == 0)
+            part.dt = part.dt / INSTANTS_PER_ROW
+            part.start = part.start & (np.arange(len(part.t)) % INSTANTS_PER_ROW == 0)
             self._finer = part
         return self._finer
 
@@ -212,7 +214,7 @@ class Samples:
     def taken(self, rows: NDArray[np.intp]) -> Samples:
         """These rows alone; `dt` and `start` are those they had."""
         part = copy(self)
-        for name in _OF_ROWS:
+        for name in _ROW_FIELDS:
             setattr(part, name, getattr(self, name)[rows])
         part._cache, part._states, part._finer, part._held = {}, {}, None, {}
         return part
@@ -224,41 +226,45 @@ class Samples:
         pairs = list(zip(early, late, strict=True))
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
-        return self._kept(
-            self._cache, key, lambda: self._make(*pairs[0], window) if shared else self._mixed(pairs, window)
+        return self._cached(
+            self._cache,
+            key,
+            lambda: self._make_signals(*pairs[0], window) if shared else self._mix_delays(pairs, window),
         )
 
     def at_joint(self, input_delay: Array, output_delay: Array, window: float) -> Signals:
         """The signals (N, J) of now, for what acts on the joint itself; commands move it with delays (s) of each, (J,)."""
         delays = np.broadcast_to(input_delay + output_delay, self.tau.shape[1:])
-        slope = partial(self._slope, 0.0, delays - 0.5 * window, ALL)
+        slope = partial(self._slope, 0.0, delays - 0.5 * window, ALL_JOINTS)
         key = ("joint", window, *np.round(delays, 7).tolist())
-        return self._kept(self._cache, key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
+        return self._cached(self._cache, key, lambda: attrs.evolve(self.at(0.0, 0.0, window), slope=slope))
 
-    def _kept(
+    def _cached(
         self, cache: dict[tuple[Any, ...], Made], key: tuple[Any, ...], make: Callable[[], Made]
     ) -> Made:
         """What `make` gives, made but once while few others are asked for."""
         if key not in cache:
             made = make()
-            if len(cache) >= max(_CACHED[0], min(_CACHED[1], _CACHED_VALUES // self.tau.size)):
+            if len(cache) >= max(
+                _CACHE_LIMITS[0], min(_CACHE_LIMITS[1], _MAX_CACHED_VALUES // self.tau.size)
+            ):
                 cache.pop(next(iter(cache)))
             cache[key] = made
         return cache[key]
 
-    def _mixed(self, pairs: Sequence[tuple[float, float]], window: float) -> Signals:
+    def _mix_delays(self, pairs: Sequence[tuple[float, float]], window: float) -> Signals:
         """Each joint's columns at its own delays; times and packets are those of the first one."""
         every = {pair: [j for j, one in enumerate(pairs) if one == pair] for pair in dict.fromkeys(pairs)}
         delays = np.array(pairs).sum(axis=1) - 0.5 * window
-        made = {pair: self._make(*pair, window, joints, delays) for pair, joints in every.items()}
+        made = {pair: self._make_signals(*pair, window, joints, delays) for pair, joints in every.items()}
         first = made[pairs[0]]
         columns: dict[str, Any] = {}
-        for name in _OF_JOINTS:
+        for name in _JOINT_FIELDS:
             if getattr(first, name) is not None:
                 columns[name] = np.empty(self.tau.shape)
                 for pair, joints in every.items():
                     columns[name][:, joints] = getattr(made[pair], name)
-                columns[name] = _one_row(columns[name])
+                columns[name] = _collapse_constant(columns[name])
         late = np.array([pair[1] for pair in pairs])
 
         def slope(name: str) -> Array:
@@ -267,26 +273,27 @@ class Samples:
                 values[:, joints] = getattr(made[pair], name)
             return values
 
-        return attrs.evolve(first, **columns, elsewhere=partial(self._elsewhere, late), slope=slope)
+        return attrs.evolve(first, **columns, elsewhere=partial(self._shifted_state, late), slope=slope)
 
-    def _instants(self, output_delay: float) -> Iterator[Array]:
+    def _request_times(self, output_delay: float) -> Iterator[Array]:
         """Of each log the instants at which the torque of these rows was asked for."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
         for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
             yield one.t[self.row[a:b] - first] - self.early[a:b] - output_delay
 
-    def _elsewhere(self, output_delay: Array | float, name: str, late: Array) -> Array:
+    def _shifted_state(self, output_delay: Array | float, name: str, late: Array) -> Array:
         """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
         before = np.squeeze(late, -2) if np.ndim(late) > 1 else late
         before = np.broadcast_to(
             before + output_delay, np.broadcast_shapes(np.shape(before), self.tau.shape[1:])
         )
         parts = [
-            one.shifted(name, at, before) for one, at in zip(self.logs, self._instants(0.0), strict=True)
+            one.state_shifted(name, at, before)
+            for one, at in zip(self.logs, self._request_times(0.0), strict=True)
         ]
         return np.concatenate(parts, axis=-2)
 
-    def _make(
+    def _make_signals(
         self,
         input_delay: float,
         output_delay: float,
@@ -295,22 +302,24 @@ class Samples:
         delays: Array | None = None,
     ) -> Signals:
         """The signals of `joints`, or of all, at one pair of delays; `delays` (J,) after which commands move the joints."""
-        chosen = ALL if joints is None else joints
+        chosen = ALL_JOINTS if joints is None else joints
         constant = self._constant
         parts: dict[str, list[Array]] = {}
         packets, ages = [], []
         if delays is None:
             delays = np.full(self.tau.shape[1], input_delay + output_delay - 0.5 * window)
-        for one, at, first in zip(self.logs, self._instants(output_delay), self._first_packet, strict=False):
+        for one, at, first in zip(
+            self.logs, self._request_times(output_delay), self._first_packet, strict=False
+        ):
             sent = at - input_delay
-            row = one.in_force(sent)
+            row = one.command_rows(sent)
             for name in one.commands.keys() - constant:
-                parts.setdefault(name, []).append(one.command(name, sent, window, chosen, row))
+                parts.setdefault(name, []).append(one.command_at(name, sent, window, chosen, row))
             for name in one.gains.keys() - constant:
                 parts.setdefault(name, []).append(one.gains[name][:, chosen][row])
             packets.append((row + first)[:, None])
             ages.append((sent - one.t_cmd[row] + (1.0 if window else 0.0))[:, None])
-        signals = {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
+        signals = {name: _collapse_constant(np.concatenate(part)) for name, part in parts.items()}
         signals |= self._state(output_delay, joints)
         for name, value in constant.items():
             value = value if value.size == 1 else value[chosen]
@@ -325,7 +334,7 @@ class Samples:
             age=np.maximum(np.concatenate(ages), 0.0),
             row=self.row[:, None],
             sent=self.sent,
-            elsewhere=partial(self._elsewhere, output_delay),
+            elsewhere=partial(self._shifted_state, output_delay),
             slope=partial(self._slope, output_delay, delays, chosen),
             **signals,
         )
@@ -335,22 +344,22 @@ class Samples:
 
         def make() -> dict[str, Array]:
             parts: dict[str, list[Array]] = {}
-            for one, at in zip(self.logs, self._instants(output_delay), strict=False):
-                found = one.between(at)
+            for one, at in zip(self.logs, self._request_times(output_delay), strict=False):
+                found = one.locate(at)
                 for name in one.states.keys() - self._constant:
                     parts.setdefault(name, []).append(
-                        one.state(name, at, ALL if joints is None else joints, found)
+                        one.state_at(name, at, ALL_JOINTS if joints is None else joints, found)
                     )
                 parts.setdefault("t", []).append((at - one.origin)[:, None])
-            return {name: _one_row(np.concatenate(part)) for name, part in parts.items()}
+            return {name: _collapse_constant(np.concatenate(part)) for name, part in parts.items()}
 
         key = (output_delay, *(joints or ()))
-        return self._kept(self._states, key, make)
+        return self._cached(self._states, key, make)
 
     def _slope(self, output_delay: float, delays: Array, joints: Joints, name: str) -> Array:
         """One of the accelerations (N, J) at this output delay, where commands move the joints after `delays` (J,)."""
         parts = [
-            one.acceleration(name, at, delays, joints)
-            for one, at in zip(self.logs, self._instants(output_delay), strict=False)
+            one.acceleration_at(name, at, delays, joints)
+            for one, at in zip(self.logs, self._request_times(output_delay), strict=False)
         ]
         return np.concatenate(parts)
