@@ -273,7 +273,7 @@ def test_gains_that_are_given_are_not_missed() -> None:
 def test_a_torque_that_never_changes_is_taken_as_not_logged() -> None:
     inspection = inspect(log(tau=np.zeros((2000, 12))))
     assert inspection.log.tau is None
-    assert "tau: is 0 throughout, which is no measurement; taken as not logged" in said(inspection, "warning")
+    assert "tau: is 0 throughout, which is no measurement; treated as not logged" in said(inspection, "warning")
 
 
 def test_what_the_motion_cannot_tell_apart_is_said() -> None:

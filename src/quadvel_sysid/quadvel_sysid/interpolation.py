@@ -1,4 +1,4 @@
-"""Series read between their rows, in compiled loops: an identification reads its logs at tens of thousands of delays."""
+"""Compiled interpolation of time series; an identification reads logs at thousands of delays."""
 
 from __future__ import annotations
 
@@ -13,32 +13,67 @@ Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
 _MAX_LINEAR_STEPS = 16
-"""Rows that are looked at one after the other before the rest is halved"""
+"""Rows of linear search before binary search."""
 
 
 def rows_at(times: Array, at: Array) -> Rows:
-    """The last row whose time (K,) is not after each of `at` (N,), the first one where none is."""
+    """Find the last row at or before each time.
+
+    Args:
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N,) row indices; 0 if no row is before.
+    """
     found = np.empty(len(at), dtype=np.intp)
     _compiled()["rows_at"](times, at, found)
     return found
 
 
 def locate(times: Array, at: Array) -> tuple[Rows, Array]:
-    """Of each of `at` (N,): the row before it, of which there is a next one, and how far it is towards that, 0 to 1."""
+    """Find the interval of rows that holds each time.
+
+    Args:
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N,) first row of the interval, and (N,) position in it, from 0 to 1.
+    """
     found, share = np.empty(len(at), dtype=np.intp), np.empty(len(at))
     _compiled()["between"](times, at, found, share)
     return found, share
 
 
 def interpolate(values: Array, row: Rows, share: Array) -> Array:
-    """Values (K, J), linear between rows, where `between` says (N,): (N, J)."""
+    """Interpolate linearly between rows.
+
+    Args:
+        values: (K, J) values of the rows.
+        row: (N,) rows, from `locate`.
+        share: (N,) positions, from `locate`.
+
+    Returns:
+        (N, J) values.
+    """
     found = np.empty((len(row), values.shape[1]))
     _compiled()["read"](values, row, share, found)
     return found
 
 
 def interpolate_shifted(values: Array, times: Array, at: Array, late: Array) -> Array:
-    """Each joint's values (K, J) at its own times, `late` (..., J) before `at` (N,): (..., N, J)."""
+    """Interpolate linearly at times that differ between joints.
+
+    Args:
+        values: (K, J) values of the rows.
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+        late: (..., J) delay of each joint, s: it is read at `at` - `late`.
+
+    Returns:
+        (..., N, J) values.
+    """
     each = late.reshape(-1, values.shape[1])
     found = np.empty((len(each), len(at), values.shape[1]))
     _compiled()["read_late"](values, times, at, each, found)
@@ -46,14 +81,24 @@ def interpolate_shifted(values: Array, times: Array, at: Array, late: Array) -> 
 
 
 def hold_integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
-    """What values (K, J), each held from its time to the next, add up to until `at` (N,), with `sums` (K + 1, J) at their times."""
+    """Integrate piecewise constant values from the first row to given times.
+
+    Args:
+        values: (K, J) values, each in force from its time to the next.
+        sums: (K + 1, J) integral at the time of each row.
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N, J) integral.
+    """
     found = np.empty((len(at), values.shape[1]))
     _compiled()["integral"](values, sums, times, at, found)
     return found
 
 
 def _last_row(times: Any, at: float, row: int) -> Any:
-    """The last row whose time is not after `at`, sought from `row` on; -1 where none is."""
+    """The last row at or before `at`, searched from `row` on; -1 if there is none."""
     for _ in range(_MAX_LINEAR_STEPS):
         if row >= 0 and times[row] > at:
             row -= 1
@@ -66,7 +111,7 @@ def _last_row(times: Any, at: float, row: int) -> Any:
 
 @cache
 def _compiled() -> dict[str, Callable[..., None]]:
-    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk."""
+    """Compile the loops; the first call after an installation takes seconds and is cached on disk."""
     import numba
     from numba.extending import register_jitable
 

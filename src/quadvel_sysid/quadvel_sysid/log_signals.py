@@ -1,4 +1,4 @@
-"""One log, read at any time: its states between their rows, its commands as they were held, and its accelerations."""
+"""Signals of one log at any time: interpolated states, held commands, and accelerations."""
 
 from __future__ import annotations
 
@@ -15,18 +15,35 @@ from .logs.log import TIME_TOLERANCE_S, Log
 Array = NDArray[np.float64]
 Joints = slice | list[int]
 ALL_JOINTS = slice(None)
+"""Selects all joints."""
 
 _MAX_CACHED_SLOPES = 4
-"""accelerations that a log keeps: two kinds at a few delays"""
+"""Accelerations that are cached for a log: two kinds at a few delays."""
 
 
 class LogSignals:
-    """One log; `steady` (s) as that of `Samples`. known: which of kp and kd count as logged, the others as 1.
+    """Signals of one log in double precision, at any time.
 
-    origin: when it began, s, or the log that it is a piece of.
+    Attributes:
+        log: The log, N state rows and M command rows of J joints.
+        origin: Start time of the recording, s.
+        t: (N,) times of the states, s.
+        t_cmd: (M,) times of the commands, s.
+        states: State signals by name, (N, J) or (N, 1).
+        commands: Command signals by name, (M, J).
+        gains: kp and kd, (M, J); 1 if they are not known.
+        sums: Integral (M + 1, J) of each command signal that is not 0.
+        signals: All of these signals by name.
     """
 
     def __init__(self, log: Log, steady: float, known: Collection[str]) -> None:
+        """Prepare the signals.
+
+        Args:
+            log: The log.
+            steady: Half width of the lines that smooth q and dq, s; 0 for none.
+            known: Which of kp and kd are used as logged.
+        """
         self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
         self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
         self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
@@ -60,7 +77,14 @@ class LogSignals:
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
     def locate(self, at: Array) -> tuple[NDArray[np.intp], Array]:
-        """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
+        """Find the interval of state rows that holds each time.
+
+        Args:
+            at: (N,) times, s.
+
+        Returns:
+            (N,) first row of the interval, and (N,) position in it, from 0 to 1.
+        """
         return interpolation.locate(self.t, at)
 
     def state_at(
@@ -70,36 +94,56 @@ class LogSignals:
         joints: Joints = ALL_JOINTS,
         found: tuple[NDArray[np.intp], Array] | None = None,
     ) -> Array:
-        """A state signal, linear between rows; `found` is `between(at)` where that is known."""
+        """Interpolate a state signal.
+
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            joints: Columns to read.
+            found: `locate(at)`, if already computed.
+
+        Returns:
+            (N, J) or (N, 1) values.
+        """
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
         return interpolation.interpolate(values, *(self.locate(at) if found is None else found))
 
     def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
-        """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
+        """Compute the acceleration of the joints.
+
+        Args:
+            name: `ddq`, `ddq_sharp` or `ddq_smooth`; selects the half width of the slope.
+            at: (N,) times, s.
+            delays: (J,) delay from a command to the motion of its joint, s.
+            joints: Columns to read.
+
+        Returns:
+            (N, J) acceleration, rad/s^2.
+        """
         if name == "ddq":
             return interpolation.interpolate(self._slope_of_dq(name)[:, joints], *self.locate(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
             if len(self._smooth) >= _MAX_CACHED_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
-            come = self._read_targets(self.t, delays, self._integral)
+            acting = self._read_targets(self.t, delays, self._integral)
             self._smooth[key] = split_acceleration(
-                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), come
+                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), acting
             )
         smooth, answer = self._smooth[key]
         jumps = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
         return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + jumps @ answer[:, joints]
 
     def _slope_of_dq(self, name: str) -> Array:
-        """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
+        """Slope of dq at each row, rad/s^2, as smooth as `name` says."""
         width = HALF_WIDTHS_S[name]
         if width not in self._slopes:
             self._slopes[width] = local_slope(self.t, as_double(self.log.dq), width)
         return self._slopes[width]
 
     def _read_targets(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
-        """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
+        """Read q_des and its integral at the send times of what acts at `at`, (N, J)."""
         found = np.zeros((len(at), len(delays)))
         if "q_des" in self.sums:
             for delay in np.unique(delays):
@@ -109,11 +153,27 @@ class LogSignals:
         return found
 
     def state_shifted(self, name: str, at: Array, late: Array) -> Array:
-        """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
+        """Interpolate a state signal at delays that differ between joints.
+
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            late: (..., J) delays, s.
+
+        Returns:
+            (..., N, J) values.
+        """
         return interpolation.interpolate_shifted(self.states[name], self.t, at, late)
 
     def command_rows(self, at: Array) -> NDArray[np.intp]:
-        """The command row that counts at the times `at` (N,), s."""
+        """Find the command rows in force.
+
+        Args:
+            at: (N,) times, s.
+
+        Returns:
+            (N,) row indices; 0 before the first command.
+        """
         return interpolation.rows_at(self.t_cmd, at + TIME_TOLERANCE_S)
 
     def command_at(
@@ -124,7 +184,19 @@ class LogSignals:
         joints: Joints = ALL_JOINTS,
         row: NDArray[np.intp] | None = None,
     ) -> Array:
-        """A command signal: the mean over `at` to `at + window`; `row` is `command_rows(at)` where that is known."""
+        """Read a command signal, or its mean over a step of the drive.
+
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            window: Step of the drive, s: the mean over `at` to `at` + `window`; 0 for the value
+                at `at`.
+            joints: Columns to read.
+            row: `command_rows(at)`, if already computed.
+
+        Returns:
+            (N, J) values.
+        """
         values = self.commands[name][:, joints]
         if name not in self.sums:
             return np.zeros((len(at), values.shape[1]))
@@ -135,8 +207,17 @@ class LogSignals:
         return (late - early) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
+        """Integral of a command signal from the first command to `at`."""
         return interpolation.hold_integral(values, sums, self.t_cmd, at)
 
 
 def as_double(values: NDArray[np.floating]) -> Array:
+    """Convert an array to double precision.
+
+    Args:
+        values: The array.
+
+    Returns:
+        The array, without a copy if possible.
+    """
     return np.asarray(values, dtype=np.float64)

@@ -1,6 +1,8 @@
-"""What glibc keeps of freed memory: nothing of a long log's arrays, of which each copy of the process would hold a copy.
+"""Control how glibc keeps freed memory.
 
-Of a short one all: to give it back and ask for it again is a fifth of an identification's time.
+For long logs, large arrays go back to the system as soon as they are freed, since each worker
+process would hold a copy. For short logs freed memory is kept: returning it and requesting it
+again costs a fifth of an identification's time.
 """
 
 from __future__ import annotations
@@ -12,22 +14,27 @@ _LARGE, _LARGEST, _FREED = 1 << 22, 1 << 25, 1 << 27  # bytes
 
 
 def return_large_arrays() -> None:
-    """Have large arrays returned as soon as they are free: left to itself glibc keeps ever larger ones, with gaps."""
+    """Return large arrays to the system as soon as they are freed.
+
+    By default glibc raises its threshold with the size of freed arrays, and keeps them with gaps
+    between.
+    """
     _set(M_MMAP_THRESHOLD, _LARGE)
 
 
 def keep_freed_arrays() -> None:
-    """Have freed memory kept for the arrays to come."""
+    """Keep freed memory for the next arrays."""
     _set(M_MMAP_THRESHOLD, _LARGEST)
     _set(M_TRIM_THRESHOLD, _FREED)
 
 
 def _set(option: int, size: int) -> None:
+    """Set an option of glibc's mallopt, if the C library has it."""
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
         mallopt(option, size)
 
 
 def trim_heap() -> None:
-    """Return what is free now between smaller arrays: what a copy of this process puts there it would hold besides."""
+    """Return free memory between small arrays to the system, before worker processes copy it."""
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)

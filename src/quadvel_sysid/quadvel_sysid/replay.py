@@ -1,12 +1,13 @@
-"""Does a model of the joints move the robot's legs as they moved? Commands replayed over short stretches, joint by joint.
+"""Replay logged commands on the legs of a robot's description, before and after a correction.
 
-What pushes a walking robot's legs beside their drives, the ground above all, is in no log. But it is the same in the
-measurement and in the replay, so that what the two differ by is
+A walking robot's legs are also pushed by the ground, which no log contains. These forces are the
+same in the measurement and in the replay. With the deviation e of the joint angles and the
+inertia M(q) of the legs, the trunk held still, what differs is
 
-    M(q) e'' = tau_model(q + e, dq + e') - tau_measured
+    M(q) e'' = tau_model(q + e, dq + e') - tau_measured.
 
-with the deviation e of the joints' angles and the inertia M(q) of the legs, the trunk held still. A model that gives the
-measured torque moves the legs as measured, e = 0; any other leaves its track as freely as the drives let it.
+A model that yields the measured torque moves the legs as measured, e = 0. Any other model
+deviates as far as the drives allow.
 """
 
 from __future__ import annotations
@@ -30,30 +31,48 @@ from .logs.log import Log, LogError
 from .signals import Array, Bools
 
 STRETCH_S = 0.2
-"""s that are replayed from a measured state, whereupon the next stretch begins with another one"""
+"""s that are replayed from a measured state; then the next stretch begins at another measured state."""
 MIN_BLOCK_S = 0.25
-"""s in a row that hold a stretch"""
+"""s; shortest block of rows that holds a stretch."""
 _WARM_UP_S = 0.04
-"""s of the measured motion that the model is led along first, so that its delays and memories are filled"""
+"""s of measured motion before a stretch, which fill the model's delays and memories."""
 _STEP_S = 0.001
-"""s of the replay"""
+"""s; time step of the replay."""
 EXPLANATION = (
     "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the measured torque; "
     "what else pushes them is as measured."
 )
+"""Explanation of the replay in the report."""
 _SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
 @attrs.frozen(eq=False)
 class Legs:
-    """The inertia that joints carry, of a description of the robot."""
+    """Inertia of a robot's joints, from a description of the robot.
+
+    Attributes:
+        model: The description as a MuJoCo model.
+        joints: Names of the joints of the log, all in the description.
+    """
 
     model: mujoco.MjModel
     joints: tuple[str, ...]
 
     @classmethod
     def load(cls, robot: str, joints: Sequence[str]) -> Legs:
-        """robot: `aliengo`, `go2`, or a file, MJCF or URDF, that holds `joints`. Raises ValueError, OSError."""
+        """Load a robot's description.
+
+        Args:
+            robot: `aliengo`, `go2`, or the path of an MJCF or URDF file.
+            joints: Names of the joints, which the description has to hold.
+
+        Returns:
+            The legs.
+
+        Raises:
+            ValueError: A joint is missing, or MuJoCo cannot read the file.
+            FileNotFoundError: There is no such description.
+        """
         model = mjcf.load_model() if robot == "aliengo" else _load_robot(robot)
         known = {model.joint(k).name for k in range(model.njnt)}
         for name in joints:
@@ -64,7 +83,14 @@ class Legs:
         return cls(model, tuple(joints))
 
     def inertia(self, q: Array) -> Array:
-        """(N, J, J) kg m^2 at angles (N, J), the other joints where the description has them and the trunk held still."""
+        """Compute the inertia matrix of the joints, with the trunk held still.
+
+        Args:
+            q: (N, J) joint angles, rad; other joints keep the angles of the description.
+
+        Returns:
+            (N, J, J) inertia, kg m^2.
+        """
         model, data = self.model, mujoco.MjData(self.model)
         joints = [model.joint(name) for name in self.joints]
         at, dofs = [int(one.qposadr[0]) for one in joints], [int(one.dofadr[0]) for one in joints]
@@ -81,9 +107,19 @@ class Legs:
     def replay_errors(
         self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools
     ) -> dict[str, Any]:
-        """Root mean square deviations over `rows` (N, J) of all logs; how many stretches there were.
+        """Replay logs and compute the root mean square deviations from the measured motion.
 
-        Raises LogError where no stretch lies within these rows.
+        Args:
+            logs: The logs, one after the other.
+            parameters: The actuator model.
+            rows: (N, J) rows of all logs that stretches may use.
+
+        Returns:
+            Number of stretches; deviations of angles (rad) and speeds (rad/s), of all joints and
+            of each.
+
+        Raises:
+            LogError: The rows hold no stretch, or a log holds no torque or gains.
         """
         found, first = [], 0
         for log in logs:
@@ -99,7 +135,7 @@ class Legs:
 
 
 def _load_robot(robot: str) -> mujoco.MjModel:
-    """The model of a shipped description, or of a file."""
+    """Load a shipped description, or a file."""
     shipped = _SHIPPED / f"{robot}.xml"
     path = shipped if shipped.is_file() else Path(robot)
     if not path.is_file():
@@ -112,7 +148,15 @@ def _load_robot(robot: str) -> mujoco.MjModel:
 
 
 def stretch_starts(log: Log, rows: Bools) -> Array:
-    """The instants (S,) s at which stretches begin that hold none but `rows` (N, J), one after the other."""
+    """Find the start times of consecutive stretches.
+
+    Args:
+        log: The log.
+        rows: (N, J) rows that stretches may use.
+
+    Returns:
+        (S,) start times, s.
+    """
     whole: Bools = np.asarray(rows.all(axis=1))
     broken = np.flatnonzero(~whole | log.after_gap)
     edges = np.concatenate([[0], broken, [len(whole)]])
@@ -128,9 +172,20 @@ def stretch_starts(log: Log, rows: Bools) -> Array:
 def replay_deviations(
     log: Log, parameters: ActuatorParameters, legs: Legs, begins: Array
 ) -> tuple[Array, Array]:
-    """What the joints of a replay are off by after each _STEP of the stretches that begin at `begins` (S,) s.
+    """Replay stretches of a log and compute the deviations from the measured motion.
 
-    (T, S, J) of the angles, rad, and of the speeds, rad/s. Raises LogError where the log holds no torque or no gains.
+    Args:
+        log: The log, with torque and gains.
+        parameters: The actuator model.
+        legs: The inertia of the joints.
+        begins: (S,) start times of the stretches, s.
+
+    Returns:
+        Deviations after each step of `_STEP_S`: angles (T, S, J), rad, and speeds (T, S, J),
+        rad/s.
+
+    Raises:
+        LogError: The log holds no torque or no gains.
     """
     if log.tau is None or log.kp is None or log.kd is None:
         raise LogError(f"{log.name}: tau, kp, kd: expected all three to replay the commands")
@@ -161,7 +216,7 @@ def replay_deviations(
 
 
 def _interpolate(log: Log, values: NDArray[np.floating[Any]], at: Array) -> Array:
-    """Lines through the rows `values` (N, J) of a log, read at `at` (S,) s: (S, J)."""
+    """Interpolate rows `values` (N, J) of a log linearly at times `at` (S,), s: (S, J)."""
     return np.stack([np.interp(at, log.t, one) for one in values.T], axis=1)
 
 

@@ -67,7 +67,7 @@ class CandidateScreening:
         self.rows = fitted[scattered_rows(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
-        self.screening_rows = context.samples.taken(self.rows)
+        self.screening_rows = context.samples.take_rows(self.rows)
         """the rows that are looked at, alone"""
         self._remembers = any(one.law.has_memory for one in context.model.effects)
         shifts = _FEW_SHIFTS if self._remembers else _TOTAL_DELAY_CHANGES_S

@@ -104,7 +104,7 @@ def torque_presence(log: Log) -> Iterator[Finding | Log]:
     if tau is not None:
         dead = joints_where(log, np.ptp(tau, axis=0) == 0.0)
         if len(dead) == len(log.joints):
-            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; taken as not logged"
+            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; treated as not logged"
             yield Finding("warning", "tau", dead, text)
             tau, log = None, attrs.evolve(log, tau=None)
             yield log

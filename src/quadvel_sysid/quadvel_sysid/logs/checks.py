@@ -197,7 +197,7 @@ ROW_CHECKS = (
         "0.2 %",
         "warning; of commands a note",
     ),
-    Check(channels.torque_presence, "span of tau, N m", "0", "taken as not logged, with a warning"),
+    Check(channels.torque_presence, "span of tau, N m", "0", "treated as not logged, with a warning"),
     Check(
         clocks.clock_offset,
         "lag from command to torque (without torque, to the acceleration) with the smallest error, s; this "

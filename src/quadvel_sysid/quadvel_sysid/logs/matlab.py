@@ -51,7 +51,7 @@ def read_mat(path: Path, choose: ColumnChooser) -> RawArrays:
     if not arrays:
         raise LogError(
             f"{path}: found no arrays but {', '.join(shapes) or 'nothing'}, expected numbers or a struct of them; a table or "
-            "a timeseries has to be taken apart: save('log.mat', 't', 'q', 'q_des')"
+            "a timeseries has to be split: save('log.mat', 't', 'q', 'q_des')"
         )
     return select_arrays(path, arrays, choose)
 

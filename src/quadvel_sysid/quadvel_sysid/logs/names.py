@@ -123,12 +123,12 @@ def _match_exactly(names: Sequence[str], column: str) -> dict[str, str]:
 
 def _unambiguous_words(names: Sequence[str]) -> Iterator[tuple[str, str, str]]:
     """Yield field, joint and name of the names that match by words, without ambiguous ones."""
-    said: dict[tuple[str, str], list[str]] = {}
+    matches: dict[tuple[str, str], list[str]] = {}
     for name in names:
         field, joint = _match_words(name) or ("", "")
         if field and not (joint and field in (*TIME_FIELDS, "voltage")):
-            said.setdefault((field, joint), []).append(name)
-    for (field, joint), those in said.items():
+            matches.setdefault((field, joint), []).append(name)
+    for (field, joint), those in matches.items():
         if len(those) == 1:
             yield field, joint, those[0]
 

@@ -283,8 +283,8 @@ def _drifting_rows(log: Log) -> Bools:
     if resting.all() or not resting.any():
         return np.zeros(len(log.t), bool)
     off = resting & (error > 2.0 * np.percentile(error[~resting], 95))
-    held = np.unique(changes[row][off])
-    return _with_margin(np.isin(changes[row], held) & (since > 2.0 * OUTAGE_MARGIN_S), log.t)
+    drifted = np.unique(changes[row][off])
+    return _with_margin(np.isin(changes[row], drifted) & (since > 2.0 * OUTAGE_MARGIN_S), log.t)
 
 
 def _with_margin(rows: Bools, t: Array) -> Bools:

@@ -114,7 +114,7 @@ def _joints(path: Path, names: list[str] | None, joints: int, remarks: list[str]
     """Names of the joints, or default names with a remark."""
     if names is None and joints == len(JOINT_NAMES):
         remarks.append(
-            f"joint_names: not there; taken as {JOINT_NAMES[0]}, {JOINT_NAMES[1]}, ... (the model's)"
+            f"joint_names: not there; assumed to be {JOINT_NAMES[0]}, {JOINT_NAMES[1]}, ... (the model's)"
         )
         return JOINT_NAMES
     if names is None:
