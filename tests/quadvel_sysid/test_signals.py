@@ -19,7 +19,7 @@ def _log(seconds=3.0, seed=2):
 def test_signals_of_few_rows_are_those_of_all():
     samples = Samples([_log(), _log(seed=3)])
     rows = np.arange(0, len(samples.t), 7)
-    few = samples.taken(rows)
+    few = samples.take_rows(rows)
     assert len(few.t) == len(rows) < len(samples.t) / 6
     for name in ("t", "q", "q_des", "ddq", "packet"):
         whole = getattr(samples.at(0.004, 0.001, 0.001), name)

@@ -37,6 +37,9 @@ def local_lines(t: Array, values: Array, half_width: float) -> tuple[Array, Arra
     """
     n, period = len(t), float(np.median(np.diff(t)))
     wide = max(half_width, period)
+    # Weighted least squares on x = t_k - t_n, y = v_k - v_n with moments S_p = sum w x^p:
+    #   [S_0 S_1] [level]   [sum w y  ]
+    #   [S_1 S_2] [slope] = [sum w x y].
     moments = np.zeros((3, n))
     sums = np.zeros((2, *values.shape))
     for k in range(-round(wide / period), round(wide / period) + 1):
@@ -90,6 +93,7 @@ def split_acceleration(
     Returns:
         D dq - B D s (N, J), rad/s^2, and B transposed (J, J), 1/s^2.
     """
+    # B from changes of slope: (D_after - D_before) dq = B (D_after - D_before) s, in least squares.
     half_width, cause, outcome = HALF_WIDTHS_S[name], _slope_change(t, acting), _slope_change(t, dq)
     answer: Array = np.asarray(
         np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float

@@ -116,6 +116,7 @@ def _log_regressors(log: Log, j: int, commands: Sequence[float], states: Sequenc
 
 def _residual(signals: Array, tau: Array, rows: Bools, penalty: float) -> Array:
     """Residual (N,) of a ridge regression fitted to `rows`; the offset has no penalty."""
+    # Ridge regression on standardised signals: (X^T X + penalty N I) w = X^T (tau - mean).
     x = signals[rows, :-1]
     centre, size = x.mean(axis=0), x.std(axis=0) + 1e-12
     x = (x - centre) / size

@@ -66,6 +66,7 @@ class LogSignals:
             name: as_double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
             for name in ("kp", "kd")
         }
+        # Integral of each held command up to its row. The last command lasts for 1000 s.
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
         self.sums = {
             name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
@@ -131,6 +132,7 @@ class LogSignals:
             self._smooth[key] = split_acceleration(
                 name, self.t, as_double(self.log.dq), self._slope_of_dq(name), acting
             )
+        # ddq = smooth + B q_des, with the command as it acts at `at`.
         smooth, answer = self._smooth[key]
         jumps = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
         return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + jumps @ answer[:, joints]
@@ -202,6 +204,7 @@ class LogSignals:
             return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
             return values[self.command_rows(at) if row is None else row]
+        # Mean of the held command over the step: (I(at + window) - I(at)) / window.
         sums = self.sums[name][:, joints]
         late, early = (self._integral(values, sums, end) for end in (at + window, at))
         return (late - early) / window

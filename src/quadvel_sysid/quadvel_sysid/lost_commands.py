@@ -52,8 +52,8 @@ class LossProbabilities:
 
     Attributes:
         lost: Probability that a new command is lost.
-        lost_again: Probability that a new command is lost if the one before was.
-        delivered_late: Probability in each row that a delayed command arrives.
+        lost_again: Probability that a new command is lost if the drive is behind already.
+        delivered_late: Probability that a delayed command arrives in a row without a new one.
     """
 
     lost: float = 0.02
@@ -70,6 +70,9 @@ class LossProbabilities:
             (D, M, M) matrices from backlog i to backlog j, for D = 0 to most + 1 new commands; M
             = most + 1.
         """
+        # No new command: from backlog i to each j < i with delivered_late / i, else i stays.
+        # D new commands: to 0 with 1 - p, else to min(i + D, most) with p, where p is `lost` for
+        # i = 0 and `lost_again` for i > 0.
         count = most + 1
         arriving = np.tril(
             np.full((count, count), self.delivered_late) / np.maximum(np.arange(count), 1)[:, None], -1
@@ -194,7 +197,7 @@ def _has_suspects(model: Model, noise: Array) -> bool:
     """Whether enough commands look lost or late, each on its own; otherwise the search is skipped."""
     s = model.signals
     gain = np.where(model.samples.judged, -np.diff(_row_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
-    gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all together
+    gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all joints together
     first = np.flatnonzero(np.diff(s.packet[:, 0], prepend=-1))
     total = np.cumsum(gain, axis=0)
     most = np.maximum.reduceat(total, first) - total[first] + gain[first]
@@ -229,6 +232,8 @@ def backlog_probabilities(model: Model, noise: Array, most: int, unread: Bools) 
 
 def _row_costs(model: Model, noise: Array, most: int) -> Array:
     """Negative log likelihood (N, J, most + 1) of each row and backlog, nats."""
+    # With the command of k packets ago the torque changes by kp (q_des_{n-k} - q_des_n). The cost is
+    # (residual - change)^2 / (2 noise variance).
     s = model.signals
     left = np.where(model.samples.judged, model.samples.tau - model.predict(), 0.0)
     stiffness = model.gains[0] * s.kp
@@ -256,7 +261,7 @@ def _forward_backward(costs: Array, new: NDArray[np.intp], chances: LossProbabil
     likely = np.where(inside[..., None, None], likely, 1.0)  # (R, S, G, M)
     moves = chances.transition_matrices(costs.shape[-1] - 1)
     which = np.where(inside, new[at], 0)
-    # With transitions A and likelihoods b, rows n (Rabiner, Eqs. 19 to 27, each normalised):
+    # With transitions A_n and likelihoods b_n of row n, each normalised (Rabiner, forward-backward):
     #   alpha_n = (alpha_{n-1} A_n) b_n,  beta_{n-1} = A_n (b_n beta_n),  gamma_n ~ alpha_n beta_n,
     #   xi_n[i, j] ~ alpha_{n-1}[i] A_n[i, j] b_n[j] beta_n[j].
     forward, backward = np.empty_like(likely), np.empty_like(likely)

@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import ctypes
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
-_LARGE, _LARGEST, _FREED = 1 << 22, 1 << 25, 1 << 27  # bytes
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Options of glibc's mallopt (malloc.h)."""
+_LARGE_BYTES, _LARGEST_BYTES, _KEPT_BYTES = 1 << 22, 1 << 25, 1 << 27
+"""Bytes: smallest array that is mapped separately, largest threshold, and memory kept at the top."""
 
 
 def return_large_arrays() -> None:
@@ -19,13 +21,13 @@ def return_large_arrays() -> None:
     By default glibc raises its threshold with the size of freed arrays, and keeps them with gaps
     between.
     """
-    _set(M_MMAP_THRESHOLD, _LARGE)
+    _set(M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def keep_freed_arrays() -> None:
     """Keep freed memory for the next arrays."""
-    _set(M_MMAP_THRESHOLD, _LARGEST)
-    _set(M_TRIM_THRESHOLD, _FREED)
+    _set(M_MMAP_THRESHOLD, _LARGEST_BYTES)
+    _set(M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 def _set(option: int, size: int) -> None:

@@ -326,6 +326,8 @@ def _replay_log(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
         none if x is None else np.asarray(x) for x in (log.kp, log.kd, log.dq_des, log.tau_ff)
     )
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
+    # Semi-implicit Euler steps of the fitted dynamics under the model's torque. Every STRETCH_S, and
+    # after a gap, the state is set to the measured one.
     errors = np.zeros((2, *log.q.shape))
     every = max(2, round(STRETCH_S / log.period))
     after_gap = log.after_gap

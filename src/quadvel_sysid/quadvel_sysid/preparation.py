@@ -29,7 +29,7 @@ _MIN_ROWS = 20
 _EVEN_CLOCK_ERROR_RATIO = 0.97
 """The even clock is used if it leaves at most this share of the error."""
 _ENCODER_NOISE_SHARE = 0.01
-"""Encoder noise is averaged out if it adds at least this share to the torque's noise."""
+"""Encoders are noisy if their noise adds at least this share of the torque's noise variance."""
 _AVERAGING_ROWS = np.array([1, 2, 4, 8])
 """Rows to either side over which q and dq may be averaged."""
 _MAX_AVERAGING_S, _MAX_AVERAGING_BLURRED_S = 0.0081, 0.0021

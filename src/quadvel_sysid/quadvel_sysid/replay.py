@@ -195,6 +195,8 @@ def replay_deviations(
     commands = [
         none if one is None else as_double(one) for one in (log.q_des, log.kp, log.kd, log.dq_des, log.tau_ff)
     ]
+    # M(q) e'' = tau_model(q + e, dq + e') - tau_measured, with M at the middle of each stretch, by
+    # semi-implicit Euler steps. During the warm-up e = 0.
     inverse = np.linalg.inv(legs.inertia(_interpolate(log, log.q, begins + 0.5 * STRETCH_S)))
     angle, speed = np.zeros(shape), np.zeros(shape)
     angles, speeds = [], []

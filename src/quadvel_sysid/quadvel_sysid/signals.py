@@ -229,6 +229,8 @@ class Samples:
 
     def _stretches(self, log: Log) -> tuple[Bools, Array, Bools]:
         """For each row: whether a stretch begins, the spacing before, whether the past is known."""
+        # The past of a row is known if SETTLING_S have passed since the last gap and since the first
+        # command.
         start = log.after_gap
         start[0] = True
         steps = np.where(start, log.period, np.diff(log.t, prepend=log.t[0]))

@@ -73,10 +73,13 @@ def wrapped_angles(log: Log) -> Iterator[Finding | Log]:
             )
             for x in (log.q, log.q_des)
         )
+        # The unwrapped angles may differ from the commands by full turns; remove these.
         off = np.median(q_des[log.command_rows(log.t)] - q, axis=0)
         q = np.where(hit, q + turn * np.round(off / turn), log.q)
-        text = f"q: jumps by {unit} in one row, {int(jumps.sum())} times on {format_names(joints_where(log, hit))}; unwrapped"
+        listed = format_names(joints_where(log, hit))
+        text = f"q: jumps by {unit} in one row, {int(jumps.sum())} times on {listed}; unwrapped"
         yield Finding("warning", "q", joints_where(log, hit), text)
+        # Speed of the jumps that were removed, in the rows where they happen.
         leap = (
             np.diff(q - log.q, axis=0, prepend=0.0 * q[:1])
             / np.diff(log.t, prepend=log.t[0] - log.period)[:, None]

@@ -155,7 +155,7 @@ def commanded_gains(log: Log) -> Iterator[Finding]:
             text = f"{field}: changes in the log, {used.min():g} to {used.max():g}"
             yield Finding("note", field, (), text)
         if field == "kd" and not len(used):
-            text = "kd: 0 was commanded; the damping that the drive has of its own is fitted"
+            text = "kd: 0 was commanded; the drive's own damping is fitted"
             yield Finding("note", field, (), text)
 
 
@@ -172,12 +172,11 @@ def repeated_rows(log: Log) -> Iterator[Finding | Log]:
     """
     parts = [log.q, log.tau, None if "dq" in log.derived else log.dq]
     same = np.all([(np.diff(x, axis=0) == 0.0).all(axis=1) for x in parts if x is not None], axis=0)
-    runs = np.diff(
-        np.flatnonzero(np.concatenate([[True], ~same, [True]]))
-    )  # rows from one change of the state to the next
+    # Rows from one change of the state to the next.
+    runs = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
     low, usual, high = np.percentile(runs, [25, 50, 75])
     if usual >= 2 and high - low <= 0.25 * usual:
-        moving = ~same | same  # an even pattern comes from the logger, whatever moves
+        moving = ~same | same  # all rows: an even pattern comes from the logger
     else:
         moving = np.abs(log.dq[1:]).max(axis=1) > MOVING_SPEED_RAD_S
     repeated, total = int((same & moving).sum()), max(1, int(moving.sum()))

@@ -82,6 +82,8 @@ class _JointSignals:
         Returns:
             (2 most + 1,) shares, for lags from -most to most rows.
         """
+        # Residual variance of the regression over that of the torque, at all lags. The commanded speed
+        # is a regressor only at lags where its weight is plausible for a drive.
         products = self._products(most)
         one, command, speed = self.fixed.shape[1] - 1, self.fixed.shape[1], self.fixed.shape[1] + 1
         variance = products[:, -1, -1] - products[:, -1, one] ** 2 / (products[:, one, one] + 1e-12)
@@ -93,6 +95,10 @@ class _JointSignals:
 
     def _products(self, most: int) -> Numbers:
         """Products of `fixed`, `moving` and `torque`, summed over the overlapping rows, (L, P, P)."""
+        # With weights w and v, each product is a cross-correlation over the overlapping rows,
+        #   sum_t w(t) a(t) b(t) v(t - l) c(t - l) d(t - l),
+        # where a, b are columns of the torque's instant and c, d those of the command's (1 if absent).
+        # It is the inverse transform of FFT(w a b) conj(FFT(v c d)).
         rows, still, sent = len(self.torque), self.fixed.shape[1], self.moving.shape[1]
         here = np.column_stack([self.fixed, np.ones((rows, sent)), self.torque])
         there = np.column_stack([np.ones((rows, still)), self.moving, np.ones(rows)])
@@ -138,6 +144,8 @@ def _causal(of_command: Any, of_speed: Any) -> Any:
 
 def _regress(products: Numbers, columns: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
     """Regress the last column on `columns`: residual sums of squares (L,), weights (L, P - 1)."""
+    # Normal equations X^T X w = X^T y at every lag, scaled to a unit diagonal; then
+    # the residual is y^T y - w^T X^T y.
     inner, outer = products[:, columns[:, None], columns], products[:, columns, -1]
     size = np.sqrt(np.maximum(np.einsum("lkk->lk", inner), 1e-12))
     inner = inner / size[:, :, None] / size[:, None, :] + 1e-9 * np.eye(len(columns))

@@ -45,9 +45,8 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
     swings, asked = _span(log.q), _span(log.q_des)
     resting = (asked < np.maximum(MOVING_SPAN_RAD, NOISE_SPAN_SHARE * swings)) & (swings > MIN_SWING_RAD)
     if log.tau is None:
-        resting &= (
-            resting.all()
-        )  # what moves a single joint, a load or a torque, the motion alone does not show
+        # Without torque, the cause of a single joint's motion is unknown: a load or a torque command.
+        resting &= resting.all()
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():
         return

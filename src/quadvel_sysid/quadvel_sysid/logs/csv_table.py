@@ -227,10 +227,9 @@ def _has_decimal_comma(form: _Dialect, lines: Sequence[Line]) -> bool:
 def _blocks(
     path: Path, lines: Iterator[Line], form: _Dialect, chosen: Mapping[str, str], remarks: list[str]
 ) -> Iterator[list[Array]]:
-    """The chosen columns, some lines of each."""
-    values = (
-        max(1, path.stat().st_size // max(1, 2 * len(form.columns))) * len(chosen) // 4
-    )  # of eight characters
+    """Yield the chosen columns, block by block of lines."""
+    # Expected number of values, if a cell has eight characters.
+    values = max(1, path.stat().st_size // max(1, 2 * len(form.columns))) * len(chosen) // 4
     rows = 0
     while block := list(_block(lines)):
         found = _parse_numeric(form, block, chosen)
@@ -246,7 +245,7 @@ def _blocks(
 
 
 def _block(lines: Iterator[Line], most: int = MAX_BLOCK_LINES) -> Iterator[Line]:
-    """The next lines, as many as are read at once, without comments."""
+    """Yield the lines of the next block, without comments."""
     length = count = 0
     for number, line in lines:
         if line.lstrip().startswith("#"):

@@ -27,12 +27,12 @@ MIN_JITTER = 0.03
 """Range of the spacing (10th to 90th percentile) over its median, above which times jitter."""
 
 _COMMAND_FIELDS = ("t_cmd", "q_des", "dq_des", "tau_ff", "kp", "kd")
-_MIN_COMMANDS, _MAX_NEW_SHARE = (
-    50,
-    0.7,
-)  # commands, and share of the rows that hold a new one: at least, at most
-_DRIFT_ROWS = 101, 31  # rows of states, of commands, over which lateness is a drift and not jitter
-_PERIOD_ROWS = 200  # rows from which the true period is read
+_MIN_COMMANDS, _MAX_NEW_SHARE = 50, 0.7
+"""Fewest distinct commands, and largest share of the rows that hold a new one."""
+_DRIFT_ROWS = 101, 31
+"""Rows of states, and of commands, over which a deviation is a drift and not jitter."""
+_PERIOD_ROWS = 200
+"""Rows over which the true period is estimated."""
 
 
 def cut_excerpts(log: Log, seconds: float, between: bool = False) -> list[Log]:
@@ -140,6 +140,8 @@ def _even_times(time: NDArray[np.floating], window: int) -> Array:
     reach = min(_PERIOD_ROWS, len(time) // 3)
     if reach < 20 or _jitter(time) <= MIN_JITTER:
         return time
+    # Model t_n = T n + drift_n + jitter_n. The period T comes from differences over many rows, the
+    # drift from a median filter of t_n - T n.
     period = float(np.median(time[reach:] - time[:-reach])) / reach
     clock = period * np.arange(len(time))
     even: Array = clock + median_filter(np.asarray(time - clock, dtype=float), window, mode="nearest")

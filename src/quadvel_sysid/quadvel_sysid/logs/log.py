@@ -1,7 +1,7 @@
 """The record of a measured joint log, independent of the file format it was read from.
 
 `Log` validates what every computation needs: matching shapes, finite numbers, increasing times.
-The checks of what a valid log says about the robot are in `checks.py`. The readers are in
+The checks of a valid log against the robot are in `checks.py`. The readers are in
 `recordings.py` (MCAP, rosbag2, ROS 1) and `tables.py` (all other formats, through `files.py`).
 `read_log.read_log` makes a `Log` from a path.
 """

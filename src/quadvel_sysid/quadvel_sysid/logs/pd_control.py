@@ -1,6 +1,6 @@
 """Find the rows in which the drives were not under PD control, which no PD model can explain.
 
-A drive that was switched off or damped while the log goes on with the last command shows it: the
+A drive that was switched off or damped while the last command stays in the log shows it: the
 torque no longer responds to the position error. The data show this without gains; if gains are
 logged, kp = 0 shows it as well.
 """
@@ -158,9 +158,8 @@ def true_runs(rows: NDArray[Any], t: Array, least: float = 0.0) -> list[tuple[fl
 def _low_gain_rows(log: Log) -> Bools:
     """Rows (N,) in windows whose gain from position error to torque is far below its usual value."""
     steps = np.diff(((log.t - log.t[0]) / BIN_S).astype(np.intp), prepend=0)
-    bins = np.cumsum(
-        np.minimum(steps, WINDOW_BINS)
-    )  # a gap shifts the bins by a window, so that none bridges it
+    # A gap shifts the bins by a whole window, so that no window bridges it.
+    bins = np.cumsum(np.minimum(steps, WINDOW_BINS))
     some = np.flatnonzero(bins % max(1, len(bins) // MAX_LAG_ROWS) == 0)
     lag = max(LAGS_S, key=lambda lag: _explained_share(_binned_sums(log, bins, some, lag)))
     sums = _binned_sums(log, bins, np.arange(len(bins)), lag)
@@ -198,6 +197,7 @@ def _differential_gain(log: Log, rows: Bools, lag: float) -> float:
     A constant load, such as a spring in part of the range, lowers the torque without switching
     the drive off. Differences from the mean do not see it.
     """
+    # Normal equations of tau - mean = kp (e - mean) + kd (d - mean), d = -dq, summed over the joints.
     squares, products = np.zeros((2, 2)), np.zeros(2)
     for use, e, d, tau in _joint_signals(log, np.flatnonzero(rows), lag):
         level = use / max(float(use.sum()), 1.0)

@@ -379,12 +379,13 @@ def command_tracking(log: Log) -> Iterator[Finding]:
     row = np.flatnonzero(log.valid.any(axis=1))
     row = row[:: max(1, len(row) // MAX_ROWS)]
     q = _normalised(log.q[row])
+    # Correlation of q (rows) with q_des (columns) at each lag, (L, J, J).
     alike = np.stack(
         [
             q.T @ _normalised(log.q_des[log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)])
             for lag in np.arange(0.0, MAX_LAG_S, 0.01)
         ]
-    )  # (L, J, J)
+    )
     most, least = alike.max(axis=0), alike.min(axis=0)
     opposite = least.diagonal()
     hit = (opposite < -EXPLAINED_ERROR_SHARE) & (most.diagonal() < 0.0)

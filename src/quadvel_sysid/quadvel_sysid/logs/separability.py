@@ -24,9 +24,9 @@ reported.
 SLOPE_HALF_WIDTH_S = 0.005
 """s to either side over which slopes are computed."""
 
-DEFAULT_KP, DEFAULT_KD = 30.0, 0.5  # where the log does not say; only their ratio matters here
+DEFAULT_KP, DEFAULT_KD = 30.0, 0.5
+"""N m/rad and N m s/rad, for logs without gains; only their ratio matters here."""
 
-# Of each pair: what separates the two.
 CONFUSED_PAIRS = {
     (
         "input delay",
@@ -79,6 +79,9 @@ def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
     slope = (log.q_des[log.command_rows(log.t[last])] - log.q_des[log.command_rows(log.t[first])]) / span
     kp = DEFAULT_KP if log.kp is None or not log.kp.any() else np.asarray(log.kp)[command]
     kd = DEFAULT_KD if log.kd is None or not log.kd.any() else np.asarray(log.kd)[command]
+    # Derivatives of tau = kp (q_des(t - d_in - d_out) - q(t - d_out)) - kd dq(t - d_out)
+    #                     - friction sign(dq) + offset
+    # by kp, kd, d_in, d_out, friction and offset, in this order.
     traces = {
         "kp": q_des - log.q[row],
         "kd": -dq,

@@ -97,6 +97,8 @@ def _leave_one_out_error(q: Array, pushed: Array, width: int) -> tuple[float, in
     """
     own = float(savgol_coeffs(width, POLYNOMIAL_ORDER)[width // 2])
     inner = slice(width // 2, len(q) - width // 2)
+    # Left-out residuals of q and of the torque's second integral; the mobility B minimises their
+    # difference |miss - driven B|.
     miss, driven = (
         (x - savgol_filter(x, width, POLYNOMIAL_ORDER, axis=0))[inner] / (1.0 - own) for x in (q, pushed)
     )
