@@ -1,4 +1,4 @@
-"""What needs no model, and what is said of a model that it beats."""
+"""Baselines without a model, and the report on a model that they beat."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import recorded
 
 
-def test_a_pd_law_of_each_joint_leaves_friction_and_a_filter_less_of_it(tmp_path: Path) -> None:
+def test_pd_law_leaves_friction_and_linear_filter_leaves_less(tmp_path: Path) -> None:
     given = recorded(3)
     np.savez(tmp_path / "log.npz", **given)
     log = read_log(tmp_path / "log.npz")
@@ -42,7 +42,7 @@ REPORT = {
 }
 
 
-def test_each_error_has_the_share_of_the_variance_that_is_explained_next_to_it() -> None:
+def test_each_error_is_printed_with_its_explained_share() -> None:
     report = REPORT | {"after": {"heldout_mse": 0.3, "heldout_explained": 0.925}}
     assert "corrected model 0.3 (explains 92.5 % of the variance)" in error_line(report)
 
@@ -55,7 +55,7 @@ def test_the_explained_share_is_of_the_variance_about_each_joints_mean() -> None
     assert explained_share(0.0, 0.0) is None
 
 
-def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
+def test_error_line_lists_baselines_and_models() -> None:
     assert error_line(REPORT) == (
         "held-out error, N^2 m^2: PD as commanded 2, a PD law of each joint 0.8, a linear filter over 16 ms 0.5, plain EAM 1, "
         "corrected model 0.3 (noise 0.25)"
@@ -74,6 +74,6 @@ def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
         ({"heldout_mse": 0.3, "heldout_q_rms_rad": 1.5}, "replayed, the commands lead 1.5 rad away"),
     ],
 )
-def test_a_model_that_says_less_than_none_is_called_that(after: dict[str, float], sentence: str) -> None:
+def test_model_worse_than_a_baseline_is_reported(after: dict[str, float], sentence: str) -> None:
     assert list(contradictions(REPORT)) == []
     assert any(text.startswith(sentence) for text in contradictions(REPORT | {"after": after}))

@@ -1,4 +1,4 @@
-"""The same log as many programs write tables: spreadsheets, loggers, numpy, pandas, PlotJuggler, rostopic."""
+"""One log in the table formats of spreadsheets, loggers, numpy, pandas, PlotJuggler and rostopic."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ SHAPES: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_table_says_the_same_in_every_shape(tmp_path: Path, shape: str) -> None:
+def test_every_shape_of_table_yields_the_same_log(tmp_path: Path, shape: str) -> None:
     content = SHAPES[shape]
     path = tmp_path / "log.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -121,7 +121,7 @@ def check(log: Log) -> None:
         np.testing.assert_allclose(values[:, 0], ROWS[:, column], atol=1e-12)
 
 
-def test_a_column_that_nobody_asked_for_is_named_in_a_note(tmp_path: Path) -> None:
+def test_unused_column_is_named_in_a_note(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(SHAPES["stages"])  # type: ignore[arg-type]
     assert any(text.startswith("stage: not used") for text in read_log(tmp_path / "log.csv").remarks)
 

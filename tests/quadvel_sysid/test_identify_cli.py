@@ -1,4 +1,4 @@
-"""`quadvel identify` as a user meets it: help, refusals, and what it leaves behind."""
+"""The command `quadvel identify`: help, refusals, and the files it writes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Compiled readers of series give what NumPy's searches and interpolation give, whatever the order of the times."""
+"""Compiled interpolation equals NumPy's, for times in any order."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -
         )
 
 
-def test_an_integral_of_held_values_is_the_sum_of_values_times_how_long_they_held() -> None:
+def test_hold_integral_is_the_sum_of_values_times_durations() -> None:
     spacing = np.diff(TIMES, append=TIMES[-1] + 1.0)[:, None]
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(VALUES * spacing, axis=0)])
     at = np.array([TIMES[0], TIMES[7], 0.25 * TIMES[7] + 0.75 * TIMES[8], TIMES[-1] + 0.5])

@@ -1,4 +1,4 @@
-"""Commands that never acted, or late: read off the torque, and told as a share of samples."""
+"""Lost and late commands, estimated from the torque and reported as a share of samples."""
 
 import attrs
 import numpy as np
@@ -37,7 +37,7 @@ def _losing(share, joints=JOINTS):
     return attrs.evolve(log, **{name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")})
 
 
-def test_lost_commands_are_named_with_the_share_of_samples_that_they_hit():
+def test_lost_commands_are_reported_with_their_share_of_samples():
     report = identify([_losing(0.1)]).report
     (effect,) = report["effects"]
     assert effect["name"] == "command_hold"
@@ -45,7 +45,7 @@ def test_lost_commands_are_named_with_the_share_of_samples_that_they_hit():
 
 
 def test_a_drive_that_lags_after_each_command_alike_loses_none(monkeypatch):
-    """It is behind, too; but that follows from how long ago the command arrived, so that no loss at random is told."""
+    """Its backlog follows from the age of the command, so no random loss is reported."""
     found = []
     looked_for = lost_commands.lost_commands
 

@@ -41,7 +41,7 @@ def test_a_leg_that_is_bent_is_turned_more_easily_about_the_hip():
     assert bent == pytest.approx(bent.T)
 
 
-def test_a_torque_too_much_moves_the_legs_as_it_would_move_a_free_body():
+def test_excess_torque_moves_the_legs_as_a_free_body():
     log = _still(tau_ff=np.ones((500, 1)))  # the model gives 1 N m, no torque was measured
     legs = Legs.load("go2", CALF)
     angle, speed = replay_deviations(log, IDEAL, legs, np.array([0.1, 0.5]))
@@ -51,7 +51,7 @@ def test_a_torque_too_much_moves_the_legs_as_it_would_move_a_free_body():
     assert angle[-1].ravel() == pytest.approx([0.5 * STRETCH_S**2 / inertia] * 2, rel=0.02)
 
 
-def test_a_model_that_gives_the_measured_torque_stays_on_the_track():
+def test_model_with_the_measured_torque_does_not_deviate():
     truth = attrs.evolve(parameters(), joints=NAMES[:3], torque_noise=0.0)
     log = record(truth, 3, 2.0, 1000, seed=1)
     legs, begins = Legs.load("aliengo", log.joints), np.array([0.5, 1.0, 1.5])
@@ -61,7 +61,7 @@ def test_a_model_that_gives_the_measured_torque_stays_on_the_track():
     assert np.sqrt(np.mean(with_it**2)) < 0.12 * np.sqrt(np.mean(without**2))
 
 
-def test_stretches_lie_in_the_rows_asked_for_and_not_across_a_gap():
+def test_stretches_lie_in_the_given_rows_and_not_across_a_gap():
     log = _still(seconds=2.0)
     rows = np.ones((1000, 1), dtype=bool)
     rows[300:400] = False  # 0.6 to 0.8 s
@@ -73,7 +73,7 @@ def test_stretches_lie_in_the_rows_asked_for_and_not_across_a_gap():
     assert len(stretch_starts(late, rows)) == 2 + 3 + 2
 
 
-def test_the_report_says_how_far_the_legs_leave_their_track_before_and_after():
+def test_report_states_replay_deviations_before_and_after():
     friction = Effect("coulomb_friction", NAMES[:3], {"c": 1.5, "v_0": 0.05})
     log = record(attrs.evolve(parameters((friction,)), joints=NAMES[:3]), 3, 3.0, 500, seed=2)
     report = identify([log], robot="aliengo").report

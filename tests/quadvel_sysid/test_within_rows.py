@@ -1,4 +1,4 @@
-"""What happens between the rows of a log, and channels that are stamped off, each against a computation of its own."""
+"""Effects between the rows of a log, and skewed time stamps, against independent computations."""
 
 import attrs
 import numpy as np
@@ -55,7 +55,7 @@ def _of_one_joint(log, law, value, input_delay=0.0):
     return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
 
 
-def test_a_lag_at_other_delays_is_computed_anew_where_rows_see_the_same_commands():
+def test_lag_is_recomputed_at_other_delays_with_the_same_commands():
     """Commands and rows on one grid of 2 ms: delays of 0.5 and 1.5 ms show the same commands, of other age."""
     law = registry()["first_order_lag"]()
     model = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0005)
@@ -112,7 +112,7 @@ def _driven(row, command, seed):
     return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
 
 
-def test_of_commands_that_stand_in_the_rows_the_instants_of_an_even_sender_are_restored(tmp_path):
+def test_send_times_of_commands_in_state_rows_are_restored(tmp_path):
     """97 Hz in rows of 500 Hz: a row shows up to 2 ms late what was sent, which lost commands would explain."""
     rows = fields()
     sending = np.floor(rows["t"] * 97.0 + 1e-9)
