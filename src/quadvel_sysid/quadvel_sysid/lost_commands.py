@@ -204,14 +204,14 @@ def _has_suspects(model: Model, noise: Array) -> bool:
     return bool(((most > SUSPICION_NATS).mean(axis=0) > _MIN_LOST_SHARE).any())
 
 
-def backlog_probabilities(model: Model, noise: Array, most: int, unread: Bools) -> Array:
+def backlog_probabilities(model: Model, noise: Array, most: int, excluded: Bools) -> Array:
     """Compute the probability of each backlog in each row.
 
     Args:
         model: The fitted model, without losses.
         noise: (J,) variance of the torque's noise, N^2 m^2.
         most: Largest backlog, commands.
-        unread: (N, J) rows in which a joint's torque is not used for its own probabilities, nor
+        excluded: (N, J) rows in which a joint's torque is not used for its own probabilities, nor
             for the probabilities of a loss.
 
     Returns:
@@ -220,7 +220,7 @@ def backlog_probabilities(model: Model, noise: Array, most: int, unread: Bools) 
     costs = _row_costs(model, noise, most)
     packet = model.signals.packet[:, 0]
     new = np.minimum(np.diff(packet, prepend=packet[0]), most + 1)
-    hidden = np.where(unread[..., None], costs, 0.0)
+    hidden = np.where(excluded[..., None], costs, 0.0)
     read = (costs - hidden).sum(axis=1, keepdims=True)
     chances = LossProbabilities()
     for _ in range(_EM_ROUNDS):

@@ -58,12 +58,12 @@ class Preprocessed:
 
 
 def preprocess(
-    material: IdentificationData, windows: Sequence[float], shortest: float = MIN_BLOCK_S
+    data: IdentificationData, windows: Sequence[float], shortest: float = MIN_BLOCK_S
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
     """Choose the time stamps and the averaging that explain the torque best.
 
     Args:
-        material: The checked logs.
+        data: The checked logs.
         windows: Steps (s) of the drive that the plain model tries.
         shortest: Shortest block, s.
 
@@ -73,10 +73,10 @@ def preprocess(
 
     def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
         samples = Samples(logs, steady)
-        parts = split_rows(samples, material, shortest)
+        parts = split_rows(samples, data, shortest)
         return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
-    logs: Sequence[Log] = material.logs
+    logs: Sequence[Log] = data.logs
     best, notes = fit_logs(logs), []
     if any(has_jitter(log) for log in logs):
         even = [restore_even_clock(log) for log in logs]
@@ -92,7 +92,7 @@ def preprocess(
     return best, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
 
 
-def split_rows(samples: Samples, material: IdentificationData, shortest: float) -> DataSplit:
+def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> DataSplit:
     """Divide the rows into blocks that are fitted, used for selection, or held out.
 
     Of five consecutive blocks, two are fitted, two are used for selection and one is held out. If
@@ -100,7 +100,7 @@ def split_rows(samples: Samples, material: IdentificationData, shortest: float) 
 
     Args:
         samples: Rows of all logs.
-        material: The checked logs.
+        data: The checked logs.
         shortest: Shortest block, s.
 
     Returns:
@@ -112,8 +112,8 @@ def split_rows(samples: Samples, material: IdentificationData, shortest: float) 
     spans = [one.log.duration for one in samples.logs]
     length = float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
     block = np.floor(samples.t / length).astype(int)
-    if material.heldout:
-        report = samples.log_of_row >= material.fitted
+    if data.heldout:
+        report = samples.log_of_row >= data.fitted
         select = (block % 2 == 1) & ~report
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
@@ -127,7 +127,7 @@ def split_rows(samples: Samples, material: IdentificationData, shortest: float) 
                 f"{samples.logs[0].log.name}: valid/{joint}: {int(count.min())} rows to be {word}, "
                 f"expected {_MIN_ROWS} or more"
             )
-    overlap = 0 if material.body is None else 1
+    overlap = 0 if data.body is None else 1
     return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
 
 

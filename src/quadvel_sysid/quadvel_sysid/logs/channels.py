@@ -184,8 +184,8 @@ def repeated_rows(log: Log) -> Iterator[Finding | Log]:
     if share > REPEATED_ROWS_SHARE:
         fresh = log.select_rows(np.concatenate([[True], ~same]))
         text = (
-            f"q: {100 * share:.0f} % of the rows repeat the state before (usually {usual:.0f} rows show one state); those "
-            f"in which it changed are used, {1.0 / fresh.period:.3g} Hz"
+            f"q: {100 * share:.0f} % of the rows repeat the state before (usually {usual:.0f} rows show one "
+            f"state); those in which it changed are used, {1.0 / fresh.period:.3g} Hz"
         )
         yield Finding("warning", "q", (), text)
         yield fresh

@@ -82,8 +82,8 @@ class _JointSignals:
         Returns:
             (2 most + 1,) shares, for lags from -most to most rows.
         """
-        # Residual variance of the regression over that of the torque, at all lags. The commanded speed
-        # is a regressor only at lags where its weight is plausible for a drive.
+        # Residual variance of the regression over that of the torque, at all lags. The commanded
+        # speed is a regressor only at lags where its weight is plausible for a drive.
         products = self._products(most)
         one, command, speed = self.fixed.shape[1] - 1, self.fixed.shape[1], self.fixed.shape[1] + 1
         variance = products[:, -1, -1] - products[:, -1, one] ** 2 / (products[:, one, one] + 1e-12)
@@ -94,7 +94,7 @@ class _JointSignals:
         return np.asarray(np.where(causal, np.minimum(plain, fed), plain) / (variance + 1e-12))
 
     def _products(self, most: int) -> Numbers:
-        """Products of `fixed`, `moving` and `torque`, summed over the overlapping rows, (L, P, P)."""
+        """Products (L, P, P) of `fixed`, `moving` and `torque`, summed over overlapping rows."""
         # With weights w and v, each product is a cross-correlation over the overlapping rows,
         #   sum_t w(t) a(t) b(t) v(t - l) c(t - l) d(t - l),
         # where a, b are columns of the torque's instant and c, d those of the command's (1 if absent).

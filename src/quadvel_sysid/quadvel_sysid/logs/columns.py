@@ -3,12 +3,13 @@
 A map file is YAML with one line for each field that has another name:
 
     t: {from: timestamp, scale: 1.0e-6}        # times 1e-6: microseconds
-    q: positions                               # cells with lists, an (N, J) array, or columns positions/JOINT
+    q: positions                               # an (N, J) array, or columns positions/JOINT
     dq: [hip_speed, knee_speed]                # a column for each joint
     tau: null                                  # left out
     kp: {value: 35.0}                          # not in the file
     q_des: {from: goal, scale: [1.0, -1.0]}    # for each joint
-    t_cmd: {from: timestamp, scale: 1.0e-6, file: [state, control]}    # in another file: `state` in its name is `control`
+    # In another file, whose name has `control` in place of `state`:
+    t_cmd: {from: timestamp, scale: 1.0e-6, file: [state, control]}
     q_des_cmd: {from: positions, file: [state, control]}
     joint_names: [hip, knee]
 """
@@ -243,7 +244,7 @@ def _is_used(name: str, used: Collection[str]) -> bool:
 def _in_order(
     path: Path, field: str, own: list[str], joints: list[str] | None
 ) -> tuple[list[str], list[str]]:
-    """The log's joints given the joints of a field's columns, and these columns in the log's order."""
+    """The log's joints given those of a field's columns, and the columns in the log's order."""
     if joints and sorted(own) == sorted(joints):
         return joints, joints
     if joints and field != "q":

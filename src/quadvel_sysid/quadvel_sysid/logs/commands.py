@@ -45,7 +45,7 @@ def constant_command(log: Log) -> Iterator[Finding | Log]:
     swings, asked = _span(log.q), _span(log.q_des)
     resting = (asked < np.maximum(MOVING_SPAN_RAD, NOISE_SPAN_SHARE * swings)) & (swings > MIN_SWING_RAD)
     if log.tau is None:
-        # Without torque, the cause of a single joint's motion is unknown: a load or a torque command.
+        # Without torque, a single joint may be moved by a load or by a torque command.
         resting &= resting.all()
     hit = np.array([bool(rests) and not _holds(log, j) for j, rests in enumerate(resting)])
     if not hit.any():

@@ -80,7 +80,7 @@ class _Dialect:
 
 
 def _seconds(cell: str) -> float:
-    """Convert an ISO 8601 date to seconds since 1970, or a time of day to seconds since midnight."""
+    """Convert an ISO 8601 date to seconds since 1970, a time of day to seconds since midnight."""
     date = datetime.fromisoformat(cell if re.match(r"\d{4}-?\d\d", cell) else f"1970-01-01T{cell}")
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
@@ -290,7 +290,7 @@ def _parse_cells(
     chosen: Mapping[str, str],
     remarks: list[str],
 ) -> list[Array]:
-    """Parse cells of every kind that `_Dialect.number` reads; a quoted cell may span further lines."""
+    """Parse cells of every kind that `_Dialect.number` reads; a quoted one may span lines."""
     rows = _split_rows(path, form, block, lines, remarks)
     found = []
     for k, name in enumerate(form.columns):

@@ -136,7 +136,7 @@ def _jitter(time: NDArray[np.floating]) -> float:
 
 
 def _even_times(time: NDArray[np.floating], window: int) -> Array:
-    """Times of an even clock: the median-filtered deviation from a uniform clock is kept as drift."""
+    """Times of an even clock plus its drift, a median-filtered deviation from a uniform clock."""
     reach = min(_PERIOD_ROWS, len(time) // 3)
     if reach < 20 or _jitter(time) <= MIN_JITTER:
         return time

@@ -1,4 +1,4 @@
-"""Common parts of the MATLAB, HDF5 and Parquet readers, and reasons why other formats are not read."""
+"""Common parts of the MATLAB, HDF5 and Parquet readers; why other formats are not read."""
 
 from __future__ import annotations
 

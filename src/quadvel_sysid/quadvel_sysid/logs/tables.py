@@ -82,7 +82,7 @@ def _log(path: Path, fields: dict[str, Any], names: list[str] | None, remarks: l
     joints = _joints(path, names, q.shape[1], remarks)
     state: dict[str, Any] = {name: fields[name] for name in STATE_FIELDS if name in fields}
     for name in state:
-        if len(joints) == 1 or name == "temperature":  # one number for all joints makes sense of no other
+        if len(joints) == 1 or name == "temperature":  # other quantities differ by joint
             state[name] = _per_joint(state[name], len(t), len(joints))
     state["valid"] = _valid(path, fields.get("valid", True), len(t), len(joints))
     if "voltage" in fields:
