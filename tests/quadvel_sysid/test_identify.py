@@ -24,7 +24,7 @@ def _truth(*effects):
 
 def test_the_eam_finds_the_truth_of_table_4():
     samples = Samples([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
-    eam = fit_eam(samples, samples.judged)
+    eam = fit_eam(samples, samples.evaluated)
     assert abs((eam.gains[0, 0] - 1) * 30 - -0.706) < 0.05 * 30 * 0.05
     assert abs(eam.gains[1, 0] * 0.5 - 0.479) < 0.2 * 0.479
     assert abs(eam.input_delay[0] + eam.output_delay[0] - 0.0081) < 2e-4

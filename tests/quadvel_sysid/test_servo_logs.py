@@ -180,7 +180,7 @@ def test_periodic_motion_has_a_definite_sign(tmp_path: Path) -> None:
 
 def test_uncommanded_damping_is_reported(tmp_path: Path) -> None:
     found = inspect_file(tmp_path, recorded(3) | {"kd": 0.0})
-    assert "kd: 0 was commanded; the damping that the drive has of its own is fitted" in texts(found, "note")
+    assert "kd: 0 was commanded; the drive's own damping is fitted" in texts(found, "note")
 
 
 def test_gains_in_a_unit_of_their_own_are_fitted_and_those_of_one_joint_are_refused(tmp_path: Path) -> None:

@@ -61,5 +61,5 @@ def test_slower_log_is_evaluated_as_well():
     fast, slow = _log(seconds=2.0), _log(seconds=2.0, seed=3)
     every = np.arange(len(slow.t)) % 4 == 0
     samples = Samples([fast, slow.select_rows(every)])
-    assert samples.judged[samples.log_of_row == 1].mean() > 0.9
+    assert samples.evaluated[samples.log_of_row == 1].mean() > 0.9
     assert samples.start[samples.log_of_row == 1].sum() == 1

@@ -22,13 +22,13 @@ RIDGE_PENALTY = 1e-4
 """Ridge penalty on the weights of signals of unit variance, times the number of rows."""
 
 
-def baseline_errors(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
+def baseline_errors(logs: Sequence[Log], fitted: Bools, heldout: Bools) -> dict[str, dict[str, float | None]]:
     """Compute the held-out errors of the baselines.
 
     Args:
         logs: The logs, one after the other.
         fitted: (N, J) rows of all logs that are fitted.
-        judged: (N, J) rows that are held out.
+        heldout: (N, J) rows that are held out.
 
     Returns:
         For `joint_pd` and `ridge`: `heldout_mse` (N^2 m^2), and `heldout_explained`, the share of
@@ -38,7 +38,7 @@ def baseline_errors(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[s
     torques = [np.asarray(log.without_feed_forward().tau, dtype=float) for log in logs]
     for j in range(fitted.shape[1]):
         tau = np.concatenate([torque[:, j] for torque in torques])
-        fit, judge = fitted[:, j], judged[:, j]
+        fit, reported = fitted[:, j], heldout[:, j]
         laws = [
             _regressors(logs, j, (delay,), (0.0,))
             for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S)
@@ -46,13 +46,13 @@ def baseline_errors(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[s
         best = min(
             (_residual(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
         )
-        squares["joint_pd"] += float(np.sum(best[judge] ** 2))
+        squares["joint_pd"] += float(np.sum(best[reported] ** 2))
         step = max(LAG_STEP_S, float(np.median([log.period for log in logs])))
         past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
         miss = _residual(_regressors(logs, j, past, past), tau, fit, RIDGE_PENALTY)
-        squares["ridge"] += float(np.sum(miss[judge] ** 2))
-    count = max(int(judged.sum()), 1)
-    variance = torque_variance(measured_torque(logs), judged)
+        squares["ridge"] += float(np.sum(miss[reported] ** 2))
+    count = max(int(heldout.sum()), 1)
+    variance = torque_variance(measured_torque(logs), heldout)
     return {
         name: {"heldout_mse": total / count, "heldout_explained": explained_share(total / count, variance)}
         for name, total in squares.items()

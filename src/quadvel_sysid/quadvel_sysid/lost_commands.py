@@ -196,7 +196,7 @@ def _residual_variance(model: Model, parts: DataSplit, noise: Array) -> Array:
 def _has_suspects(model: Model, noise: Array) -> bool:
     """Whether enough commands look lost or late, each on its own; otherwise the search is skipped."""
     s = model.signals
-    gain = np.where(model.samples.judged, -np.diff(_row_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
+    gain = np.where(model.samples.evaluated, -np.diff(_row_costs(model, noise, 1), axis=-1)[..., 0], 0.0)
     gain = np.column_stack([gain, gain.sum(axis=1)])  # of each joint, and of all joints together
     first = np.flatnonzero(np.diff(s.packet[:, 0], prepend=-1))
     total = np.cumsum(gain, axis=0)
@@ -235,14 +235,14 @@ def _row_costs(model: Model, noise: Array, most: int) -> Array:
     # With the command of k packets ago the torque changes by kp (q_des_{n-k} - q_des_n). The cost is
     # (residual - change)^2 / (2 noise variance).
     s = model.signals
-    left = np.where(model.samples.judged, model.samples.tau - model.predict(), 0.0)
+    left = np.where(model.samples.evaluated, model.samples.tau - model.predict(), 0.0)
     stiffness = model.gains[0] * s.kp
     joint = np.arange(left.shape[1])
     cost = []
     for behind in range(most + 1):
         old = s.sent[np.maximum(s.packet - behind, 0), joint]
         change = stiffness * (old - s.q_des) if behind else 0.0
-        cost.append(np.where(model.samples.judged, (left - change) ** 2 / (2.0 * noise), 0.0))
+        cost.append(np.where(model.samples.evaluated, (left - change) ** 2 / (2.0 * noise), 0.0))
     return np.stack(cost, axis=-1)
 
 

@@ -274,7 +274,7 @@ def _fit_body(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
     """Fit all limbs at one input delay; also return the sum of the variance shares that are left."""
     s = samples.at(delay, 0.0, samples.period)
     torque = s.kp * (s.q_des - s.q) + s.kd * (s.dq_des - s.dq) + s.tau_ff
-    keep = samples.judged.all(axis=1)
+    keep = samples.evaluated.all(axis=1)
     limbs, share = [], 0.0
     for joints in _group_limbs(samples.joints):
         rows = (x[keep][:, joints] for x in (s.q, s.dq, torque, ddq))

@@ -118,7 +118,7 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
     rows = {"fitted": ~(select | report), "selecting": select, "reported": report}
-    parts = {word: samples.judged & chosen[:, None] for word, chosen in rows.items()}
+    parts = {word: samples.evaluated & chosen[:, None] for word, chosen in rows.items()}
     for word, chosen in parts.items():
         count = chosen.sum(axis=0)
         if (count < _MIN_ROWS).any():

@@ -33,7 +33,7 @@ _CACHE_LIMITS = 2, 64
 _MAX_CACHED_VALUES = 400_000
 """Values of one signal in all cached sets together, about."""
 
-_ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "judged", "row", "early")
+_ROW_FIELDS = ("log_of_row", "t", "tau", "start", "dt", "evaluated", "row", "lead")
 
 INSTANTS_PER_ROW = 2
 """Instants of a row, itself the last, for effects that are integrated between the rows."""
@@ -65,7 +65,7 @@ class Signals:
             step.
         row: (N, 1) index of the row, counted over all logs.
         sent: (M, J) q_des of every command row of all logs, rad.
-        elsewhere: Function of a signal's name and a delay (s) that reads the signal at another
+        read_shifted: Function of a signal's name and a delay (s) that reads the signal at another
             time.
         slope: Function of an acceleration's name that computes it.
     """
@@ -86,7 +86,7 @@ class Signals:
     age: Array
     row: NDArray[np.intp]
     sent: Array
-    elsewhere: Callable[[str, Array], Array]
+    read_shifted: Callable[[str, Array], Array]
     slope: Callable[[str], Array]
 
     @cached_property
@@ -124,7 +124,7 @@ class Signals:
         Returns:
             (N, J) or (B, N, J) values.
         """
-        return self.elsewhere(name, late)
+        return self.read_shifted(name, late)
 
 
 def scattered_rows(count: int, every: int) -> NDArray[np.intp]:
@@ -184,10 +184,10 @@ class Samples:
         tau: (N, J) measured torque, N m; 0 if not logged.
         start: (N,) whether a stretch begins at this row.
         dt: (N,) time since the row before, s.
-        judged: (N, J) rows that a model has to explain.
+        evaluated: (N, J) rows that a model has to explain.
         sent: (M, J) q_des of every command row, rad.
         row: (N,) index of each row in all logs.
-        early: (N,) time by which an instant precedes its row, s.
+        lead: (N,) time by which an instant precedes its row, s.
     """
 
     def __init__(
@@ -215,10 +215,10 @@ class Samples:
         starts, steps, settled = zip(*(self._stretches(log) for log in logs), strict=True)
         self.start: Bools = np.concatenate(starts)
         self.dt = np.concatenate(steps)
-        self.judged: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
+        self.evaluated: Bools = np.concatenate([log.valid for log in logs]) & np.concatenate(settled)[:, None]
         self.sent = np.concatenate([one.commands["q_des"] for one in self.logs])
         self.row = np.arange(len(self.t))
-        self.early = np.zeros(len(self.t))
+        self.lead = np.zeros(len(self.t))
         self._upsampled: Samples | None = None
         self._selections: dict[bytes, Samples] = {}
         self._first_packet = np.cumsum([0, *(len(log.t_cmd) for log in logs)])
@@ -277,7 +277,7 @@ class Samples:
         if self._upsampled is None:
             part = self.take_rows(np.repeat(np.arange(len(self.t)), INSTANTS_PER_ROW))
             before = np.tile(np.arange(INSTANTS_PER_ROW)[::-1], len(self.t)) / INSTANTS_PER_ROW
-            part.early = np.where(part.start, 0.0, before * part.dt)
+            part.lead = np.where(part.start, 0.0, before * part.dt)
             part.dt = part.dt / INSTANTS_PER_ROW
             part.start = part.start & (np.arange(len(part.t)) % INSTANTS_PER_ROW == 0)
             self._upsampled = part
@@ -324,8 +324,8 @@ class Samples:
             The signals of all rows.
         """
         delays = np.broadcast_arrays(np.atleast_1d(input_delay), np.atleast_1d(output_delay))
-        early, late = np.round(delays, 7).tolist()
-        pairs = list(zip(early, late, strict=True))
+        inputs, outputs = np.round(delays, 7).tolist()
+        pairs = list(zip(inputs, outputs, strict=True))
         shared = len(set(pairs)) == 1
         key = (window, pairs[0]) if shared else (window, *pairs)
         return self._cached(
@@ -385,13 +385,13 @@ class Samples:
                 values[:, joints] = getattr(made[pair], name)
             return values
 
-        return attrs.evolve(first, **columns, elsewhere=partial(self._shifted_state, late), slope=slope)
+        return attrs.evolve(first, **columns, read_shifted=partial(self._shifted_state, late), slope=slope)
 
     def _request_times(self, output_delay: float) -> Iterator[Array]:
         """Yield for each log the instants at which the torque of its rows was requested."""
         edges = np.searchsorted(self.log_of_row, np.arange(len(self.logs) + 1))
         for one, first, a, b in zip(self.logs, self._first_row, edges[:-1], edges[1:], strict=False):
-            yield one.t[self.row[a:b] - first] - self.early[a:b] - output_delay
+            yield one.t[self.row[a:b] - first] - self.lead[a:b] - output_delay
 
     def _shifted_state(self, output_delay: Array | float, name: str, late: Array) -> Array:
         """A state signal (..., N, J) of all rows, `late` s before the instants at this output delay."""
@@ -446,7 +446,7 @@ class Samples:
             age=np.maximum(np.concatenate(ages), 0.0),
             row=self.row[:, None],
             sent=self.sent,
-            elsewhere=partial(self._shifted_state, output_delay),
+            read_shifted=partial(self._shifted_state, output_delay),
             slope=partial(self._slope, output_delay, delays, chosen),
             **signals,
         )
