@@ -16,7 +16,7 @@ import numpy as np
 from quadvel_sysid.logs.checks import inspect
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.logs.response import REACH, Response, measured
+from quadvel_sysid.logs.response import MAX_LAG_S, Response, measure_response
 from tests.identification.hidden.cases import GROUP_OF, make_case
 
 SEED, INDICES = 77, (900, 901)
@@ -33,23 +33,23 @@ def responses(folder: Path) -> list[Response]:
         except LogError as error:
             print(f"refused: {error}")
             continue
-        response = measured(inspection.log)
+        response = measure_response(inspection.log)
         found += [response] if response else []
     return found
 
 
 def report(found: list[Response]) -> None:
     """Percentiles over the joints, and of the lag over the logs."""
-    near = [np.flatnonzero(np.abs(one.lags) <= REACH) for one in found]
+    near = [np.flatnonzero(np.abs(one.lags) <= MAX_LAG_S) for one in found]
     lags = [
-        one.lags[k][np.log(one.left[k] + 1e-6).mean(axis=1).argmin()]
+        one.lags[k][np.log(one.error_share[k] + 1e-6).mean(axis=1).argmin()]
         for one, k in zip(found, near, strict=True)
     ]
     gains = [one.gain / np.median(one.log.kp, axis=0) for one in found if one.log.kp is not None]
     rows = {
-        "share of the torque that is left": np.concatenate([one.best for one in found]),
-        "partial correlation with the command": np.concatenate([one.command for one in found]),
-        "share that the position error explains": np.concatenate([one.answer for one in found]),
+        "share of the torque that is left": np.concatenate([one.min_error_share for one in found]),
+        "partial correlation with the command": np.concatenate([one.command_correlation for one in found]),
+        "share that the position error explains": np.concatenate([one.answered_share for one in found]),
         "gain over the one commanded": np.concatenate(gains),
         "best lag, ms": 1e3 * np.array(lags),
     }

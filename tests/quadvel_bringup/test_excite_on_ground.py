@@ -15,7 +15,7 @@ from quadvel_description.kinematics import HIPS, foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_sim.simulator import Simulator, SimulatorConfig
-from quadvel_sysid.excitation import PERIOD, Excitation, FootLifting, Sweep
+from quadvel_sysid.excitation import PERIOD_S, Excitation, FootLifting, Sweep
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
@@ -117,7 +117,7 @@ def test_a_sweep_goes_through_on_the_ground(plant: Callable[[int], tuple[RobotSt
 
 
 def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
-    torque = FootLifting(seconds=1.0).support()
+    torque = FootLifting(seconds=1.0).support_torque()
     model = load_model()
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, model.key("stand").id)
@@ -148,7 +148,7 @@ def test_the_log_of_foot_lifting_gives_the_gains_and_delays_of_the_drives() -> N
     states, commands = play(FootLifting(), *simulated(3))
     state = {name: np.array([getattr(s, name) for s in states]) for name in ("q", "dq", "tau")}
     sent = {name: np.array([getattr(c, name) for c in commands]) for name in ("q", "tau", "kp", "kd")}
-    t = PERIOD * np.arange(len(states))
+    t = PERIOD_S * np.arange(len(states))
     log = Log(
         name="lift",
         joints=robot.JOINT_NAMES,

@@ -1,4 +1,4 @@
-"""Logs of joints under a PD law with delays, as arrays and as files; a second computation, without the model."""
+"""Logs of joints under a PD law with delays, as arrays and files, computed without the model."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logs of three joints that somebody else recorded, with one thing wrong each; a plant of its own, without the model."""
+"""Logs of three simulated servos with one defect each, computed without the model."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""The acceleration out of logged speeds, against motions that are known in closed form."""
+"""Accelerations from logged speeds, against motions known in closed form."""
 
 import numpy as np
 
-from quadvel_sysid.acceleration import slope, smooth_part
+from quadvel_sysid.acceleration import local_slope, split_acceleration
 
 
 def _stamps(rng, count=2000):
@@ -11,15 +11,15 @@ def _stamps(rng, count=2000):
     return np.delete(t, slice(700, 730))
 
 
-def test_the_slope_of_a_line_is_found_at_the_ends_and_beside_a_gap():
+def test_slope_of_a_line_is_exact_at_the_ends_and_next_to_a_gap():
     t = _stamps(np.random.default_rng(0))
     lines = np.stack([3.0 * t + 1.0, -7.0 * t], axis=1)
     for half_width in (0.002, 0.008):
-        np.testing.assert_allclose(slope(t, lines, half_width), [[3.0, -7.0]] * len(t), rtol=1e-9)
+        np.testing.assert_allclose(local_slope(t, lines, half_width), [[3.0, -7.0]] * len(t), rtol=1e-9)
 
 
-def test_where_a_command_makes_the_acceleration_jump_it_is_not_smeared():
-    """Two coupled joints, commands every 5 ms that are held: what a torque makes jump shows on both."""
+def test_acceleration_is_sharp_where_a_command_arrives():
+    """Two coupled joints, commands every 5 ms with zero-order hold: a step of torque shows on both."""
     rng = np.random.default_rng(1)
     t, sent_at = _stamps(rng), np.arange(-0.1, 2.1, 0.005)
     q_des = rng.uniform(-0.3, 0.3, (len(sent_at), 2))
@@ -37,8 +37,8 @@ def test_where_a_command_makes_the_acceleration_jump_it_is_not_smeared():
     ddq = jumps @ answer + swing
     dq = integral @ answer + 40.0 / 12.0 * -np.cos(12.0 * t[:, None] + [0.0, 1.0])
     dq += 0.002 * rng.standard_normal(dq.shape)
-    smeared = np.sqrt(np.mean((slope(t, dq, 0.008) - ddq) ** 2))
-    smooth, found = smooth_part("ddq_smooth", t, dq, slope(t, dq, 0.008), integral)
+    smeared = np.sqrt(np.mean((local_slope(t, dq, 0.008) - ddq) ** 2))
+    smooth, found = split_acceleration("ddq_smooth", t, dq, local_slope(t, dq, 0.008), integral)
     sharp = np.sqrt(np.mean((smooth + jumps @ found - ddq) ** 2))
     np.testing.assert_allclose(found, answer, rtol=0.03, atol=10.0)
     assert smeared > 100.0  # rad/s^2

@@ -1,4 +1,4 @@
-"""What needs no model, and what is said of a model that it beats."""
+"""Baselines without a model, and the report on a model that they beat."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_sysid.baselines import baselines, explained, torque_variance
-from quadvel_sysid.cli import errors
+from quadvel_sysid.baselines import baseline_errors, explained_share, torque_variance
+from quadvel_sysid.cli import error_line
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.sanity_checks import contradictions
 
@@ -17,17 +17,18 @@ sys.path.insert(0, str(Path(__file__).parent))
 from servo_logs import recorded
 
 
-def test_a_pd_law_of_each_joint_leaves_friction_and_a_filter_less_of_it(tmp_path: Path) -> None:
+def test_pd_law_leaves_friction_and_linear_filter_leaves_less(tmp_path: Path) -> None:
     given = recorded(3)
     np.savez(tmp_path / "log.npz", **given)
     log = read_log(tmp_path / "log.npz")
     first = np.broadcast_to((log.t < 4.0)[:, None], log.q.shape)
-    found = {name: one["heldout_mse"] for name, one in baselines([log], first, ~first).items()}
+    found = {name: one["heldout_mse"] for name, one in baseline_errors([log], first, ~first).items()}
     assert 0.05**2 < found["ridge"] < found["joint_pd"] < 0.6**2
     smooth = given["tau"] + 0.6 * np.tanh(given["dq"] / 0.05)
     np.savez(tmp_path / "log.npz", **given | {"tau": smooth * [1.0, 0.9, 1.1]})
     (error,) = {
-        one["joint_pd"]["heldout_mse"] for one in [baselines([read_log(tmp_path / "log.npz")], first, ~first)]
+        one["joint_pd"]["heldout_mse"]
+        for one in [baseline_errors([read_log(tmp_path / "log.npz")], first, ~first)]
     }
     assert error < 0.1**2
 
@@ -41,21 +42,21 @@ REPORT = {
 }
 
 
-def test_each_error_has_the_share_of_the_variance_that_is_explained_next_to_it() -> None:
+def test_each_error_is_printed_with_its_explained_share() -> None:
     report = REPORT | {"after": {"heldout_mse": 0.3, "heldout_explained": 0.925}}
-    assert "corrected model 0.3 (explains 92.5 % of the variance)" in errors(report)
+    assert "corrected model 0.3 (explains 92.5 % of the variance)" in error_line(report)
 
 
 def test_the_explained_share_is_of_the_variance_about_each_joints_mean() -> None:
     torque = np.random.default_rng(0).normal([5.0, -40.0], [1.0, 2.0], (4000, 2))
     variance = torque_variance(torque, np.ones(torque.shape, bool))
     assert variance == pytest.approx(2.5, rel=0.05)
-    assert explained(0.25, variance) == pytest.approx(0.9, abs=0.01)
-    assert explained(0.0, 0.0) is None
+    assert explained_share(0.25, variance) == pytest.approx(0.9, abs=0.01)
+    assert explained_share(0.0, 0.0) is None
 
 
-def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
-    assert errors(REPORT) == (
+def test_error_line_lists_baselines_and_models() -> None:
+    assert error_line(REPORT) == (
         "held-out error, N^2 m^2: PD as commanded 2, a PD law of each joint 0.8, a linear filter over 16 ms 0.5, plain EAM 1, "
         "corrected model 0.3 (noise 0.25)"
     )
@@ -73,6 +74,6 @@ def test_errors_of_what_needs_no_model_stand_beside_the_model() -> None:
         ({"heldout_mse": 0.3, "heldout_q_rms_rad": 1.5}, "replayed, the commands lead 1.5 rad away"),
     ],
 )
-def test_a_model_that_says_less_than_none_is_called_that(after: dict[str, float], sentence: str) -> None:
+def test_model_worse_than_a_baseline_is_reported(after: dict[str, float], sentence: str) -> None:
     assert list(contradictions(REPORT)) == []
     assert any(text.startswith(sentence) for text in contradictions(REPORT | {"after": after}))

@@ -1,4 +1,4 @@
-"""What is found in logs with one thing wrong, nothing in a clean one, and what measured logs say."""
+"""Findings in logs with one defect, none in a clean log, and findings in measured logs."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def log(**changes: Any) -> Log:
     return Log(name="a.npz", joints=JOINT_NAMES, **(values | changes))
 
 
-def said(inspection: Inspection, kind: str) -> list[str]:
+def texts(inspection: Inspection, kind: str) -> list[str]:
     return [finding.text for finding in inspection.findings if finding.kind == kind]
 
 
@@ -47,37 +47,37 @@ def exchanged(values: np.ndarray, a: int = 0, b: int = 4) -> np.ndarray:
 
 
 def of_one(values: np.ndarray, factor: float) -> np.ndarray:
-    """Of the second joint alone."""
+    """Scale the second joint alone."""
     return values * np.where(np.arange(12) == 1, factor, 1.0)
 
 
 def set_back(t: np.ndarray) -> np.ndarray:
-    """A clock that was set in the middle."""
+    """Set the clock back in the middle."""
     return t + np.where(np.arange(len(t)) >= len(t) // 2, 1.7e9, 0.0)
 
 
-def test_what_is_odd_on_one_joint_is_said_of_it() -> None:
+def test_finding_names_the_joint_with_the_defect() -> None:
     noise = np.where(np.arange(12) == 1, np.random.default_rng(0).normal(size=(2000, 12)), fields()["tau"])
-    warnings = said(inspect(log(tau=noise)), "warning")
+    warnings = texts(inspect(log(tau=noise)), "warning")
     assert any(
         text.startswith("tau: does not answer the position error on FR_thigh_joint") for text in warnings
     )
     copied = fields()["q"].copy()
     copied[:, 1] = copied[:, 0]
-    warnings = said(inspect(log(q=copied)), "warning")
+    warnings = texts(inspect(log(q=copied)), "warning")
     assert any(
         text.startswith("q: FR_thigh_joint and FR_hip_joint are the same to the bit") for text in warnings
     )
     found = inspect(log(kp=of_one(np.full((2000, 12), 30.0), 0.0)))
-    assert said(found, "refusal") == []
-    assert "kp: 0 at times on FR_thigh_joint alone; left out there" in said(found, "warning")
+    assert texts(found, "refusal") == []
+    assert "kp: 0 at times on FR_thigh_joint alone; left out there" in texts(found, "warning")
 
 
-def test_of_a_clean_log_only_its_rate_is_said() -> None:
+def test_clean_log_yields_only_its_rate() -> None:
     inspection = inspect(log())
-    assert said(inspection, "warning") == []
-    assert said(inspection, "refusal") == []
-    assert "t: 2000 rows over 4.00 s, 500 Hz" in said(inspection, "note")[0]
+    assert texts(inspection, "warning") == []
+    assert texts(inspection, "refusal") == []
+    assert "t: 2000 rows over 4.00 s, 500 Hz" in texts(inspection, "note")[0]
     assert inspection.log.valid.all()
 
 
@@ -141,21 +141,21 @@ def test_of_a_clean_log_only_its_rate_is_said() -> None:
         ({"kp": of_one(np.full((2000, 12), 30.0), 100.0)}, "tau: 0.00999 times what kp asks for on FR_thigh"),
     ],
 )
-def test_a_log_that_would_mislead_is_refused(changes: dict[str, Any], sentence: str) -> None:
+def test_misleading_log_is_refused(changes: dict[str, Any], sentence: str) -> None:
     inspection = inspect(log(**changes))
-    assert any(text.startswith(sentence) for text in said(inspection, "refusal")), inspection.findings
+    assert any(text.startswith(sentence) for text in texts(inspection, "refusal")), inspection.findings
     with pytest.raises(LogError, match=r"^a\.npz: "):
         inspection.raise_refusal()
 
 
 @pytest.mark.parametrize("share", [0.02, 0.1])
-def test_a_strong_spring_at_one_joint_is_no_other_unit(share: float) -> None:
-    """It lets the torque answer the position error with a `share` of kp, and the command with all of it."""
+def test_strong_spring_at_one_joint_is_not_a_wrong_unit(share: float) -> None:
+    """The torque answers the position error with a `share` of kp, and the command with all of it."""
     given = fields()
     error, angle = (given["q_des"] - given["q"])[:, 1], given["q"][:, 1] - given["q"][:, 1].mean()
     spring = (1.0 - share) * KP * (error @ (error - error.mean())) / (error @ angle) * angle
     tau = given["tau"] - np.outer(spring, np.arange(12) == 1)
-    assert said(inspect(log(tau=tau)), "refusal") == []
+    assert texts(inspect(log(tau=tau)), "refusal") == []
 
 
 def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
@@ -166,7 +166,7 @@ def test_gaps_dropped_and_repeated_rows_are_counted() -> None:
         given[name][100:400:10] = given[name][99:399:10]
     shape = given["q"].shape
     same = {"kp": np.full(shape, 30.0), "kd": np.full(shape, 0.5), "valid": np.ones(shape, bool)}
-    warnings = said(inspect(log(**given, t_cmd=given["t"], **same)), "warning")
+    warnings = texts(inspect(log(**given, t_cmd=given["t"], **same)), "warning")
     assert "t: 1 gap, the longest of 0.304 s at 1.00 s" in warnings
     assert "t: about 37 rows were dropped, one at a time" in warnings
     assert any(text.startswith("q: 30 rows (") for text in warnings)
@@ -184,13 +184,13 @@ def test_clipped_channels_and_joints_at_rest_are_named() -> None:
     assert found["clipped (N m)"] == ("FR_calf_joint",)
 
 
-def test_names_that_contradict_the_model_are_said() -> None:
+def test_names_that_contradict_the_model_are_reported() -> None:
     order = list(np.roll(np.arange(12), 1))
     moved = {name: fields()[name][:, order] for name in ("q", "dq", "tau", "q_des")}
-    warnings = said(inspect(log(**moved)), "warning")
+    warnings = texts(inspect(log(**moved)), "warning")
     assert any(text.startswith("joint_names: q contradicts the model's range") for text in warnings)
     strange = attrs.evolve(log(), joints=(*JOINT_NAMES[:11], "RL_knee_joint"))
-    assert "joint_names: RL_knee_joint: not among" in " ".join(said(inspect(strange), "warning"))
+    assert "joint_names: RL_knee_joint: not among" in " ".join(texts(inspect(strange), "warning"))
 
 
 def test_a_gain_of_zero_is_left_out() -> None:
@@ -198,7 +198,7 @@ def test_a_gain_of_zero_is_left_out() -> None:
     kp[1000:] = 0.0
     inspection = inspect(log(kp=kp))
     assert (
-        "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in said(inspection, "warning")[0]
+        "kp: 0 (damping, switched off or torque control) 2.00 s to the end" in texts(inspection, "warning")[0]
     )
     assert inspection.log.valid[:1000].all()
     assert not inspection.log.valid[1000:].any()
@@ -214,14 +214,14 @@ def test_damping_and_switching_off_show_in_the_torque(gains_known: bool, damping
     q_des = np.where(off[:, None], given["q_des"][~off][-1] + 0.1, given["q_des"])
     gains = {} if gains_known else {"kp": None, "kd": None}
     inspection = inspect(log(tau=tau, q_des=q_des, **gains))
-    assert any("tau: the torque no longer answers" in text for text in said(inspection, "warning"))
+    assert any("tau: the torque no longer answers" in text for text in texts(inspection, "warning"))
     valid = inspection.log.valid.any(axis=1)
     assert not valid[off].any()
     assert valid[given["t"] < 2.3].all()
 
 
-def test_a_drive_that_something_pushes_against_is_not_switched_off() -> None:
-    """A spring in part of the range takes the mean of its torque, which goes on to follow the error."""
+def test_drive_under_a_constant_load_is_not_switched_off() -> None:
+    """A spring in part of the range cancels the mean torque, which still follows the error."""
     t = np.arange(3000) * 0.002
     error = (0.1 * np.sin(0.5 * np.pi * t) + 0.01 * np.sin(6.0 * np.pi * t))[:, None]
     q = 0.4 * np.sin(0.9 * t)[:, None]
@@ -233,57 +233,59 @@ def test_a_drive_that_something_pushes_against_is_not_switched_off() -> None:
     assert inspect(Log(name="a.npz", joints=("a",), tau=tau, **one, **gains)).log.valid.all()
 
 
-def test_saturation_and_friction_are_not_taken_for_damping() -> None:
+def test_saturation_and_friction_are_not_damping() -> None:
     given = fields()
     tau = np.clip(given["tau"], -0.6, 0.6) - 0.3 * np.tanh(given["dq"] / 0.02)
     assert inspect(log(tau=tau)).log.valid.all()
 
 
-def test_torque_that_was_fed_forward_is_not_looked_for_in_the_position_error() -> None:
+def test_feed_forward_torque_is_subtracted_before_the_checks() -> None:
     given = fields()
     held = np.clip(given["q_des"], NOMINAL_Q - 0.05, NOMINAL_Q + 0.05)
     inspection = inspect(log(q_des=held, tau_ff=KP * (given["q_des"] - held)))
-    assert said(inspection, "warning") == said(inspection, "refusal") == []
+    assert texts(inspection, "warning") == texts(inspection, "refusal") == []
     assert inspection.log.valid.all()
     weight = np.full(held.shape, -40.0)
     inspection = inspect(log(tau=given["tau"] + weight, tau_ff=weight))
-    assert said(inspection, "warning") == said(inspection, "refusal") == []
+    assert texts(inspection, "warning") == texts(inspection, "refusal") == []
 
 
-def test_unknown_gains_and_missing_torque_are_said() -> None:
-    notes = said(inspect(log(kp=None, kd=None)), "note")
+def test_unknown_gains_and_missing_torque_are_reported() -> None:
+    notes = texts(inspect(log(kp=None, kd=None)), "note")
     assert "kp: not in the log; it is fitted" in notes
     assert "kd: not in the log; it is fitted" in notes
-    notes = said(inspect(log(tau=None)), "note")
+    notes = texts(inspect(log(tau=None)), "note")
     assert any(one.startswith("tau: not in the log; effects") for one in notes)
 
 
-def test_without_torque_and_gains_nothing_has_a_scale() -> None:
-    (text,) = said(inspect(log(kd=None, tau=None)), "refusal")
+def test_log_without_torque_and_gains_is_refused() -> None:
+    (text,) = texts(inspect(log(kd=None, tau=None)), "refusal")
     assert text.startswith("tau, kd: not in the log; expected the torque, or the commanded gains")
-    assert said(inspect(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
+    assert texts(inspect(log(kp=None, kd=None, tau=None), gains=(30.0, 0.5)), "refusal") == []
 
 
-def test_gains_that_are_given_are_not_missed() -> None:
+def test_given_gains_are_not_reported_missing() -> None:
     assert not any(
-        "kp: not in" in text for text in said(inspect(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
+        "kp: not in" in text for text in texts(inspect(log(kp=None, kd=None), gains=(30.0, 0.5)), "note")
     )
 
 
-def test_a_torque_that_never_changes_is_taken_as_not_logged() -> None:
+def test_constant_torque_is_treated_as_not_logged() -> None:
     inspection = inspect(log(tau=np.zeros((2000, 12))))
     assert inspection.log.tau is None
-    assert "tau: is 0 throughout, which is no measurement; taken as not logged" in said(inspection, "warning")
+    assert "tau: is 0 throughout, which is no measurement; treated as not logged" in texts(
+        inspection, "warning"
+    )
 
 
-def test_what_the_motion_cannot_tell_apart_is_said() -> None:
+def test_inseparable_parameters_are_reported() -> None:
     still = np.tile(fields()["q_des"].mean(axis=0), (2000, 1))
-    warnings = said(inspect(log(q_des=still)), "warning")
+    warnings = texts(inspect(log(q_des=still)), "warning")
     assert "q_des: the command never changes, so that no delay of the command can be identified" in warnings
     slow = np.linspace(0.0, 4.0, 2000)[:, None] * np.ones(12)
     steady = {"q": 0.1 * slow, "dq": np.full((2000, 12), 0.1), "q_des": 0.1 * slow + 0.05}
-    texts = " ".join(finding.text for finding in inspect(log(**steady, tau=None)).findings)
-    assert "kp and torque offset are separable only through changes of the position error" in texts
+    sentences = " ".join(finding.text for finding in inspect(log(**steady, tau=None)).findings)
+    assert "kp and torque offset are separable only through changes of the position error" in sentences
 
 
 MEASURED = Path(os.environ.get("QUADVEL_MEASURED", ""))
@@ -320,7 +322,7 @@ def test_measured_logs_of_torque_commands_are_refused(name: str) -> None:
         read_log(MEASURED / f"{name}.npz")
 
 
-def test_speeds_that_commands_ask_for_are_no_clock_that_is_off(tmp_path):
+def test_commanded_speed_is_not_a_clock_offset(tmp_path):
     """kd dq_des leads kp q_des, as a torque before its command would."""
     log, kd = fields(), 4.0
     dq_des = np.gradient(log["q_des"], log["t"], axis=0)

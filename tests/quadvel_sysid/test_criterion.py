@@ -63,7 +63,7 @@ def test_a_torque_in_coarse_ticks_has_the_noise_of_rounding_and_a_constant_one_t
     tau[:, 1] = np.round(tau[:, 1] / 4.0) * 4.0
     tau[:, 2] = 0.0
     samples = Samples([attrs.evolve(log, tau=tau)])
-    noise = noise_variance(samples, samples.judged, samples.tau)
+    noise = noise_variance(samples, samples.evaluated, samples.tau)
     assert noise[1] == pytest.approx(4.0**2 / 12.0, rel=1e-6)
     assert noise[2] == np.mean(noise[:2])
 
@@ -85,5 +85,5 @@ def test_noise_is_white_and_normal_and_what_is_not_is_told_of_its_joint() -> Non
 
 def test_the_noise_of_a_torque_shows_without_a_model() -> None:
     samples = Samples([record(parameters(), joints=2, seconds=5.0)])
-    found = noise_variance(samples, samples.judged, samples.tau)
+    found = noise_variance(samples, samples.evaluated, samples.tau)
     np.testing.assert_allclose(found, 0.066, rtol=0.15)

@@ -1,4 +1,4 @@
-"""The same log as many programs write tables: spreadsheets, loggers, numpy, pandas, PlotJuggler, rostopic."""
+"""One log in the table formats of spreadsheets, loggers, numpy, pandas, PlotJuggler and rostopic."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ SHAPES: dict[str, str | bytes] = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_table_says_the_same_in_every_shape(tmp_path: Path, shape: str) -> None:
+def test_every_shape_of_table_yields_the_same_log(tmp_path: Path, shape: str) -> None:
     content = SHAPES[shape]
     path = tmp_path / "log.csv"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
@@ -116,12 +116,12 @@ def check(log: Log) -> None:
     assert log.joints == ("knee_joint",)
     np.testing.assert_allclose(log.t - log.t[0], T, atol=1e-6)
     assert log.tau is not None
-    assert "dq" not in log.made
+    assert "dq" not in log.derived
     for values, column in ((log.q, 1), (log.dq, 2), (log.q_des, 3), (log.tau, 4)):
         np.testing.assert_allclose(values[:, 0], ROWS[:, column], atol=1e-12)
 
 
-def test_a_column_that_nobody_asked_for_is_named_in_a_note(tmp_path: Path) -> None:
+def test_unused_column_is_named_in_a_note(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(SHAPES["stages"])  # type: ignore[arg-type]
     assert any(text.startswith("stage: not used") for text in read_log(tmp_path / "log.csv").remarks)
 
@@ -171,7 +171,7 @@ def test_a_table_that_is_none_is_refused_by_line_and_column(tmp_path: Path, text
 def test_a_packed_table_that_grows_is_refused_within_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: bytes
 ) -> None:
-    monkeypatch.setattr(csv_table, "LARGEST_TEXT", 3_000_000)
+    monkeypatch.setattr(csv_table, "MAX_TEXT_CHARS", 3_000_000)
     path = tmp_path / "log.csv.gz"
     with gzip.open(path, "wb", compresslevel=1) as file:
         file.write(b"t,q/knee,q_des/knee\n")

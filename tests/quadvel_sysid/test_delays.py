@@ -26,7 +26,7 @@ def _fitted(log, input_delay, output_delay):
     samples = Samples([log])
     delays = np.repeat([[input_delay], [output_delay]], 2, axis=1)
     model = Model(samples, 0.001, np.ones((2, 2)), ONE, delays, ONE)
-    return fit(model, samples.judged, 20), samples.judged
+    return fit(model, samples.evaluated, 20), samples.evaluated
 
 
 def test_a_log_that_tells_little_is_read_as_a_drive_that_works_in_whole_steps():
@@ -46,7 +46,7 @@ def test_values_come_from_every_row_but_those_of_a_log_that_is_held_out(heldout)
     log = _log(3.0, seed=4)
     found = identify([log], [_log(3.0, seed=5)] if heldout else []).report["before"]
     whole, _ = _fitted(log, 0.007, 0.001)
-    told = quantised_delays(whole, whole.samples.judged)
+    told = quantised_delays(whole, whole.samples.evaluated)
     assert found["delta_kp"] == pytest.approx((told.gains[0, 0] - 1.0) * 30.0, abs=0.002)
 
 
@@ -121,11 +121,11 @@ def _driven(row, command, seed):
 def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     log = _driven(0.001, 0.001, 1)
     samples = Samples([log])
-    eam = fit_eam(samples, samples.judged)
+    eam = fit_eam(samples, samples.evaluated)
     delays = np.stack([eam.input_delay, eam.output_delay])
     model = Model(samples, eam.window, eam.gains, ONE, delays, ONE)
     assert eam.output_delay[0] == pytest.approx(0.001, abs=2e-4)
-    assert longest_equivalent_delay(model, samples.judged).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
+    assert longest_equivalent_delay(model, samples.evaluated).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
 
 
 def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found():
@@ -133,7 +133,7 @@ def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found()
     log = _driven(0.001, 0.00525, 2)
     samples = Samples([log])
     off = np.repeat([[0.0095], [0.0005]], 2, axis=1)
-    stuck = fit(Model(samples, 0.0, np.ones((2, 2)), ONE, off, ONE), samples.judged)
-    found = fit_delay_profile(stuck, samples.judged)
-    assert squared_error(found, samples.judged) < 1.05 * 0.04 * samples.judged.sum()
+    stuck = fit(Model(samples, 0.0, np.ones((2, 2)), ONE, off, ONE), samples.evaluated)
+    found = fit_delay_profile(stuck, samples.evaluated)
+    assert squared_error(found, samples.evaluated) < 1.05 * 0.04 * samples.evaluated.sum()
     np.testing.assert_allclose(found.delays.sum(axis=0), 0.008, atol=5e-4)

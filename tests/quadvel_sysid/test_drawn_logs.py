@@ -1,4 +1,4 @@
-"""Drives drawn at random: a healthy log is used whole and in silence, a faulty one is named for its cause."""
+"""Randomly drawn drives: a healthy log yields no findings, a faulty one the finding of its cause."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ SEEDS = (1, 3)
 
 
 def found(inspection: Inspection) -> list[Finding]:
-    """Refusals and warnings, but those of what a motion cannot tell apart."""
+    """Refusals and warnings, except those about inseparable parameters."""
     return [one for one in inspection.findings if one.kind != "note" and "separable" not in one.text]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("stiff", [False, True])
-def test_of_a_healthy_log_every_row_is_used_and_nothing_is_said(seed: int, stiff: bool) -> None:
+def test_healthy_log_is_used_whole_without_findings(seed: int, stiff: bool) -> None:
     inspection = inspect(as_log(drawn(seed, stiff)))
     assert found(inspection) == []
     assert inspection.log.valid.all()
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_an_offset_that_keeps_a_torque_on_one_side_is_no_lost_sign(sign: float) -> None:
+def test_offset_torque_is_not_unsigned(sign: float) -> None:
     log = as_log(drawn(1))
     assert log.tau is not None
     lifted = log.tau - sign * (sign * log.tau).min(axis=0)

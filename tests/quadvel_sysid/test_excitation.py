@@ -1,4 +1,4 @@
-"""The motions that identification is made from, and which one it asks for next."""
+"""Excitation motions, and proposals which one to record next."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from quadvel_description import robot
 from quadvel_description.kinematics import HIPS, foot_positions
 from quadvel_sysid import excitation
-from quadvel_sysid.excitation import EXCITATIONS, PERIOD, TORQUE_SHARE, FootLifting, propose
+from quadvel_sysid.excitation import EXCITATIONS, MAX_TORQUE_SHARE, PERIOD_S, FootLifting, propose
 
 
 def eq9(t: float, leg: int) -> float:
@@ -23,11 +23,11 @@ def eq9(t: float, leg: int) -> float:
     return -0.4
 
 
-def test_foot_lifting_moves_the_feet_as_equation_9_says() -> None:
+def test_foot_lifting_follows_equation_9() -> None:
     targets = FootLifting(seconds=1.2).targets()
     for row in (0, 37, 125, 180, 250, 333, 501, 870, 1199):
         feet = foot_positions(targets[row]) - HIPS
-        np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD, leg) for leg in range(4)], atol=1e-9)
+        np.testing.assert_allclose(feet[:, 2], [eq9(row * PERIOD_S, leg) for leg in range(4)], atol=1e-9)
         np.testing.assert_allclose(feet[:, 0], 0.0, atol=1e-9)
 
 
@@ -37,7 +37,7 @@ def test_every_motion_stays_within_the_joints_range_and_speed(name: str) -> None
     assert targets.shape == (6000, 12)
     assert (targets >= robot.COMMAND_LOWER).all()
     assert (targets <= robot.COMMAND_UPPER).all()
-    assert (np.abs(np.diff(targets, axis=0)) <= robot.VELOCITY_LIMIT * PERIOD + 1e-12).all()
+    assert (np.abs(np.diff(targets, axis=0)) <= robot.VELOCITY_LIMIT * PERIOD_S + 1e-12).all()
 
 
 @pytest.mark.parametrize("name", ["chirp", "steps", "creep", "solo"])
@@ -48,21 +48,21 @@ def test_motions_in_the_air_move_every_joint_by_itself(name: str) -> None:
     assert np.abs(correlation).max() < 0.98
 
 
-def test_alone_means_that_one_joint_moves_at_a_time() -> None:
+def test_solo_moves_one_joint_at_a_time() -> None:
     moving = np.abs(np.diff(EXCITATIONS["solo"](seconds=12.0).targets(), axis=0)) > 1e-6
     assert moving.sum(axis=1).max() == 1
     assert moving.any(axis=0).all()
 
 
-def test_a_target_never_asks_for_more_than_its_share_of_the_torque_limit() -> None:
+def test_target_requests_at_most_its_share_of_the_torque_limit() -> None:
     rng = np.random.default_rng(0)
     for _ in range(50):
         q, dq, target = rng.normal(0, 1, 12), rng.normal(0, 10, 12), rng.normal(0, 3, 12)
-        asked = 30.0 * (excitation.within_torque(target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
-        assert (np.abs(asked) <= TORQUE_SHARE * robot.TORQUE_LIMIT + 1e-9).all()
+        asked = 30.0 * (excitation.limit_torque(target, q, dq, 30.0, 0.5) - q) - 0.5 * dq
+        assert (np.abs(asked) <= MAX_TORQUE_SHARE * robot.TORQUE_LIMIT + 1e-9).all()
     calm = robot.NOMINAL_Q + 0.1
     np.testing.assert_array_equal(
-        excitation.within_torque(calm, robot.NOMINAL_Q, np.zeros(12), 30.0, 0.5), calm
+        excitation.limit_torque(calm, robot.NOMINAL_Q, np.zeros(12), 30.0, 0.5), calm
     )
 
 
@@ -72,7 +72,7 @@ def report(*names: str, depends_on: tuple[str, ...] = ()) -> dict[str, Any]:
     return {"effects": effects, "unexplained": {"verdict": verdict, "depends_on": list(depends_on)}}
 
 
-def test_an_effect_that_stands_alone_asks_for_nothing() -> None:
+def test_distinguished_effect_needs_no_further_excitation() -> None:
     assert propose(report("coulomb_friction")) == []
     assert propose(report()) == []
 
@@ -87,7 +87,7 @@ def test_an_effect_that_stands_alone_asks_for_nothing() -> None:
         (("cross_coupling", "an effect of another package"), ["solo", "steps"]),
     ],
 )
-def test_effects_that_were_not_told_apart_get_the_motions_that_show_them(
+def test_indistinguishable_effects_get_the_excitations_that_separate_them(
     names: tuple[str, ...], motions: list[str]
 ) -> None:
     proposals = propose(report(*names))
@@ -95,13 +95,13 @@ def test_effects_that_were_not_told_apart_get_the_motions_that_show_them(
     assert all(one.separates == names for one in proposals)
 
 
-def test_what_a_remainder_depends_on_is_moved_and_one_motion_is_proposed_once() -> None:
+def test_signals_of_the_residual_are_excited_and_proposals_are_merged() -> None:
     signals = ("FR_thigh_joint/dq", "tau@history", "q", "FL_calf_joint/q")
     proposals = propose(report("stribeck_friction", "coulomb_friction", depends_on=signals))
     assert [one.excitation for one in proposals] == ["creep", "solo", "chirp"]
     assert proposals[0].separates == ("stribeck_friction", "coulomb_friction", "what depends on q")
 
 
-def test_slow_changes_ask_for_a_long_record() -> None:
+def test_slow_effects_need_a_long_recording() -> None:
     (proposal,) = propose(report("thermal_drift", "supply_sag"))
     assert proposal.command == "quadvel excite sweep --seconds 300"

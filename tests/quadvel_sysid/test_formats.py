@@ -1,4 +1,4 @@
-"""A log in the formats that people have: MATLAB, HDF5, Parquet, LeRobot, numpy records; and those that are refused."""
+"""Logs in MATLAB, HDF5, Parquet, LeRobot and numpy formats, and formats that are refused."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def check(log: Log, names: list[str] | None = None) -> None:
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_every_format_says_the_same(tmp_path: Path, form: str) -> None:
+def test_every_format_yields_the_same_log(tmp_path: Path, form: str) -> None:
     name, write = FORMATS[form]
     write(tmp_path / name)
     check(read_log(tmp_path / name))
@@ -148,7 +148,7 @@ def test_a_lerobot_data_set_is_read_episode_by_episode(tmp_path: Path, names: An
 
 
 @pytest.mark.parametrize("name", ["log.h5", "log.parquet"])
-def test_where_the_extra_is_missing_a_sentence_names_it(
+def test_missing_optional_dependency_is_named(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for module in ("h5py", "pyarrow", "pyarrow.parquet"):
@@ -192,7 +192,7 @@ def test_a_pickle_is_refused_with_the_line_that_converts_it(
 @pytest.mark.parametrize(
     "name", ["log.xlsx", "log.feather", "log.zip", "log.jsonl", "log.unknown", "log", "log.mcap.gz"]
 )
-def test_what_nothing_reads_is_refused_by_its_suffix(tmp_path: Path, name: str) -> None:
+def test_unsupported_format_is_refused_by_its_suffix(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes(b"x")
     with pytest.raises(LogError, match=r"the suffix is '.*': |the suffix is '.*', expected"):
         read_log(tmp_path / name)
@@ -216,7 +216,7 @@ def test_a_broken_file_is_refused(tmp_path: Path, name: str, content: bytes) -> 
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_file_that_was_cut_off_is_refused(tmp_path: Path, form: str) -> None:
+def test_truncated_file_is_refused(tmp_path: Path, form: str) -> None:
     name, write = FORMATS[form]
     write(tmp_path / name)
     data = (tmp_path / name).read_bytes()
@@ -241,7 +241,7 @@ def test_a_link_out_of_an_hdf5_file_is_not_followed(tmp_path: Path) -> None:
 
 
 def long_header() -> bytes:
-    """The start of an array whose header is as long as it may be said to be."""
+    """The start of an array whose header declares the greatest length."""
     return b"\x93NUMPY\x02\x00" + struct.pack("<I", 1 << 30)
 
 
@@ -279,7 +279,7 @@ def test_a_mat_file_that_grows_is_refused_within_little_memory(
 ) -> None:
     from quadvel_sysid.logs import matlab
 
-    monkeypatch.setattr(matlab, "LARGEST_UNPACKED", 20_000_000)
+    monkeypatch.setattr(matlab, "MAX_UNPACKED_BYTES", 20_000_000)
     packer = zlib.compressobj(1)
     packed = b"".join(packer.compress(bytes(1 << 20)) for _ in range(200)) + packer.flush()
     head = b"MATLAB 5.0 MAT-file".ljust(124) + struct.pack("<HH", 0x0100, 0x4D49)
@@ -295,7 +295,7 @@ def test_a_parquet_file_of_billions_of_rows_is_refused_unread(
 ) -> None:
     from quadvel_sysid.logs import raw
 
-    monkeypatch.setattr(raw, "LARGEST", 400)
+    monkeypatch.setattr(raw, "MAX_VALUES", 400)
     parquet(tmp_path / "log.parquet")
     with pytest.raises(LogError, match=r"log\.parquet: .* expected 400 at most"):
         read_log(tmp_path / "log.parquet")

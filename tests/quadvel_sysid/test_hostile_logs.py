@@ -1,4 +1,4 @@
-"""A log of somebody who means harm ends in one sentence: nothing of it runs, and little memory is taken."""
+"""Malicious logs are refused in one sentence: nothing in them runs, and memory stays bounded."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ JOINTS = np.zeros((len(SECOND), 12))
 
 
 class Trap:
-    """Makes a file where it is unpickled."""
+    """Creates a file when it is unpickled."""
 
     def __init__(self, sprung: Path) -> None:
         self.sprung = sprung
@@ -40,13 +40,13 @@ def array(values: np.ndarray) -> bytes:
 
 
 def header(shape: str, kind: str = "'<f8'") -> bytes:
-    """Of an array that does not follow."""
+    """Header of an array without its data."""
     text = f"{{'descr': {kind}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text
 
 
 def archive(path: Path, **changes: bytes) -> Path:
-    """A log as it should be, but for some of its members."""
+    """A valid log with some members replaced."""
     good = {"t": array(SECOND), **dict.fromkeys(("q", "dq", "q_des"), array(JOINTS))}
     with zipfile.ZipFile(path, "w") as file:
         for name, content in (good | changes).items():
@@ -81,7 +81,7 @@ def test_an_array_of_objects_is_refused_and_stays_packed(tmp_path: Path, field: 
         (header("(" * 5000 + ")" * 5000), "q: no NumPy array"),
     ],
 )  # fmt: skip
-def test_a_header_that_lies_is_refused_before_memory_is_taken(
+def test_false_header_is_refused_before_memory_is_allocated(
     tmp_path: Path, content: bytes, sentence: str
 ) -> None:
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -90,7 +90,7 @@ def test_a_header_that_lies_is_refused_before_memory_is_taken(
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 50_000  # kB
 
 
-def test_members_that_are_called_like_fields_but_are_none_are_not_looked_for(tmp_path: Path) -> None:
+def test_members_with_names_of_fields_only_by_prefix_are_ignored(tmp_path: Path) -> None:
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as file:
         for name in ("t", "q", "dq", "q_des", "../../t.npy", "/etc/passwd"):
             file.writestr(name, array(SECOND))
@@ -98,7 +98,7 @@ def test_members_that_are_called_like_fields_but_are_none_are_not_looked_for(tmp
         read_log(tmp_path / "a.npz")
 
 
-def test_a_table_of_a_hundred_thousand_columns_is_refused_at_once(tmp_path: Path) -> None:
+def test_table_of_a_hundred_thousand_columns_is_refused_quickly(tmp_path: Path) -> None:
     """In a time that grows with their number, not with its square."""
     (tmp_path / "a.csv").write_text(",".join(f"c{i}" for i in range(100_000)) + "\n")
     with pytest.raises(LogError, match=r"a\.csv: t: no such column"):
@@ -138,7 +138,7 @@ def test_a_folder_that_points_elsewhere_is_refused(
     ["!!python/object/apply:os.mkdir ['{sprung}']", "[" * 400, "a: &a [*a]", "a: &a [x, x]\nb: [*a, *a]", "\0"],
     ids=["object", "deep", "endless", "aliases", "binary"],
 )  # fmt: skip
-def test_metadata_that_is_more_than_data_is_refused(tmp_path: Path, text: str) -> None:
+def test_malicious_metadata_is_refused(tmp_path: Path, text: str) -> None:
     sprung = tmp_path / "sprung"
     (tmp_path / "metadata.yaml").write_text(text.replace("{sprung}", str(sprung)))
     with pytest.raises(LogError, match=f"{tmp_path}: no whole recording"):

@@ -12,7 +12,7 @@ from quadvel_sysid.eam import fit_eam
 from quadvel_sysid.identification_data import prepare
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.dataset import Dataset
-from quadvel_sysid.logs.excerpts import pieces
+from quadvel_sysid.logs.excerpts import cut_excerpts
 from quadvel_sysid.signals import Samples
 
 JOINTS = NAMES[:2]
@@ -24,7 +24,7 @@ def _truth(*effects):
 
 def test_the_eam_finds_the_truth_of_table_4():
     samples = Samples([record(parameters(input_delay=0.0068, output_delay=0.0013), 6, 5.0)])
-    eam = fit_eam(samples, samples.judged)
+    eam = fit_eam(samples, samples.evaluated)
     assert abs((eam.gains[0, 0] - 1) * 30 - -0.706) < 0.05 * 30 * 0.05
     assert abs(eam.gains[1, 0] * 0.5 - 0.479) < 0.2 * 0.479
     assert abs(eam.input_delay[0] + eam.output_delay[0] - 0.0081) < 2e-4
@@ -83,7 +83,7 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_not_confir
 
 def test_pieces_of_a_long_log_at_a_low_rate_hold_enough_rows():
     log = record(_truth(), 2, 30.0, 50, seed=4)
-    found = pieces(log, 12.0)
+    found = cut_excerpts(log, 12.0)
     assert len(found) > 4
     assert all(len(piece.t) >= 50 for piece in found)
 
@@ -91,7 +91,7 @@ def test_pieces_of_a_long_log_at_a_low_rate_hold_enough_rows():
 def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    material = prepare(Dataset.of([log]), values=3000)
+    material = prepare(Dataset.inspect_all([log]), values=3000)
     del log
     assert sum(len(log.t) for log in material.logs) == 1500
     assert [array() for array in alive] == [None] * len(alive)

@@ -1,4 +1,4 @@
-"""`quadvel identify` as a user meets it: help, refusals, and what it leaves behind."""
+"""The command `quadvel identify`: help, refusals, and the files it writes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_help_shows_an_example_and_the_fields_of_a_log() -> None:
 def test_all_logs_after_holdout_are_held_out() -> None:
     arguments = ["a", "--holdout", "b", "c", "--out", "d", "--gains", "1", "2"]
     expected = ["a", "--holdout", "b", "--holdout", "c", "--out", "d", "--gains", "1", "2"]
-    assert list(cli._repeated(arguments)) == expected
+    assert list(cli._repeat_options(arguments)) == expected
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Compiled readers of series give what NumPy's searches and interpolation give, whatever the order of the times."""
+"""Compiled interpolation equals NumPy's, for times in any order."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -
     at = ORDERS[order]
     expected = np.stack([np.interp(at, TIMES, one) for one in VALUES.T], axis=1)
     np.testing.assert_allclose(
-        interpolation.read(VALUES, *interpolation.between(TIMES, at)), expected, atol=1e-12
+        interpolation.interpolate(VALUES, *interpolation.locate(TIMES, at)), expected, atol=1e-12
     )
     late = np.array([[0.0, 0.001, -0.002], [0.02, 0.5, 2.0]])
-    found = interpolation.read_late(VALUES, TIMES, at, late)
+    found = interpolation.interpolate_shifted(VALUES, TIMES, at, late)
     assert found.shape == (2, len(at), 3)
     for b, j in np.ndindex(late.shape):
         np.testing.assert_allclose(
@@ -44,7 +44,7 @@ def test_values_between_rows_are_linear_and_end_where_the_rows_end(order: str) -
         )
 
 
-def test_an_integral_of_held_values_is_the_sum_of_values_times_how_long_they_held() -> None:
+def test_hold_integral_is_the_sum_of_values_times_durations() -> None:
     spacing = np.diff(TIMES, append=TIMES[-1] + 1.0)[:, None]
     sums = np.concatenate([np.zeros((1, 3)), np.cumsum(VALUES * spacing, axis=0)])
     at = np.array([TIMES[0], TIMES[7], 0.25 * TIMES[7] + 0.75 * TIMES[8], TIMES[-1] + 0.5])
@@ -58,4 +58,4 @@ def test_an_integral_of_held_values_is_the_sum_of_values_times_how_long_they_hel
         ]
         for t in at
     ]
-    np.testing.assert_allclose(interpolation.integral(VALUES, sums, TIMES, at), expected, atol=1e-12)
+    np.testing.assert_allclose(interpolation.hold_integral(VALUES, sums, TIMES, at), expected, atol=1e-12)

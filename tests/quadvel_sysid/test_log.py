@@ -1,4 +1,4 @@
-"""Logs read from files of every format, and files that are refused in one sentence with file and field."""
+"""Logs read from every format, and refusals that name the file and the field."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from joint_logs import csv, fields, mcap, npz
 PLAIN = [name.removesuffix("_joint") for name in JOINT_NAMES]
 
 
-def test_an_archive_is_read_as_it_stands(tmp_path: Path) -> None:
+def test_archive_is_read(tmp_path: Path) -> None:
     log = read_log(npz(tmp_path / "a.npz"))
     expected = fields()
     assert log.joints == JOINT_NAMES
@@ -38,7 +38,7 @@ def test_an_archive_is_read_as_it_stands(tmp_path: Path) -> None:
     assert (log.dq_des, log.tau_ff, log.temperature, log.voltage) == (None,) * 4
 
 
-def test_a_table_says_the_same_as_an_archive(tmp_path: Path) -> None:
+def test_table_equals_archive(tmp_path: Path) -> None:
     given = fields(0.5)
     archive = read_log(npz(tmp_path / "a.npz", **given, valid=None))
     table = read_log(csv(tmp_path / "a.csv", given | {"kp": np.full(250, 30.0)}))
@@ -56,7 +56,7 @@ def test_a_recording_of_the_stack_is_stamped_as_its_messages_are(tmp_path: Path)
     assert log.joints == JOINT_NAMES
 
 
-def test_damping_stands_in_a_log_as_a_gain_of_zero(tmp_path: Path) -> None:
+def test_damping_mode_is_a_gain_of_zero(tmp_path: Path) -> None:
     log = read_log(mcap(tmp_path / "a.mcap", fields(0.2), mode=0))
     assert log.kp is not None
     assert log.kd is not None
@@ -64,7 +64,7 @@ def test_damping_stands_in_a_log_as_a_gain_of_zero(tmp_path: Path) -> None:
     assert (log.kd == 0.5).all()
 
 
-def test_commands_with_their_own_times_win(tmp_path: Path) -> None:
+def test_commands_with_their_own_times_take_precedence(tmp_path: Path) -> None:
     t_cmd = np.arange(0.0, 4.0, 0.005)
     q_des_cmd = np.full((len(t_cmd), 12), 0.25)
     log = read_log(npz(tmp_path / "a.npz", t_cmd=t_cmd, q_des_cmd=q_des_cmd))
@@ -88,7 +88,7 @@ def test_gains_are_one_number_one_a_joint_or_one_a_sample(tmp_path: Path, shape:
     assert (log.kp == 20.0).all()
 
 
-def test_gains_on_the_states_count_for_the_commands_that_follow(tmp_path: Path) -> None:
+def test_gains_on_state_rows_apply_to_the_following_commands(tmp_path: Path) -> None:
     kp = np.where(fields()["t"] < 2.0, 20.0, 40.0)
     t_cmd = np.array([*np.arange(0.5, 2.0, 0.1), *np.arange(2.05, 3.5, 0.1)])
     log = read_log(npz(tmp_path / "a.npz", kp=kp, t_cmd=t_cmd, q_des_cmd=np.zeros((len(t_cmd), 12))))
@@ -101,7 +101,7 @@ def test_joints_are_matched_by_name_with_or_without_its_ending(tmp_path: Path) -
     given = {name: fields()[name][:, order] for name in ("q", "dq", "q_des", "tau")}
     log = read_log(npz(tmp_path / "a.npz", **given, joint_names=[PLAIN[k] for k in order]))
     assert log.joints == tuple(JOINT_NAMES[k] for k in order)
-    picked = log.select([PLAIN[11], JOINT_NAMES[5]])
+    picked = log.select_joints([PLAIN[11], JOINT_NAMES[5]])
     np.testing.assert_array_equal(picked.q, given["q"][:, [2, 0]])
     assert picked.kp is not None
     assert picked.kp.shape == (2000, 2)
@@ -113,7 +113,7 @@ def test_valid_is_read_and_foreign_fields_are_not(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.valid.all(axis=1), valid)
 
 
-def test_repeated_stamps_are_dropped_and_said(tmp_path: Path) -> None:
+def test_repeated_stamps_are_dropped_and_reported(tmp_path: Path) -> None:
     t = fields()["t"].copy()
     t[100] = t[99]
     log = read_log(npz(tmp_path / "a.npz", t=t))
@@ -189,7 +189,7 @@ def test_an_empty_folder_and_no_file_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.3, 0.5, 0.8])
-def test_of_a_recording_that_was_cut_off_what_is_whole_is_read_and_said(tmp_path: Path, share: float) -> None:
+def test_whole_part_of_a_truncated_recording_is_read(tmp_path: Path, share: float) -> None:
     path = mcap(tmp_path / "cut.mcap", fields(2.0), chunk_size=100_000)
     whole, data = read_log(path), path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -203,9 +203,7 @@ def test_of_a_recording_that_was_cut_off_what_is_whole_is_read_and_said(tmp_path
 
 
 @pytest.mark.parametrize("share", [0.01, 0.5])
-def test_a_recording_that_was_cut_off_before_anything_was_whole_is_refused(
-    tmp_path: Path, share: float
-) -> None:
+def test_recording_truncated_before_its_first_chunk_is_refused(tmp_path: Path, share: float) -> None:
     path = mcap(tmp_path / "cut.mcap", fields(0.2))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
@@ -215,7 +213,7 @@ def test_a_recording_that_was_cut_off_before_anything_was_whole_is_refused(
         read_log(path)
 
 
-def test_a_folder_that_is_no_rosbag2_is_called_that(tmp_path: Path) -> None:
+def test_folder_without_rosbag2_is_refused(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("no recording")
     with pytest.raises(
         LogError, match=r"the folder is no recording: a rosbag2 folder holds a metadata\.yaml"
@@ -223,19 +221,19 @@ def test_a_folder_that_is_no_rosbag2_is_called_that(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-def test_an_archive_that_was_cut_off_is_refused(tmp_path: Path) -> None:
+def test_truncated_archive_is_refused(tmp_path: Path) -> None:
     path = npz(tmp_path / "cut.npz")
     path.write_bytes(path.read_bytes()[:100_000])
     with pytest.raises(LogError, match=r"cut\.npz: no whole NPZ archive"):
         read_log(path)
 
 
-def test_one_column_is_not_taken_for_that_of_every_joint(tmp_path: Path) -> None:
+def test_one_column_is_not_used_for_every_joint(tmp_path: Path) -> None:
     with pytest.raises(LogError, match=r"dq: found shape \(2000,\), expected \(2000, 12\)"):
         read_log(npz(tmp_path / "a.npz", dq=fields()["dq"][:, 0]))
 
 
-def test_what_of_a_file_is_not_used_is_said(tmp_path: Path) -> None:
+def test_unused_fields_are_reported(tmp_path: Path) -> None:
     log = read_log(npz(tmp_path / "a.npz", Tau=np.zeros(3), t_cmd=fields()["t"]))
     assert "Tau: not used, as no log has such fields: Tau" in log.remarks
     assert "t_cmd: not used, as q_des_cmd is not there; q_des counts on the times t" in log.remarks
@@ -297,11 +295,11 @@ def test_a_file_of_nothing_but_zeros_is_refused_within_little_memory(tmp_path: P
 
 
 def test_a_long_log_is_kept_in_single_precision() -> None:
-    assert raw.precision(raw.LONG + 1) == np.float32
-    assert raw.precision(raw.LONG) == np.float64
+    assert raw.storage_dtype(raw.MAX_DOUBLE_VALUES + 1) == np.float32
+    assert raw.storage_dtype(raw.MAX_DOUBLE_VALUES) == np.float64
 
 
-def test_a_command_counts_from_its_time_whatever_rounding_makes_of_it(tmp_path: Path) -> None:
+def test_command_is_in_force_from_its_time_despite_rounding(tmp_path: Path) -> None:
     log = read_log(npz(tmp_path / "a.npz"))
     at = (log.t_cmd - 0.1) + 0.1
     assert (log.command_rows(at) == np.arange(len(at))).all()

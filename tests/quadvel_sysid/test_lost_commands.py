@@ -1,4 +1,4 @@
-"""Commands that never acted, or late: read off the torque, and told as a share of samples."""
+"""Lost and late commands, estimated from the torque and reported as a share of samples."""
 
 import attrs
 import numpy as np
@@ -20,12 +20,12 @@ def test_lost_commands_are_found_alike_in_one_piece_and_in_several(monkeypatch):
     rng = np.random.default_rng(0)
     costs = 5.0 * (behind[:, None, None] != np.arange(3)) + rng.exponential(0.3, (3000, 1, 3))
     new = (np.arange(3000) % 5 == 0).astype(int)
-    several, moves = lost_commands._odds(costs, new, lost_commands.LossProbabilities())
+    several, moves = lost_commands._forward_backward(costs, new, lost_commands.LossProbabilities())
     np.testing.assert_array_equal(several[:, 0].argmax(axis=1), behind)
-    assert lost_commands.LossProbabilities.of(moves).lost == pytest.approx(3 / 600, rel=0.05)
-    monkeypatch.setattr(lost_commands, "_PIECE", 3000)
+    assert lost_commands.LossProbabilities.estimate(moves).lost == pytest.approx(3 / 600, rel=0.05)
+    monkeypatch.setattr(lost_commands, "_PIECE_ROWS", 3000)
     np.testing.assert_allclose(
-        several, lost_commands._odds(costs, new, lost_commands.LossProbabilities())[0], atol=1e-9
+        several, lost_commands._forward_backward(costs, new, lost_commands.LossProbabilities())[0], atol=1e-9
     )
 
 
@@ -37,7 +37,7 @@ def _losing(share, joints=JOINTS):
     return attrs.evolve(log, **{name: getattr(log, name)[sent] for name in ("t_cmd", "q_des", "kp", "kd")})
 
 
-def test_lost_commands_are_named_with_the_share_of_samples_that_they_hit():
+def test_lost_commands_are_reported_with_their_share_of_samples():
     report = identify([_losing(0.1)]).report
     (effect,) = report["effects"]
     assert effect["name"] == "command_hold"
@@ -45,7 +45,7 @@ def test_lost_commands_are_named_with_the_share_of_samples_that_they_hit():
 
 
 def test_a_drive_that_lags_after_each_command_alike_loses_none(monkeypatch):
-    """It is behind, too; but that follows from how long ago the command arrived, so that no loss at random is told."""
+    """Its backlog follows from the age of the command, so no random loss is reported."""
     found = []
     looked_for = lost_commands.lost_commands
 

@@ -1,4 +1,4 @@
-"""Identification on measured walks of a Go2: fit one, judge on the other; one leg, so that it takes seconds."""
+"""Identification on measured walks of a Go2: fit one, evaluate on the other; one leg, to save time."""
 
 import os
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Logs without torque: joints that swing freely, alone and as the legs of the robot hung in the air."""
+"""Logs without torque: joints that swing freely, alone and on a suspended robot."""
 
 import os
 from pathlib import Path
@@ -16,7 +16,7 @@ from quadvel_sim.simulator import Simulator
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log, LogError
 from quadvel_sysid.logs.read_log import read_log
-from quadvel_sysid.motion import implied
+from quadvel_sysid.motion import imply_torque
 
 JOINTS = NAMES[:2]
 
@@ -36,7 +36,7 @@ def test_the_motion_of_a_free_joint_shows_its_inertia_and_nothing_that_is_not_th
     assert report["unexplained"]["verdict"] == "white"
 
 
-def test_joint_friction_shows_in_the_motion_and_the_replay_gains_by_it():
+def test_joint_friction_is_identified_from_motion_and_improves_the_replay():
     report = identify([_swinging(Effect("coulomb_friction", JOINTS[:1], {"c": 0.5, "v_0": 0.1}))]).report
     first = report["effects"][0]
     assert (first["name"], first["joints"]) == ("coulomb_friction", [JOINTS[0]])
@@ -48,7 +48,7 @@ def test_joint_friction_shows_in_the_motion_and_the_replay_gains_by_it():
     assert "rad" in report["decision"]
 
 
-def test_without_torque_and_gains_nothing_has_a_scale():
+def test_log_without_torque_and_gains_is_refused():
     log = attrs.evolve(_swinging(), kp=None, kd=None)
     with pytest.raises(LogError, match="tau, kp, kd: not in the log"):
         identify([log])
@@ -104,10 +104,10 @@ def test_friction_of_a_hung_leg_is_found_on_the_joint_that_has_it():
     assert report["after"]["heldout_q_rms_rad"] < 0.7 * report["before"]["heldout_q_rms_rad"]
 
 
-def test_a_leg_that_swings_is_carried_as_one_body():
+def test_swinging_leg_is_one_body():
     """The torque that the motion implies is the one that the drives gave, though the joints push each other."""
     log = _hung(np.zeros(12), 3.0)
-    coarse, body = implied(log)
+    coarse, body = imply_torque(log)
     assert np.all(body.inertia > 0.0)
     given = np.array([np.interp(coarse.t, log.t, tau) for tau in log.tau.T]).T
     assert np.all(np.std(coarse.tau - given, axis=0) < 0.2 * np.std(given, axis=0))

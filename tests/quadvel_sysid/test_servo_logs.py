@@ -1,4 +1,4 @@
-"""What people have: each log with one thing wrong is mended with a word, or refused for its true cause."""
+"""Servo logs with one defect each are corrected with a finding, or refused for the true cause."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import yaml
 
-from quadvel_sysid.logs.checks import Inspection, inspect, table
+from quadvel_sysid.logs.checks import Inspection, inspect, markdown_table
 from quadvel_sysid.logs.columns import ColumnMap
 from quadvel_sysid.logs.log import LogError
 from quadvel_sysid.logs.read_log import read_log
@@ -24,18 +24,18 @@ from servo_logs import KP, recorded
 SEEDS = (3, 14)
 
 
-def looked_at(folder: Path, log: dict[str, Any]) -> Inspection:
-    """The log through a file."""
+def inspect_file(folder: Path, log: dict[str, Any]) -> Inspection:
+    """Write the log to a file, read it and inspect it."""
     np.savez(folder / "log.npz", **log)
     return inspect(read_log(folder / "log.npz"))
 
 
-def said(inspection: Inspection, *kinds: str) -> list[str]:
+def texts(inspection: Inspection, *kinds: str) -> list[str]:
     return [finding.text for finding in inspection.findings if finding.kind in kinds]
 
 
 def refusal(inspection: Inspection) -> str:
-    (text,) = said(inspection, "refusal")
+    (text,) = texts(inspection, "refusal")
     return text
 
 
@@ -44,11 +44,11 @@ def rms(x: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_nothing_is_mended_in_a_clean_log(tmp_path: Path, seed: int) -> None:
+def test_clean_log_is_not_corrected(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
-    found = looked_at(tmp_path, log)
-    assert said(found, "refusal") == []
-    assert not [text for text in said(found, "warning") if "separable" not in text]
+    found = inspect_file(tmp_path, log)
+    assert texts(found, "refusal") == []
+    assert not [text for text in texts(found, "warning") if "separable" not in text]
     for name in ("t", "q", "dq", "tau", "q_des"):
         np.testing.assert_array_equal(getattr(found.log, name), log[name])
 
@@ -58,79 +58,81 @@ def test_nothing_is_mended_in_a_clean_log(tmp_path: Path, seed: int) -> None:
 def test_a_torque_before_its_command_is_refused(tmp_path: Path, seed: int, rows: int) -> None:
     log = recorded(seed)
     late = np.concatenate([np.repeat(log["q_des"][:1], rows + 2, 0), log["q_des"][: -rows - 2]])
-    assert "ms before its command" in refusal(looked_at(tmp_path, log | {"q_des": late}))
+    assert "ms before its command" in refusal(inspect_file(tmp_path, log | {"q_des": late}))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_of_a_state_that_is_held_the_rows_count_in_which_it_changed(tmp_path: Path, seed: int) -> None:
+def test_rows_that_repeat_the_state_are_dropped(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
     rows = np.arange(len(log["t"])) // 12 * 12
-    found = looked_at(tmp_path, log | {name: log[name][rows] for name in ("q", "dq", "tau")})
-    assert any("92 % of the rows repeat the state before" in text for text in said(found, "warning"))
+    found = inspect_file(tmp_path, log | {name: log[name][rows] for name in ("q", "dq", "tau")})
+    assert any("92 % of the rows repeat the state before" in text for text in texts(found, "warning"))
     np.testing.assert_array_equal(found.log.t, log["t"][::12])
     np.testing.assert_array_equal(found.log.t_cmd, log["t"])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("torque", [True, False])
-def test_speeds_that_are_not_there_are_made_from_the_angles(tmp_path: Path, seed: int, torque: bool) -> None:
+def test_missing_speeds_are_computed_from_the_angles(tmp_path: Path, seed: int, torque: bool) -> None:
     log = recorded(seed)
     left_out = ("dq",) if torque else ("dq", "tau")
-    found = looked_at(tmp_path, {name: value for name, value in log.items() if name not in left_out})
-    assert any(text.startswith("dq: not in the log; made from q") for text in said(found, "note"))
+    found = inspect_file(tmp_path, {name: value for name, value in log.items() if name not in left_out})
+    assert any(text.startswith("dq: not in the log; made from q") for text in texts(found, "note"))
     assert rms(found.log.dq - log["dq"]) < 0.1 * rms(log["dq"])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_speeds_without_a_sign_are_replaced(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
-    found = looked_at(tmp_path, log | {"dq": np.abs(log["dq"])})
-    assert any(text.startswith("dq: has no sign on hip_joint, thigh") for text in said(found, "warning"))
+    found = inspect_file(tmp_path, log | {"dq": np.abs(log["dq"])})
+    assert any(text.startswith("dq: has no sign on hip_joint, thigh") for text in texts(found, "warning"))
     assert rms(found.log.dq - log["dq"]) < 0.1 * rms(log["dq"])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_speeds_that_are_differences_of_coarse_ticks_are_made_anew(tmp_path: Path, seed: int) -> None:
+def test_speeds_of_a_coarse_encoder_are_recomputed(tmp_path: Path, seed: int) -> None:
     log, tick = recorded(seed), 2.0 * np.pi / 1024.0
     q = np.round(log["q"] / tick) * tick
     dq = np.concatenate([np.zeros((1, 3)), np.diff(q, axis=0) / 0.004])
-    found = looked_at(tmp_path, log | {"q": q, "dq": dq})
+    found = inspect_file(tmp_path, log | {"q": q, "dq": dq})
     assert any(
-        "q counts in steps of 6.14 mrad, dq is its difference" in text for text in said(found, "warning")
+        "q counts in steps of 6.14 mrad, dq is its difference" in text for text in texts(found, "warning")
     )
     assert rms(found.log.dq - log["dq"]) < 0.2 * rms(dq - log["dq"])
     assert rms(found.log.q - log["q"]) < 0.5 * rms(q - log["q"])
 
 
-def test_speeds_that_the_drive_acted_on_stay_however_coarse_they_are(tmp_path: Path) -> None:
+def test_coarse_speeds_that_the_drive_used_are_kept(tmp_path: Path) -> None:
     log = recorded(3, ticks=2.0 * np.pi / 1024.0)
-    found = looked_at(tmp_path, log)
-    assert any("but the drive acted on it" in text for text in said(found, "note"))
+    found = inspect_file(tmp_path, log)
+    assert any("but the drive acted on it" in text for text in texts(found, "note"))
     np.testing.assert_array_equal(found.log.dq, log["dq"])
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_torque_without_a_sign_is_refused(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
-    text = refusal(looked_at(tmp_path, log | {"tau": np.abs(log["tau"])}))
+    text = refusal(inspect_file(tmp_path, log | {"tau": np.abs(log["tau"])}))
     assert text.startswith("tau: has no sign on")
 
 
-def test_a_torque_that_a_load_keeps_on_one_side_has_a_sign(tmp_path: Path) -> None:
+def test_one_sided_torque_under_load_is_not_unsigned(tmp_path: Path) -> None:
     log = recorded(3)
     carried = log["q_des"] - (np.abs(log["tau"]).max() + 1.0) / KP  # what it takes to carry the load
-    found = looked_at(tmp_path, log | {"tau": log["tau"] - np.abs(log["tau"]).max() - 1.0, "q_des": carried})
-    assert said(found, "refusal") == []
+    found = inspect_file(
+        tmp_path, log | {"tau": log["tau"] - np.abs(log["tau"]).max() - 1.0, "q_des": carried}
+    )
+    assert texts(found, "refusal") == []
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_gap_is_told_and_tolerated(tmp_path: Path, seed: int) -> None:
+def test_gap_is_reported_and_accepted(tmp_path: Path, seed: int) -> None:
     log = recorded(seed)
     keep = (log["t"] < 2.0) | (log["t"] > 3.5)
     rows = ("t", "q", "dq", "tau", "q_des")
-    found = looked_at(tmp_path, log | {name: log[name][keep] for name in rows})
-    assert said(found, "refusal") == []
-    assert any(text.startswith("t: 1 gap, the longest of 1.5") for text in said(found, "warning"))
+    found = inspect_file(tmp_path, log | {name: log[name][keep] for name in rows})
+    assert texts(found, "refusal") == []
+    assert any(text.startswith("t: 1 gap, the longest of 1.5") for text in texts(found, "warning"))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -138,34 +140,34 @@ def test_a_gap_is_told_and_tolerated(tmp_path: Path, seed: int) -> None:
 def test_angles_that_jump_by_a_turn_are_unwrapped(tmp_path: Path, seed: int, both: bool) -> None:
     log = recorded(seed, middle=np.pi - 0.1)
     turned = {name: (log[name] + np.pi) % (2.0 * np.pi) - np.pi for name in ("q", "q_des")[: 1 + both]}
-    found = looked_at(tmp_path, log | turned)
-    assert any(text.startswith("q: jumps by 2 pi in one row") for text in said(found, "warning"))
+    found = inspect_file(tmp_path, log | turned)
+    assert any(text.startswith("q: jumps by 2 pi in one row") for text in texts(found, "warning"))
     np.testing.assert_allclose(found.log.q - found.log.q_des, log["q"] - log["q_des"], atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("torque", [True, False])
-def test_a_joint_against_its_own_sign_is_no_other_order_of_columns(
-    tmp_path: Path, seed: int, torque: bool
-) -> None:
+def test_inverted_joint_is_not_another_order_of_joints(tmp_path: Path, seed: int, torque: bool) -> None:
     log = recorded(seed, middle=0.0)
     q_des = log["q_des"] * [1.0, -1.0, 1.0]
     given = log | {"q_des": q_des}
-    text = refusal(looked_at(tmp_path, given if torque else {k: v for k, v in given.items() if k != "tau"}))
+    text = refusal(
+        inspect_file(tmp_path, given if torque else {k: v for k, v in given.items() if k != "tau"})
+    )
     assert text.startswith("q_des: thigh_joint")
     assert "own command with the opposite sign" in text
     assert "columns" not in text
 
 
-def test_joints_that_are_led_by_one_command_are_not_told_apart(tmp_path: Path) -> None:
+def test_joints_with_the_same_command_are_not_reordered(tmp_path: Path) -> None:
     log = recorded(3)
     one = {name: np.repeat(log[name][:, :1], 3, 1) for name in ("q", "dq", "tau", "q_des")}
     one["tau"] = one["tau"] + np.random.default_rng(0).normal(0.0, 0.05, one["tau"].shape)
-    assert not [text for text in said(looked_at(tmp_path, log | one), "refusal") if "columns" in text]
+    assert not [text for text in texts(inspect_file(tmp_path, log | one), "refusal") if "columns" in text]
 
 
-def test_a_wave_that_would_answer_with_either_sign_has_its_own(tmp_path: Path) -> None:
-    """Half a period apart a wave is its opposite."""
+def test_periodic_motion_has_a_definite_sign(tmp_path: Path) -> None:
+    """A wave is inverted half a period later."""
     t = 0.002 * np.arange(3000)
     wave = np.sin(10.0 * np.pi * t[:, None] + [0.0, 1.0, 2.0])
     q, dq = 0.1 * np.sin(10.0 * np.pi * t[:, None] - 0.5), np.pi * np.cos(10.0 * np.pi * t[:, None] - 0.5)
@@ -173,28 +175,28 @@ def test_a_wave_that_would_answer_with_either_sign_has_its_own(tmp_path: Path) -
         KP * (np.roll(wave, 4, axis=0) - q) - 0.5 * dq + np.random.default_rng(0).normal(0.0, 0.3, wave.shape)
     )
     log = {"t": t, "q": np.tile(q, 3), "dq": np.tile(dq, 3), "q_des": wave, "tau": tau, "kp": KP, "kd": 0.5}
-    assert said(looked_at(tmp_path, log), "refusal") == []
+    assert texts(inspect_file(tmp_path, log), "refusal") == []
 
 
-def test_damping_that_was_not_commanded_is_told(tmp_path: Path) -> None:
-    found = looked_at(tmp_path, recorded(3) | {"kd": 0.0})
-    assert "kd: 0 was commanded; the damping that the drive has of its own is fitted" in said(found, "note")
+def test_uncommanded_damping_is_reported(tmp_path: Path) -> None:
+    found = inspect_file(tmp_path, recorded(3) | {"kd": 0.0})
+    assert "kd: 0 was commanded; the drive's own damping is fitted" in texts(found, "note")
 
 
 def test_gains_in_a_unit_of_their_own_are_fitted_and_those_of_one_joint_are_refused(tmp_path: Path) -> None:
-    found = looked_at(tmp_path, recorded(3) | {"kp": 850.0, "kd": 30.0})
+    found = inspect_file(tmp_path, recorded(3) | {"kp": 850.0, "kd": 30.0})
     assert found.log.kp is None
-    assert any("in a unit of its own, as a servo's is" in text for text in said(found, "warning"))
+    assert any("in a unit of its own, as a servo's is" in text for text in texts(found, "warning"))
     log = recorded(3)
-    assert "kp in N m/degree" in refusal(looked_at(tmp_path, log | {"kp": KP * np.pi / 180.0}))
-    assert "on thigh_joint" in refusal(looked_at(tmp_path, log | {"kp": KP * np.array([1.0, 40.0, 1.0])}))
+    assert "kp in N m/degree" in refusal(inspect_file(tmp_path, log | {"kp": KP * np.pi / 180.0}))
+    assert "on thigh_joint" in refusal(inspect_file(tmp_path, log | {"kp": KP * np.array([1.0, 40.0, 1.0])}))
 
 
 # Files
 
 
 def columns(log: dict[str, Any]) -> dict[str, list[Any]]:
-    """The rows of a log as PACE calls them, lists of numbers."""
+    """The fields of a log under the names of PACE, as lists."""
     names = {"t": "time", "q": "dof_pos", "q_des": "des_dof_pos"}
     return {other: log[name].tolist() for name, other in names.items()}
 
@@ -216,7 +218,7 @@ def test_a_document_is_read_by_columns_and_by_records(tmp_path: Path, form: str,
     np.testing.assert_allclose(read.q, log["q"])
     np.testing.assert_allclose(read.q_des, log["q_des"])
     assert "q: read from 'dof_pos'" in read.remarks
-    assert read.made == ("dq",)
+    assert read.derived == ("dq",)
 
 
 def test_a_table_may_hold_lists_in_its_cells_and_its_commands_in_another_file(tmp_path: Path) -> None:
@@ -255,7 +257,7 @@ def test_a_table_may_hold_lists_in_its_cells_and_its_commands_in_another_file(tm
         (["q"], "expected a line for each field"),
     ],
 )
-def test_a_map_that_says_nothing_is_refused_by_its_entry(tmp_path: Path, names: Any, sentence: str) -> None:
+def test_invalid_map_is_refused_by_its_entry(tmp_path: Path, names: Any, sentence: str) -> None:
     (tmp_path / "map.yaml").write_text(yaml.safe_dump(names))
     with pytest.raises(LogError, match=rf"map\.yaml: .*{sentence}"):
         ColumnMap.load(tmp_path / "map.yaml")
@@ -304,5 +306,5 @@ def test_measured_logs_of_servos_are_refused_for_what_they_lack(
     assert sentence in str(refused.value)
 
 
-def test_the_table_of_checks_is_in_the_documents() -> None:
-    assert table() in (Path(__file__).parents[2] / "docs" / "identification.md").read_text()
+def test_table_of_checks_is_documented() -> None:
+    assert markdown_table() in (Path(__file__).parents[2] / "docs" / "identification.md").read_text()

@@ -1,4 +1,4 @@
-"""The signals of rows: of some of them, of each joint at delays of its own."""
+"""Signals of selected rows, and of each joint at its own delays."""
 
 import attrs
 import numpy as np
@@ -6,7 +6,7 @@ import pytest
 from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects import registry
-from quadvel_sysid.signals import Samples, scattered
+from quadvel_sysid.signals import Samples, scattered_rows
 
 JOINTS = NAMES[:2]
 
@@ -19,7 +19,7 @@ def _log(seconds=3.0, seed=2):
 def test_signals_of_few_rows_are_those_of_all():
     samples = Samples([_log(), _log(seed=3)])
     rows = np.arange(0, len(samples.t), 7)
-    few = samples.taken(rows)
+    few = samples.take_rows(rows)
     assert len(few.t) == len(rows) < len(samples.t) / 6
     for name in ("t", "q", "q_des", "ddq", "packet"):
         whole = getattr(samples.at(0.004, 0.001, 0.001), name)
@@ -29,7 +29,7 @@ def test_signals_of_few_rows_are_those_of_all():
 @pytest.mark.parametrize("every", [2, 5, 10])
 def test_few_rows_lie_at_all_places_between_two_commands(every):
     """Commands at 200 Hz, rows at 500 or 1000 Hz: even steps would show few of the places, and hide a wrong delay."""
-    rows = scattered(4000, every)
+    rows = scattered_rows(4000, every)
     assert len(rows) == pytest.approx(4000 / every, abs=1)
     assert np.diff(rows).min() > 0
     counts = np.bincount(rows % 10)
@@ -37,7 +37,7 @@ def test_few_rows_lie_at_all_places_between_two_commands(every):
     assert counts.max() < 1.2 * len(rows) / 10
 
 
-def test_each_joint_reads_the_signals_at_its_own_delays():
+def test_each_joint_reads_signals_at_its_own_delays():
     samples = Samples([_log()])
     mixed = samples.at(np.array([0.004, 0.009]), np.array([0.001, 0.003]), 0.001)
     for joint, pair in enumerate(((0.004, 0.001), (0.009, 0.003))):
@@ -46,8 +46,8 @@ def test_each_joint_reads_the_signals_at_its_own_delays():
             np.testing.assert_array_equal(getattr(mixed, name)[:, joint], own)
 
 
-def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
-    """Each error between two guesses is a jump of the torque that a slope along the width does not see."""
+def test_grid_of_deadbands_leaves_few_errors_between_its_values():
+    """Each error between two values is a jump of the torque that a slope along the width misses."""
     samples = Samples([_log(seconds=1.0)])
     s = samples.at(0.009, 0.003, 0.0)
     starts = registry()["deadband"](edge="hard").starts(s, samples.tau, samples.tau)
@@ -57,9 +57,9 @@ def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
     assert (share[-1] > 0.95).all()
 
 
-def test_a_log_that_is_slower_than_its_companion_is_judged_as_well():
+def test_slower_log_is_evaluated_as_well():
     fast, slow = _log(seconds=2.0), _log(seconds=2.0, seed=3)
     every = np.arange(len(slow.t)) % 4 == 0
-    samples = Samples([fast, slow.of_rows(every)])
-    assert samples.judged[samples.log_of_row == 1].mean() > 0.9
+    samples = Samples([fast, slow.select_rows(every)])
+    assert samples.evaluated[samples.log_of_row == 1].mean() > 0.9
     assert samples.start[samples.log_of_row == 1].sum() == 1

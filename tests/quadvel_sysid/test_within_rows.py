@@ -1,4 +1,4 @@
-"""What happens between the rows of a log, and channels that are stamped off, each against a computation of its own."""
+"""Effects between the rows of a log, and skewed time stamps, against independent computations."""
 
 import attrs
 import numpy as np
@@ -8,7 +8,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator.effects import registry
 from quadvel_sysid.identify import identify
-from quadvel_sysid.logs.excerpts import evened, jitters
+from quadvel_sysid.logs.excerpts import has_jitter, restore_even_clock
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.logs.read_log import read_log
 from quadvel_sysid.model import AppliedEffect, Model
@@ -55,7 +55,7 @@ def _of_one_joint(log, law, value, input_delay=0.0):
     return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
 
 
-def test_a_lag_at_other_delays_is_computed_anew_where_rows_see_the_same_commands():
+def test_lag_is_recomputed_at_other_delays_with_the_same_commands():
     """Commands and rows on one grid of 2 ms: delays of 0.5 and 1.5 ms show the same commands, of other age."""
     law = registry()["first_order_lag"]()
     model = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0005)
@@ -112,14 +112,14 @@ def _driven(row, command, seed):
     return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
 
 
-def test_of_commands_that_stand_in_the_rows_the_instants_of_an_even_sender_are_restored(tmp_path):
+def test_send_times_of_commands_in_state_rows_are_restored(tmp_path):
     """97 Hz in rows of 500 Hz: a row shows up to 2 ms late what was sent, which lost commands would explain."""
     rows = fields()
     sending = np.floor(rows["t"] * 97.0 + 1e-9)
     rows["q_des"] = rows["q_des"][np.searchsorted(sending, sending)]
     log = read_log(npz(tmp_path / "log.npz", q_des=rows["q_des"]))
-    assert jitters(log)
-    even = evened(log).t_cmd
+    assert has_jitter(log)
+    even = restore_even_clock(log).t_cmd
     assert len(even) == len(np.unique(sending))
     assert np.abs(np.diff(even)[2:-2] - 1.0 / 97.0).max() < 5e-4
     assert 0.0 < (even - np.unique(sending) / 97.0)[2:-2].mean() < 0.002

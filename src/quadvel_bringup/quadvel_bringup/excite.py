@@ -24,7 +24,7 @@ from quadvel_description.state import JointCommand, RobotState
 from quadvel_eval.output import output_file, replacing
 from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
-from quadvel_sysid.excitation import EXCITATIONS, PERIOD, Excitation, propose, within_torque
+from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
 
 from .exclusivity import ensure_alone
 from .node_output import PrefixedOutput
@@ -64,7 +64,7 @@ class Player:
         self._kp = excitation.kp if kp is None else kp
         self._kd = excitation.kd if kd is None else kd
         in_the_air = excitation.hung if hung is None else hung
-        self._support = np.zeros_like(self._targets) if in_the_air else excitation.support()
+        self._support = np.zeros_like(self._targets) if in_the_air else excitation.support_torque()
         self._begin: RobotState | None = None
         self._last = 0.0
         self.total = RAMP + excitation.seconds
@@ -91,7 +91,7 @@ class Player:
         if self.done:
             return JointCommand.damping(tick=state.tick)
         target, tau = self._wanted(self._begin.q)
-        target = within_torque(target, state.q, state.dq, self._kp, self._kd, tau)
+        target = limit_torque(target, state.q, state.dq, self._kp, self._kd, tau)
         return JointCommand(
             q=target, tau=tau, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick
         )
@@ -102,7 +102,7 @@ class Player:
             s = self.elapsed / RAMP
             share = s * s * (3.0 - 2.0 * s)
             return start + share * (self._targets[0] - start), share * self._support[0]
-        row = min(int((self.elapsed - RAMP) / PERIOD + 0.5), len(self._targets) - 1)
+        row = min(int((self.elapsed - RAMP) / PERIOD_S + 0.5), len(self._targets) - 1)
         return self._targets[row], self._support[row]
 
 

@@ -1,10 +1,11 @@
-"""The acceleration of joints whose speeds are noisy, sharp where a command comes in.
+"""Accelerations of joints from noisy speeds, sharp where a command arrives.
 
-A slope of dq over some milliseconds smears what a command makes jump: at once the torque, and with it ddq. How far it jumps
-the speeds tell themselves. With `come` the integral of q_des as it acts, D a slope over rows and B the answer (rad/s^2 of each
-joint for 1 rad of each command) that makes bends of dq out of bends of `come`,
+A slope of dq over some milliseconds blurs the steps that a command causes in the torque, and so
+in ddq. The size of these steps follows from the speeds themselves. Let s be the integral of q_des
+as it acts, D the slope over a window of rows, and B the response (rad/s^2 of each joint for 1 rad
+of each command) that maps changes of slope of s to changes of slope of dq. Then
 
-    ddq = D dq + B (q_des - D come).
+    ddq = D dq + B (q_des - D s).
 """
 
 from __future__ import annotations
@@ -14,17 +15,31 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-HALF_WIDTHS = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
-"""By signal: the slope is taken over so long to either side, s; `ddq` is left smeared, for torques that rise slowly"""
+HALF_WIDTHS_S = {"ddq": 0.002, "ddq_sharp": 0.002, "ddq_smooth": 0.008}
+"""s to either side over which the slope is computed, by signal; `ddq` stays blurred, for torques
+that rise slowly.
+"""
 
-_BEND = 0.002
-"""Bends are differences of slopes over so long before and after, s"""
+_BEND_S = 0.002
+"""s before and after a row; the difference of the two slopes is the change of slope."""
 
 
-def lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
-    """Level at and slope of the line through `values` (N, J) at most `half_width` s off, near ones counting more; by rows."""
+def local_lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
+    """Fit a weighted line to the rows around each row.
+
+    Args:
+        t: (N,) times, s.
+        values: (N, J) signal.
+        half_width: Half width of the window, s, at least one row; weights fall to 0 as 1 - x^2.
+
+    Returns:
+        (N, J) value and (N, J) slope of the line at each row.
+    """
     n, period = len(t), float(np.median(np.diff(t)))
     wide = max(half_width, period)
+    # Weighted least squares on x = t_k - t_n, y = v_k - v_n with moments S_p = sum w x^p:
+    #   [S_0 S_1] [level]   [sum w y  ]
+    #   [S_1 S_2] [slope] = [sum w x y].
     moments = np.zeros((3, n))
     sums = np.zeros((2, *values.shape))
     for k in range(-round(wide / period), round(wide / period) + 1):
@@ -41,23 +56,46 @@ def lines(t: Array, values: Array, half_width: float) -> tuple[Array, Array]:
     return values + square * sums[0] - late * sums[1], one * sums[1] - late * sums[0]
 
 
-def slope(t: Array, values: Array, half_width: float) -> Array:
-    """The slope of `lines`."""
-    return lines(t, values, half_width)[1]
+def local_slope(t: Array, values: Array, half_width: float) -> Array:
+    """Compute the slope of `local_lines`.
+
+    Args:
+        t: (N,) times, s.
+        values: (N, J) signal.
+        half_width: Half width of the window, s.
+
+    Returns:
+        (N, J) slope, units of `values` per second.
+    """
+    return local_lines(t, values, half_width)[1]
 
 
-def _bend(t: Array, values: Array) -> Array:
-    """Slope of `values` (N, J) after each row less the one before; (N - 2 reach, J)."""
-    reach = max(1, round(_BEND / float(np.median(np.diff(t)))))
+def _slope_change(t: Array, values: Array) -> Array:
+    """Slope of `values` (N, J) after each row minus the slope before, (N - 2 reach, J)."""
+    reach = max(1, round(_BEND_S / float(np.median(np.diff(t)))))
     steps: Array = (values[reach:] - values[:-reach]) / (t[reach:] - t[:-reach])[:, None]
     bend: Array = steps[reach:] - steps[:-reach]
     return bend
 
 
-def smooth_part(name: str, t: Array, dq: Array, slope_of_dq: Array, come: Array) -> tuple[Array, Array]:
-    """Of ddq (N, J), as `name` says, what is left without B q_des, D dq - B D come, and B (J, J), transposed."""
-    half_width, cause, outcome = HALF_WIDTHS[name], _bend(t, come), _bend(t, dq)
+def split_acceleration(
+    name: str, t: Array, dq: Array, slope_of_dq: Array, acting: Array
+) -> tuple[Array, Array]:
+    """Split an acceleration into a smooth part and the response to commands.
+
+    Args:
+        name: `ddq_sharp` or `ddq_smooth`; selects the half width.
+        t: (N,) times, s.
+        dq: (N, J) speeds, rad/s.
+        slope_of_dq: (N, J) slope D dq, rad/s^2.
+        acting: (N, J) integral s of q_des as it acts, rad s.
+
+    Returns:
+        D dq - B D s (N, J), rad/s^2, and B transposed (J, J), 1/s^2.
+    """
+    # B from changes of slope: (D_after - D_before) dq = B (D_after - D_before) s, in least squares.
+    half_width, cause, outcome = HALF_WIDTHS_S[name], _slope_change(t, acting), _slope_change(t, dq)
     answer: Array = np.asarray(
         np.linalg.lstsq(cause.T @ cause, cause.T @ outcome, rcond=1e-6)[0], dtype=float
     )
-    return slope_of_dq - slope(t, come, half_width) @ answer, answer
+    return slope_of_dq - local_slope(t, acting, half_width) @ answer, answer

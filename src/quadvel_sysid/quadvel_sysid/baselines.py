@@ -1,6 +1,7 @@
-"""What needs no actuator model: a PD law of each joint, and a linear filter of its signals. A named model has to beat both.
+"""Baselines without an actuator model, which a named model has to beat.
 
-Both are fitted to the rows that a model is fitted to, and judged on the rows that it is judged on.
+They are a PD law of each joint and a linear filter of its signals. Both are fitted to the rows
+that a model is fitted to, and evaluated on the same held-out rows.
 """
 
 from __future__ import annotations
@@ -11,69 +12,100 @@ import numpy as np
 
 from .logs.log import Array, Bools, Log
 
-SPAN = 0.016
-"""s of the past that the filter sees"""
-STEP = 0.001
-"""s between the instants that it sees, a row of the log at least; and between the delays of the PD law"""
-LONGEST = 0.02
-"""s, delay of the PD law"""
-RIDGE = 1e-4
-"""Penalty on the weights of signals of unit variance, in times the number of rows"""
+FILTER_SPAN_S = 0.016
+"""s of the past that the filter uses."""
+LAG_STEP_S = 0.001
+"""s between the filter's taps, at least one row of the log, and between the delays of the PD law."""
+MAX_DELAY_S = 0.02
+"""s; longest delay of the PD law."""
+RIDGE_PENALTY = 1e-4
+"""Ridge penalty on the weights of signals of unit variance, times the number of rows."""
 
 
-def baselines(logs: Sequence[Log], fitted: Bools, judged: Bools) -> dict[str, dict[str, float | None]]:
-    """Held-out mean squared errors (N^2 m^2) of a PD law of each joint, and of a ridge regression over SPAN.
+def baseline_errors(logs: Sequence[Log], fitted: Bools, heldout: Bools) -> dict[str, dict[str, float | None]]:
+    """Compute the held-out errors of the baselines.
 
-    `fitted` and `judged` (N, J) are the rows of all logs, one after the other, as wide as their joints.
+    Args:
+        logs: The logs, one after the other.
+        fitted: (N, J) rows of all logs that are fitted.
+        heldout: (N, J) rows that are held out.
+
+    Returns:
+        For `joint_pd` and `ridge`: `heldout_mse` (N^2 m^2), and `heldout_explained`, the share of
+        the torque's variance.
     """
     squares = {"joint_pd": 0.0, "ridge": 0.0}
     torques = [np.asarray(log.without_feed_forward().tau, dtype=float) for log in logs]
     for j in range(fitted.shape[1]):
         tau = np.concatenate([torque[:, j] for torque in torques])
-        fit, judge = fitted[:, j], judged[:, j]
-        laws = [_together(logs, j, (delay,), (0.0,)) for delay in np.arange(0.0, LONGEST + STEP / 2, STEP)]
+        fit, reported = fitted[:, j], heldout[:, j]
+        laws = [
+            _regressors(logs, j, (delay,), (0.0,))
+            for delay in np.arange(0.0, MAX_DELAY_S + LAG_STEP_S / 2, LAG_STEP_S)
+        ]
         best = min(
-            (_fitted(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
+            (_residual(law, tau, fit, 0.0) for law in laws), key=lambda one: float(np.mean(one[fit] ** 2))
         )
-        squares["joint_pd"] += float(np.sum(best[judge] ** 2))
-        step = max(STEP, float(np.median([log.period for log in logs])))
-        past = tuple(step * np.arange(max(1, round(SPAN / step)) + 1))
-        miss = _fitted(_together(logs, j, past, past), tau, fit, RIDGE)
-        squares["ridge"] += float(np.sum(miss[judge] ** 2))
-    count = max(int(judged.sum()), 1)
-    variance = torque_variance(torques_of(logs), judged)
+        squares["joint_pd"] += float(np.sum(best[reported] ** 2))
+        step = max(LAG_STEP_S, float(np.median([log.period for log in logs])))
+        past = tuple(step * np.arange(max(1, round(FILTER_SPAN_S / step)) + 1))
+        miss = _residual(_regressors(logs, j, past, past), tau, fit, RIDGE_PENALTY)
+        squares["ridge"] += float(np.sum(miss[reported] ** 2))
+    count = max(int(heldout.sum()), 1)
+    variance = torque_variance(measured_torque(logs), heldout)
     return {
-        name: {"heldout_mse": total / count, "heldout_explained": explained(total / count, variance)}
+        name: {"heldout_mse": total / count, "heldout_explained": explained_share(total / count, variance)}
         for name, total in squares.items()
     }
 
 
-def torques_of(logs: Sequence[Log]) -> Array:
-    """Measured torque of all logs (N, J), N m, one after the other."""
+def measured_torque(logs: Sequence[Log]) -> Array:
+    """Concatenate the measured torque of logs.
+
+    Args:
+        logs: The logs.
+
+    Returns:
+        (N, J) torque, N m.
+    """
     return np.concatenate([np.asarray(log.tau, dtype=float) for log in logs])
 
 
 def torque_variance(torque: Array, rows: Bools) -> float:
-    """Variance (N^2 m^2) of the `torque` (N, J) about each joint's mean, over the `rows` (N, J)."""
+    """Compute the variance of the torque about each joint's mean.
+
+    Args:
+        torque: (N, J) torque, N m.
+        rows: (N, J) rows that count.
+
+    Returns:
+        The variance over all joints, N^2 m^2.
+    """
     count = np.maximum(rows.sum(axis=0), 1)
     centred = torque - np.sum(torque, axis=0, where=rows) / count
     return float(np.sum(centred**2, where=rows) / count.sum())
 
 
-def explained(mse: float, variance: float) -> float | None:
-    """Share of the torque's `variance` that a mean squared error of `mse` leaves nothing of, below 0 where it is larger.
+def explained_share(mse: float, variance: float) -> float | None:
+    """Compute the share of the torque's variance that a model explains.
 
-    None of a torque that does not vary.
+    Args:
+        mse: Mean squared error of the model, N^2 m^2.
+        variance: Variance of the torque, N^2 m^2.
+
+    Returns:
+        1 - mse / variance, negative if the error is larger; None for a constant torque.
     """
     return 1.0 - mse / variance if variance > 0.0 else None
 
 
-def _together(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
-    """Commands, angles and speeds of joint `j`, so many seconds ago, and 1, (N, K)."""
-    return np.concatenate([np.stack([*_signals(log, j, commands, states)], axis=1) for log in logs])
+def _regressors(logs: Sequence[Log], j: int, commands: Sequence[float], states: Sequence[float]) -> Array:
+    """Regressors (N, K) of joint `j`: commands, angles and speeds at the given delays (s), and 1."""
+    return np.concatenate([np.stack([*_log_regressors(log, j, commands, states)], axis=1) for log in logs])
 
 
-def _signals(log: Log, j: int, commands: Sequence[float], states: Sequence[float]) -> Iterator[Array]:
+def _log_regressors(log: Log, j: int, commands: Sequence[float], states: Sequence[float]) -> Iterator[Array]:
+    """Yield the regressors of one log."""
     for late in commands:
         yield np.asarray(log.q_des[log.command_rows(log.t - late), j], dtype=float)
     for values in (log.q, log.dq):
@@ -82,8 +114,9 @@ def _signals(log: Log, j: int, commands: Sequence[float], states: Sequence[float
     yield np.ones(len(log.t))
 
 
-def _fitted(signals: Array, tau: Array, rows: Bools, penalty: float) -> Array:
-    """What is left of the torque (N,) with weights fitted to `rows`, the last one, of 1, without a penalty."""
+def _residual(signals: Array, tau: Array, rows: Bools, penalty: float) -> Array:
+    """Residual (N,) of a ridge regression fitted to `rows`; the offset has no penalty."""
+    # Ridge regression on standardised signals: (X^T X + penalty N I) w = X^T (tau - mean).
     x = signals[rows, :-1]
     centre, size = x.mean(axis=0), x.std(axis=0) + 1e-12
     x = (x - centre) / size

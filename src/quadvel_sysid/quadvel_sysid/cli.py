@@ -1,4 +1,4 @@
-"""The command `quadvel identify`, which `ros2 run quadvel_sysid identify` is too: files in, report out."""
+"""The command `quadvel identify`, also `ros2 run quadvel_sysid identify`: logs in, report out."""
 
 from __future__ import annotations
 
@@ -15,42 +15,48 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from threadpoolctl import threadpool_limits
 from typer.core import TyperCommand
+from typing_extensions import override
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import SPAN
+from .baselines import FILTER_SPAN_S
 from .logs.checks import Inspection
 from .logs.columns import ColumnMap
 from .logs.dataset import Dataset
 from .logs.read_log import read_log
 from .logs.recordings import Topics
-from .memory import give_large_arrays_back, keep_freed_arrays
+from .memory import keep_freed_arrays, return_large_arrays
 
 if TYPE_CHECKING:
     from .identification_data import IdentificationData
-    from .identification_data import Progress as Tell
+    from .identification_data import Progress as ProgressCallback
 
-SEVERAL = ("--holdout", "--joints")
-CORES = 2
-"""Unless more are asked for: each takes some 200 MB"""
-_LONG = 1_000_000
-"""Values of q in all logs, from which memory counts for more than time: ten minutes of twelve joints take less than 1 GB"""
+MULTI_VALUE_OPTIONS = ("--holdout", "--joints")
+"""Options that take several values after one name."""
+DEFAULT_CORES = 2
+"""Worker processes unless `--cores` asks for more; each one takes about 200 MB."""
+_LONG_LOG_VALUES = 1_000_000
+"""Values of q in all logs, from which low memory matters more than time: ten minutes of twelve
+joints take less than 1 GB.
+"""
 STYLE = {"note": "dim", "warning": "yellow", "refusal": "red"}
+"""Style of each kind of finding in the terminal."""
 
 
 class _SeveralValues(TyperCommand):
-    """An option in SEVERAL takes all values up to the next option: a log named after --holdout is never fitted."""
+    """A command whose `MULTI_VALUE_OPTIONS` take all values up to the next option."""
 
+    @override
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        return super().parse_args(ctx, list(_repeated(args)))
+        return super().parse_args(ctx, list(_repeat_options(args)))
 
 
-def _repeated(arguments: Iterable[str]) -> Iterable[str]:
-    """`--holdout a b` as click reads it: `--holdout a --holdout b`."""
+def _repeat_options(arguments: Iterable[str]) -> Iterable[str]:
+    """Rewrite `--holdout a b` as click parses it: `--holdout a --holdout b`."""
     option = ""
     for argument in arguments:
         if argument.startswith("--"):
-            option = argument if argument in SEVERAL else ""
+            option = argument if argument in MULTI_VALUE_OPTIONS else ""
             if not option:
                 yield argument
         elif option:
@@ -76,7 +82,9 @@ def identify(
     holdout: Annotated[
         list[Path] | None,
         typer.Option(
-            metavar="<log...>", help="Logs to judge on.", show_default="a fifth of each log, in blocks"
+            metavar="<log...>",
+            help="Logs that are held out for evaluation.",
+            show_default="a fifth of each log, in blocks",
         ),
     ] = None,
     base: Annotated[
@@ -100,7 +108,7 @@ def identify(
         Path | None,
         typer.Option(
             metavar="<file>",
-            help="YAML file that says what the logs call the fields.",
+            help="YAML file that maps the names of the logs to fields.",
             show_default="names as in docs/identification.md",
         ),
     ] = None,
@@ -124,34 +132,31 @@ def identify(
     ] = None,
     cores: Annotated[
         int | None,
-        typer.Option(
-            min=1, help="How many share the work.", show_default=f"those there are, {CORES} at most"
-        ),
+        typer.Option(min=1, help="Worker processes.", show_default=f"min({DEFAULT_CORES}, cores)"),
     ] = None,
 ) -> None:
     """Find what the actuator model lacks, from measured logs of joints.
 
-    First it says what it sees in the data. Then it fits delays and gains of the plain model, looks for what is
-    left of the measured torque, adds the effects that explain it on data which was not fitted, and writes
-    the error before and after.
+    It checks the logs and prints what it found. Then it fits delays and gains of the plain model, searches for
+    effects that explain the remaining torque on data that was not fitted, and writes the error before and after.
 
     \b
-    For example, a recording of the stack while it walks, of which blocks are kept aside to judge on:
+    For example, a recording of the stack while it walks, of which blocks are held out for evaluation:
       quadvel record low_state low_cmd --out walk.mcap --seconds 30
       quadvel identify walk.mcap --out out/identify
-    Two logs of another robot; fit one, judge on the other, and replay the commands on its legs:
+    Two logs of another robot; fit one, evaluate on the other, and replay the commands on its legs:
       quadvel identify walk_1.npz --holdout walk_2.npz --gains 35 0.5 --robot go2 --out out/identify
-    Some joints of it:
+    Some of its joints:
       quadvel identify walk_1.npz --joints FR_hip FR_thigh FR_calf --out out/identify
 
     \b
     An NPZ file holds, in SI units, N samples of J joints:
       t (N,)   q, dq (N, J)   q_des (N, J), or t_cmd (M,) with q_des_cmd (M, J)
       and if known: tau, kp, kd, dq_des, tau_ff, temperature, voltage, joint_names, valid
-    A CSV file has the same as columns: t, q/FR_hip_joint, dq/FR_hip_joint, ...
+    A CSV file has the same fields as columns: t, q/FR_hip_joint, dq/FR_hip_joint, ...
     Other names, units and signs, in a map file: t: {from: timestamp, scale: 1.0e-6}
 
-    What is in the folder besides the three files stays. Ctrl-C leaves the folder as it was.
+    Other files in the folder are kept. Ctrl-C leaves the folder unchanged.
     """
     messages = Console(stderr=True)
     topics = Topics(state_topic, command_topic)
@@ -175,39 +180,40 @@ def _run(
     cores: int | None,
     messages: Console,
 ) -> None:
+    """Read the logs, identify the model, write the report and print a summary."""
     _check_folder(out)
     names = ColumnMap() if columns is None else ColumnMap.load(columns)
-    give_large_arrays_back()
+    return_large_arrays()
     parameters = ActuatorParameters.default() if base is None else ActuatorParameters.load(base)
     parts = (BarColumn(), TaskProgressColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
     with Progress(*parts, console=messages, transient=True) as bar:
         task = bar.add_task("reading", total=1.0)
 
-        def tell(share: float, text: str) -> None:
+        def on_progress(share: float, text: str) -> None:
             bar.update(task, completed=share, description=text)
 
-        material, long = _material(logs, holdout, joints, names, topics, gains, messages, tell)
+        data, long = _load_data(logs, holdout, joints, names, topics, gains, messages, on_progress)
         if not long:
             keep_freed_arrays()
         from .identify import identified
 
-        cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
-        with threadpool_limits(1):  # of each copy of this process: they share the cores
-            found = identified(material, parameters, cores, tell, robot)
+        cores = cores or (1 if long else min(DEFAULT_CORES, len(os.sched_getaffinity(0))))
+        with threadpool_limits(1):  # of each worker process: they share the cores
+            found = identified(data, parameters, cores, on_progress, robot)
     from .report.report import write
 
     write(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
-    console.print(errors(found.report), soft_wrap=True, highlight=False)
+    console.print(error_line(found.report), soft_wrap=True, highlight=False)
     if "replay" in found.report:
-        console.print(replays(found.report["replay"]), soft_wrap=True, highlight=False)
+        console.print(replay_line(found.report["replay"]), soft_wrap=True, highlight=False)
     for text in found.report["warnings"]:
         messages.print(escape(f"warning: {text}"), style=STYLE["warning"], soft_wrap=True, highlight=False)
     console.print(f"written: {out}/report.html, report.json, actuator.yaml", soft_wrap=True, highlight=False)
 
 
-def _material(
+def _load_data(
     logs: Sequence[Path],
     holdout: Sequence[Path],
     joints: Sequence[str] | None,
@@ -215,43 +221,56 @@ def _material(
     topics: Topics,
     gains: tuple[float, float] | None,
     messages: Console,
-    tell: Tell,
+    on_progress: ProgressCallback,
 ) -> tuple[IdentificationData, bool]:
-    """What of the files is computed on, and whether they hold long logs, which are let go of here."""
+    """Read, check and prepare the logs; return whether they are long, and release them if so."""
     with threadpool_limits(1):
         fitted, heldout = (
             [read_log(one, joints, names, topics) for one in paths] for paths in (logs, holdout)
         )
-        data = Dataset.of(fitted, heldout, gains, lambda one: say(one, messages))
-        long = sum(log.q.size for log in data.logs) >= _LONG
-        from .identification_data import (
-            prepare,
-        )  # what is wrong with the files shows before the engine is loaded
+        data = Dataset.inspect_all(fitted, heldout, gains, lambda one: print_findings(one, messages))
+        long = sum(log.q.size for log in data.logs) >= _LONG_LOG_VALUES
+        # Imported here, so that errors in the files appear before the engine is loaded.
+        from .identification_data import prepare
 
-        return prepare(data, progress=tell), long
+        return prepare(data, progress=on_progress), long
 
 
-def errors(report: Mapping[str, Any]) -> str:
-    """The held-out errors in a line with the shares that they explain, those of what needs no model among them."""
+def error_line(report: Mapping[str, Any]) -> str:
+    """Format the held-out errors of all models, baselines included, in one line.
+
+    Args:
+        report: Content of report.json.
+
+    Returns:
+        The line, with the share of the torque's variance that each model explains.
+    """
     entries = (
         ("PD as commanded", report["pd"]),
         ("a PD law of each joint", report["baselines"]["joint_pd"]),
-        (f"a linear filter over {1e3 * SPAN:.0f} ms", report["baselines"]["ridge"]),
+        (f"a linear filter over {1e3 * FILTER_SPAN_S:.0f} ms", report["baselines"]["ridge"]),
         ("plain EAM", report["before"]),
         ("corrected model", report["after"]),
     )
-    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_share(entry)}" for name, entry in entries)
+    each = ", ".join(f"{name} {entry['heldout_mse']:.3g}{_explained_text(entry)}" for name, entry in entries)
     return f"held-out error, N^2 m^2: {each} (noise {report['noise_floor']:.3g})"
 
 
-def _share(entry: Mapping[str, Any]) -> str:
-    """How much of the torque's variance an account explains; nothing where the torque does not vary."""
+def _explained_text(entry: Mapping[str, Any]) -> str:
+    """Share of the torque's variance that a model explains, in parentheses, or nothing."""
     found = entry.get("heldout_explained")
     return "" if found is None else f" (explains {100.0 * found:.3g} % of the variance)"
 
 
-def replays(replay: Mapping[str, Any]) -> str:
-    """How far the legs leave their measured track, in a line."""
+def replay_line(replay: Mapping[str, Any]) -> str:
+    """Format the deviations of the replayed legs from their measured motion in one line.
+
+    Args:
+        replay: The entry `replay` of report.json.
+
+    Returns:
+        The line.
+    """
     before, after = replay["before"], replay["after"]
     return (
         f"replayed over {1e3 * replay['stretch_s']:.0f} ms, root mean square: angles off by {before['q_rms_rad']:.3g} rad "
@@ -259,8 +278,13 @@ def replays(replay: Mapping[str, Any]) -> str:
     )
 
 
-def say(inspection: Inspection, messages: Console) -> None:
-    """Print what was found in a log."""
+def print_findings(inspection: Inspection, messages: Console) -> None:
+    """Print the findings about a log.
+
+    Args:
+        inspection: The findings.
+        messages: Console to print to.
+    """
     messages.print(escape(inspection.log.name), style="bold", soft_wrap=True, highlight=False)
     for finding in inspection.findings:
         line = f"  {finding.kind:8} {finding.text}"
@@ -268,18 +292,18 @@ def say(inspection: Inspection, messages: Console) -> None:
 
 
 def _check_folder(out: Path) -> None:
-    """Raises OSError where `out` cannot become a folder to write to, which is tried; nothing is left of that."""
+    """Raise OSError if `out` cannot become a writable folder; the test file is deleted."""
     there = next(folder for folder in (out, *out.absolute().parents) if folder.exists())
     if not there.is_dir():
         raise NotADirectoryError(f"{out}: is a file or lies below one, expected a folder")
     try:
         TemporaryFile(dir=there).close()
     except OSError as error:
-        raise type(error)(f"{out}: the folder can't be written to: {error.strerror}") from None
+        raise type(error)(f"{out}: the folder is not writable: {error.strerror}") from None
 
 
 def main() -> None:
-    """A wrong argument or file ends in one sentence and exit code 2, without a traceback."""
+    """Run the command; a wrong argument or file ends it with one sentence and exit code 2."""
     try:
         app()
     except (OSError, ValueError) as error:

@@ -13,7 +13,7 @@ import attrs
 import numpy as np
 
 from .log_signals import LogSignals
-from .signals import Array, Bools, Samples, scattered
+from .signals import Array, Bools, Samples, scattered_rows
 
 LONGEST_INPUT, LONGEST_OUTPUT = 0.020, 0.006  # s
 WINDOWS = (0.0, 0.001)
@@ -57,7 +57,7 @@ def pd_torque(
 def fit_eam(samples: Samples, rows: Bools, windows: Sequence[float] = WINDOWS) -> Eam:
     """Fit the EAM to `rows` (N, J). The drive's step is the first of `windows` (s) unless a later one fits better."""
     few = np.zeros_like(rows)
-    some = scattered(len(rows), max(1, len(rows) // _ENOUGH))
+    some = scattered_rows(len(rows), max(1, len(rows) // _ENOUGH))
     few[some] = rows[some]
     best, *others = (_fitted(samples, few, rows, window) for window in windows)
     for eam in others:
@@ -108,14 +108,14 @@ class _Sums:
             offset += len(one.t)
 
     def _add(self, one: LogSignals, t: Array, tau: Array, keep: Array) -> None:
-        packet = one.in_force(t - self._at)
+        packet = one.command_rows(t - self._at)
         kp, kd = (one.gains[name][packet] * keep for name in ("kp", "kd"))
         c, d, f = (
-            _stacked(one.command(name, t - late, self._window) * by for late in self._totals)
+            _stacked(one.command_at(name, t - late, self._window) * by for late in self._totals)
             for name, by in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
         )
         q, v = (
-            _stacked(one.state(name, t - late) * by for late in self._outputs)
+            _stacked(one.state_at(name, t - late) * by for late in self._outputs)
             for name, by in (("q", kp), ("dq", kd))
         )
         z = (tau * keep).ravel() - f

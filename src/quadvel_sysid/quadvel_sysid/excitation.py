@@ -1,8 +1,8 @@
-"""Motions that make the joints show what they are: joint targets over time, and which one to record next.
+"""Excitation motions for identification, and proposals which one to record next.
 
-Pure arrays; who sends them and records the answer is `quadvel excite`. Every excitation gives its targets on the
-grid of `PERIOD`, held to the joints' range and speed; the torque is bounded where the state is known, by
-`within_torque`.
+An excitation is an array of joint targets every `PERIOD_S`, within the joints' range and speed.
+`quadvel excite` sends them and records the response. `limit_torque` bounds the torque where the
+state is known.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import attrs
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import override
 
 from quadvel_description import robot
 from quadvel_description.command_range import held
@@ -21,23 +22,31 @@ from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinemat
 
 Array = NDArray[np.float64]
 
-PERIOD = 0.001  # s, between two commands
-TORQUE_SHARE = 0.7  # of the torque limit, that a target may ask for
+PERIOD_S = 0.001
+"""s between two targets."""
+MAX_TORQUE_SHARE = 0.7
+"""Share of the torque limit that a target may request."""
 _SIDE = np.array([robot.LEFT[leg] for leg in robot.LEGS], float)
-_HEIGHT = -0.4  # m, of the feet below the hips, standing
-_LEG_PHASE = np.array([0.0, 2.0, 2.0, 0.0])  # k_{i,0} of Eq. 9: diagonal legs together
+_FOOT_HEIGHT_M = -0.4
+"""m; height of the feet relative to the hips, standing."""
+_LEG_PHASE = np.array([0.0, 2.0, 2.0, 0.0])
+"""Phase k_{i,0} of each leg in Eq. 9: diagonal legs move together."""
 
 
-def _seconds(default: float) -> Any:
+def _duration_field(default: float) -> Any:
+    """An attrs field for a duration, s."""
     return attrs.field(default=default, validator=[attrs.validators.gt(0.0), attrs.validators.lt(3600.0)])
 
 
 @attrs.frozen
 class Excitation(ABC):
-    """A motion of `seconds`.
+    """A motion of all joints for a given duration.
 
-    hung: to be done with the robot hung, its feet in the air. kp (N m/rad), kd (N m s/rad): the gains it is made
-    for, the policy's own unless a motion says why it takes others.
+    Attributes:
+        hung: Whether the robot has to be suspended, with its feet in the air.
+        kp: Position gain that the motion is designed for, N m/rad.
+        kd: Speed gain that the motion is designed for, N m s/rad.
+        seconds: Duration, s.
     """
 
     hung: ClassVar[bool] = True
@@ -46,23 +55,43 @@ class Excitation(ABC):
     seconds: float
 
     def targets(self) -> Array:
-        """Joint targets within the limits, (n, 12) rad, one row each PERIOD."""
-        return within_speed(held(self._motion(self._times())))
+        """Compute the joint targets, within range and speed limits.
 
-    def support(self) -> Array:
-        """Joint torque (n, 12) N m that carries the robot on its feet, a row each PERIOD; zero for motions in the air."""
+        Returns:
+            (n, 12) targets, rad, one row every `PERIOD_S`.
+        """
+        return limit_speed(held(self._joint_targets(self._times())))
+
+    def support_torque(self) -> Array:
+        """Compute the feed-forward torque that carries the robot on its feet.
+
+        Returns:
+            (n, 12) torque, N m, one row every `PERIOD_S`; 0 for motions in the air.
+        """
         return np.zeros((len(self._times()), 12))
 
     def _times(self) -> Array:
-        return PERIOD * np.arange(round(self.seconds / PERIOD), dtype=np.float64)
+        """Times (n,) of the targets, s."""
+        return PERIOD_S * np.arange(round(self.seconds / PERIOD_S), dtype=np.float64)
 
     @abstractmethod
-    def _motion(self, t: Array) -> Array:
-        """Joint targets (n, 12) rad at the times (n,)."""
+    def _joint_targets(self, t: Array) -> Array:
+        """Joint targets (n, 12) at the times (n,), rad, before limits."""
 
 
-def lift(k: ArrayLike) -> Array:
-    """Share of the lifting height at the phase k (1), Eq. 9: up over [0, 1), down over [1, 2), else on the ground."""
+def lift_profile(k: ArrayLike) -> Array:
+    """Compute the lifting profile of a foot, Eq. 9 of the paper.
+
+        h(k) = -2 k^3 + 3 k^2              0 <= k < 1 (up)
+        h(k) = 2 k^3 - 9 k^2 + 12 k - 4    1 <= k < 2 (down)
+        h(k) = 0                           2 <= k < 4 (on the ground)
+
+    Args:
+        k: Phase, of any shape.
+
+    Returns:
+        Share of the lifting height, same shape.
+    """
     k = np.asarray(k, float)
     up, down = -2 * k**3 + 3 * k**2, 2 * k**3 - 9 * k**2 + 12 * k - 4
     shape: Array = np.where(k < 1.0, up, np.where(k < 2.0, down, 0.0))
@@ -71,12 +100,12 @@ def lift(k: ArrayLike) -> Array:
 
 @attrs.frozen
 class OnGround(Excitation):
-    """Diagonal feet lifted in turn, straight up, from a stand on the ground.
+    """Base of motions on the ground: diagonal feet are lifted in turn, straight up.
 
-    Two feet carry the robot at any time, and it tips about the line between them until the next two come down. These
-    right it only where they do not give way: with the policy's gains the legs sag by 0.1 m, and the trunk tips over
-    within 3 s. So the gains are those with which this robot stands up, and the legs carry the weight by
-    feed-forward torque, so that the feet are where Eq. 9 has them.
+    Two feet carry the robot at any time, and it tips about the line between them until the next
+    two touch the ground. The motion stays upright only with stiff legs: with the policy's gains
+    they sag by 0.1 m and the trunk tips over within 3 s. The gains are therefore those with which
+    the robot stands up. Feed-forward torque carries the weight, so that the feet follow Eq. 9.
     """
 
     hung: ClassVar[bool] = False
@@ -84,83 +113,109 @@ class OnGround(Excitation):
     kd: ClassVar[float] = 4.0
 
     @abstractmethod
-    def _lifting(self, t: Array) -> tuple[Array, Array]:
-        """At the times (n,): the share of its height that each foot is lifted by (n, 4), and that height (n,) m."""
+    def _foot_lift(self, t: Array) -> tuple[Array, Array]:
+        """Share of its height that each foot is lifted by (n, 4), and the height (n,), m."""
 
-    def _motion(self, t: Array) -> Array:
-        share, height = self._lifting(t)
+    def _joint_targets(self, t: Array) -> Array:
+        share, height = self._foot_lift(t)
         feet = np.empty((len(t), 4, 3))
         feet[...] = HIPS
         feet[..., 1] += robot.THIGH_OFFSET * _SIDE
-        feet[..., 2] = _HEIGHT + height[:, None] * share
+        feet[..., 2] = _FOOT_HEIGHT_M + height[:, None] * share
         return inverse_kinematics(feet)
 
-    def support(self) -> Array:
-        """A foot carries the more of the weight the less it is lifted."""
-        down = 1.0 - self._lifting(self._times())[0]
+    @override
+    def support_torque(self) -> Array:
+        # Virtual work: the foot force f_z = m g share gives the torque -J_z^T f_z. The share of a foot
+        # falls linearly with its lift.
+        down = 1.0 - self._foot_lift(self._times())[0]
         force = robot.MASS * robot.GRAVITY * down / down.sum(axis=1, keepdims=True)
-        jacobians = foot_jacobians(self._motion(self._times()))
+        jacobians = foot_jacobians(self._joint_targets(self._times()))
         return -(jacobians[:, :, 2] * force[..., None]).reshape(-1, 12)
 
 
 def _lift_of_feet(phase: Array) -> Array:
-    """Shares of the height (n, 4) at the common phase (n,)."""
-    return lift((phase[:, None] + _LEG_PHASE) % 4.0)
+    """Lifting shares (n, 4) of the feet at the common phase (n,)."""
+    return lift_profile((phase[:, None] + _LEG_PHASE) % 4.0)
 
 
 @attrs.frozen
 class FootLifting(OnGround):
-    """The paper's trajectory, Eq. 9: diagonal feet lifted in turn by `height` (m), phase `rate` (1/s)."""
+    """The paper's trajectory, Eq. 9: diagonal feet lifted in turn.
 
-    seconds: float = _seconds(5.0)
+    Attributes:
+        seconds: Duration, s.
+        rate: Phase rate, 1/s.
+        height: Lifting height, m.
+    """
+
+    seconds: float = _duration_field(5.0)
     rate: float = 8.0
     height: float = 0.1
 
-    def _lifting(self, t: Array) -> tuple[Array, Array]:
+    def _foot_lift(self, t: Array) -> tuple[Array, Array]:
         return _lift_of_feet(self.rate * t), np.full(len(t), self.height)
 
 
 @attrs.frozen
 class Sweep(OnGround):
-    """Foot lifting whose rate and height rise and fall: loads and speeds in many combinations."""
+    """Foot lifting with varying rate and height, which combines many loads and speeds.
 
-    seconds: float = _seconds(20.0)
-    rates: tuple[float, float] = (5.0, 9.0)  # 1/s
-    heights: tuple[float, float] = (0.03, 0.1)  # m
+    Attributes:
+        seconds: Duration, s.
+        rates: Lowest and highest phase rate, 1/s.
+        heights: Lowest and highest lifting height, m.
+    """
 
-    def _lifting(self, t: Array) -> tuple[Array, Array]:
-        rate = _between(self.rates, np.sin(2 * np.pi * 2 * t / self.seconds))
-        height = _between(self.heights, np.sin(2 * np.pi * 5 * t / self.seconds))
-        return _lift_of_feet(np.cumsum(rate) * PERIOD), height
+    seconds: float = _duration_field(20.0)
+    rates: tuple[float, float] = (5.0, 9.0)
+    heights: tuple[float, float] = (0.03, 0.1)
+
+    def _foot_lift(self, t: Array) -> tuple[Array, Array]:
+        rate = _sweep_between(self.rates, np.sin(2 * np.pi * 2 * t / self.seconds))
+        height = _sweep_between(self.heights, np.sin(2 * np.pi * 5 * t / self.seconds))
+        return _lift_of_feet(np.cumsum(rate) * PERIOD_S), height
 
 
 @attrs.frozen
 class Chirp(Excitation):
-    """All joints swing at once, each at its own pace, from slow to fast: lags, delays and inertias differ."""
+    """All joints swing at once with rising frequencies, which separates lags, delays and inertias.
 
-    seconds: float = _seconds(20.0)
-    frequencies: tuple[float, float] = (0.3, 20.0)  # Hz
-    amplitude: float = 0.35  # rad, less where the speed limit asks for it
+    Attributes:
+        seconds: Duration, s.
+        frequencies: First and last frequency, Hz; each joint has its own factor from 0.75 to
+            1.25.
+        amplitude: Amplitude, rad; less where the speed limit requires it.
+    """
 
-    def _motion(self, t: Array) -> Array:
+    seconds: float = _duration_field(20.0)
+    frequencies: tuple[float, float] = (0.3, 20.0)
+    amplitude: float = 0.35
+
+    def _joint_targets(self, t: Array) -> Array:
         low, high = self.frequencies
         growth = np.log(high / low) / self.seconds
         frequency = low * np.exp(growth * t)[:, None] * np.linspace(0.75, 1.25, 12)
         fastest = 0.5 * robot.VELOCITY_LIMIT / (2 * np.pi * frequency)
         swing = np.minimum(self.amplitude, fastest) * np.sin(
-            2 * np.pi * np.cumsum(frequency, axis=0) * PERIOD
+            2 * np.pi * np.cumsum(frequency, axis=0) * PERIOD_S
         )
-        return robot.NOMINAL_Q + _eased(t) * swing
+        return robot.NOMINAL_Q + _fade_in(t) * swing
 
 
 @attrs.frozen
 class Solo(Excitation):
-    """One joint swings at a time while the others hold still: what one joint does to another shows."""
+    """One joint swings at a time while the others hold still, which shows coupling between joints.
 
-    seconds: float = _seconds(36.0)
-    amplitude: float = 0.4  # rad
+    Attributes:
+        seconds: Duration of all twelve swings, s.
+        amplitude: Amplitude, rad.
+    """
 
-    def _motion(self, t: Array) -> Array:
+    seconds: float = _duration_field(36.0)
+    amplitude: float = 0.4
+
+    def _joint_targets(self, t: Array) -> Array:
         turn = self.seconds / 12
         targets = np.tile(robot.NOMINAL_Q, (len(t), 1))
         for joint in range(12):
@@ -173,21 +228,28 @@ class Solo(Excitation):
 
 @attrs.frozen
 class RandomSteps(Excitation):
-    """Steps of all sizes at random times: bounds of torque where they are large, play and deadband where small."""
+    """Steps of random size at random times, which show torque limits, backlash and deadband.
 
-    seconds: float = _seconds(20.0)
-    sizes: tuple[float, float] = (0.01, 0.6)  # rad, drawn evenly in the logarithm
-    holds: tuple[float, float] = (0.08, 0.5)  # s
+    Attributes:
+        seconds: Duration, s.
+        sizes: Smallest and largest step, rad; uniform in the logarithm.
+        holds: Shortest and longest time between steps, s.
+        seed: Seed of the random numbers.
+    """
+
+    seconds: float = _duration_field(20.0)
+    sizes: tuple[float, float] = (0.01, 0.6)
+    holds: tuple[float, float] = (0.08, 0.5)
     seed: int = 0
 
-    def _motion(self, t: Array) -> Array:
+    def _joint_targets(self, t: Array) -> Array:
         n = len(t)
         rng = np.random.default_rng(self.seed)
         targets = np.empty((n, 12))
         for joint in range(12):
             row, offset = 0, 0.0
             while row < n:
-                hold = round(rng.uniform(*self.holds) / PERIOD)
+                hold = round(rng.uniform(*self.holds) / PERIOD_S)
                 targets[row : row + hold, joint] = robot.NOMINAL_Q[joint] + offset
                 row += hold
                 size = np.exp(rng.uniform(*np.log(self.sizes)))
@@ -197,16 +259,22 @@ class RandomSteps(Excitation):
 
 @attrs.frozen
 class Creep(Excitation):
-    """Slow back and forth through a wide range: friction at standstill, cogging, springs, rubbing."""
+    """Slow triangle waves over a wide range, which show static friction, cogging and springs.
 
-    seconds: float = _seconds(40.0)
-    amplitude: float = 0.5  # rad
-    periods: tuple[float, float] = (4.0, 11.0)  # s, of the fastest and the slowest joint
+    Attributes:
+        seconds: Duration, s.
+        amplitude: Amplitude, rad.
+        periods: Period of the fastest and of the slowest joint, s.
+    """
 
-    def _motion(self, t: Array) -> Array:
+    seconds: float = _duration_field(40.0)
+    amplitude: float = 0.5
+    periods: tuple[float, float] = (4.0, 11.0)
+
+    def _joint_targets(self, t: Array) -> Array:
         period = np.linspace(*self.periods, 12)
         triangle = 2 * np.abs(2 * ((t[:, None] / period + 0.25) % 1.0) - 1.0) - 1.0
-        return robot.NOMINAL_Q - _eased(t) * self.amplitude * triangle
+        return robot.NOMINAL_Q - _fade_in(t) * self.amplitude * triangle
 
 
 EXCITATIONS: dict[str, Callable[..., Excitation]] = {
@@ -217,63 +285,91 @@ EXCITATIONS: dict[str, Callable[..., Excitation]] = {
     "creep": Creep,
     "solo": Solo,
 }
+"""Excitations by the name that `quadvel excite` takes."""
 
 
-def _between(bounds: tuple[float, float], wave: Array) -> Array:
+def _sweep_between(bounds: tuple[float, float], wave: Array) -> Array:
+    """Map a wave in [-1, 1] to the range between two bounds."""
     low, high = bounds
     return low + (high - low) * 0.5 * (1.0 + wave)
 
 
-def _eased(t: Array) -> Array:
-    """From 0 to 1 over the first second, (n, 1)."""
+def _fade_in(t: Array) -> Array:
+    """Smooth step from 0 to 1 over the first second, (n, 1)."""
     s = np.minimum(t, 1.0)[:, None]
     return s * s * (3.0 - 2.0 * s)
 
 
-def within_speed(targets: Array) -> Array:
-    """`targets` (n, 12) with steps stretched so that no target moves faster than its joint may."""
+def limit_speed(targets: Array) -> Array:
+    """Limit the speed of targets to the joints' velocity limits.
+
+    Args:
+        targets: (n, 12) targets, rad, one row every `PERIOD_S`.
+
+    Returns:
+        (n, 12) targets; a step that is too fast becomes a ramp.
+    """
     slowed = targets.copy()
-    reach = robot.VELOCITY_LIMIT * PERIOD
+    reach = robot.VELOCITY_LIMIT * PERIOD_S
     for row in range(1, len(slowed)):
         before = slowed[row - 1]
         slowed[row] = np.minimum(np.maximum(slowed[row], before - reach), before + reach)
     return slowed
 
 
-def within_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau: ArrayLike = 0.0) -> Array:
-    """`target` (12,) rad held to what asks for TORQUE_SHARE of the torque limit at the state q, dq (12,).
+def limit_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau: ArrayLike = 0.0) -> Array:
+    """Limit a target so that it requests at most `MAX_TORQUE_SHARE` of the torque limit.
 
-    tau: feed-forward torque (12,) N m that goes with it.
+    Solves |kp (target - q) - kd dq + tau| <= bound for the target.
+
+    Args:
+        target: (12,) target, rad.
+        q: (12,) measured angles, rad.
+        dq: (12,) measured speeds, rad/s.
+        kp: Position gain, N m/rad.
+        kd: Speed gain, N m s/rad.
+        tau: Feed-forward torque that is sent with it, N m.
+
+    Returns:
+        (12,) limited target, rad.
     """
-    bound = TORQUE_SHARE * robot.TORQUE_LIMIT
-    held = kd * dq - np.asarray(tau)
-    return np.clip(target, q + (held - bound) / kp, q + (held + bound) / kp)
+    bound = MAX_TORQUE_SHARE * robot.TORQUE_LIMIT
+    offset = kd * dq - np.asarray(tau)
+    return np.clip(target, q + (offset - bound) / kp, q + (offset + bound) / kp)
 
 
 @attrs.frozen
 class Proposal:
-    """What to record next, and what that would tell apart."""
+    """An excitation to record next, and what it would distinguish.
+
+    Attributes:
+        excitation: Key of `EXCITATIONS`.
+        seconds: Duration, s.
+        separates: Names of the effects, or descriptions of the residual, that it would
+            distinguish.
+        reason: Why this excitation distinguishes them.
+    """
 
     excitation: str
-    """a key of EXCITATIONS"""
     seconds: float
     separates: tuple[str, ...]
     reason: str
 
     @property
     def command(self) -> str:
-        """As it is typed."""
+        """The command that records it, as it is typed."""
         return f"quadvel excite {self.excitation} --seconds {self.seconds:g}"
 
 
 _REASONS = {
     "chirp": "fast swings, in which a lag, a delay, a filter and an inertia turn the phase differently",
     "creep": "slow motion through the range and its turning points: angle and sign of the speed count alone",
-    "steps": "large and small steps from rest, in which torque, speed and size of the error come apart",
+    "steps": "large and small steps from rest, in which torque, speed and size of the error vary independently",
     "sweep": "many loads at every speed, for long enough that heat and supply change",
     "solo": "one joint at a time: what the resting ones show comes from the one that moves",
 }
-_REVEALING = {
+"""Reason for each excitation."""
+_BEST_EXCITATION = {
     "armature": "chirp",
     "command_hold": "chirp",
     "first_order_lag": "chirp",
@@ -293,9 +389,10 @@ _REVEALING = {
     "thermal_drift": "sweep",
     "cross_coupling": "solo",
 }
-"""The excitation that shows an effect best; "steps", which hold most, for all others."""
-_LONG = {"thermal_drift": 300.0, "supply_sag": 60.0}  # s
-_BY_SIGNAL = {
+"""Excitation that shows an effect best; "steps" for all other effects."""
+_MIN_DURATION_S = {"thermal_drift": 300.0, "supply_sag": 60.0}
+"""s; effects that need a longer recording."""
+_EXCITATION_OF_SIGNAL = {
     "t": "sweep",
     "q": "creep",
     "dq": "creep",
@@ -303,41 +400,48 @@ _BY_SIGNAL = {
     "q_des": "steps",
     "tau": "sweep",
 }
+"""Excitation that varies a signal most."""
 
 
 def propose(report: Mapping[str, Any]) -> list[Proposal]:
-    """Which excitations would separate what the report (the content of report.json) lists as not told apart.
+    """Propose excitations that would settle what a report leaves open.
 
-    Nothing where all effects stand alone and the rest is white.
+    Args:
+        report: Content of report.json.
+
+    Returns:
+        One proposal for each excitation; empty if all effects are distinguished and the residual
+        is white.
     """
     found: list[Proposal] = []
     for effect in report["effects"]:
         names = (effect["name"], *effect["indistinguishable"])
         if len(names) > 1:
-            kinds = dict.fromkeys(_REVEALING.get(name, "steps") for name in names)
-            found += [_proposal(kind, names) for kind in kinds]
+            kinds = dict.fromkeys(_BEST_EXCITATION.get(name, "steps") for name in names)
+            found += [_make_proposal(kind, names) for kind in kinds]
     unexplained = report["unexplained"]
     if unexplained["verdict"] == "structured":
         for signal in unexplained["depends_on"]:
-            found.append(_proposal(_showing(signal), (f"what depends on {signal}",)))
-    return _merged(found)
+            found.append(_make_proposal(_excitation_for_signal(signal), (f"what depends on {signal}",)))
+    return _merge_by_excitation(found)
 
 
-def _showing(signal: str) -> str:
-    """The excitation that moves a signal (q, tau@history, FR_thigh_joint/dq, ...) in the most ways."""
+def _excitation_for_signal(signal: str) -> str:
+    """The excitation that varies a signal (q, tau@history, FR_thigh_joint/dq, ...) most."""
     if "/" in signal:
         return "solo"
-    return "chirp" if "@" in signal else _BY_SIGNAL.get(signal, "steps")
+    return "chirp" if "@" in signal else _EXCITATION_OF_SIGNAL.get(signal, "steps")
 
 
-def _proposal(kind: str, separates: tuple[str, ...]) -> Proposal:
+def _make_proposal(kind: str, separates: tuple[str, ...]) -> Proposal:
+    """A proposal with the usual duration, or a longer one for slow effects."""
     usual = EXCITATIONS[kind]().seconds
-    slow = [_LONG[name] for name in separates if kind == "sweep" and name in _LONG]
+    slow = [_MIN_DURATION_S[name] for name in separates if kind == "sweep" and name in _MIN_DURATION_S]
     return Proposal(kind, max([usual, *slow]), separates, _REASONS[kind])
 
 
-def _merged(proposals: list[Proposal]) -> list[Proposal]:
-    """One proposal an excitation, in the order of the first, for all that it separates."""
+def _merge_by_excitation(proposals: list[Proposal]) -> list[Proposal]:
+    """Merge proposals of the same excitation, in the order of the first."""
     merged: dict[str, Proposal] = {}
     for new in proposals:
         old = merged.setdefault(new.excitation, new)

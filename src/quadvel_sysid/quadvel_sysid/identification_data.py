@@ -7,10 +7,10 @@ from collections.abc import Callable
 import attrs
 
 from .logs.dataset import Dataset
-from .logs.excerpts import pieces
+from .logs.excerpts import cut_excerpts
 from .logs.findings import Finding
 from .logs.log import Log
-from .motion import Body, implied
+from .motion import Body, imply_torque
 
 Progress = Callable[[float, str], None]
 """Told now and then which share is done, and what is done next."""
@@ -47,11 +47,11 @@ def prepare(
     body = None
     if logs[0].tau is None:
         progress(0.01, "the torque that the motion implies")
-        first, body = implied(logs[0])
-        logs = [first, *(implied(log, body)[0] for log in logs[1:])]
+        first, body = imply_torque(logs[0])
+        logs = [first, *(imply_torque(log, body)[0] for log in logs[1:])]
     rows = values // (len(logs) * len(logs[0].joints))
     # One script may have led all logs: what judges comes from other instants of it than what is fitted.
-    parts = [pieces(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
+    parts = [cut_excerpts(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
     chosen = tuple(log for part in parts for log in part)
     fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)
     return IdentificationData(chosen, fitted, body, data.findings)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import baselines
+from .baselines import baseline_errors
 from .confidence import intervals
 from .criterion import DataSplit, noise_variance
 from .delays import longest_equivalent_delay, quantised_delays
@@ -31,12 +31,12 @@ from .logs.dataset import Dataset
 from .logs.log import Log, LogError
 from .lost_commands import reassign_losses
 from .model import Model
-from .motion import STRETCH, Body, Replay, replayed
+from .motion import STRETCH_S, Body, Replay, replay_errors
 from .outcome import Outcome, SelectedEffect, identification
-from .preparation import SHORTEST, Preprocessed, preprocess
-from .replay import BLOCK as LEG_BLOCK
-from .replay import STRETCH as LEG_STRETCH
-from .replay import TEXT as LEG_TEXT
+from .preparation import MIN_BLOCK_S, Preprocessed, preprocess
+from .replay import EXPLANATION as LEG_TEXT
+from .replay import MIN_BLOCK_S as LEG_BLOCK
+from .replay import STRETCH_S as LEG_STRETCH
 from .replay import Legs
 from .sanity_checks import contradictions
 from .selection import Search
@@ -61,7 +61,7 @@ def identify(
     joints; longer logs are cut to pieces spread over all of each. options: as those of `identified`. Raises LogError where
     the logs cannot be used together.
     """
-    return identified(prepare(Dataset.of(train, heldout, gains), values), **options)
+    return identified(prepare(Dataset.inspect_all(train, heldout, gains), values), **options)
 
 
 def identified(
@@ -81,7 +81,7 @@ def identified(
     legs = None if robot is None else _legs(robot, material)
     progress(0.02, "gains and delays")
     windows = WINDOWS if body is None else (material.logs[0].period,)
-    shortest = SHORTEST if legs is None or material.heldout else LEG_BLOCK
+    shortest = MIN_BLOCK_S if legs is None or material.heldout else LEG_BLOCK
     reading, notes = preprocess(material, windows, shortest)
     steps = iter(range(10**6))
 
@@ -109,7 +109,7 @@ def identified(
     found = identification(outcome, [*material.findings, *notes])
     parts, samples = reading.parts, reading.samples
     logs = [one.log for one in samples.logs]
-    report = {**found.report, "baselines": baselines(logs, parts.fit_or_select, parts.report)}
+    report = {**found.report, "baselines": baseline_errors(logs, parts.fit_or_select, parts.report)}
     if replayer:
         report |= replayer.section(outcome)
     if body is not None:
@@ -129,7 +129,7 @@ def _legs(robot: str, material: IdentificationData) -> Legs:
                 raise LogError(
                     f"{log.name}: {name}: not in the log, expected {what} to replay the commands (--robot)"
                 )
-    return Legs.of(robot, material.logs[0].joints)
+    return Legs.load(robot, material.logs[0].joints)
 
 
 def _searched(reading: Preprocessed) -> tuple[Samples, NDArray[np.intp]]:
@@ -229,7 +229,7 @@ class _Replayer:
         return {
             "motion": {
                 "inertia": {"value": self.body.inertia.tolist(), "unit": "kg m^2"},
-                "replayed_s": STRETCH,
+                "replayed_s": STRETCH_S,
                 "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
                 "the inertia and an encoder bias part of the torque offset.",
                 **sizes,
@@ -240,16 +240,16 @@ class _Replayer:
         logs = [one.log for one in self.reading.samples.logs]
         corrected = parameters(model, self.reading.parts, self.base)
         if self.legs is not None:
-            return self.legs.replayed(logs, corrected, rows)
+            return self.legs.replay_errors(logs, corrected, rows)
         assert self.body is not None
-        return replayed(logs, corrected, self.body, rows)
+        return replay_errors(logs, corrected, self.body, rows)
 
 
 def _told_of_motion(report: Mapping[str, Any]) -> dict[str, Any]:
     """What changes in a report where the torque is what the motion implies."""
     before, after = report["motion"]["before"], report["motion"]["after"]
     decision = (
-        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH:.0f} ms, the error of q goes from "
+        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH_S:.0f} ms, the error of q goes from "
         f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
     )
     return {

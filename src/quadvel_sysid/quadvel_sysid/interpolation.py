@@ -1,4 +1,4 @@
-"""Series read between their rows, in compiled loops: an identification reads its logs at tens of thousands of delays."""
+"""Compiled interpolation of time series; an identification reads logs at thousands of delays."""
 
 from __future__ import annotations
 
@@ -12,49 +12,94 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Rows = NDArray[np.intp]
 
-_STEPS = 16
-"""Rows that are looked at one after the other before the rest is halved"""
+_MAX_LINEAR_STEPS = 16
+"""Rows of linear search before binary search."""
 
 
 def rows_at(times: Array, at: Array) -> Rows:
-    """The last row whose time (K,) is not after each of `at` (N,), the first one where none is."""
+    """Find the last row at or before each time.
+
+    Args:
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N,) row indices; 0 if no row is before.
+    """
     found = np.empty(len(at), dtype=np.intp)
     _compiled()["rows_at"](times, at, found)
     return found
 
 
-def between(times: Array, at: Array) -> tuple[Rows, Array]:
-    """Of each of `at` (N,): the row before it, of which there is a next one, and how far it is towards that, 0 to 1."""
+def locate(times: Array, at: Array) -> tuple[Rows, Array]:
+    """Find the interval of rows that holds each time.
+
+    Args:
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N,) first row of the interval, and (N,) position in it, from 0 to 1.
+    """
     found, share = np.empty(len(at), dtype=np.intp), np.empty(len(at))
     _compiled()["between"](times, at, found, share)
     return found, share
 
 
-def read(values: Array, row: Rows, share: Array) -> Array:
-    """Values (K, J), linear between rows, where `between` says (N,): (N, J)."""
+def interpolate(values: Array, row: Rows, share: Array) -> Array:
+    """Interpolate linearly between rows.
+
+    Args:
+        values: (K, J) values of the rows.
+        row: (N,) rows, from `locate`.
+        share: (N,) positions, from `locate`.
+
+    Returns:
+        (N, J) values.
+    """
     found = np.empty((len(row), values.shape[1]))
     _compiled()["read"](values, row, share, found)
     return found
 
 
-def read_late(values: Array, times: Array, at: Array, late: Array) -> Array:
-    """Each joint's values (K, J) at its own times, `late` (..., J) before `at` (N,): (..., N, J)."""
+def interpolate_shifted(values: Array, times: Array, at: Array, late: Array) -> Array:
+    """Interpolate linearly at times that differ between joints.
+
+    Args:
+        values: (K, J) values of the rows.
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+        late: (..., J) delay of each joint, s: it is read at `at` - `late`.
+
+    Returns:
+        (..., N, J) values.
+    """
     each = late.reshape(-1, values.shape[1])
     found = np.empty((len(each), len(at), values.shape[1]))
     _compiled()["read_late"](values, times, at, each, found)
     return found.reshape(*late.shape[:-1], *found.shape[1:])
 
 
-def integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
-    """What values (K, J), each held from its time to the next, add up to until `at` (N,), with `sums` (K + 1, J) at their times."""
+def hold_integral(values: Array, sums: Array, times: Array, at: Array) -> Array:
+    """Integrate piecewise constant values from the first row to given times.
+
+    Args:
+        values: (K, J) values, each in force from its time to the next.
+        sums: (K + 1, J) integral at the time of each row.
+        times: (K,) times of the rows, s.
+        at: (N,) times, s.
+
+    Returns:
+        (N, J) integral.
+    """
     found = np.empty((len(at), values.shape[1]))
     _compiled()["integral"](values, sums, times, at, found)
     return found
 
 
-def _last(times: Any, at: float, row: int) -> Any:
-    """The last row whose time is not after `at`, sought from `row` on; -1 where none is."""
-    for _ in range(_STEPS):
+def _last_row(times: Any, at: float, row: int) -> Any:
+    """The last row at or before `at`, searched from `row` on; -1 if there is none."""
+    for _ in range(_MAX_LINEAR_STEPS):
         if row >= 0 and times[row] > at:
             row -= 1
         elif row + 1 < len(times) and times[row + 1] <= at:
@@ -66,22 +111,22 @@ def _last(times: Any, at: float, row: int) -> Any:
 
 @cache
 def _compiled() -> dict[str, Callable[..., None]]:
-    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk."""
+    """Compile the loops; the first call after an installation takes seconds and is cached on disk."""
     import numba
     from numba.extending import register_jitable
 
-    register_jitable(_last)
+    register_jitable(_last_row)
 
     def rows_at(times: Any, at: Any, found: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             found[n] = max(row, 0)
 
     def between(times: Any, at: Any, found: Any, share: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             here = min(max(row, 0), len(times) - 2)
             found[n] = here
             share[n] = min(max((at[n] - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
@@ -97,7 +142,7 @@ def _compiled() -> dict[str, Callable[..., None]]:
             row = 0
             for n in range(len(at)):
                 when = at[n] - late[b, j]
-                row = _last(times, when, row)
+                row = _last_row(times, when, row)
                 here = min(max(row, 0), len(times) - 2)
                 share = min(max((when - times[here]) / (times[here + 1] - times[here]), 0.0), 1.0)
                 early = values[here, j]
@@ -106,7 +151,7 @@ def _compiled() -> dict[str, Callable[..., None]]:
     def integral(values: Any, sums: Any, times: Any, at: Any, found: Any) -> None:
         row = 0
         for n in range(len(at)):
-            row = _last(times, at[n], row)
+            row = _last_row(times, at[n], row)
             here = max(row, 0)
             for j in range(values.shape[1]):
                 found[n, j] = sums[here, j] + values[here, j] * (at[n] - times[here])

@@ -1,4 +1,4 @@
-"""One log, read at any time: its states between their rows, its commands as they were held, and its accelerations."""
+"""Signals of one log at any time: interpolated states, held commands, and accelerations."""
 
 from __future__ import annotations
 
@@ -9,89 +9,143 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import interpolation
-from .acceleration import HALF_WIDTHS, lines, slope, smooth_part
-from .logs.log import ALMOST, Log
+from .acceleration import HALF_WIDTHS_S, local_lines, local_slope, split_acceleration
+from .logs.log import TIME_TOLERANCE_S, Log
 
 Array = NDArray[np.float64]
 Joints = slice | list[int]
-ALL = slice(None)
+ALL_JOINTS = slice(None)
+"""Selects all joints."""
 
-_KEPT_SLOPES = 4
-"""accelerations that a log keeps: two kinds at a few delays"""
+_MAX_CACHED_SLOPES = 4
+"""Accelerations that are cached for a log: two kinds at a few delays."""
 
 
 class LogSignals:
-    """One log; `steady` (s) as that of `Samples`. known: which of kp and kd count as logged, the others as 1.
+    """Signals of one log in double precision, at any time.
 
-    origin: when it began, s, or the log that it is a piece of.
+    Attributes:
+        log: The log, N state rows and M command rows of J joints.
+        origin: Start time of the recording, s.
+        t: (N,) times of the states, s.
+        t_cmd: (M,) times of the commands, s.
+        states: State signals by name, (N, J) or (N, 1).
+        commands: Command signals by name, (M, J).
+        gains: kp and kd, (M, J); 1 if they are not known.
+        sums: Integral (M + 1, J) of each command signal that is not 0.
+        signals: All of these signals by name.
     """
 
     def __init__(self, log: Log, steady: float, known: Collection[str]) -> None:
-        self.log, self.origin = log, float(log.t[0]) if log.began is None else log.began
-        self.t, self.t_cmd = double(log.t), double(log.t_cmd)
-        self.states = {"q": double(log.q), "dq": double(log.dq)}
+        """Prepare the signals.
+
+        Args:
+            log: The log.
+            steady: Half width of the lines that smooth q and dq, s; 0 for none.
+            known: Which of kp and kd are used as logged.
+        """
+        self.log, self.origin = log, float(log.t[0]) if log.recording_start is None else log.recording_start
+        self.t, self.t_cmd = as_double(log.t), as_double(log.t_cmd)
+        self.states = {"q": as_double(log.q), "dq": as_double(log.dq)}
         if steady > 0.0:
-            self.states = {k: lines(double(log.t), values, steady)[0] for k, values in self.states.items()}
+            self.states = {
+                k: local_lines(as_double(log.t), values, steady)[0] for k, values in self.states.items()
+            }
         if log.temperature is not None:
-            self.states["temperature"] = double(log.temperature)
+            self.states["temperature"] = as_double(log.temperature)
         if log.voltage is not None:
-            self.states["voltage"] = double(log.voltage)[:, None]
+            self.states["voltage"] = as_double(log.voltage)[:, None]
         shape = log.q_des.shape
         zero = np.zeros(shape)
         self.commands = {
-            "q_des": double(log.q_des),
-            "dq_des": zero if log.dq_des is None else double(log.dq_des),
-            "tau_ff": zero if log.tau_ff is None else double(log.tau_ff),
+            "q_des": as_double(log.q_des),
+            "dq_des": zero if log.dq_des is None else as_double(log.dq_des),
+            "tau_ff": zero if log.tau_ff is None else as_double(log.tau_ff),
         }
         self.gains = {
-            name: double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
+            name: as_double(getattr(log, name)) if name in known else np.broadcast_to(1.0, shape)
             for name in ("kp", "kd")
         }
+        # Integral of each held command up to its row. The last command lasts for 1000 s.
         spacing = np.diff(log.t_cmd, append=log.t_cmd[-1] + 1e3)[:, None]
         self.sums = {
             name: np.concatenate([np.zeros((1, shape[1])), np.cumsum(values * spacing, axis=0)])
             for name, values in self.commands.items()
             if values.any()
         }
-        self.all: dict[str, Array] = {**self.states, **self.commands, **self.gains}
+        self.signals: dict[str, Array] = {**self.states, **self.commands, **self.gains}
         self._slopes: dict[float, Array] = {}
         self._smooth: dict[tuple[Any, ...], tuple[Array, Array]] = {}
 
-    def between(self, at: Array) -> tuple[NDArray[np.intp], Array]:
-        """Of times (N,): the state row before, and how far towards the next, 0 to 1."""
-        return interpolation.between(self.t, at)
+    def locate(self, at: Array) -> tuple[NDArray[np.intp], Array]:
+        """Find the interval of state rows that holds each time.
 
-    def state(
-        self, name: str, at: Array, joints: Joints = ALL, found: tuple[NDArray[np.intp], Array] | None = None
+        Args:
+            at: (N,) times, s.
+
+        Returns:
+            (N,) first row of the interval, and (N,) position in it, from 0 to 1.
+        """
+        return interpolation.locate(self.t, at)
+
+    def state_at(
+        self,
+        name: str,
+        at: Array,
+        joints: Joints = ALL_JOINTS,
+        found: tuple[NDArray[np.intp], Array] | None = None,
     ) -> Array:
-        """A state signal, linear between rows; `found` is `between(at)` where that is known."""
+        """Interpolate a state signal.
+
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            joints: Columns to read.
+            found: `locate(at)`, if already computed.
+
+        Returns:
+            (N, J) or (N, 1) values.
+        """
         values = self.states[name]
         values = values if values.shape[1] == 1 else values[:, joints]
-        return interpolation.read(values, *(self.between(at) if found is None else found))
+        return interpolation.interpolate(values, *(self.locate(at) if found is None else found))
 
-    def acceleration(self, name: str, at: Array, delays: Array, joints: Joints = ALL) -> Array:
-        """rad/s^2 where commands move the joints `delays` (J,) after they were sent; `name` says how smooth it is."""
+    def acceleration_at(self, name: str, at: Array, delays: Array, joints: Joints = ALL_JOINTS) -> Array:
+        """Compute the acceleration of the joints.
+
+        Args:
+            name: `ddq`, `ddq_sharp` or `ddq_smooth`; selects the half width of the slope.
+            at: (N,) times, s.
+            delays: (J,) delay from a command to the motion of its joint, s.
+            joints: Columns to read.
+
+        Returns:
+            (N, J) acceleration, rad/s^2.
+        """
         if name == "ddq":
-            return interpolation.read(self._slope_of_dq(name)[:, joints], *self.between(at))
+            return interpolation.interpolate(self._slope_of_dq(name)[:, joints], *self.locate(at))
         key = (name, *delays.tolist())
         if key not in self._smooth:
-            if len(self._smooth) >= _KEPT_SLOPES:
+            if len(self._smooth) >= _MAX_CACHED_SLOPES:
                 self._smooth.pop(next(iter(self._smooth)))
-            come = self._acting(self.t, delays, self._integral)
-            self._smooth[key] = smooth_part(name, self.t, double(self.log.dq), self._slope_of_dq(name), come)
+            acting = self._read_targets(self.t, delays, self._integral)
+            self._smooth[key] = split_acceleration(
+                name, self.t, as_double(self.log.dq), self._slope_of_dq(name), acting
+            )
+        # ddq = smooth + B q_des, with the command as it acts at `at`.
         smooth, answer = self._smooth[key]
-        jumps = self._acting(at, delays, lambda values, _, sent: values[self.in_force(sent)])
-        return interpolation.read(smooth[:, joints], *self.between(at)) + jumps @ answer[:, joints]
+        jumps = self._read_targets(at, delays, lambda values, _, sent: values[self.command_rows(sent)])
+        return interpolation.interpolate(smooth[:, joints], *self.locate(at)) + jumps @ answer[:, joints]
 
     def _slope_of_dq(self, name: str) -> Array:
-        """rad/s^2 by rows, as smooth as `name` says, whatever commands do."""
-        width = HALF_WIDTHS[name]
+        """Slope of dq at each row, rad/s^2, as smooth as `name` says."""
+        width = HALF_WIDTHS_S[name]
         if width not in self._slopes:
-            self._slopes[width] = slope(self.t, double(self.log.dq), width)
+            self._slopes[width] = local_slope(self.t, as_double(self.log.dq), width)
         return self._slopes[width]
 
-    def _acting(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
-        """What is read of q_des and its sums at the times at which what acts at `at` was sent, (N, J)."""
+    def _read_targets(self, at: Array, delays: Array, read: Callable[[Array, Array, Array], Array]) -> Array:
+        """Read q_des and its integral at the send times of what acts at `at`, (N, J)."""
         found = np.zeros((len(at), len(delays)))
         if "q_des" in self.sums:
             for delay in np.unique(delays):
@@ -100,35 +154,73 @@ class LogSignals:
                 found[:, joints] = read(values, sums, at - delay)
         return found
 
-    def shifted(self, name: str, at: Array, late: Array) -> Array:
-        """A state signal (..., N, J) of every joint `late` (..., J) s before `at` (N,)."""
-        return interpolation.read_late(self.states[name], self.t, at, late)
+    def state_shifted(self, name: str, at: Array, late: Array) -> Array:
+        """Interpolate a state signal at delays that differ between joints.
 
-    def in_force(self, at: Array) -> NDArray[np.intp]:
-        """The command row that counts at the times `at` (N,), s."""
-        return interpolation.rows_at(self.t_cmd, at + ALMOST)
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            late: (..., J) delays, s.
 
-    def command(
+        Returns:
+            (..., N, J) values.
+        """
+        return interpolation.interpolate_shifted(self.states[name], self.t, at, late)
+
+    def command_rows(self, at: Array) -> NDArray[np.intp]:
+        """Find the command rows in force.
+
+        Args:
+            at: (N,) times, s.
+
+        Returns:
+            (N,) row indices; 0 before the first command.
+        """
+        return interpolation.rows_at(self.t_cmd, at + TIME_TOLERANCE_S)
+
+    def command_at(
         self,
         name: str,
         at: Array,
         window: float,
-        joints: Joints = ALL,
+        joints: Joints = ALL_JOINTS,
         row: NDArray[np.intp] | None = None,
     ) -> Array:
-        """A command signal: the mean over `at` to `at + window`; `row` is `in_force(at)` where that is known."""
+        """Read a command signal, or its mean over a step of the drive.
+
+        Args:
+            name: Name of the signal.
+            at: (N,) times, s.
+            window: Step of the drive, s: the mean over `at` to `at` + `window`; 0 for the value
+                at `at`.
+            joints: Columns to read.
+            row: `command_rows(at)`, if already computed.
+
+        Returns:
+            (N, J) values.
+        """
         values = self.commands[name][:, joints]
         if name not in self.sums:
             return np.zeros((len(at), values.shape[1]))
         if window == 0.0:
-            return values[self.in_force(at) if row is None else row]
+            return values[self.command_rows(at) if row is None else row]
+        # Mean of the held command over the step: (I(at + window) - I(at)) / window.
         sums = self.sums[name][:, joints]
         late, early = (self._integral(values, sums, end) for end in (at + window, at))
         return (late - early) / window
 
     def _integral(self, values: Array, sums: Array, at: Array) -> Array:
-        return interpolation.integral(values, sums, self.t_cmd, at)
+        """Integral of a command signal from the first command to `at`."""
+        return interpolation.hold_integral(values, sums, self.t_cmd, at)
 
 
-def double(values: NDArray[np.floating]) -> Array:
+def as_double(values: NDArray[np.floating]) -> Array:
+    """Convert an array to double precision.
+
+    Args:
+        values: The array.
+
+    Returns:
+        The array, without a copy if possible.
+    """
     return np.asarray(values, dtype=np.float64)

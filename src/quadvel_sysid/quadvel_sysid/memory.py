@@ -1,33 +1,42 @@
-"""What glibc keeps of freed memory: nothing of a long log's arrays, of which each copy of the process would hold a copy.
+"""Control how glibc keeps freed memory.
 
-Of a short one all: to give it back and ask for it again is a fifth of an identification's time.
+For long logs, large arrays go back to the system as soon as they are freed, since each worker
+process would hold a copy. For short logs freed memory is kept: returning it and requesting it
+again costs a fifth of an identification's time.
 """
 
 from __future__ import annotations
 
 import ctypes
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's mallopt
-_LARGE, _LARGEST, _FREED = 1 << 22, 1 << 25, 1 << 27  # bytes
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Options of glibc's mallopt (malloc.h)."""
+_LARGE_BYTES, _LARGEST_BYTES, _KEPT_BYTES = 1 << 22, 1 << 25, 1 << 27
+"""Bytes: smallest array that is mapped separately, largest threshold, and memory kept at the top."""
 
 
-def give_large_arrays_back() -> None:
-    """Have large arrays returned as soon as they are free: left to itself glibc keeps ever larger ones, with gaps."""
-    _set(M_MMAP_THRESHOLD, _LARGE)
+def return_large_arrays() -> None:
+    """Return large arrays to the system as soon as they are freed.
+
+    By default glibc raises its threshold with the size of freed arrays, and keeps them with gaps
+    between.
+    """
+    _set(M_MMAP_THRESHOLD, _LARGE_BYTES)
 
 
 def keep_freed_arrays() -> None:
-    """Have freed memory kept for the arrays to come."""
-    _set(M_MMAP_THRESHOLD, _LARGEST)
-    _set(M_TRIM_THRESHOLD, _FREED)
+    """Keep freed memory for the next arrays."""
+    _set(M_MMAP_THRESHOLD, _LARGEST_BYTES)
+    _set(M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 def _set(option: int, size: int) -> None:
+    """Set an option of glibc's mallopt, if the C library has it."""
     if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
         mallopt(option, size)
 
 
-def give_gaps_back() -> None:
-    """Return what is free now between smaller arrays: what a copy of this process puts there it would hold besides."""
+def trim_heap() -> None:
+    """Return free memory between small arrays to the system, before worker processes copy it."""
     if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
         trim(0)

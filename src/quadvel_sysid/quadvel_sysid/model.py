@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
 from quadvel_actuator.effects.base import distinct
 
-from .signals import BETWEEN, Array, Bools, Samples, Signals
+from .signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
 
 Groups = NDArray[np.intp]
 
@@ -110,7 +110,7 @@ class Model:
         """
         if self.window == 0.0 and any(one.law.acts_between_rows for one in self.effects):
             finer = attrs.evolve(self, samples=self.samples.upsampled)
-            return finer._evaluate(gains, values)[..., BETWEEN - 1 :: BETWEEN, :]
+            return finer._evaluate(gains, values)[..., INSTANTS_PER_ROW - 1 :: INSTANTS_PER_ROW, :]
         return self._evaluate(gains, values)
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:

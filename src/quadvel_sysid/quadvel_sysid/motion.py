@@ -1,10 +1,10 @@
-"""Logs without measured torque: what commands and encoders alone show (friction, damping, encoder bias).
+"""Identification without measured torque: the motion of free limbs implies the joint torques.
 
-Limbs that swing freely say what torque their joints got: accelerations go with torques, and with a load that depends on
-place and speed. Both are fitted together with the PD law and a friction that stays out of them; the torque that the
-motion then implies stands for a measured one, and the same diagnosis runs on it. Torque is known to a scale only, that of
-the commanded gains. What is gained is told in rad and rad/s, by replaying the commands over short stretches. Contacts with
-the ground are not in it: the robot hangs in the air.
+Accelerations are linear in the torques and in a load that depends on angles and speeds. Both are
+fitted together with the PD law and with friction. The torque that the motion then implies
+replaces the measured one, and the same identification runs on it. Its scale is that of the
+commanded gains. The improvement is stated in rad and rad/s, from a replay of the commands over
+short stretches. There is no model of contacts: the robot has to be suspended.
 """
 
 from __future__ import annotations
@@ -22,63 +22,115 @@ from .eam import LONGEST_INPUT
 from .logs.log import Log, LogError
 from .signals import Array, Bools, Samples
 
-STRETCH = 0.05
-"""s that are replayed from a measured state before the next one is taken"""
+STRETCH_S = 0.05
+"""s that are replayed from a measured state before the next one is used."""
 
-_SPAN = 0.008  # s over which an acceleration is taken: encoders are too coarse for less
-_DELAY_STEP = 0.0005  # s
-_STEP = 0.001  # s of the replay, at most
-_LARGEST = 4  # joints that may carry each other
+_AVERAGING_S = 0.008
+"""s over which an acceleration is computed; encoders are too coarse for less."""
+_DELAY_STEP_S = 0.0005
+"""s between the delays that are tried."""
+_MAX_STEP_S = 0.001
+"""s; longest time step of the replay."""
+_MAX_LIMB_JOINTS = 4
+"""Most joints of a limb, which carry each other."""
 _RIDGE = 1e-5
+"""Ridge penalty on the regression's normalised weights, times the number of rows."""
 
 
 Replay = dict[str, float]
+"""Root mean square deviations of a replay: `q_rms_rad` and `dq_rms_rad_s`."""
 
 
 @attrs.frozen(eq=False)
 class Limb:
-    """Joints that carry each other: how they accelerate, linear about the middle of the motion."""
+    """Dynamics of K joints that carry each other, linear about the middle of the motion.
 
-    joints: NDArray[np.intp]  # (K,)
-    middle: Array  # (K,) rad
-    mobility: Array  # (K + 1, K, K): acceleration for a torque, and how that changes with each angle
-    drift: Array  # (D, K): acceleration without torque, of `_drifting`
+        ddq = (B_0 + sum_k (q_k - middle_k) B_k) tau + drift^T phi(q - middle, dq)
+
+    with the regressors phi of `_load_regressors`.
+
+    Attributes:
+        joints: (K,) indices of the joints.
+        middle: (K,) mean angles, rad.
+        mobility: (K + 1, K, K) matrices B_0, B_1, ..., B_K, 1/(kg m^2), the latter per rad.
+        drift: (D, K) weights of the acceleration without torque.
+    """
+
+    joints: NDArray[np.intp]
+    middle: Array
+    mobility: Array
+    drift: Array
 
     @classmethod
-    def of(
+    def fit(
         cls, joints: NDArray[np.intp], q: Array, dq: Array, torque: Array, ddq: Array
     ) -> tuple[Limb, float]:
-        """Fitted to rows (N, K), and the share of the acceleration that is left."""
+        """Fit the dynamics to a motion.
+
+        Args:
+            joints: (K,) indices of the joints.
+            q: (N, K) angles, rad.
+            dq: (N, K) speeds, rad/s.
+            torque: (N, K) torques of the PD law, N m.
+            ddq: (N, K) accelerations, rad/s^2.
+
+        Returns:
+            The limb, and the share of the acceleration's variance that is left.
+        """
         middle = q.mean(axis=0)
-        pushed = np.concatenate([torque, *(torque * one[:, None] for one in (q - middle).T)], axis=1)
-        drifting, rubbing = _drifting(q - middle, dq), np.concatenate([dq, np.tanh(dq / 0.05)], axis=1)
-        x = np.concatenate([pushed, drifting, rubbing], axis=1)
+        # Regress ddq on [tau, (q_k - middle_k) tau, phi(q - middle, dq), dq, tanh(dq / 0.05)] with a
+        # ridge penalty on normalised columns; the last two, friction, stay out of the dynamics.
+        torque_terms = np.concatenate([torque, *(torque * one[:, None] for one in (q - middle).T)], axis=1)
+        load_terms, friction_terms = (
+            _load_regressors(q - middle, dq),
+            np.concatenate([dq, np.tanh(dq / 0.05)], axis=1),
+        )
+        x = np.concatenate([torque_terms, load_terms, friction_terms], axis=1)
         size = np.sqrt(np.mean(x * x, axis=0)) + 1e-12
         gram = (x / size).T @ (x / size) + _RIDGE * len(x) * np.eye(x.shape[1])
         solution = np.linalg.solve(gram, (x / size).T @ ddq) / size[:, None]
         left = float(np.sum((ddq - x @ solution) ** 2) / (np.sum((ddq - ddq.mean(axis=0)) ** 2) + 1e-12))
-        k, last = len(joints), pushed.shape[1]
+        k, last = len(joints), torque_terms.shape[1]
         mobility = solution[:last].reshape(k + 1, k, k).transpose(0, 2, 1)
-        return cls(joints, middle, mobility, solution[last : last + drifting.shape[1]]), left
+        return cls(joints, middle, mobility, solution[last : last + load_terms.shape[1]]), left
 
     def accelerations(self, q: Array, dq: Array, torque: Array) -> Array:
-        """What joints (N, K) at `q`, `dq` do under `torque`, rad/s^2."""
-        pushed: Array = (self._mobility(q) @ torque[..., None])[..., 0]
-        drift: Array = _drifting(q - self.middle, dq) @ self.drift
-        return pushed + drift
+        """Compute forward dynamics.
+
+        Args:
+            q: (N, K) angles, rad.
+            dq: (N, K) speeds, rad/s.
+            torque: (N, K) torques, N m.
+
+        Returns:
+            (N, K) accelerations, rad/s^2.
+        """
+        torque_terms: Array = (self._mobility(q) @ torque[..., None])[..., 0]
+        drift: Array = _load_regressors(q - self.middle, dq) @ self.drift
+        return torque_terms + drift
 
     def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """The torques (N, K) under which they accelerate so, N m."""
-        moved = ddq - _drifting(q - self.middle, dq) @ self.drift
-        return np.asarray(np.linalg.solve(self._mobility(q), moved[..., None])[..., 0], dtype=np.float64)
+        """Compute inverse dynamics.
+
+        Args:
+            q: (N, K) angles, rad.
+            dq: (N, K) speeds, rad/s.
+            ddq: (N, K) accelerations, rad/s^2.
+
+        Returns:
+            (N, K) torques, N m.
+        """
+        driven = ddq - _load_regressors(q - self.middle, dq) @ self.drift
+        return np.asarray(np.linalg.solve(self._mobility(q), driven[..., None])[..., 0], dtype=np.float64)
 
     def _mobility(self, q: Array) -> Array:
+        """Mobility (..., K, K) at angles q (..., K)."""
         turned: Array = self.mobility[0] + np.einsum("...k,kij->...ij", q - self.middle, self.mobility[1:])
         return turned
 
 
-def _drifting(q: Array, dq: Array) -> Array:
-    """What loads and inertial forces are sums of: 1, angles, and products of angles and of speeds, (N, D)."""
+def _load_regressors(q: Array, dq: Array) -> Array:
+    """Regressors (N, D) of loads and inertial forces: 1, q, products of q, products of dq."""
     k = q.shape[1]
     pairs = [(a, b) for a in range(k) for b in range(a, k)]
     columns = [
@@ -92,20 +144,33 @@ def _drifting(q: Array, dq: Array) -> Array:
 
 @attrs.frozen(eq=False)
 class Body:
-    """All limbs of a robot."""
+    """Dynamics of all limbs of a robot.
+
+    Attributes:
+        limbs: The limbs, which do not affect each other.
+    """
 
     limbs: tuple[Limb, ...]
 
     @property
     def inertia(self) -> Array:
-        """What each joint turns in the middle of the motion, the others held, (J,), kg m^2."""
+        """Inertia (J,) of each joint in the middle of the motion, the other joints fixed, kg m^2."""
         found = np.zeros(sum(len(limb.joints) for limb in self.limbs))
         for limb in self.limbs:
             found[limb.joints] = np.diagonal(np.linalg.inv(limb.mobility[0]))
         return found
 
     def torques(self, q: Array, dq: Array, ddq: Array) -> Array:
-        """Of all joints, (N, J), N m."""
+        """Compute inverse dynamics of all joints.
+
+        Args:
+            q: (N, J) angles, rad.
+            dq: (N, J) speeds, rad/s.
+            ddq: (N, J) accelerations, rad/s^2.
+
+        Returns:
+            (N, J) torques, N m.
+        """
         found = np.zeros_like(q)
         for limb in self.limbs:
             at = limb.joints
@@ -113,7 +178,16 @@ class Body:
         return found
 
     def accelerations(self, q: Array, dq: Array, torque: Array) -> Array:
-        """Of all joints, (N, J), rad/s^2."""
+        """Compute forward dynamics of all joints.
+
+        Args:
+            q: (N, J) angles, rad.
+            dq: (N, J) speeds, rad/s.
+            torque: (N, J) torques, N m.
+
+        Returns:
+            (N, J) accelerations, rad/s^2.
+        """
         found = np.zeros_like(q)
         for limb in self.limbs:
             at = limb.joints
@@ -121,12 +195,19 @@ class Body:
         return found
 
 
-def spans(log: Log) -> tuple[Log, Array]:
-    """The log in steps of _SPAN, each row the mean over a step, and the accelerations in them (N, J).
+def average_over_steps(log: Log) -> tuple[Log, Array]:
+    """Average a log over steps of `_AVERAGING_S` and compute the accelerations in them.
 
-    Commands are stamped half a step later, so that their mean over a step from a row on is that over the row's own step.
+    Commands are stamped half a step later, so that their mean over a step that starts at a row is
+    that of the row's own step.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The averaged log with N rows, without torque, and (N, J) accelerations, rad/s^2.
     """
-    count = max(1, round(_SPAN / log.period))
+    count = max(1, round(_AVERAGING_S / log.period))
     first = np.arange(0, len(log.t) - count, count)
     last = first + count
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
@@ -144,33 +225,41 @@ def spans(log: Log) -> tuple[Log, Array]:
         temperature=temperature,
         voltage=voltage,
         tau=None,
-        q=_mean(q, first, count),
-        dq=_mean(dq, first, count),
+        q=_trapezoid_mean(q, first, count),
+        dq=_trapezoid_mean(dq, first, count),
     )
     return coarse, (dq[last] - dq[first]) / dt
 
 
-def _mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
-    """Over rows `first` to `first + count`, the outer two for half."""
+def _trapezoid_mean(x: Array, first: NDArray[np.intp], count: int) -> Array:
+    """Mean over rows `first` to `first + count`, the outer two with half weight."""
     rows = [x[first + k] for k in range(count + 1)]
     mean: Array = (0.5 * (rows[0] + rows[-1]) + sum(rows[1:-1], start=np.zeros_like(rows[0]))) / count
     return mean
 
 
-def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
-    """The log with the torque that its motion implies, and the body that carries it, fitted unless it is known.
+def imply_torque(log: Log, body: Body | None = None) -> tuple[Log, Body]:
+    """Compute the torque that a log's motion implies.
 
-    Raises LogError where the gains are not known: without torque the scale of everything hangs on them.
+    Args:
+        log: The log, with gains.
+        body: The dynamics, if known; else they are fitted to the log.
+
+    Returns:
+        The averaged log with the implied torque, and the dynamics.
+
+    Raises:
+        LogError: The gains are missing, or the motion implies a negative inertia.
     """
     if log.kp is None or log.kd is None:
         raise LogError(
             f"{log.name}: tau, kp: both are missing, expected the torque or the gains (--gains KP KD)"
         )
-    coarse, ddq = spans(log)
+    coarse, ddq = average_over_steps(log)
     samples = Samples([coarse])
     if body is None:
-        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP)
-        body = min((_fitted(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
+        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP_S)
+        body = min((_fit_body(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
         for joint, inertia in zip(log.joints, body.inertia, strict=True):
             if inertia <= 0.0:
                 raise LogError(
@@ -181,42 +270,52 @@ def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     return attrs.evolve(coarse, tau=tau), body
 
 
-def _fitted(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
-    """The body that explains the accelerations best with this delay, and what it leaves of them."""
+def _fit_body(samples: Samples, ddq: Array, delay: float) -> tuple[Body, float]:
+    """Fit all limbs at one input delay; also return the sum of the variance shares that are left."""
     s = samples.at(delay, 0.0, samples.period)
     torque = s.kp * (s.q_des - s.q) + s.kd * (s.dq_des - s.dq) + s.tau_ff
-    keep = samples.judged.all(axis=1)
+    keep = samples.evaluated.all(axis=1)
     limbs, share = [], 0.0
-    for joints in _limbs(samples.joints):
+    for joints in _group_limbs(samples.joints):
         rows = (x[keep][:, joints] for x in (s.q, s.dq, torque, ddq))
-        limb, left = Limb.of(joints, *rows)
+        limb, left = Limb.fit(joints, *rows)
         limbs.append(limb)
         share += left * len(joints)
     return Body(tuple(limbs)), share
 
 
-def _limbs(joints: Sequence[str]) -> list[NDArray[np.intp]]:
-    """Joints whose names begin alike, FR_hip_joint and FR_calf_joint; each on its own where these are too many."""
+def _group_limbs(joints: Sequence[str]) -> list[NDArray[np.intp]]:
+    """Group joints with the same first part of the name, and split groups that are too large."""
     names = [name.partition("_")[0] for name in joints]
     groups = [np.flatnonzero([one == name for one in names]) for name in dict.fromkeys(names)]
     return [
         part
         for group in groups
-        for part in ([group] if len(group) <= _LARGEST else np.split(group, len(group)))
+        for part in ([group] if len(group) <= _MAX_LIMB_JOINTS else np.split(group, len(group)))
     ]
 
 
-def replayed(logs: Sequence[Log], parameters: ActuatorParameters, body: Body, rows: Bools) -> Replay:
-    """Root mean square errors of q (rad) and dq (rad/s) over `rows` (N, J) of all logs, replaying STRETCH at a time."""
-    errors = np.concatenate([_replay(log, parameters, body) for log in logs], axis=1)
+def replay_errors(logs: Sequence[Log], parameters: ActuatorParameters, body: Body, rows: Bools) -> Replay:
+    """Replay the commands of logs and compute the root mean square deviations.
+
+    Args:
+        logs: Averaged logs, from `imply_torque`.
+        parameters: The actuator model.
+        body: The dynamics.
+        rows: (N, J) rows of all logs that count.
+
+    Returns:
+        Deviations of angles (rad) and speeds (rad/s).
+    """
+    errors = np.concatenate([_replay_log(log, parameters, body) for log in logs], axis=1)
     count = max(int(rows.sum()), 1)
     sizes = np.sqrt(np.sum(np.where(rows, errors, 0.0) ** 2, axis=(1, 2)) / count)
     return {"q_rms_rad": float(sizes[0]), "dq_rms_rad_s": float(sizes[1])}
 
 
-def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
-    """Errors (2, N, J) of q and dq."""
-    count = max(1, int(np.ceil(log.period / _STEP - 1e-9)))
+def _replay_log(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
+    """Deviations (2, N, J) of q and dq in the replay of one log."""
+    count = max(1, int(np.ceil(log.period / _MAX_STEP_S - 1e-9)))
     dt = log.period / count
     model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), (len(log.joints),), dt)
     packets = log.command_rows((log.t[:, None] + 0.5 * log.period + dt * np.arange(count)).ravel()).reshape(
@@ -227,16 +326,18 @@ def _replay(log: Log, parameters: ActuatorParameters, body: Body) -> Array:
         none if x is None else np.asarray(x) for x in (log.kp, log.kd, log.dq_des, log.tau_ff)
     )
     q, dq = np.asarray(log.q, dtype=float), np.asarray(log.dq, dtype=float)
+    # Semi-implicit Euler steps of the fitted dynamics under the model's torque. Every STRETCH_S, and
+    # after a gap, the state is set to the measured one.
     errors = np.zeros((2, *log.q.shape))
-    every = max(2, round(STRETCH / log.period))
+    every = max(2, round(STRETCH_S / log.period))
     after_gap = log.after_gap
-    place, speed = q[0], dq[0]
+    angle, speed = q[0], dq[0]
     for n, commands in enumerate(packets):
         if n % every == 0 or after_gap[n]:
-            place, speed = q[n], dq[n]
-        errors[:, n] = place - q[n], speed - dq[n]
+            angle, speed = q[n], dq[n]
+        errors[:, n] = angle - q[n], speed - dq[n]
         for row in commands:
-            torque = model.step(place, speed, log.q_des[row], kp[row], kd[row], dq_des[row], tau_ff[row])
-            speed = speed + dt * body.accelerations(place[None], speed[None], torque[None])[0]
-            place = place + dt * speed
+            torque = model.step(angle, speed, log.q_des[row], kp[row], kd[row], dq_des[row], tau_ff[row])
+            speed = speed + dt * body.accelerations(angle[None], speed[None], torque[None])[0]
+            angle = angle + dt * speed
     return errors

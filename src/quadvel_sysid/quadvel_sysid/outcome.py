@@ -11,7 +11,7 @@ import numpy as np
 from quadvel_actuator.effects.terms import NAME as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .baselines import explained, torque_variance
+from .baselines import explained_share, torque_variance
 from .confidence import Intervals
 from .criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, DataSplit, normality, whiteness
 from .export_parameters import (
@@ -118,7 +118,7 @@ def _report(o: Outcome) -> dict[str, Any]:
     }
     variance = torque_variance(samples.tau, parts.report)
     for entry in mses.values():
-        entry["heldout_explained"] = explained(entry["heldout_mse"], variance)
+        entry["heldout_explained"] = explained_share(entry["heldout_mse"], variance)
     for name in ("before", "after"):
         mses[name]["per_joint"] = [
             mean_square(errors[name][:, [j]], parts.report[:, [j]]) for j in range(len(samples.joints))

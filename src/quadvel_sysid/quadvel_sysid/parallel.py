@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
-from .memory import give_gaps_back
+from .memory import trim_heap
 from .signals import Samples
 
 R = TypeVar("R")
@@ -34,7 +34,7 @@ def side_by_side(work: Callable[[int], R], count: int, cores: int, samples: Samp
         return [work(k) for k in range(count)]
     if count > _MOST:
         raise ValueError(f"{count} pieces of work, expected {_MOST} at most")
-    give_gaps_back()
+    trim_heap()
     todo = _numbers(count)
     helpers = []
     try:

@@ -1,7 +1,8 @@
-"""How a log's rows are read: with stamps as logged or of an even sender, q and dq as logged or averaged over some rows.
+"""Preprocess logs: choose time stamps and the smoothing of q and dq that explain the torque best.
 
-Whichever explains the torque better. A drive that acted on noisy encoders has their noise in its torque; where it did not,
-the noise is averaged out before anything is fitted, as whatever filters would be taken for an effect.
+The choice is the one that explains the torque best. If the drive acted on noisy encoders, their
+noise is in its torque and the measurements stay as they are. If it did not, the noise is averaged
+out before anything is fitted, because an effect could otherwise be fitted to it.
 """
 
 from __future__ import annotations
@@ -14,32 +15,42 @@ import numpy as np
 from .criterion import DataSplit, clusters, encoder_variance, noise_variance
 from .eam import Eam, fit_eam
 from .identification_data import IdentificationData
-from .logs.excerpts import evened, jitters
+from .logs.excerpts import has_jitter, restore_even_clock
 from .logs.findings import Finding
 from .logs.log import Log, LogError
 from .signals import Samples
 
-_BLOCKS = 20  # of a log, at least
-SHORTEST, _LONGEST = 0.2, 2.0
-"""s, of the blocks of which some are fitted, some select and some are reported"""
-_LEAST_ROWS = 20
-_CLEARLY = 0.97
-"""of the error: what an even clock has to leave at most"""
-_NOISY = 0.01
-"""of the torque's noise: what encoders' noise may add to it"""
-_WIDTHS = np.array([1, 2, 4, 8])
-"""rows to either side that q and dq may be averaged over"""
-_LONGEST_MEAN, _BLURRED_MEAN = 0.0081, 0.0021
-"""s, at most; and where only friction shows the noise: bristles and play act on as slow a scale as the longer ones"""
-_AT_REST = np.array([0.02, 0.06, 0.2])
-"""rad/s, widths of friction's step"""
-_STEADIER = 0.005
-"""of the noise: what each further step has to take off the error"""
+_MIN_BLOCKS = 20
+"""Blocks of a log, at least."""
+MIN_BLOCK_S, _MAX_BLOCK_S = 0.2, 2.0
+"""s; shortest and longest duration of the blocks that are fitted, used for selection, or held out."""
+_MIN_ROWS = 20
+"""Rows of each joint and part, at least."""
+_EVEN_CLOCK_ERROR_RATIO = 0.97
+"""The even clock is used if it leaves at most this share of the error."""
+_ENCODER_NOISE_SHARE = 0.01
+"""Encoders are noisy if their noise adds at least this share of the torque's noise variance."""
+_AVERAGING_ROWS = np.array([1, 2, 4, 8])
+"""Rows to either side over which q and dq may be averaged."""
+_MAX_AVERAGING_S, _MAX_AVERAGING_BLURRED_S = 0.0081, 0.0021
+"""s; longest averages, in general and if only friction shows the noise: bristles and backlash act on
+the time scale of the longer ones.
+"""
+_FRICTION_WIDTHS_RAD_S = np.array([0.02, 0.06, 0.2])
+"""rad/s; widths of the smooth step of friction that are fitted."""
+_MIN_AVERAGING_GAIN = 0.005
+"""Share of the noise variance by which each wider average has to reduce the error."""
 
 
 @attrs.frozen(eq=False)
 class Preprocessed:
-    """Samples, which of their rows are for what, and the plain model on them."""
+    """Preprocessed logs and the plain model fitted to them.
+
+    Attributes:
+        samples: Rows of all logs, N rows of J joints.
+        parts: Which rows are fitted, used for selection, or held out.
+        eam: The plain actuator model.
+    """
 
     samples: Samples
     parts: DataSplit
@@ -47,57 +58,88 @@ class Preprocessed:
 
 
 def preprocess(
-    material: IdentificationData, windows: Sequence[float], shortest: float = SHORTEST
+    data: IdentificationData, windows: Sequence[float], shortest: float = MIN_BLOCK_S
 ) -> tuple[Preprocessed, list[tuple[str, Finding]]]:
-    """The reading that explains the torque best, and what was chosen. shortest: s, blocks at least."""
+    """Choose the time stamps and the averaging that explain the torque best.
 
-    def tried(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
+    Args:
+        data: The checked logs.
+        windows: Steps (s) of the drive that the plain model tries.
+        shortest: Shortest block, s.
+
+    Returns:
+        The preprocessed logs, and a note for each choice other than the logs as they are.
+    """
+
+    def fit_logs(logs: Sequence[Log], steady: float = 0.0) -> Preprocessed:
         samples = Samples(logs, steady)
-        parts = split_rows(samples, material, shortest)
+        parts = split_rows(samples, data, shortest)
         return Preprocessed(samples, parts, fit_eam(samples, parts.fit, windows=windows))
 
-    logs: Sequence[Log] = material.logs
-    found, notes = tried(logs), []
-    if any(jitters(log) for log in logs):
-        even = [evened(log) for log in logs]
-        other = tried(even)
-        if other.eam.mse <= _CLEARLY * found.eam.mse:
-            logs, found = even, other
+    logs: Sequence[Log] = data.logs
+    best, notes = fit_logs(logs), []
+    if any(has_jitter(log) for log in logs):
+        even = [restore_even_clock(log) for log in logs]
+        other = fit_logs(even)
+        if other.eam.mse <= _EVEN_CLOCK_ERROR_RATIO * best.eam.mse:
+            logs, best = even, other
             text = "the even clock of the sender explains the torque better and was restored"
             notes.append(("t", f"t: the stamps jitter as those of received messages do; {text}"))
-    found, steady = _steadied(found, lambda steady: tried(logs, steady))
+    best, steady = _choose_averaging(best, lambda steady: fit_logs(logs, steady))
     if steady:
         text = f"is averaged out over {1e3 * steady:.3g} ms to either side"
         notes.append(("dq", f"q, dq: their noise, on which the drive did not act, {text}"))
-    return found, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
+    return best, [(logs[0].name, Finding("note", field, (), text)) for field, text in notes]
 
 
-def split_rows(samples: Samples, material: IdentificationData, shortest: float) -> DataSplit:
-    """Blocks of the logs in turn: two are fitted, two select, one is reported; a log that is held out is the only one reported."""
+def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> DataSplit:
+    """Divide the rows into blocks that are fitted, used for selection, or held out.
+
+    Of five consecutive blocks, two are fitted, two are used for selection and one is held out. If
+    there are held-out logs, these alone are held out.
+
+    Args:
+        samples: Rows of all logs.
+        data: The checked logs.
+        shortest: Shortest block, s.
+
+    Returns:
+        The parts, (N, J) masks.
+
+    Raises:
+        LogError: A joint has too few rows in one part.
+    """
     spans = [one.log.duration for one in samples.logs]
-    length = float(np.clip(min(spans) / _BLOCKS, shortest, _LONGEST))
+    length = float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
     block = np.floor(samples.t / length).astype(int)
-    if material.heldout:
-        report = samples.log_of_row >= material.fitted
+    if data.heldout:
+        report = samples.log_of_row >= data.fitted
         select = (block % 2 == 1) & ~report
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
     rows = {"fitted": ~(select | report), "selecting": select, "reported": report}
-    parts = {word: samples.judged & chosen[:, None] for word, chosen in rows.items()}
+    parts = {word: samples.evaluated & chosen[:, None] for word, chosen in rows.items()}
     for word, chosen in parts.items():
         count = chosen.sum(axis=0)
-        if (count < _LEAST_ROWS).any():
+        if (count < _MIN_ROWS).any():
             joint = samples.joints[int(np.argmin(count))]
             raise LogError(
                 f"{samples.logs[0].log.name}: valid/{joint}: {int(count.min())} rows to be {word}, "
-                f"expected {_LEAST_ROWS} or more"
+                f"expected {_MIN_ROWS} or more"
             )
-    overlap = 0 if material.body is None else 1
+    overlap = 0 if data.body is None else 1
     return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
 
 
 def reference_gains(samples: Samples) -> tuple[float, float]:
-    """The gains that the deviations are given at: the usual ones of the log."""
+    """Compute the gains that deviations are relative to: the medians over all logs.
+
+    Args:
+        samples: Rows of all logs.
+
+    Returns:
+        kp (N m/rad) and kd (N m s/rad).
+    """
     kp, kd = (
         float(np.median(np.concatenate([one.gains[name].ravel() for one in samples.logs])))
         for name in ("kp", "kd")
@@ -105,36 +147,41 @@ def reference_gains(samples: Samples) -> tuple[float, float]:
     return max(kp, 1e-6), max(kd, 1e-6)
 
 
-def _steadied(found: Preprocessed, tried: Callable[[float], Preprocessed]) -> tuple[Preprocessed, float]:
-    """The reading with q and dq averaged over so long (s) to either side as it pays; `tried` makes one."""
-    samples, parts, eam = found.samples, found.parts, found.eam
+def _choose_averaging(
+    best: Preprocessed, fit_logs: Callable[[float], Preprocessed]
+) -> tuple[Preprocessed, float]:
+    """Average q and dq over wider windows while this reduces the error; return the half width, s."""
+    samples, parts, eam = best.samples, best.parts, best.eam
     rows, gains = parts.fit_or_select, np.ones(2) if samples.commanded else eam.gains.mean(axis=1)
     noise = noise_variance(samples, rows, samples.tau - eam.predict(samples)).mean()
-    noisy = encoder_variance(samples, rows, *gains * reference_gains(samples)).mean() >= _NOISY * noise
+    noisy = (
+        encoder_variance(samples, rows, *gains * reference_gains(samples)).mean()
+        >= _ENCODER_NOISE_SHARE * noise
+    )
 
-    def left(one: Preprocessed) -> float:
-        """Error beside dry friction, or how much more than without where the PD law itself is hardly blurred."""
-        return _beside_friction(one) - (0.0 if noisy else one.eam.mse)
+    def error_of(one: Preprocessed) -> float:
+        """Error with friction; relative to the error without it if noise hardly affects the PD law."""
+        return _error_with_friction(one) - (0.0 if noisy else one.eam.mse)
 
-    chosen, least = 0.0, left(found)
-    widths = _WIDTHS * samples.period
-    for steady in widths[widths <= (_LONGEST_MEAN if noisy else _BLURRED_MEAN)]:
-        other = tried(steady)
-        error = left(other)
-        if error < least - _STEADIER * noise:
-            found, chosen, least = other, float(steady), error
+    chosen, least = 0.0, error_of(best)
+    widths = _AVERAGING_ROWS * samples.period
+    for steady in widths[widths <= (_MAX_AVERAGING_S if noisy else _MAX_AVERAGING_BLURRED_S)]:
+        other = fit_logs(steady)
+        error = error_of(other)
+        if error < least - _MIN_AVERAGING_GAIN * noise:
+            best, chosen, least = other, float(steady), error
         elif error > least:
             break
-    return found, chosen
+    return best, chosen
 
 
-def _beside_friction(one: Preprocessed) -> float:
-    """Mean squared error of the EAM with dry friction, whose steps noisy speeds blur most, on each joint beside it."""
+def _error_with_friction(one: Preprocessed) -> float:
+    """Mean squared error of the plain model with friction, whose step noisy speeds blur most."""
     samples, eam, rows = one.samples, one.eam, one.parts.fit
     dq = samples.at(eam.input_delay, eam.output_delay, eam.window).dq
     left, total = samples.tau - eam.predict(samples), 0.0
     for j, chosen in enumerate(rows.T):
-        steps = np.tanh(dq[chosen, j, None] / _AT_REST)
+        steps = np.tanh(dq[chosen, j, None] / _FRICTION_WIDTHS_RAD_S)
         r = left[chosen, j] - steps @ np.linalg.lstsq(steps, left[chosen, j], rcond=None)[0]
         total += float(r @ r)
     return total / int(rows.sum())

@@ -1,12 +1,13 @@
-"""Does a model of the joints move the robot's legs as they moved? Commands replayed over short stretches, joint by joint.
+"""Replay logged commands on the legs of a robot's description, before and after a correction.
 
-What pushes a walking robot's legs beside their drives, the ground above all, is in no log. But it is the same in the
-measurement and in the replay, so that what the two differ by is
+A walking robot's legs are also pushed by the ground, which no log contains. These forces are the
+same in the measurement and in the replay. With the deviation e of the joint angles and the
+inertia M(q) of the legs, the trunk held still, what differs is
 
-    M(q) e'' = tau_model(q + e, dq + e') - tau_measured
+    M(q) e'' = tau_model(q + e, dq + e') - tau_measured.
 
-with the deviation e of the joints' angles and the inertia M(q) of the legs, the trunk held still. A model that gives the
-measured torque moves the legs as measured, e = 0; any other leaves its track as freely as the drives let it.
+A model that yields the measured torque moves the legs as measured, e = 0. Any other model
+deviates as far as the drives allow.
 """
 
 from __future__ import annotations
@@ -25,36 +26,54 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 from quadvel_description import mjcf
 
-from .log_signals import double
+from .log_signals import as_double
 from .logs.log import Log, LogError
 from .signals import Array, Bools
 
-STRETCH = 0.2
-"""s that are replayed from a measured state, whereupon the next stretch begins with another one"""
-BLOCK = 0.25
-"""s in a row that hold a stretch"""
-_BEFORE = 0.04
-"""s of the measured motion that the model is led along first, so that its delays and memories are filled"""
-_STEP = 0.001
-"""s of the replay"""
-TEXT = (
+STRETCH_S = 0.2
+"""s that are replayed from a measured state; then the next stretch begins at another measured state."""
+MIN_BLOCK_S = 0.25
+"""s; shortest block of rows that holds a stretch."""
+_WARM_UP_S = 0.04
+"""s of measured motion before a stretch, which fill the model's delays and memories."""
+_STEP_S = 0.001
+"""s; time step of the replay."""
+EXPLANATION = (
     "The legs of the robot's description, the trunk held still, pushed by what the model gives beyond the measured torque; "
     "what else pushes them is as measured."
 )
+"""Explanation of the replay in the report."""
 _SHIPPED = Path(mjcf.__file__).parent / "robots"
 
 
 @attrs.frozen(eq=False)
 class Legs:
-    """The inertia that joints carry, of a description of the robot."""
+    """Inertia of a robot's joints, from a description of the robot.
+
+    Attributes:
+        model: The description as a MuJoCo model.
+        joints: Names of the joints of the log, all in the description.
+    """
 
     model: mujoco.MjModel
     joints: tuple[str, ...]
 
     @classmethod
-    def of(cls, robot: str, joints: Sequence[str]) -> Legs:
-        """robot: `aliengo`, `go2`, or a file, MJCF or URDF, that holds `joints`. Raises ValueError, OSError."""
-        model = mjcf.load_model() if robot == "aliengo" else _loaded(robot)
+    def load(cls, robot: str, joints: Sequence[str]) -> Legs:
+        """Load a robot's description.
+
+        Args:
+            robot: `aliengo`, `go2`, or the path of an MJCF or URDF file.
+            joints: Names of the joints, which the description has to hold.
+
+        Returns:
+            The legs.
+
+        Raises:
+            ValueError: A joint is missing, or MuJoCo cannot read the file.
+            FileNotFoundError: There is no such description.
+        """
+        model = mjcf.load_model() if robot == "aliengo" else _load_robot(robot)
         known = {model.joint(k).name for k in range(model.njnt)}
         for name in joints:
             if name not in known:
@@ -64,7 +83,14 @@ class Legs:
         return cls(model, tuple(joints))
 
     def inertia(self, q: Array) -> Array:
-        """(N, J, J) kg m^2 at angles (N, J), the other joints where the description has them and the trunk held still."""
+        """Compute the inertia matrix of the joints, with the trunk held still.
+
+        Args:
+            q: (N, J) joint angles, rad; other joints keep the angles of the description.
+
+        Returns:
+            (N, J, J) inertia, kg m^2.
+        """
         model, data = self.model, mujoco.MjData(self.model)
         joints = [model.joint(name) for name in self.joints]
         at, dofs = [int(one.qposadr[0]) for one in joints], [int(one.dofadr[0]) for one in joints]
@@ -78,26 +104,38 @@ class Legs:
             found[n] = full[np.ix_(dofs, dofs)]
         return found
 
-    def replayed(self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools) -> dict[str, Any]:
-        """Root mean square deviations over `rows` (N, J) of all logs; how many stretches there were.
+    def replay_errors(
+        self, logs: Sequence[Log], parameters: ActuatorParameters, rows: Bools
+    ) -> dict[str, Any]:
+        """Replay logs and compute the root mean square deviations from the measured motion.
 
-        Raises LogError where no stretch lies within these rows.
+        Args:
+            logs: The logs, one after the other.
+            parameters: The actuator model.
+            rows: (N, J) rows of all logs that stretches may use.
+
+        Returns:
+            Number of stretches; deviations of angles (rad) and speeds (rad/s), of all joints and
+            of each.
+
+        Raises:
+            LogError: The rows hold no stretch, or a log holds no torque or gains.
         """
         found, first = [], 0
         for log in logs:
-            begins = stretches(log, rows[first : first + len(log.t)])
+            begins = stretch_starts(log, rows[first : first + len(log.t)])
             first += len(log.t)
             if len(begins):
-                found.append(deviations(log, parameters, self, begins))
+                found.append(replay_deviations(log, parameters, self, begins))
         if not found:
             raise LogError(
-                f"{logs[0].name}: no {1e3 * STRETCH:.0f} ms in a row are to be replayed, expected longer blocks"
+                f"{logs[0].name}: no {1e3 * STRETCH_S:.0f} ms in a row are to be replayed, expected longer blocks"
             )
-        return {"stretches": sum(one[0].shape[1] for one in found), **_sizes(found)}
+        return {"stretches": sum(one[0].shape[1] for one in found), **_rms_errors(found)}
 
 
-def _loaded(robot: str) -> mujoco.MjModel:
-    """The model of a shipped description, or of a file."""
+def _load_robot(robot: str) -> mujoco.MjModel:
+    """Load a shipped description, or a file."""
     shipped = _SHIPPED / f"{robot}.xml"
     path = shipped if shipped.is_file() else Path(robot)
     if not path.is_file():
@@ -109,8 +147,16 @@ def _loaded(robot: str) -> mujoco.MjModel:
         raise ValueError(f"{path}: no MJCF or URDF that MuJoCo reads: {error}") from None
 
 
-def stretches(log: Log, rows: Bools) -> Array:
-    """The instants (S,) s at which stretches begin that hold none but `rows` (N, J), one after the other."""
+def stretch_starts(log: Log, rows: Bools) -> Array:
+    """Find the start times of consecutive stretches.
+
+    Args:
+        log: The log.
+        rows: (N, J) rows that stretches may use.
+
+    Returns:
+        (S,) start times, s.
+    """
     whole: Bools = np.asarray(rows.all(axis=1))
     broken = np.flatnonzero(~whole | log.after_gap)
     edges = np.concatenate([[0], broken, [len(whole)]])
@@ -118,50 +164,65 @@ def stretches(log: Log, rows: Bools) -> Array:
     for first, end in pairwise(edges):
         inside = np.flatnonzero(whole[first:end]) + first
         if len(inside):
-            start = max(float(log.t[inside[0]]), float(log.t[0]) + _BEFORE)
-            begins += np.arange(start, log.t[inside[-1]] - STRETCH, STRETCH).tolist()
+            start = max(float(log.t[inside[0]]), float(log.t[0]) + _WARM_UP_S)
+            begins += np.arange(start, log.t[inside[-1]] - STRETCH_S, STRETCH_S).tolist()
     return np.array(begins)
 
 
-def deviations(log: Log, parameters: ActuatorParameters, legs: Legs, begins: Array) -> tuple[Array, Array]:
-    """What the joints of a replay are off by after each _STEP of the stretches that begin at `begins` (S,) s.
+def replay_deviations(
+    log: Log, parameters: ActuatorParameters, legs: Legs, begins: Array
+) -> tuple[Array, Array]:
+    """Replay stretches of a log and compute the deviations from the measured motion.
 
-    (T, S, J) of the angles, rad, and of the speeds, rad/s. Raises LogError where the log holds no torque or no gains.
+    Args:
+        log: The log, with torque and gains.
+        parameters: The actuator model.
+        legs: The inertia of the joints.
+        begins: (S,) start times of the stretches, s.
+
+    Returns:
+        Deviations after each step of `_STEP_S`: angles (T, S, J), rad, and speeds (T, S, J),
+        rad/s.
+
+    Raises:
+        LogError: The log holds no torque or no gains.
     """
     if log.tau is None or log.kp is None or log.kd is None:
         raise LogError(f"{log.name}: tau, kp, kd: expected all three to replay the commands")
     shape = (len(begins), len(log.joints))
-    model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), shape, _STEP)
+    model = ActuatorModel(attrs.evolve(parameters, torque_noise=0.0), shape, _STEP_S)
     none = np.zeros(log.q_des.shape)
     commands = [
-        none if one is None else double(one) for one in (log.q_des, log.kp, log.kd, log.dq_des, log.tau_ff)
+        none if one is None else as_double(one) for one in (log.q_des, log.kp, log.kd, log.dq_des, log.tau_ff)
     ]
-    inverse = np.linalg.inv(legs.inertia(_between(log, log.q, begins + 0.5 * STRETCH)))
+    # M(q) e'' = tau_model(q + e, dq + e') - tau_measured, with M at the middle of each stretch, by
+    # semi-implicit Euler steps. During the warm-up e = 0.
+    inverse = np.linalg.inv(legs.inertia(_interpolate(log, log.q, begins + 0.5 * STRETCH_S)))
     angle, speed = np.zeros(shape), np.zeros(shape)
     angles, speeds = [], []
-    for k in range(-round(_BEFORE / _STEP), round(STRETCH / _STEP)):
-        t = begins + k * _STEP
+    for k in range(-round(_WARM_UP_S / _STEP_S), round(STRETCH_S / _STEP_S)):
+        t = begins + k * _STEP_S
         q, dq, tau = (
-            _between(log, log.q, t),
-            _between(log, log.dq, t),
-            _between(log, log.tau, t + 0.5 * _STEP),
+            _interpolate(log, log.q, t),
+            _interpolate(log, log.dq, t),
+            _interpolate(log, log.tau, t + 0.5 * _STEP_S),
         )
         sent = log.command_rows(t)
         torque = model.step(q + angle, dq + speed, *(one[sent] for one in commands))
         if k >= 0:
-            speed = speed + _STEP * (inverse @ (torque - tau)[..., None])[..., 0]
-            angle = angle + _STEP * speed
+            speed = speed + _STEP_S * (inverse @ (torque - tau)[..., None])[..., 0]
+            angle = angle + _STEP_S * speed
             angles.append(angle)
             speeds.append(speed)
     return np.array(angles), np.array(speeds)
 
 
-def _between(log: Log, values: NDArray[np.floating[Any]], at: Array) -> Array:
-    """Lines through the rows `values` (N, J) of a log, read at `at` (S,) s: (S, J)."""
+def _interpolate(log: Log, values: NDArray[np.floating[Any]], at: Array) -> Array:
+    """Interpolate rows `values` (N, J) of a log linearly at times `at` (S,), s: (S, J)."""
     return np.stack([np.interp(at, log.t, one) for one in values.T], axis=1)
 
 
-def _sizes(found: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
+def _rms_errors(found: Sequence[tuple[Array, Array]]) -> dict[str, Any]:
     """Root mean squares over all stretches, of all joints and of each."""
     sizes: dict[str, Any] = {}
     for k, name in enumerate(("q_rms_rad", "dq_rms_rad_s")):

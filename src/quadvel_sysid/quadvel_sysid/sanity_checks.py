@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from .baselines import SPAN
+from .baselines import FILTER_SPAN_S
 
 FAR = 1.0
 """rad; a replay that strays so far from the measured angles shows nothing of the model."""
@@ -20,7 +20,7 @@ def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
     after = report["after"]
     for name, what in (
         ("joint_pd", "a PD law of each joint"),
-        ("ridge", f"a ridge regression over {1e3 * SPAN:.0f} ms"),
+        ("ridge", f"a ridge regression over {1e3 * FILTER_SPAN_S:.0f} ms"),
     ):
         other = report["baselines"][name]["heldout_mse"]
         if after["heldout_mse"] > WORTH * other:

@@ -21,7 +21,7 @@ from .fit import RIDGE
 from .library import Context, SignalTerm, complexity, may_act
 from .model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
 from .parallel import side_by_side
-from .signals import Array, scattered
+from .signals import Array, scattered_rows
 
 _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
 _FEW_SHIFTS = (0.0,)
@@ -64,10 +64,10 @@ class CandidateScreening:
         self.context, self._cores = context, cores
         self.joints = context.samples.joints
         fitted = np.flatnonzero(context.parts.fit.any(axis=1))
-        self.rows = fitted[scattered(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
+        self.rows = fitted[scattered_rows(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
         """(n, J): rows that are fitted, in units of the noise"""
-        self.screening_rows = context.samples.taken(self.rows)
+        self.screening_rows = context.samples.take_rows(self.rows)
         """the rows that are looked at, alone"""
         self._remembers = any(one.law.has_memory for one in context.model.effects)
         shifts = _FEW_SHIFTS if self._remembers else _TOTAL_DELAY_CHANGES_S

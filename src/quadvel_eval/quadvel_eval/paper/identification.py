@@ -15,7 +15,7 @@ from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import PolicyFile
 from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
-from quadvel_sysid.excitation import FootLifting, within_torque
+from quadvel_sysid.excitation import FootLifting, limit_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
@@ -88,7 +88,7 @@ def lifting(seed: int, seconds: float) -> Log:
     rise = np.linspace(0.0, 1.0, round(EASE / PERIOD))[:, None]
     for target in np.vstack([start + rise * (targets[0] - start), targets]):
         state = simulator.state()
-        q = within_torque(target, state.q, state.dq, robot.KP, robot.KD)
+        q = limit_torque(target, state.q, state.dq, robot.KP, robot.KD)
         simulator.command(JointCommand(q=q, kp=kp, kd=kd))
         simulator.step(STEPS)
     return simulator.log(f"Eq. 9, seed {seed}", EASE)

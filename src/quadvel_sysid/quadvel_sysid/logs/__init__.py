@@ -1,1 +1,1 @@
-"""Measured logs: read from what people have, looked at before anything is fitted."""
+"""Measured logs of joints: readers for all formats, and the checks before identification."""

@@ -1,4 +1,4 @@
-"""Checks of single channels: what rests, repeats, is clipped, copied or not there, and joints' names and gains."""
+"""Checks of single channels: motionless, repeated, clipped, duplicated or missing ones."""
 
 from __future__ import annotations
 
@@ -10,82 +10,138 @@ from numpy.typing import NDArray
 
 from quadvel_description.robot import JOINT_NAMES, LOWER, UPPER
 
-from .findings import Finding, some
+from .findings import Finding, format_names
 from .log import Array, Bools, Log
 
-ROWS = 20_000
-"""So many rows tell as much as all, in bounded memory."""
-TURN = 2.0 * np.pi
-DEGREE = np.pi / 180.0
-HALF_WIDTH = 0.005
-"""s to either side over which a slope of q is taken, one row at least."""
-MOVING = 0.05
-"""rad/s from which a joint moves."""
-REACHES = 1e-3
-"""rad; a joint whose q spans less rests."""
-MOSTLY = 0.5
-"""Share of the rows in motion that repeat the one before, from which the logger is faster than the state."""
-REACH = 0.4
-"""rad beyond the model's range, before its name is doubted."""
+MAX_ROWS = 20_000
+"""Rows that a check reads at most; they are spread evenly over the log to bound its memory."""
+TURN_RAD = 2.0 * np.pi
+"""rad; one full turn."""
+DEGREE_RAD = np.pi / 180.0
+"""rad; one degree."""
+SLOPE_HALF_WIDTH_S = 0.005
+"""s to either side over which a slope of q is computed, at least one row."""
+MOVING_SPEED_RAD_S = 0.05
+"""rad/s; a joint moves from this speed on."""
+MOVING_SPAN_RAD = 1e-3
+"""rad; a joint whose q spans less is motionless."""
+REPEATED_ROWS_SHARE = 0.5
+"""If more than this share of the rows in motion repeats the row before, the logger is faster than
+the state.
+"""
+RANGE_MARGIN_RAD = 0.4
+"""rad beyond the model's joint range; from there the joint's name is doubted."""
 
 
-def rows_of(log: Log) -> NDArray[np.intp]:
-    """At most ROWS rows of the log, evenly spread."""
-    return np.unique(np.linspace(0, len(log.t) - 1, min(ROWS, len(log.t))).astype(np.intp))
+def sample_rows(log: Log) -> NDArray[np.intp]:
+    """Select at most `MAX_ROWS` rows, spread evenly over the log.
+
+    Args:
+        log: The log.
+
+    Returns:
+        (R,) row indices, increasing.
+    """
+    return np.unique(np.linspace(0, len(log.t) - 1, min(MAX_ROWS, len(log.t))).astype(np.intp))
 
 
-def slope_of(log: Log, values: Array, row: NDArray[np.intp]) -> Array:
-    """Slope of `values` (N, J) at `row`, (rows, J) a second, over HALF_WIDTH to either side."""
-    reach = max(1, round(HALF_WIDTH / log.period))
+def slope_at_rows(log: Log, values: Array, row: NDArray[np.intp]) -> Array:
+    """Compute central differences over `SLOPE_HALF_WIDTH_S` to either side.
+
+    Args:
+        log: The log whose times apply.
+        values: (N, J) signal.
+        row: (R,) rows at which the slope is computed.
+
+    Returns:
+        (R, J) slope, units of `values` per second.
+    """
+    reach = max(1, round(SLOPE_HALF_WIDTH_S / log.period))
     first, last = np.maximum(row - reach, 0), np.minimum(row + reach, len(log.t) - 1)
     return np.asarray((values[last] - values[first]) / (log.t[last] - log.t[first])[:, None], dtype=float)
 
 
-def names(log: Log, hit: Bools) -> tuple[str, ...]:
-    """Of the joints that `hit` (J,) marks."""
+def joints_where(log: Log, hit: Bools) -> tuple[str, ...]:
+    """Return the names of the joints that a mask marks.
+
+    Args:
+        log: The log.
+        hit: (J,) mask.
+
+    Returns:
+        The names, in the order of the log.
+    """
     return tuple(name for name, one in zip(log.joints, hit, strict=True) if one)
 
 
-def still(log: Log) -> Iterator[Finding]:
-    """Joints that never move."""
-    resting = names(log, np.ptp(log.q, axis=0) < REACHES)
+def motionless(log: Log) -> Iterator[Finding]:
+    """Joints that never move.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal if no joint moves, a warning if some joints do not.
+    """
+    resting = joints_where(log, np.ptp(log.q, axis=0) < MOVING_SPAN_RAD)
     if len(resting) == len(log.joints):
         yield Finding("refusal", "q", resting, "q: no joint ever moves, so nothing can be identified")
     elif resting:
-        text = f"q: never moves: {some(resting)}; of these only the torque at rest is seen"
+        text = f"q: never moves: {format_names(resting)}; only their torque at rest is observed"
         yield Finding("warning", "q", resting, text)
 
 
-def torque(log: Log) -> Iterator[Finding | Log]:
-    """Torque that is not there, or never changes."""
+def torque_presence(log: Log) -> Iterator[Finding | Log]:
+    """Torque that is not there, or never changes.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A note or a warning; the log without `tau` if it is constant on all joints.
+    """
     tau = log.tau
     if tau is not None:
-        dead = names(log, np.ptp(tau, axis=0) == 0.0)
+        dead = joints_where(log, np.ptp(tau, axis=0) == 0.0)
         if len(dead) == len(log.joints):
-            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; taken as not logged"
+            text = f"tau: is {tau[0, 0]:g} throughout, which is no measurement; treated as not logged"
             yield Finding("warning", "tau", dead, text)
             tau, log = None, attrs.evolve(log, tau=None)
             yield log
         elif dead:
-            yield Finding("warning", "tau", dead, f"tau: never changes: {some(dead)}")
+            yield Finding("warning", "tau", dead, f"tau: never changes: {format_names(dead)}")
     if tau is None:
         text = "tau: not in the log; effects are judged by the motion that follows from the commands"
         yield Finding("note", "tau", (), text)
 
 
-def scaled(log: Log) -> Iterator[Finding]:
-    """Without torque the gains give everything its scale, so they have to be known."""
+def torque_or_gains(log: Log) -> Iterator[Finding]:
+    """Gains that are not there although the torque is missing, so that nothing gives the scale.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal if both the torque and one of the gains are missing.
+    """
     lacking = [name for name in ("kp", "kd") if getattr(log, name) is None]
     if log.tau is None and lacking:
         text = (
-            f"tau, {', '.join(lacking)}: not in the log; expected the torque, or the commanded gains in N m/rad and N m s/rad "
-            "(--gains KP KD), as nothing else has a scale; a servo's own numbers do not do"
+            f"tau, {', '.join(lacking)}: not in the log; expected the torque, or the commanded gains in N m/rad "
+            "and N m s/rad (--gains KP KD), as nothing else gives the scale; a servo's own numbers do not"
         )
         yield Finding("refusal", "tau", (), text)
 
 
-def gains(log: Log) -> Iterator[Finding]:
-    """Gains that are not there, change, or are negative."""
+def commanded_gains(log: Log) -> Iterator[Finding]:
+    """Gains that are not there, change, or are negative.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal of negative gains, notes on missing or changing ones.
+    """
     for field, values in (("kp", log.kp), ("kd", log.kd)):
         if values is None:
             fitted = "" if log.tau is None else "; it is fitted"
@@ -99,38 +155,48 @@ def gains(log: Log) -> Iterator[Finding]:
             text = f"{field}: changes in the log, {used.min():g} to {used.max():g}"
             yield Finding("note", field, (), text)
         if field == "kd" and not len(used):
-            text = "kd: 0 was commanded; the damping that the drive has of its own is fitted"
+            text = "kd: 0 was commanded; the drive's own damping is fitted"
             yield Finding("note", field, (), text)
 
 
-def held(log: Log) -> Iterator[Finding | Log]:
-    """Rows that repeat the whole state before although the joints move: where most do, the others are the log."""
-    parts = [log.q, log.tau, None if "dq" in log.made else log.dq]
+def repeated_rows(log: Log) -> Iterator[Finding | Log]:
+    """Rows that repeat the whole state before although the joints move.
+
+    If most rows repeat, the rows in which the state changed become the log.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A note or warning; the log without the repeated rows if these are the majority.
+    """
+    parts = [log.q, log.tau, None if "dq" in log.derived else log.dq]
     same = np.all([(np.diff(x, axis=0) == 0.0).all(axis=1) for x in parts if x is not None], axis=0)
-    runs = np.diff(
-        np.flatnonzero(np.concatenate([[True], ~same, [True]]))
-    )  # rows from one change to the next
+    # Rows from one change of the state to the next.
+    runs = np.diff(np.flatnonzero(np.concatenate([[True], ~same, [True]])))
     low, usual, high = np.percentile(runs, [25, 50, 75])
     if usual >= 2 and high - low <= 0.25 * usual:
-        moving = ~same | same  # a steady beat is the logger's, whatever moves
+        moving = ~same | same  # all rows: an even pattern comes from the logger
     else:
-        moving = np.abs(log.dq[1:]).max(axis=1) > MOVING
+        moving = np.abs(log.dq[1:]).max(axis=1) > MOVING_SPEED_RAD_S
     repeated, total = int((same & moving).sum()), max(1, int(moving.sum()))
     share = repeated / total
-    if share > MOSTLY:
-        fresh = log.of_rows(np.concatenate([[True], ~same]))
+    if share > REPEATED_ROWS_SHARE:
+        fresh = log.select_rows(np.concatenate([[True], ~same]))
         text = (
-            f"q: {100 * share:.0f} % of the rows repeat the state before (usually {usual:.0f} rows show one state); those "
-            f"in which it changed are used, {1.0 / fresh.period:.3g} Hz"
+            f"q: {100 * share:.0f} % of the rows repeat the state before (usually {usual:.0f} rows show one "
+            f"state); those in which it changed are used, {1.0 / fresh.period:.3g} Hz"
         )
         yield Finding("warning", "q", (), text)
         yield fresh
         return
     if log.tau is not None:
         late = (np.diff(log.tau, axis=0) == 0.0).all(axis=1)
-        if late[moving].mean() > MOSTLY:
+        if late[moving].mean() > REPEATED_ROWS_SHARE:
             share = 100.0 * late[moving].mean()
-            text = f"tau: {share:.0f} % of the rows repeat the torque before; those in which it changed are judged"
+            text = (
+                f"tau: {share:.0f} % of the rows repeat the torque before; those in which it changed are used"
+            )
             yield Finding("warning", "tau", (), text)
             yield attrs.evolve(log, valid=log.valid & ~np.concatenate([[False], late])[:, None])
     if repeated:
@@ -138,9 +204,16 @@ def held(log: Log) -> Iterator[Finding | Log]:
         yield Finding("warning" if share > 0.01 else "note", "q", (), text)
 
 
-def copies(log: Log) -> Iterator[Finding]:
-    """Two joints whose measurements are the same to the bit."""
-    row = rows_of(log)
+def duplicated_channels(log: Log) -> Iterator[Finding]:
+    """Two joints whose measurements are the same to the bit.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A warning for the first such pair of each field.
+    """
+    row = sample_rows(log)
     for field in ("q", "tau"):
         values = getattr(log, field)
         seen: dict[bytes, str] = {}
@@ -153,29 +226,43 @@ def copies(log: Log) -> Iterator[Finding]:
                 return
 
 
-def ranges(log: Log) -> Iterator[Finding]:
-    """Names of the model on joints that move where the model's joint cannot; names that it does not have."""
+def joint_ranges(log: Log) -> Iterator[Finding]:
+    """Joints outside the range of the model's joint of that name; unknown names next to known ones.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        Warnings.
+    """
     named = [name for name in log.joints if name in JOINT_NAMES]
     if named and len(named) < len(log.joints):
         strange = tuple(name for name in log.joints if name not in JOINT_NAMES)
-        text = f"joint_names: {some(strange)}: not among the model's joints, though {named[0]} is"
+        text = f"joint_names: {format_names(strange)}: not among the model's joints, though {named[0]} is"
         yield Finding("warning", "joint_names", strange, text)
     outside = {}
     for name in named:
         low, high = np.percentile(log.q[:, log.joints.index(name)], [1, 99])
         lower, upper = LOWER[JOINT_NAMES.index(name)], UPPER[JOINT_NAMES.index(name)]
-        if low < lower - REACH or high > upper + REACH:
+        if low < lower - RANGE_MARGIN_RAD or high > upper + RANGE_MARGIN_RAD:
             outside[name] = f"{name} {low:.2f} to {high:.2f} (the model's: {lower:.2f} to {upper:.2f})"
     if outside:
         text = (
-            f"joint_names: q contradicts the model's range, rad: {some(list(outside.values()), 2)}: "
+            f"joint_names: q contradicts the model's range, rad: {format_names(list(outside.values()), 2)}: "
             "another order of names, or another robot?"
         )
         yield Finding("warning", "joint_names", tuple(outside), text)
 
 
-def clipped(log: Log) -> Iterator[Finding]:
-    """Channels that stay at one extreme value again and again."""
+def clipped_channels(log: Log) -> Iterator[Finding]:
+    """Channels that stay at one extreme value again and again.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A warning for each field with clipped joints; a note for commands.
+    """
     for field, unit in (("q", "rad"), ("dq", "rad/s"), ("tau", "N m"), ("q_des", "rad")):
         values = getattr(log, field)
         hit: dict[str, str] = {}
@@ -186,5 +273,5 @@ def clipped(log: Log) -> Iterator[Finding]:
                 if np.sum(runs >= 3) >= 3 and 0.002 < at.mean() < 0.5:
                     hit[joint] = f"{joint} at {bound:.4g} in {100 * at.mean():.1f} %"
         if hit:
-            text = f"{field}: clipped ({unit}): {some(list(hit.values()))} of the rows"
+            text = f"{field}: clipped ({unit}): {format_names(list(hit.values()))} of the rows"
             yield Finding("note" if field == "q_des" else "warning", field, tuple(hit), text)

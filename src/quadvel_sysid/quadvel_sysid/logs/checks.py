@@ -1,8 +1,9 @@
-"""What a log says before anything is fitted to it: one table of checks, in the order in which causes come before symptoms.
+"""The table of checks that a log passes before anything is fitted to it.
 
-Each check asks one thing and says what it found in a sentence. A refusal means that a report on this log would be wrong;
-a warning that a part of it is not used or was mended, or is to be read with care. `python -m quadvel_sysid.logs.checks`
-prints the table.
+Each check looks for one defect and describes it in a sentence. A refusal means that a report on
+this log would be wrong. A warning means that a part of the log is left out, was corrected or is
+unreliable. The order matters: a cause is checked before its symptoms. `python -m
+quadvel_sysid.logs.checks` prints the table.
 """
 
 from __future__ import annotations
@@ -14,62 +15,87 @@ import attrs
 
 from . import angles, channels, clocks, commands, response, separability, stamps, torque
 from .findings import Finding
-from .log import GAP, Log, LogError
-from .pd_control import explainable, masked
+from .log import GAP_FACTOR, Log, LogError
+from .pd_control import explainable_rows, masked_rows
 
 
 @attrs.frozen
 class Check:
-    """`look` yields what it found, and the log anew where it mended it."""
+    """One row of the table of checks.
 
-    look: Callable[..., Iterator[Finding | Log]]
-    measures: str
+    Attributes:
+        run: The check. It yields findings, and the corrected log if it can correct the defect.
+            The first line of its docstring is the first column of the table.
+        measured: The quantity that is compared with the limit.
+        limit: The limit, with its unit.
+        consequence: What happens beyond the limit.
+    """
+
+    run: Callable[..., Iterator[Finding | Log]]
+    measured: str
     limit: str
-    then: str
+    consequence: str
 
 
 @attrs.frozen(eq=False)
 class Inspection:
-    """What was found, and the log as it is to be used: mended, `valid` narrowed to the rows that a PD model can explain."""
+    """The findings about a log, and the log that identification uses.
+
+    Attributes:
+        log: The corrected log. Its `valid` is restricted to rows that a PD model can explain.
+        findings: All findings, in the order of the checks.
+    """
 
     log: Log
     findings: tuple[Finding, ...]
 
     def raise_refusal(self) -> None:
-        """Raises LogError with what was refused, if anything was."""
+        """Raise an error if the log was refused.
+
+        Raises:
+            LogError: At least one finding is a refusal; the message joins their sentences.
+        """
         refused = [finding.text for finding in self.findings if finding.kind == "refusal"]
         if refused:
             raise LogError(f"{self.log.name}: {'; and '.join(refused)}")
 
 
 def inspect(log: Log, gains: tuple[float, float] | None = None) -> Inspection:
-    """All that can be said about the log, check by check, as far as the first refusal.
+    """Run all checks on a log, in their order, up to the first refusal.
 
-    `gains` are the commanded kp and kd (N m/rad, N m s/rad) of a log that holds none.
+    The checks of the rows come first, then the search for rows outside PD control, then the
+    checks of the response to commands, then those of the motion.
+
+    Args:
+        log: The log to check.
+        gains: Commanded kp (N m/rad) and kd (N m s/rad), used if the log holds none.
+
+    Returns:
+        The findings and the corrected log.
     """
     log = log.with_gains(gains)
     findings = [Finding("note", text.partition(":")[0], (), text) for text in log.remarks]
     findings += [Finding("warning", text.partition(":")[0], (), text) for text in log.warnings]
-    for check in OF_ROWS:
-        log = _looked(check, findings, log)
-    if _refused(findings):
+    for check in ROW_CHECKS:
+        log = _run_check(check, findings, log)
+    if _has_refusal(findings):
         return Inspection(log, tuple(findings))
     answer = log.without_feed_forward()
-    valid, why = explainable(answer)
+    valid, why = explainable_rows(answer)
     findings += why
     log = attrs.evolve(log, valid=valid)
-    found = None if _refused(findings) else response.measured(log)
-    for check in OF_RESPONSE if found else ():
-        log = _looked(check, findings, log, found)
-    if not _refused(findings):  # these say nothing of each other: all are heard
-        findings += [one for check in OF_MOTION for one in check.look(log) if isinstance(one, Finding)]
+    found = None if _has_refusal(findings) else response.measure_response(log)
+    for check in RESPONSE_CHECKS if found else ():
+        log = _run_check(check, findings, log, found)
+    if not _has_refusal(findings):  # independent of each other: all of them run
+        findings += [one for check in MOTION_CHECKS for one in check.run(log) if isinstance(one, Finding)]
     return Inspection(log, tuple(findings))
 
 
-def _looked(check: Check, findings: list[Finding], log: Log, *given: Any) -> Log:
-    """The log as the check leaves it, what it found added to `findings`; nothing where one has refused already."""
-    if not _refused(findings):
-        for one in check.look(log, *given):
+def _run_check(check: Check, findings: list[Finding], log: Log, *given: Any) -> Log:
+    """Run one check, unless the log was refused before; append its findings and return the log."""
+    if not _has_refusal(findings):
+        for one in check.run(log, *given):
             if isinstance(one, Log):
                 log = one
             else:
@@ -77,78 +103,187 @@ def _looked(check: Check, findings: list[Finding], log: Log, *given: Any) -> Log
     return log
 
 
-def _refused(findings: list[Finding]) -> bool:
+def _has_refusal(findings: list[Finding]) -> bool:
+    """Whether one of the findings is a refusal."""
     return any(finding.kind == "refusal" for finding in findings)
 
 
-OF_ROWS = (
-    Check(stamps.clocks, "spacing of the rows, s; its longest step; the spans of t and t_cmd",
-          f"{stamps.FASTEST:g} to {stamps.SLOWEST:g} s; a day; {stamps.LONGEST_SPAN:g} times as long", "refusal"),
-    Check(stamps.rates, "spacings, in times of the usual one", f"{GAP:g}", "note, warning of gaps"),
-    Check(masked, "rows of `valid` that are false", "any", "note; left out"),
-    Check(channels.still, "span of q, rad", f"{channels.REACHES:g}", "warning; on all joints a refusal"),
-    Check(channels.held, "share of the rows in motion that repeat the whole state before, or its torque", f"{channels.MOSTLY:.0%}",
-          "the rows in which it changed are used, with a warning"),
-    Check(angles.wrapped, "steps of q from one row to the next, rad off a full turn", f"{angles.WRAPPED:g}",
-          "unwrapped, with a warning"),
-    Check(angles.speed, "dq that is not there, has one sign while the slope of q has both; correlation of the two; ticks of q",
-          f"each sign in {torque.BOTH_WAYS:.0%} of the rows; {angles.UNLIKE:g}",
-          "made from q, with a note or a warning; where the torque is explained better by dq as logged, that stays"),
-    Check(torque.spikes, "how far rows of tau stand off the rows around and off what a PD law explains, standard deviations",
-          f"{torque.FAR:g} in both", "left out, with a warning"),
-    Check(torque.sign, "tau of one sign that reaches 0: the error that the size of what a PD law asks for leaves, over that of the "
-          "law with an offset, where that leaves half of the torque or more", f"{torque.CLEARLY:g}", "refusal"),
-    Check(angles.units, "slope of q over dq, and their correlation",
-          f"a factor of {angles.OFF:g} at a correlation of {angles.ALIKE:g}", "refusal, with the unit that would explain it"),
-    Check(commands.constant, "where q_des spans next to nothing of what q spans: share of the torque that a "
-          "PD law about it leaves; share of the rest that the angle explains",
-          f"{commands.HELD:g}; {commands.ANSWERED:g}", "left out, with a warning; on all joints, or without torque, a refusal"),
-    Check(angles.degrees, "size of q_des over that of q; size of q, rad", f"25 to 130; {angles.TURNS:g}", "refusal"),
-    Check(channels.copies, "joints whose q or tau is the same to the bit", "all rows", "warning"),
-    Check(channels.ranges, "q beyond the range that the model's joint of that name has, rad", f"{channels.REACH:g}", "warning"),
-    Check(channels.clipped, "share of the rows at one extreme, in runs of three or more", "0.2 %", "warning; of commands a note"),
-    Check(channels.torque, "span of tau, N m", "0", "taken as not logged, with a warning"),
-    Check(clocks.clock, "lag from command to torque (without torque, to the acceleration) that leaves least, s; what it leaves "
-          f"over what those of a drive leave, and how sure that is, in standard errors over pieces of {clocks.PIECE:g} s",
-          f"0 to {clocks.LATEST:g} s (without torque -{clocks.SLOW:g} to {clocks.SLOW:g} s); {response.BETTER:g}; "
-          f"{clocks.STANDARD_ERRORS:g}",
-          "refusal"),
-    Check(channels.gains, "kp and kd: there, constant, not negative", "0", "note; refusal of negative ones"),
-)  # fmt: skip
-"""What is asked of all rows."""
+ROW_CHECKS = (
+    Check(
+        stamps.time_bases,
+        "spacing of the rows, s; its longest step; the spans of t and t_cmd",
+        f"{stamps.MIN_PERIOD_S:g} to {stamps.MAX_PERIOD_S:g} s; a day; {stamps.MAX_SPAN_RATIO:g} times as long",
+        "refusal",
+    ),
+    Check(
+        stamps.sampling_rates,
+        "spacings, in times of the usual one",
+        f"{GAP_FACTOR:g}",
+        "note, warning of gaps",
+    ),
+    Check(masked_rows, "rows of `valid` that are false", "any", "note; left out"),
+    Check(
+        channels.motionless,
+        "span of q, rad",
+        f"{channels.MOVING_SPAN_RAD:g}",
+        "warning; on all joints a refusal",
+    ),
+    Check(
+        channels.repeated_rows,
+        "share of the rows in motion that repeat the whole state before, or its torque",
+        f"{channels.REPEATED_ROWS_SHARE:.0%}",
+        "the rows in which it changed are used, with a warning",
+    ),
+    Check(
+        angles.wrapped_angles,
+        "steps of q from one row to the next, rad off a full turn",
+        f"{angles.WRAP_TOLERANCE_RAD:g}",
+        "unwrapped, with a warning",
+    ),
+    Check(
+        angles.unusable_speed,
+        "dq that is missing, or has one sign while the slope of q has both; correlation of the two; "
+        "steps of the encoder of q",
+        f"each sign in {torque.MIN_SIGN_SHARE:.0%} of the rows; {angles.UNRELATED_CORRELATION:g}",
+        "computed from q, with a note or a warning; if dq as logged explains the torque better, it stays",
+    ),
+    Check(
+        torque.spikes,
+        "deviation of a row of tau from the rows around it and from a fitted PD law, standard deviations",
+        f"{torque.SPIKE_SIGMAS:g} in both",
+        "left out, with a warning",
+    ),
+    Check(
+        torque.unsigned_torque,
+        "tau of one sign that reaches 0: error of the magnitude of a PD law over that of a PD law with an "
+        "offset, if the latter leaves half of the torque or more",
+        f"{torque.MAGNITUDE_ERROR_RATIO:g}",
+        "refusal",
+    ),
+    Check(
+        angles.speed_units,
+        "slope of q over dq, and their correlation",
+        f"a factor of {angles.UNIT_FACTOR:g} at a correlation of {angles.UNIT_CORRELATION:g}",
+        "refusal, with the unit that would explain it",
+    ),
+    Check(
+        commands.constant_command,
+        "if q_des spans almost nothing of what q spans: share of the torque that a PD law about it "
+        "leaves; share of the rest that the angle explains",
+        f"{commands.MAX_HOLDING_ERROR:g}; {commands.MIN_ANSWERED_SHARE:g}",
+        "left out, with a warning; on all joints, or without torque, a refusal",
+    ),
+    Check(
+        angles.angle_units,
+        "size of q_des over that of q; size of q, rad",
+        f"25 to 130; {angles.MAX_ANGLE_RAD:g}",
+        "refusal",
+    ),
+    Check(
+        channels.duplicated_channels,
+        "joints whose q or tau is the same to the bit",
+        "all rows",
+        "warning",
+    ),
+    Check(
+        channels.joint_ranges,
+        "q beyond the range that the model's joint of that name has, rad",
+        f"{channels.RANGE_MARGIN_RAD:g}",
+        "warning",
+    ),
+    Check(
+        channels.clipped_channels,
+        "share of the rows at one extreme, in runs of three or more",
+        "0.2 %",
+        "warning; of commands a note",
+    ),
+    Check(channels.torque_presence, "span of tau, N m", "0", "treated as not logged, with a warning"),
+    Check(
+        clocks.clock_offset,
+        "lag from command to torque (without torque, to the acceleration) with the smallest error, s; this "
+        "error over that of the best lag a drive can have; certainty, in standard errors over pieces of "
+        f"{clocks.PIECE_S:g} s",
+        f"0 to {clocks.MAX_DRIVE_DELAY_S:g} s (without torque -{clocks.MAX_MOTION_LAG_S:g} to "
+        f"{clocks.MAX_MOTION_LAG_S:g} s); {response.PREFERRED_ERROR_RATIO:g}; "
+        f"{clocks.MIN_STANDARD_ERRORS:g}",
+        "refusal",
+    ),
+    Check(
+        channels.commanded_gains,
+        "kp and kd: there, constant, not negative",
+        "0",
+        "note; refusal of negative ones",
+    ),
+)
+"""Checks of all rows."""
 
-OF_RESPONSE = (
-    Check(response.columns, "share of the torque left by the best order of joints, over that left by the order as it is",
-          f"{response.BETTER:g} on two joints or more whose commands differ (correlation below {response.SAME:g})", "refusal"),
-    Check(response.signs, "partial correlation of torque and own command, beside the joint's angle, speed and direction",
-          f"below {-response.SURE:g}", "refusal: which of q, q_des and tau has the opposite sign"),
-    Check(response.deaf, "share of the torque, beside speed and friction, that the position error explains",
-          f"{response.UNANSWERED:.0%}", "warning; on all joints a refusal"),
-    Check(response.scale, "gain that the torque shows over the one commanded, of the position error and of the command alone",
-          f"a factor of {response.FAR_OFF:g}",
-          "refusal where a unit or one joint explains it; else the gains are in a servo's own unit and are fitted, with a warning"),
-)  # fmt: skip
-"""What is asked of logs with torque, in the rows under PD control."""
+RESPONSE_CHECKS = (
+    Check(
+        response.joint_order,
+        "share of the torque left by the best order of joints, over that left by the order as it is",
+        f"{response.PREFERRED_ERROR_RATIO:g} on two joints or more whose commands differ "
+        f"(correlation below {response.SAME_COMMAND_CORRELATION:g})",
+        "refusal",
+    ),
+    Check(
+        response.opposite_signs,
+        "partial correlation of torque and own command, given the joint's angle, speed and direction",
+        f"below {-response.MIN_SIGN_CORRELATION:g}",
+        "refusal: which of q, q_des and tau has the opposite sign",
+    ),
+    Check(
+        response.unresponsive,
+        "share of the torque left by speed and friction that the position error explains",
+        f"{response.MIN_ANSWERED_SHARE:.0%}",
+        "warning; on all joints a refusal",
+    ),
+    Check(
+        response.gain_units,
+        "gain that the torque shows over the one commanded, of the position error and of the command alone",
+        f"a factor of {response.UNIT_GAIN_FACTOR:g}",
+        "refusal if a unit or one joint explains it; else the gains are in a servo's own unit and are "
+        "fitted, with a warning",
+    ),
+)
+"""Checks of logs with torque, in the rows under PD control."""
 
-OF_MOTION = (
-    Check(response.followed, f"without torque: correlation r of q with commands up to {response.REACH:g} s before; 1 - r^2 "
-          "of the best order of joints over that of the order as it is",
-          f"r below {-response.CLEAR:g} at every lag; {response.BETTER:g} on two joints", "refusal: the sign, or the order"),
-    Check(channels.scaled, "tau, kp and kd that are there", "the torque or both gains", "refusal"),
-    Check(separability.collinear, "share of what a parameter does to the torque that no mix of the others does",
-          f"{separability.APART:g}", "note or warning, with the motion that would separate them"),
-)  # fmt: skip
-"""What is asked of the motion, in the rows under PD control; each is asked, whatever the others say."""
+MOTION_CHECKS = (
+    Check(
+        response.command_tracking,
+        f"without torque: correlation r of q with commands up to {response.MAX_LAG_S:g} s before; 1 - r^2 "
+        "of the best order of joints over that of the order as it is",
+        f"r below {-response.EXPLAINED_ERROR_SHARE:g} at every lag; "
+        f"{response.PREFERRED_ERROR_RATIO:g} on two joints",
+        "refusal: the sign, or the order",
+    ),
+    Check(
+        channels.torque_or_gains,
+        "tau, kp and kd that are there",
+        "the torque or both gains",
+        "refusal",
+    ),
+    Check(
+        separability.collinear,
+        "share of what a parameter does to the torque that no mix of the others does",
+        f"{separability.MIN_SEPARATION:g}",
+        "note or warning, with the motion that would separate them",
+    ),
+)
+"""Checks of the motion, in the rows under PD control; each runs, whatever the others find."""
 
 
-def table() -> str:
-    """All checks in their order, as Markdown."""
+def markdown_table() -> str:
+    """Format all checks as a Markdown table, in their order.
+
+    Returns:
+        The table, as it stands in docs/identification.md.
+    """
     lines = ["| check | measured | limit | then |", "|---|---|---|---|"]
-    for check in (*OF_ROWS, *OF_RESPONSE, *OF_MOTION):
-        asks = str(check.look.__doc__).partition("\n")[0].rstrip(".")
-        lines.append(f"| {asks} | {check.measures} | {check.limit} | {check.then} |")
+    for check in (*ROW_CHECKS, *RESPONSE_CHECKS, *MOTION_CHECKS):
+        summary = str(check.run.__doc__).partition("\n")[0].rstrip(".")
+        lines.append(f"| {summary} | {check.measured} | {check.limit} | {check.consequence} |")
     return "\n".join(lines)
 
 
 if __name__ == "__main__":
-    print(table())
+    print(markdown_table())

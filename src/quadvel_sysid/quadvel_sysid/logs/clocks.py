@@ -1,11 +1,12 @@
-"""Are states and commands on one clock? The lag from command to torque that explains the torque best, of all within seconds.
+"""Check that states and commands share one clock, by the lag that explains the torque best.
 
-At each lag l the torque of a joint is regressed on what a PD law can ask for at that lag,
+At each lag l the torque of a joint is regressed on the terms of a PD law at that lag,
 
-    tau(t) = a q_des(t - l) + b dq_des(t - l) + c tau_ff(t - l) + d q(t) + e dq(t) + f sign(dq(t)) + g,
+    tau(t) = a q_des(t - l) + b dq_des(t - l) + c tau_ff(t - l) + d q(t) + e dq(t) + f sign(dq(t)) + g.
 
-with the slope of q_des where dq_des is not logged, as a drive may feed it forward. The sums over the rows that overlap are
-correlations, so that Fourier transforms give them for all lags at once. Without torque, the acceleration stands for it.
+If dq_des is not logged, the slope of q_des replaces it, as a drive may feed it forward. The sums
+of products over the overlapping rows are cross-correlations, so Fourier transforms give them for
+all lags at once. Without torque, the acceleration replaces it.
 """
 
 from __future__ import annotations
@@ -21,53 +22,83 @@ from scipy import fft
 
 from .findings import Finding
 from .log import Log
-from .response import BETTER, CLEAR, REACH, ROUNDING, motion
+from .response import (
+    EXPLAINED_ERROR_SHARE,
+    MAX_LAG_S,
+    PREFERRED_ERROR_RATIO,
+    TIME_ROUNDING_S,
+    motion_regressors,
+)
 
 Numbers = NDArray[np.float64]
 
-STEP = 0.002
-"""s between the lags, a row of the log at least."""
-FAR = 10.0
-"""s, the longest lag to either side; half of the log at most."""
-MOST_ROWS = 30_000
-"""Rows used, from the middle of a long log: a minute at STEP."""
-LATEST = 0.045
-"""s, the longest delay of a drive: the model has 26 ms at most, and rows at 50 Hz add up to 20 ms."""
-LEAD = 0.2
-"""s, the largest kd / kp with which a drive feeds the speed of its command forward."""
-STANDARD_ERRORS = 4.0
-"""By which another lag must explain more than those of a drive: in a healthy log chance does that once in 30,000."""
-PIECE = 0.1
-"""s of motion that count as one piece of evidence."""
-SLOW = 0.25
-"""s, within which an acceleration may lead or follow the command that it answers: its springs and friction are not known."""
-HALF_WIDTH = 0.01
-"""s to either side over which the slope of dq is taken."""
+LAG_STEP_S = 0.002
+"""s between two lags, at least one row of the log."""
+MAX_CLOCK_LAG_S = 10.0
+"""s; largest lag to either side, at most half of the log."""
+MAX_ROWS = 30_000
+"""Rows used, from the middle of a long log: one minute at `LAG_STEP_S`."""
+MAX_DRIVE_DELAY_S = 0.045
+"""s; longest delay of a drive: the model has 26 ms at most, and rows at 50 Hz add up to 20 ms."""
+MAX_SPEED_LEAD_S = 0.2
+"""s; largest kd / kp of a drive that feeds the commanded speed forward."""
+MIN_STANDARD_ERRORS = 4.0
+"""Standard errors by which another lag must explain more; in a healthy log chance does that once in
+30,000.
+"""
+PIECE_S = 0.1
+"""s of motion that count as one independent piece of evidence."""
+MAX_MOTION_LAG_S = 0.25
+"""s; lag of an acceleration to its command, to either side: springs and friction are not known."""
+SLOPE_HALF_WIDTH_S = 0.01
+"""s to either side over which the slope of dq is computed."""
 
 
 @attrs.frozen(eq=False)
-class _Joint:
-    """Signals of one joint at N instants, evenly spaced; `fixed` ends with 1, and belongs to the torque's instant."""
+class _JointSignals:
+    """Signals of one joint at N evenly spaced instants.
 
-    torque: Numbers  # (N,)
-    fixed: Numbers  # (N, K): angle, speed, direction, 1
-    moving: Numbers  # (N, C): q_des, its speed, and tau_ff where there is one
-    use: Numbers  # (N,), 1 where the row counts
-    sent: Numbers  # (N,), 1 where a command was in force
+    Attributes:
+        torque: (N,) torque, N m, or acceleration.
+        fixed: (N, K) regressors at the torque's instant: angle, speed, direction, 1.
+        moving: (N, C) regressors that are shifted by the lag: q_des, its speed, and tau_ff if
+            logged.
+        use: (N,) 1 in valid rows, else 0.
+        sent: (N,) 1 after the first command, else 0.
+    """
 
-    def left(self, most: int) -> Numbers:
-        """(2 most + 1,), the share of the torque's variance that commands leave which are `-most` to `most` rows late."""
+    torque: Numbers
+    fixed: Numbers
+    moving: Numbers
+    use: Numbers
+    sent: Numbers
+
+    def error_share(self, most: int) -> Numbers:
+        """Share of the torque's variance that the regression leaves at each lag.
+
+        Args:
+            most: Largest lag, rows.
+
+        Returns:
+            (2 most + 1,) shares, for lags from -most to most rows.
+        """
+        # Residual variance of the regression over that of the torque, at all lags. The commanded
+        # speed is a regressor only at lags where its weight is plausible for a drive.
         products = self._products(most)
         one, command, speed = self.fixed.shape[1] - 1, self.fixed.shape[1], self.fixed.shape[1] + 1
         variance = products[:, -1, -1] - products[:, -1, one] ** 2 / (products[:, one, one] + 1e-12)
         every = np.arange(products.shape[1] - 1)
-        plain, _ = _regressed(products, np.delete(every, speed))
-        fed, weights = _regressed(products, every)
+        plain, _ = _regress(products, np.delete(every, speed))
+        fed, weights = _regress(products, every)
         causal = _causal(weights[:, command], weights[:, speed])
         return np.asarray(np.where(causal, np.minimum(plain, fed), plain) / (variance + 1e-12))
 
     def _products(self, most: int) -> Numbers:
-        """(L, P, P), for each lag the products of `fixed`, `moving` and `torque`, summed over the rows that overlap."""
+        """Products (L, P, P) of `fixed`, `moving` and `torque`, summed over overlapping rows."""
+        # With weights w and v, each product is a cross-correlation over the overlapping rows,
+        #   sum_t w(t) a(t) b(t) v(t - l) c(t - l) d(t - l),
+        # where a, b are columns of the torque's instant and c, d those of the command's (1 if absent).
+        # It is the inverse transform of FFT(w a b) conj(FFT(v c d)).
         rows, still, sent = len(self.torque), self.fixed.shape[1], self.moving.shape[1]
         here = np.column_stack([self.fixed, np.ones((rows, sent)), self.torque])
         there = np.column_stack([np.ones((rows, still)), self.moving, np.ones(rows)])
@@ -83,8 +114,15 @@ class _Joint:
         found[:, a, b] = found[:, b, a] = np.concatenate([sums[:, -most:], sums[:, : most + 1]], axis=1).T
         return found
 
-    def errors(self, late: int) -> Numbers:
-        """(N,), squared error of the torque over its variance with commands `late` rows late, 0 where they are not known."""
+    def squared_errors(self, late: int) -> Numbers:
+        """Squared error of the regression at one lag, over the torque's variance.
+
+        Args:
+            late: The lag, rows.
+
+        Returns:
+            (N,) errors; 0 in rows without a known command.
+        """
         row = np.arange(len(self.torque)) - late
         known = (row >= 0) & (row < len(row))
         row = np.clip(row, 0, len(row) - 1)
@@ -100,12 +138,14 @@ class _Joint:
 
 
 def _causal(of_command: Any, of_speed: Any) -> Any:
-    """Does a drive feed the speed forward with these weights, so that its torque leads its command by 0 to LEAD?"""
-    return (of_command * of_speed >= 0.0) & (np.abs(of_speed) <= LEAD * np.abs(of_command))
+    """Whether a drive that feeds the speed forward can have these weights: a lead of 0 to 0.2 s."""
+    return (of_command * of_speed >= 0.0) & (np.abs(of_speed) <= MAX_SPEED_LEAD_S * np.abs(of_command))
 
 
-def _regressed(products: Numbers, columns: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
-    """What a regression of the last column on `columns` leaves, (L,), and its weights (L, P - 1), 0 of the others."""
+def _regress(products: Numbers, columns: NDArray[np.intp]) -> tuple[Numbers, Numbers]:
+    """Regress the last column on `columns`: residual sums of squares (L,), weights (L, P - 1)."""
+    # Normal equations X^T X w = X^T y at every lag, scaled to a unit diagonal; then
+    # the residual is y^T y - w^T X^T y.
     inner, outer = products[:, columns[:, None], columns], products[:, columns, -1]
     size = np.sqrt(np.maximum(np.einsum("lkk->lk", inner), 1e-12))
     inner = inner / size[:, :, None] / size[:, None, :] + 1e-9 * np.eye(len(columns))
@@ -116,62 +156,87 @@ def _regressed(products: Numbers, columns: NDArray[np.intp]) -> tuple[Numbers, N
 
 
 @attrs.frozen(eq=False)
-class Lags:
-    """What commands of each lag explain of the torque of a log's joints, on instants `step` s apart."""
+class LagProfile:
+    """Error of the regression at each lag, for all joints that move.
+
+    Attributes:
+        step: Time between lags, s.
+        max_steps: Number of lags to either side.
+        joints: Signals of each joint.
+    """
 
     step: float
-    most: int  # steps to either side
-    joints: tuple[_Joint, ...]
+    max_steps: int
+    joints: tuple[_JointSignals, ...]
 
     @cached_property
     def lags(self) -> Numbers:
-        """(L,), from a command to its torque, s."""
-        return np.asarray(self.step * np.arange(-self.most, self.most + 1), dtype=np.float64)
+        """Lags (L,) from a command to its torque, s."""
+        return np.asarray(self.step * np.arange(-self.max_steps, self.max_steps + 1), dtype=np.float64)
 
     @cached_property
-    def left(self) -> Numbers:
-        """(L, J), share of each joint's torque that is left."""
-        return np.stack([one.left(self.most) for one in self.joints], axis=1)
+    def error_share(self) -> Numbers:
+        """Share (L, J) of each joint's torque variance that is left."""
+        return np.stack([one.error_share(self.max_steps) for one in self.joints], axis=1)
 
     @cached_property
-    def total(self) -> Numbers:
-        """(L,), geometric mean over the joints."""
-        return np.asarray(np.exp(np.mean(np.log(self.left + 1e-6), axis=1)), dtype=np.float64)
+    def mean_error_share(self) -> Numbers:
+        """Geometric mean (L,) of `error_share` over the joints."""
+        return np.asarray(np.exp(np.mean(np.log(self.error_share + 1e-6), axis=1)), dtype=np.float64)
 
     def standard_errors(self, lag: int, other: int) -> float:
-        """By how many the lag of index `lag` explains more than that of index `other`, in pieces of PIECE."""
-        gains = [one.errors(other - self.most) - one.errors(lag - self.most) for one in self.joints]
+        """Certainty that one lag explains more than another.
+
+        Args:
+            lag: Index of the first lag.
+            other: Index of the second lag.
+
+        Returns:
+            Difference of their errors in standard errors, estimated from pieces of `PIECE_S`.
+        """
+        gains = [
+            one.squared_errors(other - self.max_steps) - one.squared_errors(lag - self.max_steps)
+            for one in self.joints
+        ]
         gain = np.sum(gains, axis=0)
-        pieces = np.add.reduceat(gain, np.arange(0, len(gain), max(1, round(PIECE / self.step))))
+        pieces = np.add.reduceat(gain, np.arange(0, len(gain), max(1, round(PIECE_S / self.step))))
         return float(pieces.sum() / np.sqrt(np.sum((pieces - pieces.mean()) ** 2) + 1e-12))
 
 
-def lags_of(log: Log) -> Lags | None:
-    """None where too few rows count."""
-    step = max(STEP, log.period)
+def lag_profile(log: Log) -> LagProfile | None:
+    """Compute the error of the regression at each lag.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The profile; None with fewer than 50 valid instants or without a changing command.
+    """
+    step = max(LAG_STEP_S, log.period)
     t = np.arange(log.t[0], log.t[-1], step)
-    t = t[max(0, len(t) - MOST_ROWS) // 2 :][:MOST_ROWS]
-    row, command = np.searchsorted(log.t, t + ROUNDING, side="right") - 1, log.command_rows(t)
+    t = t[max(0, len(t) - MAX_ROWS) // 2 :][:MAX_ROWS]
+    row, command = np.searchsorted(log.t, t + TIME_ROUNDING_S, side="right") - 1, log.command_rows(t)
     moving = np.flatnonzero(log.valid[row].any(axis=0) & (np.ptp(log.q_des[command], axis=0) > 0.0))
     if log.valid[row].any(axis=1).sum() < 50 or not len(moving):
         return None
     sent = np.asarray(t >= log.t_cmd[0], dtype=float)
-    joints = tuple(_joint(log, int(j), row, command, sent, step) for j in moving)
-    return Lags(step, int(min(FAR, step * len(t) / 2) / step), joints)
+    joints = tuple(_joint_signals(log, int(j), row, command, sent, step) for j in moving)
+    return LagProfile(step, int(min(MAX_CLOCK_LAG_S, step * len(t) / 2) / step), joints)
 
 
-def _joint(
+def _joint_signals(
     log: Log, j: int, row: NDArray[np.intp], command: NDArray[np.intp], sent: Numbers, step: float
-) -> _Joint:
+) -> _JointSignals:
+    """Signals of joint `j` at evenly spaced instants, means removed."""
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
     q_des = np.asarray(log.q_des[command, j], dtype=float) - q.mean()
-    reach = max(1, round(HALF_WIDTH / step))
+    reach = max(1, round(SLOPE_HALF_WIDTH_S / step))
     torque = _slope(dq, reach, step) if log.tau is None else np.asarray(log.tau[row, j], dtype=float)
     speed = np.gradient(q_des, step) if log.dq_des is None else log.dq_des[command, j]
     asked = [q_des, speed, *([] if log.tau_ff is None else [log.tau_ff[command, j]])]
-    return _Joint(
+    return _JointSignals(
         torque - torque.mean(),
-        np.column_stack([q - q.mean(), motion(dq)]),
+        np.column_stack([q - q.mean(), motion_regressors(dq)]),
         np.column_stack(asked).astype(float),
         log.valid[row, j].astype(float),
         sent,
@@ -179,30 +244,44 @@ def _joint(
 
 
 def _slope(x: Numbers, reach: int, step: float) -> Numbers:
+    """Central difference of `x` (N,) over `reach` rows to either side."""
     first, last = np.maximum(np.arange(len(x)) - reach, 0), np.minimum(np.arange(len(x)) + reach, len(x) - 1)
     return np.asarray((x[last] - x[first]) / ((last - first) * step))
 
 
-def clock(log: Log) -> Iterator[Finding]:
-    """Torque (without it, motion) that answers commands of a lag that no drive has: t and t_cmd are not of one clock."""
-    found = lags_of(log)
+def clock_offset(log: Log) -> Iterator[Finding]:
+    """Torque (or motion) that follows the commands with a lag that no drive has: two clocks.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal.
+    """
+    found = lag_profile(log)
     if found is None:
         return
-    earliest, latest = (0.0, LATEST) if log.tau is not None else (-SLOW, SLOW)
-    of_a_drive = (found.lags > earliest - STEP / 2) & (found.lags < latest + STEP / 2)
-    best = int(np.argmin(found.total))
-    usual = int(np.argmin(np.where(of_a_drive, found.total, np.inf)))
-    lag, left, other = float(found.lags[best]), float(found.total[best]), float(found.total[usual])
-    ratio = CLEAR if latest < lag <= SLOW else BETTER
-    if of_a_drive[best] or left > min(ratio * other, CLEAR):
+    earliest, latest = (
+        (0.0, MAX_DRIVE_DELAY_S) if log.tau is not None else (-MAX_MOTION_LAG_S, MAX_MOTION_LAG_S)
+    )
+    of_a_drive = (found.lags > earliest - LAG_STEP_S / 2) & (found.lags < latest + LAG_STEP_S / 2)
+    best = int(np.argmin(found.mean_error_share))
+    usual = int(np.argmin(np.where(of_a_drive, found.mean_error_share, np.inf)))
+    lag, left, other = (
+        float(found.lags[best]),
+        float(found.mean_error_share[best]),
+        float(found.mean_error_share[usual]),
+    )
+    ratio = EXPLAINED_ERROR_SHARE if latest < lag <= MAX_MOTION_LAG_S else PREFERRED_ERROR_RATIO
+    if of_a_drive[best] or left > min(ratio * other, EXPLAINED_ERROR_SHARE):
         return
-    if found.standard_errors(best, usual) < STANDARD_ERRORS:
+    if found.standard_errors(best, usual) < MIN_STANDARD_ERRORS:
         return
     what = "torque" if log.tau is not None else "motion"
     shares = (
         f"that leaves {100 * left:.2g} % of the {what}, a delay that a drive can have {100 * other:.2g} %"
     )
-    if -REACH <= lag < 0.0:
+    if -MAX_LAG_S <= lag < 0.0:
         text = (
             f"t_cmd: the {what} comes {-1e3 * lag:.0f} ms before its command ({shares}); expected each command at the time it "
             "was sent: is it logged a step late?"

@@ -1,6 +1,7 @@
-"""Tables of text: CSV as spreadsheets, loggers and `numpy.savetxt` write it.
+"""Reader of text tables: CSV as spreadsheets, loggers and `numpy.savetxt` write it.
 
-Separators, decimal commas, comments, units and dates are recognised; columns that no log needs are skipped unread.
+It recognises separators, decimal commas, comments, units and dates. Columns that no log needs are
+not parsed.
 """
 
 from __future__ import annotations
@@ -22,44 +23,50 @@ import numpy as np
 
 from . import units
 from .log import Array, LogError
-from .names import TIMES
-from .raw import LARGEST, LARGEST_TEXT, LONGEST_LINE, Choose, Raw, opened, type_of
+from .names import TIME_FIELDS
+from .raw import MAX_LINE_CHARS, MAX_TEXT_CHARS, MAX_VALUES, ColumnChooser, RawArrays, field_dtype, open_bytes
 
 SEPARATORS = (",", ";", "\t", "|")
-LINES = 20_000
-"""Lines of a table that are read at once."""
-SEEN = 100
-"""Lines below the head that tell how numbers are written."""
-BLOCK = 1 << 23
-"""Characters that are read at once."""
+MAX_BLOCK_LINES = 20_000
+"""Lines of a table that are parsed together."""
+SAMPLE_LINES = 100
+"""Lines below the head from which the decimal mark and a row of units are recognised."""
+MAX_BLOCK_CHARS = 1 << 23
+"""Characters that are parsed together."""
 MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none", "-")
-EXPECTED = "expected t, q/FR_hip_joint, ..."
+EXPECTED_HEAD = "expected t, q/FR_hip_joint, ..."
 
 Line = tuple[int, str]
-"""The number of a line, from 1, and its text."""
+"""Number of a line, from 1, and its text."""
 
 
 @attrs.frozen
-class _Form:
-    """How the cells of a table are written. separator: None for white space."""
+class _Dialect:
+    """How the cells of a table are written.
+
+    Attributes:
+        separator: Character between cells; None for white space.
+        columns: Names of the columns.
+        decimal_comma: Whether numbers are written as 0,5.
+    """
 
     separator: str | None
     columns: Sequence[str]
     decimal_comma: bool = False
 
     def cells(self, line: str) -> list[str]:
-        """The cells of one line, without spaces around and quotes."""
+        """Split one line into cells, without quotes and surrounding spaces."""
         return next(self.rows([line]))
 
     def rows(self, lines: Iterator[str] | Sequence[str]) -> Iterator[list[str]]:
-        """The same of many; a quoted cell may go over several lines."""
+        """Split lines into rows of cells; a quoted cell may span several lines."""
         if self.separator is None:
             return (line.split() for line in lines)
         reader = csv.reader(lines, delimiter=self.separator, skipinitialspace=True)
         return ([cell.strip() for cell in row] for row in reader)
 
     def number(self, cell: str, time: bool = False) -> Any:
-        """The number, truth value, date or list of numbers in a cell. Raises ValueError."""
+        """Parse a number, truth value, date or list of numbers; raises ValueError."""
         plain = cell.lower()
         if plain in MISSING:
             return np.nan
@@ -69,40 +76,55 @@ class _Form:
             return json.loads(cell)
         if time and ":" in cell:
             return _seconds(cell)
-        return float(_with_point(cell) if self.decimal_comma else cell)
+        return float(_decimal_point(cell) if self.decimal_comma else cell)
 
 
 def _seconds(cell: str) -> float:
-    """A date of ISO 8601 as seconds since 1970, a time of the day as seconds since midnight."""
+    """Convert an ISO 8601 date to seconds since 1970, a time of day to seconds since midnight."""
     date = datetime.fromisoformat(cell if re.match(r"\d{4}-?\d\d", cell) else f"1970-01-01T{cell}")
     return (date if date.tzinfo else date.replace(tzinfo=UTC)).timestamp()
 
 
-def _with_point(text: str) -> str:
+def _decimal_point(text: str) -> str:
+    """Replace decimal commas by points."""
     return text.replace(",", ".")
 
 
 def _is_number(cell: str) -> bool:
+    """Whether a cell holds a number."""
     return (
         re.fullmatch(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?|nan|[+-]?inf", cell, re.IGNORECASE)
         is not None
     )
 
 
-def read(path: Path, choose: Choose) -> Raw:
-    """The columns that `choose` names. Raises LogError, which names the line and the column."""
-    with _text(path) as file:
+def read(path: Path, choose: ColumnChooser) -> RawArrays:
+    """Read the selected columns of a text table.
+
+    Args:
+        path: The file.
+        choose: Selects the columns to read.
+
+    Returns:
+        The selected columns, with the units that the table states.
+
+    Raises:
+        LogError: The table has no head or no rows, or a cell is wrong; the message names line and
+            column.
+    """
+    with _open_text(path) as file:
         try:
             return _read(path, file, choose)
         except csv.Error as error:
             raise LogError(f"{path}: no table: {error}") from None
 
 
-def _read(path: Path, file: IO[str], choose: Choose) -> Raw:
+def _read(path: Path, file: IO[str], choose: ColumnChooser) -> RawArrays:
+    """Read the table from an open file."""
     lines = _lines(path, file)
-    form, stated, begin = _head(path, lines)
+    form, stated, begin = _read_head(path, lines)
     chosen = _chosen(path, form.columns, choose)
-    first = list(_block(chain(begin, lines), SEEN))
+    first = list(_block(chain(begin, lines), SAMPLE_LINES))
     below = _units_below(form, chosen, first)
     if below:
         stated, first = stated | below, first[1:]
@@ -111,7 +133,7 @@ def _read(path: Path, file: IO[str], choose: Choose) -> Raw:
     blocks = list(_blocks(path, chain(first, lines), form, chosen, remarks))
     if not blocks:
         raise LogError(f"{path}: {next(iter(chosen))}: the table has no rows")
-    return Raw(
+    return RawArrays(
         {name: np.concatenate([block[i] for block in blocks]) for i, name in enumerate(chosen)},
         tuple(name for name in form.columns if name not in chosen),
         {name: unit for name, unit in stated.items() if name in chosen and unit},
@@ -119,28 +141,29 @@ def _read(path: Path, file: IO[str], choose: Choose) -> Raw:
     )
 
 
-def _text(path: Path) -> IO[str]:
-    with opened(path) as file:
+def _open_text(path: Path) -> IO[str]:
+    """Open a file as text: UTF-8, or UTF-16 with a byte order mark."""
+    with open_bytes(path) as file:
         wide = file.read(2) in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-    return io.TextIOWrapper(opened(path), encoding="utf-16" if wide else "utf-8-sig", errors="replace")
+    return io.TextIOWrapper(open_bytes(path), encoding="utf-16" if wide else "utf-8-sig", errors="replace")
 
 
 def _lines(path: Path, file: IO[str]) -> Iterator[Line]:
-    """The lines that are not empty. Raises LogError where the text is longer than a log can be."""
+    """Yield the lines that are not empty; raises LogError if the text is too long for a log."""
     length = number = 0
-    while line := file.readline(LONGEST_LINE):
+    while line := file.readline(MAX_LINE_CHARS):
         number += 1
         length += len(line)
-        if length > LARGEST_TEXT:
-            raise LogError(f"{path}: more than {LARGEST_TEXT} characters, expected fewer; cut the log")
+        if length > MAX_TEXT_CHARS:
+            raise LogError(f"{path}: more than {MAX_TEXT_CHARS} characters, expected fewer; cut the log")
         if number == 1 and ("\0" in line or not line.endswith("\n")):
-            raise LogError(f"{path}: the first line is no head, {EXPECTED}")
+            raise LogError(f"{path}: the first line is no head, {EXPECTED_HEAD}")
         if not line.isspace():
             yield number, line
 
 
-def _head(path: Path, lines: Iterator[Line]) -> tuple[_Form, dict[str, str], list[Line]]:
-    """How the table is written, the units that its head states, and the first row where that was read.
+def _read_head(path: Path, lines: Iterator[Line]) -> tuple[_Dialect, dict[str, str], list[Line]]:
+    """Read the head: the dialect, the units it states, and the first row if that was read.
 
     `numpy.savetxt` writes the head as a comment.
     """
@@ -150,91 +173,91 @@ def _head(path: Path, lines: Iterator[Line]) -> tuple[_Form, dict[str, str], lis
             break
         comment = begin[1].lstrip(" #\t")
     head = begin[1]
-    form = _Form(_separator(head), ())
+    form = _Dialect(_separator(head), ())
     cells, rows = form.cells(head), []
     if all(map(_is_number, cells)):
         cells, rows = form.cells(comment) if comment else [], [begin]
         if len(cells) != len(form.cells(head)) or all(map(_is_number, cells)):
             found = f"found the numbers {head.strip()[:40]}"
-            raise LogError(f"{path}: line {begin[0]}: {found}, but no head above them; {EXPECTED}")
-    named = [units.name_and_unit(cell) for cell in cells]
+            raise LogError(f"{path}: line {begin[0]}: {found}, but no head above them; {EXPECTED_HEAD}")
+    named = [units.split_unit(cell) for cell in cells]
     return attrs.evolve(form, columns=[name for name, _ in named]), dict(named), rows
 
 
 def _separator(head: str) -> str | None:
-    """What stands between the cells of a line, None for white space."""
+    """Guess the separator of a line; None for white space."""
     bare = re.sub(r'"[^"]*"', "", head)
     for one in SEPARATORS[1:]:
-        if one in bare and all(map(_is_number, _Form(one, ()).cells(head))):
+        if one in bare and all(map(_is_number, _Dialect(one, ()).cells(head))):
             return one
     most = max(SEPARATORS, key=bare.count)
     return most if most in bare or len(head.split()) == 1 else None
 
 
-def _chosen(path: Path, columns: Sequence[str], choose: Choose) -> Mapping[str, str]:
-    """The columns that are needed, each with its field."""
+def _chosen(path: Path, columns: Sequence[str], choose: ColumnChooser) -> Mapping[str, str]:
+    """The columns that are needed, each with its field, in the order of the table."""
     chosen = choose(columns)
     if not chosen:
         there = ", ".join(columns)[:60]
-        raise LogError(f"{path}: t: no such column in the head ({there}); {EXPECTED}")
+        raise LogError(f"{path}: t: no such column in the head ({there}); {EXPECTED_HEAD}")
     for column, times in Counter(columns).items():
         if times > 1 and column in chosen:
             raise LogError(f"{path}: {column}: the column stands there twice")
     return {column: chosen[column] for column in columns if column in chosen}
 
 
-def _units_below(form: _Form, chosen: Mapping[str, str], first: Sequence[Line]) -> dict[str, str]:
-    """The units of the chosen columns, where the row below the head holds units and no number."""
+def _units_below(form: _Dialect, chosen: Mapping[str, str], first: Sequence[Line]) -> dict[str, str]:
+    """The units of the chosen columns, if the row below the head holds units and no number."""
     cells = form.cells(first[0][1]) if first else []
     if len(cells) != len(form.columns):
         return {}
     stated = {
         name: cell.strip("[]() ") for name, cell in zip(form.columns, cells, strict=True) if name in chosen
     }
-    known = [unit for unit in stated.values() if units.factor(unit) is not None and not _is_number(unit)]
+    known = [unit for unit in stated.values() if units.si_factor(unit) is not None and not _is_number(unit)]
     return stated if known and not any(map(_is_number, stated.values())) else {}
 
 
-def _has_decimal_comma(form: _Form, lines: Sequence[Line]) -> bool:
-    """Whether numbers are written as 0,5, which with commas between the cells takes quotes."""
+def _has_decimal_comma(form: _Dialect, lines: Sequence[Line]) -> bool:
+    """Whether numbers are written as 0,5; with commas between the cells such numbers are quoted."""
     cells = chain.from_iterable(form.cells(line) for _, line in lines)
     return any(re.fullmatch(r"[+-]?\d*,\d+(e[+-]?\d+)?", cell, re.IGNORECASE) for cell in cells)
 
 
 def _blocks(
-    path: Path, lines: Iterator[Line], form: _Form, chosen: Mapping[str, str], remarks: list[str]
+    path: Path, lines: Iterator[Line], form: _Dialect, chosen: Mapping[str, str], remarks: list[str]
 ) -> Iterator[list[Array]]:
-    """The chosen columns, some lines of each."""
-    values = (
-        max(1, path.stat().st_size // max(1, 2 * len(form.columns))) * len(chosen) // 4
-    )  # of eight characters
+    """Yield the chosen columns, block by block of lines."""
+    # Expected number of values, if a cell has eight characters.
+    values = max(1, path.stat().st_size // max(1, 2 * len(form.columns))) * len(chosen) // 4
     rows = 0
     while block := list(_block(lines)):
-        found = _plain(form, block, chosen)
+        found = _parse_numeric(form, block, chosen)
         if found is None:
-            found = _any(path, form, block, lines, chosen, remarks)
+            found = _parse_cells(path, form, block, lines, chosen, remarks)
         rows += len(found[0])
-        if rows * sum(max(1, part.size // max(1, len(part))) for part in found) > LARGEST:
-            raise LogError(f"{path}: more than {LARGEST} values, expected fewer; cut the log")
+        if rows * sum(max(1, part.size // max(1, len(part))) for part in found) > MAX_VALUES:
+            raise LogError(f"{path}: more than {MAX_VALUES} values, expected fewer; cut the log")
         yield [
-            part.astype(type_of(field, values)) for part, field in zip(found, chosen.values(), strict=True)
+            part.astype(field_dtype(field, values))
+            for part, field in zip(found, chosen.values(), strict=True)
         ]
 
 
-def _block(lines: Iterator[Line], most: int = LINES) -> Iterator[Line]:
-    """The next lines, as many as are read at once, without comments."""
+def _block(lines: Iterator[Line], most: int = MAX_BLOCK_LINES) -> Iterator[Line]:
+    """Yield the lines of the next block, without comments."""
     length = count = 0
     for number, line in lines:
         if line.lstrip().startswith("#"):
             continue
         yield number, line
         length, count = length + len(line), count + 1
-        if length > BLOCK or count == most:
+        if length > MAX_BLOCK_CHARS or count == most:
             return
 
 
-def _plain(form: _Form, block: Sequence[Line], chosen: Mapping[str, str]) -> list[Array] | None:
-    """The chosen columns of lines that hold a number, or nothing, in each of these cells; otherwise None."""
+def _parse_numeric(form: _Dialect, block: Sequence[Line], chosen: Mapping[str, str]) -> list[Array] | None:
+    """Parse lines whose chosen cells hold plain numbers or nothing; None if one does not."""
     separator = form.separator
     lines = [line.strip() if separator is None else line.strip("\r\n ") for _, line in block]
     text = "".join(lines)
@@ -250,7 +273,7 @@ def _plain(form: _Form, block: Sequence[Line], chosen: Mapping[str, str]) -> lis
         empty = re.compile(rf"(?<={mark})[ \t]*(?={mark}|$)" if separator != "\t" else r"(?<=\t) *(?=\t|$)")
         lines = [empty.sub("nan", separator + line)[1:] for line in lines]
     if form.decimal_comma:
-        lines = [_with_point(line) for line in lines]
+        lines = [_decimal_point(line) for line in lines]
     lines = [line.replace("True", "1").replace("False", "0") for line in lines]
     wanted = [k for k, name in enumerate(form.columns) if name in chosen]
     try:
@@ -259,20 +282,23 @@ def _plain(form: _Form, block: Sequence[Line], chosen: Mapping[str, str]) -> lis
         return None
 
 
-def _any(
+def _parse_cells(
     path: Path,
-    form: _Form,
+    form: _Dialect,
     block: list[Line],
     lines: Iterator[Line],
     chosen: Mapping[str, str],
     remarks: list[str],
 ) -> list[Array]:
-    """The same of cells of every kind that `_Form.number` reads; a quoted cell may take further lines."""
-    rows = _rows(path, form, block, lines, remarks)
+    """Parse cells of every kind that `_Dialect.number` reads; a quoted one may span lines."""
+    rows = _split_rows(path, form, block, lines, remarks)
     found = []
     for k, name in enumerate(form.columns):
         if name in chosen:
-            cells = [_value(path, form, number, name, row[k], chosen[name] in TIMES) for number, row in rows]
+            cells = [
+                _parse_cell(path, form, number, name, row[k], chosen[name] in TIME_FIELDS)
+                for number, row in rows
+            ]
             try:
                 found.append(np.array(cells, dtype=float))
             except (ValueError, TypeError):
@@ -282,10 +308,10 @@ def _any(
     return found
 
 
-def _rows(
-    path: Path, form: _Form, block: list[Line], lines: Iterator[Line], remarks: list[str]
+def _split_rows(
+    path: Path, form: _Dialect, block: list[Line], lines: Iterator[Line], remarks: list[str]
 ) -> list[tuple[int, list[str]]]:
-    """Number and cells of each row, as many cells as the head has; half a row at the end is left out."""
+    """Line number and cells of each row; a truncated row at the end is left out, with a remark."""
     at, (last, ending) = 0, block[-1]
 
     def text() -> Iterator[str]:
@@ -301,7 +327,7 @@ def _rows(
         if len(cells) == len(form.columns):
             rows.append((at, cells))
         elif at == last and not ending.endswith("\n") and len(cells) < len(form.columns):
-            remarks.append(f"{form.columns[0]}: line {at}, the last one, was cut off and is left out")
+            remarks.append(f"{form.columns[0]}: line {at}, the last one, is truncated and left out")
         else:
             between = {None: "spaces", ",": "commas", "\t": "tabs"}.get(form.separator, f"'{form.separator}'")
             expected = f"expected {len(form.columns)} as the head has, with {between} between"
@@ -311,7 +337,8 @@ def _rows(
     return rows
 
 
-def _value(path: Path, form: _Form, line: int, column: str, cell: str, time: bool) -> Any:
+def _parse_cell(path: Path, form: _Dialect, line: int, column: str, cell: str, time: bool) -> Any:
+    """Parse one cell; raises LogError with the line and the column."""
     try:
         return form.number(cell, time)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""One thing that was found in a log, as a record and a sentence."""
+"""The record of one finding about a log: its kind, its field, its joints and a sentence."""
 
 from __future__ import annotations
 
@@ -12,7 +12,14 @@ Kind = Literal["note", "warning", "refusal"]
 
 @attrs.frozen
 class Finding:
-    """`text` begins with the field; `joints` are those that it is about, none where it is about all."""
+    """One finding of a check.
+
+    Attributes:
+        kind: `note`, `warning` or `refusal`. After a refusal the log is not identified.
+        field: The field of the log that the finding concerns, such as `q_des`.
+        joints: Names of the joints concerned; empty if it concerns all of them.
+        text: One sentence that begins with the field.
+    """
 
     kind: Kind
     field: str
@@ -20,7 +27,15 @@ class Finding:
     text: str
 
 
-def some(names: Sequence[str], most: int = 4) -> str:
-    """The first of the names, and how many more there are."""
+def format_names(names: Sequence[str], most: int = 4) -> str:
+    """Join the first names with commas and count the others.
+
+    Args:
+        names: Names to list.
+        most: Number of names that are spelled out.
+
+    Returns:
+        The list, such as `a, b and 3 more`.
+    """
     more = f" and {len(names) - most} more" if len(names) > most else ""
     return ", ".join(names[:most]) + more

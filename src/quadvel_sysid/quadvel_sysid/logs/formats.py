@@ -1,4 +1,4 @@
-"""What readers of MATLAB, HDF5 and Parquet have in common, and why files of other formats are not read."""
+"""Common parts of the MATLAB, HDF5 and Parquet readers; why other formats are not read."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import attrs
 import numpy as np
 
 from .log import LogError
-from .raw import Choose, Raw, check_size, check_type, numbers
+from .raw import ColumnChooser, RawArrays, as_numbers, check_size, check_type
 
-MOST_GROUPS = 1000
-"""Structs or groups of a file among which a log is looked for."""
+MAX_GROUPS = 1000
+"""Structs or groups of a file that are searched for a log."""
 
 _TORCH = (
     "python -c \"import numpy, torch; numpy.savez('log.npz', "
@@ -35,11 +35,19 @@ CONVERSIONS: Mapping[str, tuple[str, str]] = {
     **dict.fromkeys((".jsonl", ".ndjson"), (_CONVERTED, _PANDAS.replace("{reader}", "read_json('{name}', lines=True)"))),
     **dict.fromkeys((".zip", ".zst", ".xz", ".bz2"), (_CONVERTED, "unpack it")),
 }  # fmt: skip
-"""By suffix: why a file is not read, and the command that makes one of it that is."""
+"""By suffix: why a file is not read, and a command that converts it."""
 
 
-def refusal(path: Path, known: Collection[str]) -> str:
-    """Why a file of this suffix is not read, in one sentence."""
+def unreadable_reason(path: Path, known: Collection[str]) -> str:
+    """Explain in one sentence why files of this suffix are not read.
+
+    Args:
+        path: The file.
+        known: Suffixes that are read.
+
+    Returns:
+        The sentence, with a command that converts the file if there is one.
+    """
     reason, command = CONVERSIONS.get(path.suffix.lower(), ("", ""))
     command = command.replace("{name}", path.name)
     if reason:
@@ -48,8 +56,19 @@ def refusal(path: Path, known: Collection[str]) -> str:
     return f"{path}: the suffix is '{path.suffix}', expected {listed}, or a folder of rosbag2 or LeRobot"
 
 
-def library(path: Path, name: str) -> Any:
-    """A module of the extra `formats`. Raises LogError where it is not installed."""
+def import_reader(path: Path, name: str) -> Any:
+    """Import a module of the optional dependency group `formats`.
+
+    Args:
+        path: The file to be read, for the error message.
+        name: Name of the module.
+
+    Returns:
+        The module.
+
+    Raises:
+        LogError: It is not installed.
+    """
     try:
         return importlib.import_module(name)
     except ImportError:
@@ -59,39 +78,64 @@ def library(path: Path, name: str) -> Any:
 
 
 @attrs.frozen(eq=False)
-class Stored:
-    """An array that a file holds and that was not read yet."""
+class LazyArray:
+    """An array in a file that is read on demand.
+
+    Attributes:
+        shape: Its shape.
+        dtype: Its dtype.
+        read: Function that reads it.
+    """
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
     read: Callable[[], Any]
 
     @classmethod
-    def of(cls, values: Any) -> Stored:
-        """An array that was read already."""
+    def loaded(cls, values: Any) -> LazyArray:
+        """Wrap an array that is in memory.
+
+        Args:
+            values: The array.
+
+        Returns:
+            The wrapper.
+        """
         return cls(values.shape, values.dtype, lambda: values)
 
 
-def selected(path: Path, arrays: Mapping[str, Stored], choose: Choose) -> Raw:
-    """What of named arrays belongs to a log, in whatever struct or group it stands; that is read. Raises LogError."""
-    folder = _folder(list(arrays), choose)
+def select_arrays(path: Path, arrays: Mapping[str, LazyArray], choose: ColumnChooser) -> RawArrays:
+    """Find the struct or group that holds the log, and read its fields.
+
+    Args:
+        path: The file, for error messages.
+        arrays: Arrays by path inside the file.
+        choose: Selects the arrays to read.
+
+    Returns:
+        The selected arrays.
+
+    Raises:
+        LogError: An array has the wrong type, or the log is too large.
+    """
+    folder = _best_folder(list(arrays), choose)
     there = {name.removeprefix(folder): array for name, array in arrays.items() if name.startswith(folder)}
     chosen = choose(list(there))
     for name, field in chosen.items():
         check_type(path, name, there[name].dtype, field)
     check_size(path, {name: there[name].shape for name in chosen})
     total = sum(math.prod(there[name].shape) for name in chosen)
-    read = {name: numbers(_squeezed(there[name].read()), field, total) for name, field in chosen.items()}
-    return Raw(read, tuple(name for name in arrays if name.removeprefix(folder) not in read))
+    read = {name: as_numbers(_squeezed(there[name].read()), field, total) for name, field in chosen.items()}
+    return RawArrays(read, tuple(name for name in arrays if name.removeprefix(folder) not in read))
 
 
 def _squeezed(values: Any) -> Any:
-    """Without axes of length 1, which MATLAB gives to every vector; a row of joints stays one."""
+    """Remove axes of length 1, which MATLAB gives to every vector."""
     return np.squeeze(np.asarray(values))
 
 
-def _folder(names: Sequence[str], choose: Choose) -> str:
-    """The struct or group that holds most fields of a log, with a slash behind it, or "" for the file itself."""
+def _best_folder(names: Sequence[str], choose: ColumnChooser) -> str:
+    """The struct or group with most fields of a log, with a trailing slash; "" for the file itself."""
     parents = {"", *(name[: at + 1] for name in names for at, letter in enumerate(name) if letter == "/")}
 
     def fields(folder: str) -> int:
@@ -99,4 +143,4 @@ def _folder(names: Sequence[str], choose: Choose) -> str:
             set(choose([name.removeprefix(folder) for name in names if name.startswith(folder)]).values())
         )
 
-    return max(sorted(parents, key=lambda one: (one.count("/"), one))[:MOST_GROUPS], key=fields)
+    return max(sorted(parents, key=lambda one: (one.count("/"), one))[:MAX_GROUPS], key=fields)

@@ -1,8 +1,9 @@
-"""A measured log of joints, whatever file it came from; `read_log` makes one of a path.
+"""The record of a measured joint log, independent of the file format it was read from.
 
-Here stands what a log has to be before anything can be computed from it: shapes that fit, finite numbers, times
-that rise. What a well-formed log says about the robot is for `checks.py`; the formats are in `recordings.py`
-(MCAP, rosbag2, ROS 1) and `tables.py` (all others, read by `files.py`).
+`Log` validates what every computation needs: matching shapes, finite numbers, increasing times.
+The checks of a valid log against the robot are in `checks.py`. The readers are in
+`recordings.py` (MCAP, rosbag2, ROS 1) and `tables.py` (all other formats, through `files.py`).
+`read_log.read_log` makes a `Log` from a path.
 """
 
 from __future__ import annotations
@@ -17,53 +18,88 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 Bools = NDArray[np.bool_]
 
-ALMOST = 1e-9
-"""s: a command counts that is sent no later than this after an instant, which is a sum of rounded numbers."""
+TIME_TOLERANCE_S = 1e-9
+"""s; a command sent at most this long after an instant is in force at it (round-off of summed
+times).
+"""
 
-GAP = 3.5
-"""Times the usual spacing, beyond which rows are no neighbours: memories, slopes and replays begin anew there."""
+GAP_FACTOR = 3.5
+"""A spacing of more than this many median spacings is a gap: memories, slopes and replays restart
+there.
+"""
 
-LEAST_ROWS = 10
-"""Fewer samples say nothing about a joint."""
+MIN_ROWS = 10
+"""Fewest rows of a log."""
 
 
 class LogError(ValueError):
-    """What is wrong with a log: one sentence that names the file and the field."""
+    """A log that cannot be used; the message is one sentence that names the file and the field."""
 
 
 def joint_name(name: str) -> str:
-    """The name with `_joint` at its end."""
+    """Append `_joint` to a name that does not end with it.
+
+    Args:
+        name: Name of a joint, with or without the suffix.
+
+    Returns:
+        The name with the suffix.
+    """
     return name if name.endswith("_joint") else f"{name}_joint"
 
 
 @attrs.frozen(eq=False)
 class Log:
-    """J joints, state rows (N,) and command rows (M,) on time bases of their own; SI units.
+    """A measured log of J joints in SI units: N state rows, M command rows, each with own times.
 
-    A row holds what was at its time; a command counts from its time until the next. Times rise strictly and all
-    numbers are finite: building a Log that breaks this raises LogError. Floats are double precision, single in
-    a log of more than `raw.LONG` values: cast before solving with them.
+    A state row holds the values measured at its time. A command is in force from its time until
+    the next one (zero-order hold). Construction raises `LogError` unless times increase strictly,
+    all numbers are finite and all shapes match. Arrays are in double precision, or in single
+    precision if the file holds more than `raw.MAX_DOUBLE_VALUES` values: cast before solving
+    linear systems with them.
+
+    Attributes:
+        name: Path of the file.
+        joints: (J,) names, each ends with `_joint`.
+        t: (N,) times of the state rows, s.
+        q: (N, J) measured joint angles, rad.
+        dq: (N, J) joint speeds, rad/s.
+        t_cmd: (M,) times of the command rows, s.
+        q_des: (M, J) commanded joint angles, rad.
+        valid: (N, J) rows and joints that a model has to explain.
+        tau: (N, J) measured joint torques, N m; None if not logged.
+        temperature: (N, J) drive temperatures, degrees Celsius, or None.
+        voltage: (N,) supply voltage, V, or None.
+        dq_des: (M, J) commanded joint speeds, rad/s, or None.
+        tau_ff: (M, J) feed-forward torques, N m, or None.
+        kp: (M, J) commanded position gains, N m/rad, or None.
+        kd: (M, J) commanded speed gains, N m s/rad, or None.
+        recording_start: Start time of the whole recording, s, if this log is an excerpt of it;
+            else None.
+        remarks: Assumptions of the reader, one sentence each.
+        warnings: Defects that the reader found, one sentence each.
+        derived: Fields that the file did not hold, such as a `dq` computed from `q`.
     """
 
-    name: str  # the file
-    joints: tuple[str, ...]  # (J,), each ends in _joint
-    t: Array  # (N,) s
-    q: Array  # (N, J) rad
-    dq: Array  # (N, J) rad/s
-    t_cmd: Array  # (M,) s
-    q_des: Array  # (M, J) rad
-    valid: Bools  # (N, J), false: not to be explained
-    tau: Array | None = None  # (N, J) N m
-    temperature: Array | None = None  # (N, J) degrees Celsius
-    voltage: Array | None = None  # (N,) V
-    dq_des: Array | None = None  # (M, J) rad/s
-    tau_ff: Array | None = None  # (M, J) N m
-    kp: Array | None = None  # (M, J) N m/rad
-    kd: Array | None = None  # (M, J) N m s/rad
-    began: float | None = None  # s, of a piece: when the whole log began
-    remarks: tuple[str, ...] = ()  # what the reader had to assume
-    warnings: tuple[str, ...] = ()  # what it found that is to be read with care
-    made: tuple[str, ...] = ()  # fields that the file did not hold, such as a dq that is made from q
+    name: str
+    joints: tuple[str, ...]
+    t: Array
+    q: Array
+    dq: Array
+    t_cmd: Array
+    q_des: Array
+    valid: Bools
+    tau: Array | None = None
+    temperature: Array | None = None
+    voltage: Array | None = None
+    dq_des: Array | None = None
+    tau_ff: Array | None = None
+    kp: Array | None = None
+    kd: Array | None = None
+    recording_start: float | None = None
+    remarks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    derived: tuple[str, ...] = ()
 
     def __attrs_post_init__(self) -> None:
         for name in self.joints:
@@ -81,26 +117,41 @@ class Log:
 
     @property
     def duration(self) -> float:
-        """From the first state to the last, s."""
+        """Time from the first state row to the last, s."""
         return float(self.t[-1] - self.t[0])
 
     @property
     def period(self) -> float:
-        """The median spacing of the states, s."""
+        """Median spacing of the state rows, s."""
         return float(np.median(np.diff(self.t)))
 
     @property
     def after_gap(self) -> Bools:
-        """Which rows (N,) follow a gap."""
-        after: Bools = np.diff(self.t, prepend=self.t[0]) > GAP * self.period
+        """State rows (N,) that follow a gap."""
+        after: Bools = np.diff(self.t, prepend=self.t[0]) > GAP_FACTOR * self.period
         return after
 
     def command_rows(self, at: Array) -> NDArray[np.intp]:
-        """The command row that counts at the times `at`, s, the first one before there is any; shape of `at`."""
-        return np.maximum(np.searchsorted(self.t_cmd, np.asarray(at) + ALMOST, side="right") - 1, 0)
+        """Return the command rows in force at given times.
+
+        Args:
+            at: Times of any shape, s.
+
+        Returns:
+            Row indices of the same shape; 0 before the first command.
+        """
+        return np.maximum(np.searchsorted(self.t_cmd, np.asarray(at) + TIME_TOLERANCE_S, side="right") - 1, 0)
 
     def without_feed_forward(self) -> Log:
-        """The log with the torque alone that answers angles and speeds: less what `tau_ff` and `dq_des` in force ask for."""
+        """Subtract the feed-forward torque from the measured torque.
+
+        What remains is the response to measured angles and speeds: tau - tau_ff - kd dq_des, with
+        the command in force at each state row.
+
+        Returns:
+            The log without `tau_ff` and `dq_des`; the same log if it holds no torque or no
+            feed-forward.
+        """
         speed = None if self.kd is None or self.dq_des is None else self.kd * self.dq_des
         asked = [torque for torque in (self.tau_ff, speed) if torque is not None]
         if self.tau is None or not asked:
@@ -109,7 +160,17 @@ class Log:
         return attrs.evolve(self, tau=tau, tau_ff=None, dq_des=self.dq_des if speed is None else None)
 
     def with_gains(self, gains: tuple[float, float] | None) -> Log:
-        """The log with these commanded gains, kp and kd, where it holds none. Raises ValueError."""
+        """Fill in the commanded gains that the log does not hold.
+
+        Args:
+            gains: kp (N m/rad) and kd (N m s/rad), or None to change nothing.
+
+        Returns:
+            The log with gains; those that were logged stay.
+
+        Raises:
+            ValueError: A gain is negative or not finite.
+        """
         if gains is None:
             return self
         if not np.isfinite(gains).all() or min(gains) < 0.0:
@@ -119,14 +180,31 @@ class Log:
             self, kp=kp if self.kp is None else self.kp, kd=kd if self.kd is None else self.kd
         )
 
-    def of_rows(self, keep: Bools) -> Log:
-        """The log with the state rows that `keep` (N,) names; the commands stay."""
-        fields = ("t", "q", "dq", "valid", "tau", "temperature", "voltage")
-        taken = {name: getattr(self, name)[keep] for name in fields if getattr(self, name) is not None}
-        return attrs.evolve(self, **taken)
+    def select_rows(self, keep: Bools) -> Log:
+        """Keep some of the state rows and all command rows.
 
-    def select(self, joints: Sequence[str]) -> Log:
-        """The log with these joints only, in this order. Raises LogError for one that it does not hold."""
+        Args:
+            keep: (N,) state rows to keep.
+
+        Returns:
+            The log with these state rows.
+        """
+        fields = ("t", "q", "dq", "valid", "tau", "temperature", "voltage")
+        selected = {name: getattr(self, name)[keep] for name in fields if getattr(self, name) is not None}
+        return attrs.evolve(self, **selected)
+
+    def select_joints(self, joints: Sequence[str]) -> Log:
+        """Keep some of the joints, in the given order.
+
+        Args:
+            joints: Names, with or without `_joint`.
+
+        Returns:
+            The log with these joints.
+
+        Raises:
+            LogError: The log does not hold one of the joints.
+        """
         names = tuple(joint_name(name) for name in joints)
         for name in names:
             if name not in self.joints:
@@ -134,18 +212,16 @@ class Log:
         if names == self.joints:
             return self
         columns = [self.joints.index(name) for name in names]
-        taken = {
+        selected = {
             field.name: getattr(self, field.name)[:, columns]
             for field in attrs.fields(Log)
             if np.ndim(getattr(self, field.name)) == 2
         }
-        return attrs.evolve(self, joints=names, **taken)
+        return attrs.evolve(self, joints=names, **selected)
 
     def _check_time(self, field: str, time: Array) -> None:
-        if time.ndim != 1 or len(time) < LEAST_ROWS:
-            raise LogError(
-                f"{self.name}: {field}: found shape {time.shape}, expected ({LEAST_ROWS} or more,)"
-            )
+        if time.ndim != 1 or len(time) < MIN_ROWS:
+            raise LogError(f"{self.name}: {field}: found shape {time.shape}, expected ({MIN_ROWS} or more,)")
         self._check_finite(field, time)
         steps = np.diff(time)
         backward = np.flatnonzero(steps <= 0.0)

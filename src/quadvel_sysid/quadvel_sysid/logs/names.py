@@ -1,7 +1,8 @@
-"""Which columns of a file hold which field, by the field's own name or by the names that other tools use.
+"""Match the column names of a file to the fields of a log.
 
-A name is taken as it is written (`q`, `q/FR_hip`), then as an alias, then by its words: case, separators, a leading
-`joint_` and the order of field and joint do not matter (`Joint_Position_0`, `knee.pos`, `/joint_states/knee/position`).
+A name matches as it is written (`q`, `q/FR_hip`), then as an alias, then by its words. In the
+last case the letter case, separators, a leading `joint_` and the order of field and joint do not
+matter (`Joint_Position_0`, `knee.pos`, `/joint_states/knee/position`).
 """
 
 from __future__ import annotations
@@ -14,10 +15,13 @@ from itertools import product
 FIELDS = (
     "t", "q", "dq", "tau", "q_des", "t_cmd", "q_des_cmd", "dq_des", "tau_ff", "kp", "kd", "temperature", "voltage", "valid",
 )  # fmt: skip
-NAMES = "joint_names"
-TIMES = ("t", "t_cmd")
-WHOLE = ""
-"""In place of a joint: the column holds all joints, or a quantity that is no joint's."""
+"""Fields of a log in a file."""
+JOINT_NAMES_FIELD = "joint_names"
+"""Array with the names of the joints."""
+TIME_FIELDS = ("t", "t_cmd")
+"""Fields that hold times."""
+ALL_JOINTS = ""
+"""Stands for a joint if the column holds all joints, or a quantity that belongs to no joint."""
 ALIASES = {
     "t": ("time", "timestamp"),
     "q": ("dof_pos", "position", "positions", "observation.state"),
@@ -25,9 +29,11 @@ ALIASES = {
     "tau": ("effort", "torque", "torques", "observation.effort"),
     "q_des": ("des_dof_pos", "goal_position"),
 }
-"""What PACE, the message JointState, SAGE, BAM and LeRobot call them; taken where a field is not there by its own name."""
+"""Names that PACE, the message JointState, SAGE, BAM and LeRobot use, if the field's own name is
+absent.
+"""
 LEROBOT_TARGET = "action"
-"""The commanded angles of a LeRobot data set; elsewhere an action need not be an angle."""
+"""The commanded angles of a LeRobot data set; in other files an action need not be an angle."""
 
 _ANGLE = (("q",), ("pos",), ("position",), ("positions",), ("angle",), ("angles",), ("qpos",), ("dof", "pos"))
 _SPEED = (
@@ -61,7 +67,7 @@ _WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
 
 @cache
 def _spellings() -> Mapping[tuple[str, ...], str]:
-    """Field by the words that spell it."""
+    """Field by the tuple of words that spells it."""
     words = {
         ("time",): "t",
         ("timestamp",): "t",
@@ -91,7 +97,7 @@ def _spellings() -> Mapping[tuple[str, ...], str]:
     return words
 
 
-def _spelled(name: str) -> tuple[str, str] | None:
+def _match_words(name: str) -> tuple[str, str] | None:
     """Field and joint of a name by its words, or None."""
     found = [] if ".." in name else list(_WORD.finditer(name))
     words = [word[0].lower() for word in found]
@@ -100,7 +106,7 @@ def _spelled(name: str) -> tuple[str, str] | None:
         for start in (first, 0):
             field = _spellings().get(tuple(words[start : start + length]))
             if field and len(words[start : start + length]) == length:
-                rest = name[found[start + length].start() :] if start + length < len(words) else WHOLE
+                rest = name[found[start + length].start() :] if start + length < len(words) else ALL_JOINTS
                 return field, rest.rstrip("/._ []()")
         field = _spellings().get(tuple(words[-length:]))
         if field:
@@ -108,36 +114,40 @@ def _spelled(name: str) -> tuple[str, str] | None:
     return None
 
 
-def _as_written(names: Sequence[str], column: str) -> dict[str, str]:
-    """Column by joint, of a field that is called `column`."""
+def _match_exactly(names: Sequence[str], column: str) -> dict[str, str]:
+    """Column of each joint for a field called `column`."""
     if column in names:
-        return {WHOLE: column}
+        return {ALL_JOINTS: column}
     return {name.partition("/")[2]: name for name in names if name.startswith(f"{column}/")}
 
 
-def _by_words(names: Sequence[str]) -> Iterator[tuple[str, str, str]]:
-    """Field, joint and name of those whose words say so; of several that say the same none."""
-    said: dict[tuple[str, str], list[str]] = {}
+def _unambiguous_words(names: Sequence[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield field, joint and name of the names that match by words, without ambiguous ones."""
+    matches: dict[tuple[str, str], list[str]] = {}
     for name in names:
-        field, joint = _spelled(name) or ("", "")
-        if field and not (joint and field in (*TIMES, "voltage")):
-            said.setdefault((field, joint), []).append(name)
-    for (field, joint), those in said.items():
+        field, joint = _match_words(name) or ("", "")
+        if field and not (joint and field in (*TIME_FIELDS, "voltage")):
+            matches.setdefault((field, joint), []).append(name)
+    for (field, joint), those in matches.items():
         if len(those) == 1:
             yield field, joint, those[0]
 
 
-def resolve(names: Sequence[str]) -> dict[str, dict[str, str]]:
-    """For each field that is there, its column by joint; WHOLE is the only joint of a column for all of them.
+def resolve_columns(names: Sequence[str]) -> dict[str, dict[str, str]]:
+    """Find the columns of each field.
 
     Args:
-        names: all names in the file, in its order.
+        names: All names in the file, in its order.
+
+    Returns:
+        For each field found: the column of each joint. `ALL_JOINTS` is the only key of a column
+        that holds all joints.
     """
     names = list(dict.fromkeys(names))
     worded: dict[str, dict[str, str]] = {}
-    for field, joint, name in _by_words(names):
+    for field, joint, name in _unambiguous_words(names):
         worded.setdefault(field, {})[joint] = name
-    found = {field: _written(names, field) or _whole(worded.get(field, {})) for field in FIELDS}
+    found = {field: _match_field(names, field) or _only_all_joints(worded.get(field, {})) for field in FIELDS}
     joints = _joints(found, worded)
     for field in FIELDS:
         if not found[field]:
@@ -145,19 +155,20 @@ def resolve(names: Sequence[str]) -> dict[str, dict[str, str]]:
     return {field: columns for field, columns in found.items() if columns}
 
 
-def _written(names: Sequence[str], field: str) -> dict[str, str]:
-    """Of a field that is called by its own name or by an alias."""
+def _match_field(names: Sequence[str], field: str) -> dict[str, str]:
+    """Columns of a field called by its own name or by an alias."""
     aliases = ALIASES.get(field, ())
-    if field == "q_des" and _as_written(names, "observation.state"):
+    if field == "q_des" and _match_exactly(names, "observation.state"):
         aliases = (*aliases, LEROBOT_TARGET)
-    return next((found for one in (field, *aliases) if (found := _as_written(names, one))), {})
+    return next((found for one in (field, *aliases) if (found := _match_exactly(names, one))), {})
 
 
-def _whole(columns: Mapping[str, str]) -> dict[str, str]:
-    return {WHOLE: columns[WHOLE]} if WHOLE in columns else {}
+def _only_all_joints(columns: Mapping[str, str]) -> dict[str, str]:
+    """The column that holds all joints, if there is one."""
+    return {ALL_JOINTS: columns[ALL_JOINTS]} if ALL_JOINTS in columns else {}
 
 
 def _joints(found: Mapping[str, Mapping[str, str]], worded: Mapping[str, Mapping[str, str]]) -> set[str]:
-    """The joints that words may name: those of the angles, and of the commands if these name some."""
+    """Joints that words may match: those of the angles, restricted to those of the commands."""
     angles, commands = (set(found[field] or worded.get(field, {})) for field in ("q", "q_des"))
-    return (angles & commands or angles) - {WHOLE}
+    return (angles & commands or angles) - {ALL_JOINTS}

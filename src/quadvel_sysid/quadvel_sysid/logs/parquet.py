@@ -1,4 +1,4 @@
-"""Parquet files: a column a field, or one a joint; a cell may hold a list."""
+"""Reader of Parquet files: one column for each field or joint; a cell may hold a list."""
 
 from __future__ import annotations
 
@@ -8,17 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from .formats import library
+from .formats import import_reader
 from .log import LogError
-from .raw import Choose, Raw, check_size, check_type, numbers
+from .raw import ColumnChooser, RawArrays, as_numbers, check_size, check_type
 
-BATCH = 10_000
-"""Rows that are read at once."""
+BATCH_ROWS = 10_000
+"""Rows that are read together."""
 
 
-def read(path: Path, choose: Choose) -> Raw:
-    """The columns of a log. Raises LogError."""
-    parquet = library(path, "pyarrow.parquet")
+def read_parquet(path: Path, choose: ColumnChooser) -> RawArrays:
+    """Read the selected columns.
+
+    Args:
+        path: The file.
+        choose: Selects the columns to read.
+
+    Returns:
+        The selected columns.
+
+    Raises:
+        LogError: The file is damaged or too large, or lists differ in length.
+    """
+    parquet = import_reader(path, "pyarrow.parquet")
     try:
         with parquet.ParquetFile(path) as file:
             return _read(path, file, choose)
@@ -28,12 +39,13 @@ def read(path: Path, choose: Choose) -> Raw:
         raise LogError(f"{path}: no whole Parquet file: {' '.join(str(error).split())[:200]}") from None
 
 
-def _read(path: Path, file: Any, choose: Choose) -> Raw:
+def _read(path: Path, file: Any, choose: ColumnChooser) -> RawArrays:
+    """Read the selected columns of an open file, batch by batch."""
     names = file.schema_arrow.names
     chosen = choose(names)
-    check_size(path, _values(file.metadata, chosen))
+    check_size(path, _value_counts(file.metadata, chosen))
     parts: dict[str, list[Any]] = {name: [] for name in chosen}
-    for batch in file.iter_batches(BATCH, columns=list(chosen)) if chosen else ():
+    for batch in file.iter_batches(BATCH_ROWS, columns=list(chosen)) if chosen else ():
         for name, field in chosen.items():
             part = _column(path, name, batch.column(name))
             check_type(path, name, part.dtype, field)
@@ -41,7 +53,7 @@ def _read(path: Path, file: Any, choose: Choose) -> Raw:
     total = sum(part.size for those in parts.values() for part in those)
     try:
         arrays = {
-            name: numbers(np.concatenate(those), chosen[name], total)
+            name: as_numbers(np.concatenate(those), chosen[name], total)
             for name, those in parts.items()
             if those
         }
@@ -49,11 +61,11 @@ def _read(path: Path, file: Any, choose: Choose) -> Raw:
         raise LogError(
             f"{path}: {', '.join(chosen)}: found lists of unlike length, expected a number for each joint"
         ) from None
-    return Raw(arrays, tuple(name for name in names if name not in arrays))
+    return RawArrays(arrays, tuple(name for name in names if name not in arrays))
 
 
-def _values(metadata: Any, chosen: Mapping[str, str]) -> dict[str, tuple[int, ...]]:
-    """How many values of each chosen column the file says that it holds."""
+def _value_counts(metadata: Any, chosen: Mapping[str, str]) -> dict[str, tuple[int, ...]]:
+    """Number of values of each chosen column, as the metadata declares."""
     count: dict[str, int] = dict.fromkeys(chosen, 0)
     for group in range(metadata.num_row_groups):
         row_group = metadata.row_group(group)
@@ -66,7 +78,7 @@ def _values(metadata: Any, chosen: Mapping[str, str]) -> dict[str, tuple[int, ..
 
 
 def _column(path: Path, name: str, column: Any) -> Any:
-    """One column of a batch; a missing number is NaN."""
+    """One column of a batch; a missing number becomes NaN."""
     if not str(column.type).startswith(("list", "fixed_size_list", "large_list")):
         return column.to_numpy(zero_copy_only=False)
     rows = len(column)

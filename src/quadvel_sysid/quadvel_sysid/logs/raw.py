@@ -1,4 +1,4 @@
-"""Named arrays as a file holds them, and how much of it a log may hold; the readers of all formats fill `Raw`."""
+"""Named arrays as the readers return them, and limits on their size and type."""
 
 from __future__ import annotations
 
@@ -13,26 +13,30 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from .log import LogError
-from .names import NAMES, TIMES
+from .names import JOINT_NAMES_FIELD, TIME_FIELDS
 
-LONG = 16_000_000
+MAX_DOUBLE_VALUES = 16_000_000
 """Values (128 MB in double precision) above which a log is kept in single precision."""
-LARGEST = 120_000_000
-"""Values: 20 minutes of 12 joints at 1 kHz with 8 quantities."""
-LARGEST_TEXT = 3_000_000_000
-"""Characters of a table, also of one that is packed: some 25 for each of LARGEST values."""
-LONGEST_LINE = 1 << 20
+MAX_VALUES = 120_000_000
+"""Values of a log: 20 minutes of 12 joints at 1 kHz with 8 quantities."""
+MAX_TEXT_CHARS = 3_000_000_000
+"""Characters of a table after unpacking: some 25 for each of `MAX_VALUES`."""
+MAX_LINE_CHARS = 1 << 20
 """Characters of a line of text, or of a text that a log needs."""
 
-Choose = Callable[[Sequence[str]], Mapping[str, str]]
-"""Of all names in a file those that are needed, each with the field that it holds."""
+ColumnChooser = Callable[[Sequence[str]], Mapping[str, str]]
+"""Maps all names in a file to those that are needed, each with its field."""
 
 
 @attrs.frozen
-class Raw:
-    """The arrays of a file that were asked for, (N,), (N, J) or (), and the names of all others.
+class RawArrays:
+    """Arrays read from a file, before they are mapped to fields.
 
-    units: by array, where the file states one. remarks: what was assumed while reading.
+    Attributes:
+        arrays: The selected arrays by name, (N,), (N, J) or ().
+        others: Names of all other arrays.
+        units: Unit of each array, if the file states it.
+        remarks: What the reader assumed, one sentence each.
     """
 
     arrays: Mapping[str, Any]
@@ -41,47 +45,96 @@ class Raw:
     remarks: tuple[str, ...] = ()
 
 
-def opened(path: Path) -> IO[bytes]:
-    """The bytes of a file, unpacked where its name ends in .gz."""
+def open_bytes(path: Path) -> IO[bytes]:
+    """Open a file, unpacked if its name ends with .gz.
+
+    Args:
+        path: The file.
+
+    Returns:
+        A binary file object.
+    """
     return cast(IO[bytes], gzip.open(path, "rb")) if path.suffix == ".gz" else path.open("rb")
 
 
-def precision(values: int) -> DTypeLike:
-    """The type that a log of so many values is kept in."""
-    return np.float64 if values <= LONG else np.float32
+def storage_dtype(values: int) -> DTypeLike:
+    """Choose the precision in which a log is kept.
+
+    Args:
+        values: Number of values of the log.
+
+    Returns:
+        float64, or float32 above `MAX_DOUBLE_VALUES`.
+    """
+    return np.float64 if values <= MAX_DOUBLE_VALUES else np.float32
 
 
-def type_of(field: str, values: int) -> DTypeLike:
-    """The same for one field: times are kept in double precision, however long the log is."""
-    return np.float64 if field in TIMES else precision(values)
+def field_dtype(field: str, values: int) -> DTypeLike:
+    """Choose the precision of one field; times are always in double precision.
+
+    Args:
+        field: Name of the field.
+        values: Number of values of the log.
+
+    Returns:
+        float64 or float32.
+    """
+    return np.float64 if field in TIME_FIELDS else storage_dtype(values)
 
 
 def check_size(path: Path, shapes: Mapping[str, tuple[int, ...]]) -> None:
-    """Raises LogError where arrays of these shapes are more than a log may hold."""
+    """Check that arrays are no larger than a log may be.
+
+    Args:
+        path: The file, for the error message.
+        shapes: Shape of each array.
+
+    Raises:
+        LogError: They hold more than `MAX_VALUES` values.
+    """
     size = {name: math.prod(shape) for name, shape in shapes.items()}
     total = sum(size.values())
-    if total > LARGEST:
+    if total > MAX_VALUES:
         largest = max(size, key=lambda name: size[name])
         raise LogError(
             f"{path}: {largest}: found shape {shapes[largest]}, {total} values with the other fields, "
-            f"expected {LARGEST} at most; cut the log"
+            f"expected {MAX_VALUES} at most; cut the log"
         )
 
 
 def check_type(path: Path, name: str, dtype: np.dtype[Any], field: str) -> None:
-    """Raises LogError where an array holds anything but numbers, truth values or times, or text where a field is text."""
-    kinds = "US" if field == NAMES else "biufM" if field in TIMES else "biuf"
+    """Check that an array holds numbers, truth values or times, or text if the field is text.
+
+    Args:
+        path: The file, for the error message.
+        name: Name of the array.
+        dtype: Its dtype.
+        field: Field that it holds.
+
+    Raises:
+        LogError: It holds something else.
+    """
+    kinds = "US" if field == JOINT_NAMES_FIELD else "biufM" if field in TIME_FIELDS else "biuf"
     if dtype.kind not in kinds:
-        expected = "text" if field == NAMES else "numbers"
+        expected = "text" if field == JOINT_NAMES_FIELD else "numbers"
         raise LogError(f"{path}: {name}: found the type {dtype}, expected {expected}")
 
 
-def numbers(values: Any, field: str, total: int) -> Any:
-    """The array in the precision of a log of `total` values; dates become seconds since 1970."""
+def as_numbers(values: Any, field: str, total: int) -> Any:
+    """Convert an array to the precision of its log; dates become seconds since 1970.
+
+    Args:
+        values: The array; text is returned unchanged.
+        field: Field that it holds.
+        total: Number of values of the log.
+
+    Returns:
+        The converted array.
+    """
     values = np.asarray(values)
     if values.dtype.kind in "US":
         return values
     if values.dtype.kind == "M":
         missing, values = np.isnat(values), values.astype("datetime64[ns]").astype(np.int64) * 1e-9
         values[missing] = np.nan
-    return values.astype(type_of(field, total), copy=False)
+    return values.astype(field_dtype(field, total), copy=False)

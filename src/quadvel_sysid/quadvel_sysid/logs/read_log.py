@@ -1,4 +1,4 @@
-"""From a path to a `Log`, by what the file is."""
+"""Read a log from a path, in any supported format."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from pathlib import Path
 from . import lerobot
 from .columns import ColumnMap
 from .log import Log
-from .recordings import Topics
-from .recordings import read as read_recording
+from .recordings import Topics, read_recording
 from .tables import read_table
 
 
@@ -19,23 +18,26 @@ def read_log(
     names: ColumnMap | None = None,
     topics: Topics | None = None,
 ) -> Log:
-    """The log at `path`, whatever its format.
+    """Read a measured joint log.
 
     Args:
-        path: a recording (MCAP, rosbag2, ROS 1) or a table of `files.READERS`.
-        joints: use these joints only.
-        names: what the fields are called in a table.
-        topics: which topics of a recording hold the log.
+        path: A recording (MCAP, rosbag2, ROS 1), or a table with a suffix of `files.READERS`.
+        joints: Names of the joints to keep, or None for all.
+        names: Names of the fields in a table.
+        topics: Topics of a recording that hold the log.
+
+    Returns:
+        The log, with checked shapes, numbers and times.
 
     Raises:
-        LogError: one sentence that names the file and the field.
-        OSError: there is no such file.
+        LogError: The file cannot be used; the message names the file and the field.
+        FileNotFoundError: There is no such file.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.root_of(path) != path):
+    if path.suffix in (".mcap", ".db3", ".bag") or (path.is_dir() and lerobot.find_root(path) != path):
         log = read_recording(path, topics or Topics())
     else:
         log = read_table(path, names or ColumnMap())
-    return log if joints is None else log.select(joints)
+    return log if joints is None else log.select_joints(joints)

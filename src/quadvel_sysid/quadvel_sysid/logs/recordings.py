@@ -1,7 +1,7 @@
-"""Logs out of recordings: of the stack, of a Go2, or of any robot whose states and commands are `sensor_msgs/JointState`.
+"""Reader of recordings: of this stack, of a Unitree Go2, or with `sensor_msgs/JointState`.
 
-Topics are found by their types, so namespaces and other topics of the recording do not matter. Rows are stamped as their
-messages are, or as they were received where messages have no stamps.
+Topics are found by their types, so namespaces and other topics do not matter. Rows have the
+stamps of their messages, or the times of reception if the messages have none.
 """
 
 from __future__ import annotations
@@ -16,20 +16,36 @@ from quadvel_recordings.joint_log import Series, expect_commands, read_joint_log
 from quadvel_recordings.reading import RecordingError
 
 from .log import Array, Log, LogError, joint_name
-from .raw import check_size, precision
+from .raw import check_size, storage_dtype
 from .tables import drop_repeated_times
 
 
 @attrs.frozen
 class Topics:
-    """Topics of states and commands, where a recording has several that could hold them."""
+    """Topics to read, for recordings in which several could hold the log.
+
+    Attributes:
+        state: Topic of the states, or None to find it by its type.
+        command: Topic of the commands, or None to find it by its type and name.
+    """
 
     state: str | None = None
     command: str | None = None
 
 
-def read(path: Path, topics: Topics) -> Log:
-    """The recording as a log; torque control and damping stand in it as kp = 0. Raises LogError."""
+def read_recording(path: Path, topics: Topics) -> Log:
+    """Read a log from a recording; rows of torque control and damping have kp = 0.
+
+    Args:
+        path: The recording.
+        topics: Topics to read.
+
+    Returns:
+        The log.
+
+    Raises:
+        LogError: The recording is damaged, or holds no states or commands.
+    """
     remarks: list[str] = []
     warnings: list[str] = []
     try:
@@ -40,10 +56,10 @@ def read(path: Path, topics: Topics) -> Log:
     joints = _joints(path, state, command, remarks)
     if "q" not in state.values:
         raise LogError(f"{path}: {state.topic}: found no angles in it, expected positions")
-    t, states = _of_joints(path, "t", state, joints, remarks)
-    t_cmd, commands = _of_joints(path, "t_cmd", command, joints, remarks)
-    made = () if "dq" in states else ("dq",)
-    if made and (np.diff(t) > 0.0).all():
+    t, states = _select_joints(path, "t", state, joints, remarks)
+    t_cmd, commands = _select_joints(path, "t_cmd", command, joints, remarks)
+    derived = () if "dq" in states else ("dq",)
+    if derived and (np.diff(t) > 0.0).all():
         states["dq"] = np.gradient(states["q"], t, axis=0)
     return Log(
         name=str(path),
@@ -55,18 +71,18 @@ def read(path: Path, topics: Topics) -> Log:
         valid=np.ones(states["q"].shape, bool),
         t_cmd=t_cmd,
         q_des=commands["q"],
-        dq_des=_unless_zero(commands.get("dq")),
-        tau_ff=_unless_zero(commands.get("tau")),
+        dq_des=_none_if_zero(commands.get("dq")),
+        tau_ff=_none_if_zero(commands.get("tau")),
         kp=commands.get("kp"),
         kd=commands.get("kd"),
         remarks=tuple(remarks),
         warnings=tuple(warnings),
-        made=made,
+        derived=derived,
     )
 
 
 def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> list[str]:
-    """The joints that states and commands both name."""
+    """Joints that both states and commands name."""
     joints = shared(state.joints, command.joints)
     if not joints:
         found = f"found {', '.join(command.joints[:3])}, ..."
@@ -79,16 +95,17 @@ def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> l
     return joints
 
 
-def _of_joints(
+def _select_joints(
     path: Path, field: str, series: Series, joints: list[str], remarks: list[str]
 ) -> tuple[Array, dict[str, Any]]:
     """Times and values of these joints, without rows that repeat a time."""
     columns = [series.joints.index(name) for name in joints]
     check_size(path, {name: values.shape for name, values in series.values.items()})
-    dtype = precision(sum(values.size for values in series.values.values()))
+    dtype = storage_dtype(sum(values.size for values in series.values.values()))
     values = {name: each[:, columns].astype(dtype, copy=False) for name, each in series.values.items()}
     return drop_repeated_times(field, series.time, values, remarks)
 
 
-def _unless_zero(values: Array | None) -> Array | None:
+def _none_if_zero(values: Array | None) -> Array | None:
+    """None if all values are 0."""
     return values if values is not None and values.any() else None

@@ -1,8 +1,9 @@
-"""How the measured torque goes with the commands: partial correlations at every lag, and the checks that read them.
+"""Response of the measured torque to the commands, at every lag, and the checks that use it.
 
-A drive under PD control gives kp (q_des(t - lag) - q) - kd dq. Of the torque of a joint and of a command, what the joint's
-own angle, speed and direction of motion explain is taken out (Frisch, Waugh and Lovell); the correlation of what is left
-says with which sign, how late, and to whose command the torque answers, whatever gains, friction and offset are.
+A drive under PD control gives tau = kp (q_des(t - lag) - q) - kd dq. The joint's own angle, speed
+and direction of motion are projected out of both the torque and the command (Frisch, Waugh and
+Lovell). The correlation of the two residuals is the partial correlation of torque and command.
+Its sign, its best lag and its best joint do not depend on gains, friction and offset.
 """
 
 from __future__ import annotations
@@ -14,65 +15,95 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from .channels import DEGREE, REACHES, TURN, names
-from .findings import Finding, some
+from .channels import DEGREE_RAD, MOVING_SPAN_RAD, TURN_RAD, joints_where
+from .findings import Finding, format_names
 from .log import Array, Bools, Log
 
-ROWS = 4000
-"""Rows that are looked at, spread over the log."""
-LAG_STEP, REACH = 0.002, 0.1
-"""s between the lags that are looked at, a row of the log at least, and how far they go to either side."""
-ROUNDING = 1e-9
-"""s, by which a command may be later than the instant at which it counts, a sum of rounded numbers."""
-AT_REST = 0.05
-"""rad/s, within which friction turns its sign."""
+MAX_ROWS = 4000
+"""Rows of a log that are used, spread over its length."""
+LAG_STEP_S, MAX_LAG_S = 0.002, 0.1
+"""s; largest lag to either side; lags are `LAG_STEP_S` apart, or one row of the log if that is more."""
+TIME_ROUNDING_S = 1e-9
+"""s; a command this much later than an instant is still in force at it (round-off of summed times)."""
+FRICTION_SPEED_RAD_S = 0.05
+"""rad/s; width of the smooth step of friction, tanh(dq / width)."""
 
-# `python -m tests.identification.limits FOLDER` prints what the limits rest on, here with two walks and a replay of a Go2.
-CLEAR = 0.5
-"""Share of the torque that a joint's command, angle and speed leave, below which they explain it: so for 95 % of the joints."""
-SURE = 0.8
-"""Partial correlation with the own command, from which its sign is told: 0.996 and more where a sign was reversed."""
-BETTER = 0.3
-"""A second account must leave less than this share of what the first one leaves, to be preferred on one joint."""
-UNANSWERED = 0.1
-"""Share of the torque that speed and friction leave, explained by the position error: usually 0.97, in 1 % below 0.05."""
-SAME = 0.95
-"""Correlation from which two commands are one, and no order of columns can be told."""
-FAR_OFF = 8.0
-"""Times the commanded gain, or as small a part of it: 0.5 to 1.25 in 98 %. Beyond, the units are others."""
+# `python -m tests.identification.limits FOLDER` prints the distributions behind these limits; the
+# numbers here include two walks and a replay of a Go2.
+EXPLAINED_ERROR_SHARE = 0.5
+"""Command, angle and speed explain a torque if they leave less than this share of it: so for 95 % of
+the joints.
+"""
+MIN_SIGN_CORRELATION = 0.8
+"""Partial correlation with the own command, from which its sign is certain; 0.996 and more with a
+reversed sign.
+"""
+PREFERRED_ERROR_RATIO = 0.3
+"""A second explanation is preferred on a joint if it leaves less than this share of the first one's
+error.
+"""
+MIN_ANSWERED_SHARE = 0.1
+"""Share of the torque left by speed and friction that the position error explains: usually 0.97, in
+1 % below 0.05.
+"""
+SAME_COMMAND_CORRELATION = 0.95
+"""Commands that correlate more are the same, and their joints cannot be distinguished."""
+UNIT_GAIN_FACTOR = 8.0
+"""A gain off by more than this factor is in another unit; 98 % of the joints are within 0.5 to 1.25."""
 
 
 @attrs.frozen(eq=False)
 class Response:
-    """Of R rows and J joints; `log` is without feed-forward torque."""
+    """Response of the torque of J joints to their commands, on R rows and L lags.
+
+    Attributes:
+        log: The log, with the feed-forward torque subtracted.
+        rows: (R,) state rows used.
+        lags: (L,) lags from a command to its torque, s.
+        error_share: (L, J) share of each joint's torque variance that command, angle and speed
+            leave.
+        command_correlation: (J,) partial correlation with the own command at the best lag.
+        angle_correlation: (J,) partial correlation with the own angle, given the command.
+        gain: (J,) gain of the position error, N m/rad.
+        command_gain: (J,) gain of the command given the angle, N m/rad; springs do not change it.
+        answered_share: (J,) share of the torque left by speed and friction that the position
+            error explains.
+    """
 
     log: Log
-    row: NDArray[np.intp]
-    lags: Array  # (L,) s, from a command to its torque
-    left: Array  # (L, J), share of each joint's torque that its command of that lag, its angle and its speed leave
-    command: Array  # (J,), partial correlation with the own command at the best lag
-    angle: Array  # (J,), partial correlation with the own angle beside it
-    gain: Array  # (J,) N m/rad, of the position error
-    command_gain: Array  # (J,) N m/rad, of the command beside the angle: springs leave it as it is
-    answer: Array  # (J,), share that the position error explains of what speed and friction leave
+    rows: NDArray[np.intp]
+    lags: Array
+    error_share: Array
+    command_correlation: Array
+    angle_correlation: Array
+    gain: Array
+    command_gain: Array
+    answered_share: Array
 
     @property
-    def best(self) -> Array:
-        """(J,), what each joint's best lag leaves."""
-        return np.asarray(self.left.min(axis=0))
+    def min_error_share(self) -> Array:
+        """Error share (J,) at each joint's best lag."""
+        return np.asarray(self.error_share.min(axis=0))
 
 
-def measured(log: Log) -> Response | None:
-    """The response in the valid rows of a log with torque, at lags up to REACH; None where that is too short."""
+def measure_response(log: Log) -> Response | None:
+    """Measure the response of the torque to the commands in the valid rows.
+
+    Args:
+        log: The log.
+
+    Returns:
+        The response at lags up to `MAX_LAG_S`; None without torque or with fewer than 50 rows.
+    """
     log = log.without_feed_forward()
-    step = max(LAG_STEP, log.period)
-    known = (log.t > log.t_cmd[0] + REACH) & (log.t < log.t_cmd[-1] - REACH)
+    step = max(LAG_STEP_S, log.period)
+    known = (log.t > log.t_cmd[0] + MAX_LAG_S) & (log.t < log.t_cmd[-1] - MAX_LAG_S)
     row = np.flatnonzero(log.valid.any(axis=1) & known)
-    row = row[:: max(1, len(row) // ROWS)]
+    row = row[:: max(1, len(row) // MAX_ROWS)]
     if log.tau is None or len(row) < 50:
         return None
-    lags = step * np.arange(-int(REACH / step + 0.5), int(REACH / step + 0.5) + 1)
-    at = [log.command_rows(log.t[row] - lag + ROUNDING) for lag in lags]
+    lags = step * np.arange(-int(MAX_LAG_S / step + 0.5), int(MAX_LAG_S / step + 0.5) + 1)
+    at = [log.command_rows(log.t[row] - lag + TIME_ROUNDING_S) for lag in lags]
     left, found = np.empty((len(lags), len(log.joints))), np.empty((5, len(log.joints)))
     for j in range(len(log.joints)):
         left[:, j], found[:, j] = _of_joint(log, row, at, j)
@@ -82,69 +113,111 @@ def measured(log: Log) -> Response | None:
 def _of_joint(
     log: Log, row: NDArray[np.intp], at: Sequence[NDArray[np.intp]], j: int
 ) -> tuple[Array, tuple[float, float, float, float, float]]:
-    """`left` (L,) of joint `j`, and `command`, `angle`, `gain`, `command_gain`, `answer` of `Response`.
+    """Error share (L,) of joint `j`, and its five scalars of `Response`.
 
-    `at` are the command rows of each lag.
+    Args:
+        log: The log, with the feed-forward torque subtracted.
+        row: (R,) state rows.
+        at: Command rows (R,) of each lag.
+        j: Index of the joint.
     """
     assert log.tau is not None
     q, dq, tau = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq, log.tau))
     commands = np.stack([np.asarray(log.q_des[k, j], dtype=float) for k in at], 1)
     variance = float(np.var(tau)) + 1e-12
-    y, p, c = (_without(motion(dq), x) for x in (tau, q, commands))
-    # With the angle taken out of torque and commands.
-    beside, of_c = _residual(y, p), c - np.outer(p, p @ c) / (p @ p + 1e-12)
+    y, p, c = (_project_out(motion_regressors(dq), x) for x in (tau, q, commands))
+    # y: torque, p: angle, c: commands (R, L), each with speed, friction and offset projected out.
+    # The angle is projected out of torque and commands too; r (L,) is their partial correlation.
+    torque_rest, of_c = _residual(y, p), c - np.outer(p, p @ c) / (p @ p + 1e-12)
     size = np.sqrt(np.sum(of_c**2, axis=0)) + 1e-9 * np.sqrt(len(row))
-    r = beside @ of_c / size / (np.linalg.norm(beside) + 1e-12)
-    # Waves answer with either sign, half a period apart: the opposite one has to explain clearly more.
+    r = torque_rest @ of_c / size / (np.linalg.norm(torque_rest) + 1e-12)
+    # A periodic torque correlates with either sign, half a period apart: prefer the positive one
+    # unless the negative one explains clearly more.
     right, opposite = (int(np.argmax(sign * r)) for sign in (1.0, -1.0))
-    k = opposite if 1.0 - r[opposite] ** 2 < BETTER * (1.0 - max(r[right], 0.0) ** 2) else right
+    k = (
+        opposite
+        if 1.0 - r[opposite] ** 2 < PREFERRED_ERROR_RATIO * (1.0 - max(r[right], 0.0) ** 2)
+        else right
+    )
     other = _residual(p, c[:, k])
     angle = float(other @ _residual(y, c[:, k]) / (np.linalg.norm(other) * np.linalg.norm(y) + 1e-12))
+    # Gains by regression: of the position error (q_des - q), and of q_des given q.
     error = c[:, k] - p
     gain = float(error @ y / (error @ error + 1e-12))
-    command_gain = float(beside @ of_c[:, k] / size[k] ** 2)
+    command_gain = float(torque_rest @ of_c[:, k] / size[k] ** 2)
     answer = float((error @ y) ** 2 / ((error @ error) * (y @ y) + 1e-12))
-    misses = (beside[:, None] - of_c * (beside @ of_c / size**2)) ** 2 / variance
+    misses = (torque_rest[:, None] - of_c * (torque_rest @ of_c / size**2)) ** 2 / variance
     return misses.mean(axis=0), (float(r[k]), angle, gain, command_gain, answer if gain > 0.0 else 0.0)
 
 
-def motion(dq: Array) -> Array:
-    """What of the torque the motion explains beside the angle: speed, friction and an offset, (R, 3)."""
-    return np.stack([dq, np.tanh(dq / AT_REST), np.ones(len(dq))], 1)
+def motion_regressors(dq: Array) -> Array:
+    """Return the regressors of speed, Coulomb friction and offset.
+
+    Args:
+        dq: (R,) speeds, rad/s.
+
+    Returns:
+        (R, 3) columns dq, tanh(dq / FRICTION_SPEED_RAD_S), 1.
+    """
+    return np.stack([dq, np.tanh(dq / FRICTION_SPEED_RAD_S), np.ones(len(dq))], 1)
 
 
-def _without(regressors: Array, x: Array) -> Array:
-    """What a linear fit on `regressors` (R, K) leaves of `x` (R,) or (R, L)."""
+def _project_out(regressors: Array, x: Array) -> Array:
+    """Residual of `x` (R,) or (R, L) after a least-squares fit on `regressors` (R, K)."""
     basis = np.linalg.qr(regressors)[0]
     left: Array = x - basis @ (basis.T @ x)
     return left
 
 
 def _residual(y: Array, x: Array) -> Array:
+    """Residual of `y` (R,) after a least-squares fit on one regressor `x` (R,)."""
     left: Array = y - x * (x @ y) / (x @ x + 1e-12)
     return left
 
 
-def signs(log: Log, found: Response) -> Iterator[Finding]:
-    """Joints whose command, angle or torque has the opposite sign of the two others."""
-    clear = found.best < CLEAR
-    strong = clear & (np.abs(found.command) > SURE) & (np.abs(found.angle) > UNANSWERED)
+def opposite_signs(log: Log, found: Response) -> Iterator[Finding]:
+    """Joints whose command, angle or torque has the opposite sign of the two others.
+
+    Args:
+        log: The log to check.
+        found: Its response.
+
+    Yields:
+        A refusal for each field with the opposite sign.
+    """
+    clear = found.min_error_share < EXPLAINED_ERROR_SHARE
+    strong = (
+        clear
+        & (np.abs(found.command_correlation) > MIN_SIGN_CORRELATION)
+        & (np.abs(found.angle_correlation) > MIN_ANSWERED_SHARE)
+    )
+    # A torque kp (q_des - q) correlates positively with q_des and negatively with q.
+    command_inverted, angle_inverted = found.command_correlation < 0.0, found.angle_correlation > 0.0
     cases = (
-        ("q_des", (found.command < 0.0) & (found.angle < 0.0), "{} answers its own command with the opposite sign"),
-        ("tau", (found.command < 0.0) & (found.angle > 0.0), "has the opposite sign on {}, of which command and angle have theirs"),
-        ("q", (found.command > 0.0) & (found.angle > 0.0), "{} has the opposite sign of its command and its torque"),
-    )  # fmt: skip
+        ("q_des", command_inverted & ~angle_inverted, "{} answers its own command with the opposite sign"),
+        ("tau", command_inverted & angle_inverted, "has the opposite sign on {}; command and angle agree"),
+        ("q", ~command_inverted & angle_inverted, "{} has the opposite sign of its command and its torque"),
+    )
     for field, hit, text in cases:
         if (hit & strong).any():
-            joints = names(log, hit & strong)
-            r = float(np.median(found.command[hit & strong]))
-            said = f"{field}: {text.format(some(joints))} (partial correlation of torque and command {r:.2f})"
-            yield Finding("refusal", field, joints, said)
+            joints = joints_where(log, hit & strong)
+            r = float(np.median(found.command_correlation[hit & strong]))
+            correlation = f"partial correlation of torque and command {r:.2f}"
+            description = f"{field}: {text.format(format_names(joints))} ({correlation})"
+            yield Finding("refusal", field, joints, description)
 
 
-def columns(log: Log, found: Response) -> Iterator[Finding]:
-    """Another order of the joints in one of the fields, that explains the torque far better than the order as it is."""
-    if len(log.joints) < 2 or (found.best < UNANSWERED).all():
+def joint_order(log: Log, found: Response) -> Iterator[Finding]:
+    """Another order of the joints in one field that explains the torque far better.
+
+    Args:
+        log: The log to check.
+        found: Its response.
+
+    Yields:
+        A refusal that names the field and the joints.
+    """
+    if len(log.joints) < 2 or (found.min_error_share < MIN_ANSWERED_SHARE).all():
         return
     joints = range(len(log.joints))
     best: tuple[float, Finding] = 0.0, Finding("refusal", "", (), "")
@@ -154,140 +227,184 @@ def columns(log: Log, found: Response) -> Iterator[Finding]:
         ("tau", "tau follows another joint's command and motion", 1, 1),
     ):
         left = np.array(
-            [[_left(found, j, k if of_command else j, k if of_motion else j) for k in joints] for j in joints]
+            [
+                [_error_share(found, j, k if of_command else j, k if of_motion else j) for k in joints]
+                for j in joints
+            ]
         )
-        told, order = _reordered(log, found.best, left)
-        score = float(np.sum(np.log(left[told, order[told]] / found.best[told])))
-        if len(told) >= 2 and score < best[0]:
-            best = score, _other_order(log, field, what, told, order)
+        moved, order = _best_order(log, found.min_error_share, left)
+        score = float(np.sum(np.log(left[moved, order[moved]] / found.min_error_share[moved])))
+        if len(moved) >= 2 and score < best[0]:
+            best = score, _order_finding(log, field, what, moved, order)
     if best[0] < 0.0:
         yield best[1]
 
 
-def _left(found: Response, j: int, k: int, m: int) -> float:
-    """Share of the torque of joint j that the command of k and the motion of m leave, at the better of three lags."""
-    log, row = found.log, found.row[::4]
+def _error_share(found: Response, j: int, k: int, m: int) -> float:
+    """Share of joint j's torque that k's command and m's motion leave, at the best of three lags."""
+    log, row = found.log, found.rows[::4]
     assert log.tau is not None
     tau, q, dq = (np.asarray(x, dtype=float) for x in (log.tau[row, j], log.q[row, m], log.dq[row, m]))
     shares = []
     for lag in (0.0, 0.006, 0.012):
-        q_des = np.asarray(log.q_des[log.command_rows(log.t[row] - lag + ROUNDING), k], dtype=float)
-        y, error = (_without(motion(dq), x) for x in (tau, q_des - q))
+        q_des = np.asarray(log.q_des[log.command_rows(log.t[row] - lag + TIME_ROUNDING_S), k], dtype=float)
+        y, error = (_project_out(motion_regressors(dq), x) for x in (tau, q_des - q))
         shares.append(float(np.var(_residual(y, error) if error @ y > 0.0 else y) / (np.var(tau) + 1e-12)))
     return min(shares)
 
 
-def _reordered(log: Log, own: Array, left: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Joints that the best order moves and that gain clearly by it, and that order.
+def _best_order(log: Log, own: Array, left: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The best assignment of columns (Hungarian method), and the joints that gain clearly by it.
 
-    `own` (J,) is the share that is left as it is, `left` (J, J) the one with the columns of each other joint.
+    Args:
+        log: The log.
+        own: (J,) error share with the columns as they are.
+        left: (J, J) error share of joint j with the columns of joint k.
     """
     order = linear_sum_assignment(np.log(left + 1e-6))[1]
     other = left[np.arange(len(order)), order]
-    commands = _unit(log.q_des[:: max(1, len(log.q_des) // ROWS)])
-    same = (
-        np.abs(commands.T @ commands)[np.arange(len(order)), order] > SAME
-    )  # the joint itself, or one led alike
-    return np.flatnonzero((other < BETTER * own) & (other < CLEAR) & ~same), order
+    commands = _normalised(log.q_des[:: max(1, len(log.q_des) // MAX_ROWS)])
+    # Exclude the joint itself and joints with the same command.
+    same = np.abs(commands.T @ commands)[np.arange(len(order)), order] > SAME_COMMAND_CORRELATION
+    return np.flatnonzero(
+        (other < PREFERRED_ERROR_RATIO * own) & (other < EXPLAINED_ERROR_SHARE) & ~same
+    ), order
 
 
-def _other_order(log: Log, field: str, what: str, told: NDArray[np.intp], order: NDArray[np.intp]) -> Finding:
-    pairs = some([f"{log.joints[j]} follows {log.joints[order[j]]}" for j in told])
-    text = f"{field}: a joint's {what} ({pairs}): the columns stand in different orders"
-    return Finding("refusal", field, tuple(log.joints[j] for j in told), text)
+def _order_finding(
+    log: Log, field: str, what: str, moved: NDArray[np.intp], order: NDArray[np.intp]
+) -> Finding:
+    """The refusal of a wrong order of joints."""
+    pairs = format_names([f"{log.joints[j]} follows {log.joints[order[j]]}" for j in moved])
+    text = f"{field}: a joint's {what} ({pairs}): the columns are in different orders"
+    return Finding("refusal", field, tuple(log.joints[j] for j in moved), text)
 
 
-def deaf(log: Log, found: Response) -> Iterator[Finding]:
-    """Torque that has nothing to do with the position error."""
-    used = log.valid[found.row].any(axis=0)
-    lost = found.answer < UNANSWERED
-    moves = np.ptp(log.q[found.row], axis=0) > REACHES
+def unresponsive(log: Log, found: Response) -> Iterator[Finding]:
+    """Torque that has nothing to do with the position error.
+
+    Args:
+        log: The log to check.
+        found: Its response.
+
+    Yields:
+        A refusal if it is so on all joints, else a warning.
+    """
+    used = log.valid[found.rows].any(axis=0)
+    lost = found.answered_share < MIN_ANSWERED_SHARE
+    moves = np.ptp(log.q[found.rows], axis=0) > MOVING_SPAN_RAD
     if (lost | ~used).all():
-        rests = np.ptp(log.q_des, axis=0) < REACHES
-        never = f"q_des never changes on {some(names(log, rests))}, and tau " if rests.any() else ""
+        rests = np.ptp(log.q_des, axis=0) < MOVING_SPAN_RAD
+        never = (
+            f"q_des never changes on {format_names(joints_where(log, rests))}, and tau "
+            if rests.any()
+            else ""
+        )
         text = (
-            f"tau: {never}does not answer the position error on any joint (which explains {100 * found.answer.max():.0f} % of it "
-            "at most); expected q_des, q and tau of the same joints, with the same signs"
+            f"tau: {never}does not answer the position error on any joint (which explains "
+            f"{100 * found.answered_share.max():.0f} % of it at most); expected q_des, q and tau of the same "
+            "joints, with the same signs"
         )
         yield Finding("refusal", "tau", log.joints, text)
     elif (lost & moves & used).any():
-        joints = names(log, lost & moves & used)
-        text = f"tau: does not answer the position error on {some(joints)}: what is found there is not to be trusted"
+        joints = joints_where(log, lost & moves & used)
+        text = (
+            f"tau: does not answer the position error on {format_names(joints)}: results for these joints "
+            "are unreliable"
+        )
         yield Finding("warning", "tau", joints, text)
 
 
-def scale(log: Log, found: Response) -> Iterator[Finding | Log]:
-    """Gains of another unit than the torque's: a servo's own numbers, N m/degree, mN m."""
+def gain_units(log: Log, found: Response) -> Iterator[Finding | Log]:
+    """Gains of another unit than the torque's: a servo's own numbers, N m/degree, mN m.
+
+    Args:
+        log: The log to check.
+        found: Its response.
+
+    Yields:
+        A refusal; or a warning and the log without gains, so that these are fitted.
+    """
     if log.kp is None:
         return
-    asked = np.median(log.kp[log.command_rows(log.t[found.row])], axis=0)
-    clear = (found.best < CLEAR) & (asked > 0.0) & (found.gain > 0.0)
+    asked = np.median(log.kp[log.command_rows(log.t[found.rows])], axis=0)
+    clear = (found.min_error_share < EXPLAINED_ERROR_SHARE) & (asked > 0.0) & (found.gain > 0.0)
     if not clear.any():
         return
     ratio = found.gain / np.where(asked > 0.0, asked, 1.0)
-    off = clear & _far(ratio) & _far(found.command_gain / np.where(asked > 0.0, asked, 1.0))
+    off = clear & _is_far_off(ratio) & _is_far_off(found.command_gain / np.where(asked > 0.0, asked, 1.0))
     if not off.any():
         return
-    number, joints = float(np.median(ratio[off])), names(log, off)
+    number, joints = float(np.median(ratio[off])), joints_where(log, off)
     known = [unit for unit, factor in _UNITS_OF_TORQUE if abs(np.log(number / factor)) < np.log(1.5)]
     if known or (off != clear).any():
         expected = f"{known[0]}? " if known else ""
         size = f"{number:.3g}" if number < 100.0 else f"{number:.2g}"
-        text = (
-            f"tau: {size} times what kp asks for on {some(joints)}: {expected}expected N m, and kp in N m/rad"
-        )
+        text = f"tau: {size} times what kp asks for on {format_names(joints)}: {expected}expected N m, and kp in N m/rad"
         yield Finding("refusal", "tau", joints, text)
         return
     text = (
-        f"kp: the torque shows {number:.3g} times what it asks for, on all joints: it is in a unit of its own, as a servo's "
-        "is; both gains are fitted"
+        f"kp: the torque shows {number:.3g} times what it asks for, on all joints: it is in a unit of its own, "
+        "as a servo's is; both gains are fitted"
     )
     yield Finding("warning", "kp", joints, text)
     yield attrs.evolve(log, kp=None, kd=None)
 
 
-def _far(ratio: Array) -> Bools:
-    return np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(FAR_OFF)
+def _is_far_off(ratio: Array) -> Bools:
+    """Whether a ratio, or its inverse, exceeds `UNIT_GAIN_FACTOR`."""
+    return np.abs(np.log(np.maximum(ratio, 1e-12))) > np.log(UNIT_GAIN_FACTOR)
 
 
 _UNITS_OF_TORQUE = (
     ("tau in mN m", 1e3),
     ("tau in kN m, or kp in mN m/rad", 1e-3),
-    ("kp in N m/degree", 360.0 / TURN),
-    ("q in degrees, or tau of another unit", DEGREE),
+    ("kp in N m/degree", 360.0 / TURN_RAD),
+    ("q in degrees, or tau of another unit", DEGREE_RAD),
 )
-"""By how much, as a factor, the torque may be off what the gains ask for: within a factor of 1.5."""
+"""Known ratios of the torque to kp times the position error, each with the mistake that causes it."""
 
 
-def followed(log: Log) -> Iterator[Finding]:
-    """Without torque: joints that follow their own command with the opposite sign, or another joint's command."""
+def command_tracking(log: Log) -> Iterator[Finding]:
+    """Without torque: joints that follow their own command inverted, or another joint's command.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal.
+    """
     if log.tau is not None:
         return
     row = np.flatnonzero(log.valid.any(axis=1))
-    row = row[:: max(1, len(row) // ROWS)]
-    q = _unit(log.q[row])
+    row = row[:: max(1, len(row) // MAX_ROWS)]
+    q = _normalised(log.q[row])
+    # Correlation of q (rows) with q_des (columns) at each lag, (L, J, J).
     alike = np.stack(
         [
-            q.T @ _unit(log.q_des[log.command_rows(log.t[row] - lag + ROUNDING)])
-            for lag in np.arange(0.0, REACH, 0.01)
+            q.T @ _normalised(log.q_des[log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)])
+            for lag in np.arange(0.0, MAX_LAG_S, 0.01)
         ]
-    )  # (L, J, J)
+    )
     most, least = alike.max(axis=0), alike.min(axis=0)
     opposite = least.diagonal()
-    hit = (opposite < -CLEAR) & (most.diagonal() < 0.0)
+    hit = (opposite < -EXPLAINED_ERROR_SHARE) & (most.diagonal() < 0.0)
     if hit.any():
-        joints = names(log, hit)
-        text = f"q_des: {some(joints)} follows its own command with the opposite sign (correlation {np.median(opposite[hit]):.2f})"
+        joints = joints_where(log, hit)
+        text = (
+            f"q_des: {format_names(joints)} follows its own command with the opposite sign "
+            f"(correlation {np.median(opposite[hit]):.2f})"
+        )
         yield Finding("refusal", "q_des", joints, text)
         return
     left = 1.0 - np.maximum(most, 0.0) ** 2
-    told, order = _reordered(log, left.diagonal(), left)
-    if len(told) >= 2:
-        yield _other_order(log, "q_des", "q follows another joint's command", told, order)
+    moved, order = _best_order(log, left.diagonal(), left)
+    if len(moved) >= 2:
+        yield _order_finding(log, "q_des", "q follows another joint's command", moved, order)
 
 
-def _unit(values: Array) -> NDArray[np.float64]:
-    """Columns without their means, of length 1; a column that never changes stays 0."""
+def _normalised(values: Array) -> NDArray[np.float64]:
+    """Columns with their mean removed and scaled to length 1; a constant column becomes 0."""
     centred = values.astype(float) - values.astype(float).mean(axis=0)
     length = np.sqrt(np.sum(centred**2, axis=0))
     return np.divide(centred, length, out=np.zeros_like(centred), where=length > 1e-6)

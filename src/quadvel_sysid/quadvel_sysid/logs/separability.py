@@ -1,7 +1,9 @@
-"""What the motion of a log can tell apart: collinearity of what the parameters change in the torque, in words.
+"""Collinearity of parameters: which of them the motion of a log can distinguish.
 
-Linear in small changes (Eq. 1): the gains weigh position error and speed, an input delay the slope of the command, an
-output delay the slope of the whole torque. Where one of these traces is a mix of the others, only their sum is seen.
+Linearise Eq. 1 in small changes of its parameters. A change of a gain adds a multiple of the
+position error or the speed to the torque, an input delay the slope of the command, an output
+delay the slope of the whole torque. If one of these traces is a linear combination of the others,
+only the combination can be identified.
 """
 
 from __future__ import annotations
@@ -11,18 +13,21 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import rows_of
+from .channels import sample_rows
 from .findings import Finding
 from .log import Log
 
-APART = 0.3
-"""Share (of the root mean square) of a trace that no mix of the others gives; below it a sentence is due."""
-HALF_WIDTH = 0.005  # s, of slopes
+MIN_SEPARATION = 0.3
+"""Share (root mean square) of a trace outside the span of the others, below which the pair is
+reported.
+"""
+SLOPE_HALF_WIDTH_S = 0.005
+"""s to either side over which slopes are computed."""
 
-KP, KD = 30.0, 0.5  # where the log does not say; only their ratio matters here
+DEFAULT_KP, DEFAULT_KD = 30.0, 0.5
+"""N m/rad and N m s/rad, for logs without gains; only their ratio matters here."""
 
-# Of each pair: what separates the two.
-PAIRS = {
+CONFUSED_PAIRS = {
     (
         "input delay",
         "output delay",
@@ -31,32 +36,40 @@ PAIRS = {
     ("kp", "torque offset"): "changes of the position error: load the joint both ways",
     ("kd", "output delay"): "fast changes of the torque: steps or higher frequencies",
 }
+"""Pairs of parameters that are often confused, each with the motion that separates them."""
 
 
 def collinear(log: Log) -> Iterator[Finding]:
-    """A sentence for each pair of parameters that this motion hardly separates, and for what it cannot show."""
+    """Pairs of parameters that this motion hardly separates, and parameters that it cannot show.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        Notes and warnings.
+    """
     traces = _traces(log)
     if traces is None:
         return
     if not any(one["input delay"].any() for one in traces):
         text = "q_des: the command never changes, so that no delay of the command can be identified"
         yield Finding("warning", "q_des", (), text)
-    for (first, second), motion in PAIRS.items():
-        shares = [_apart(one[first], one[second], _others(one, first, second)) for one in traces]
+    for (first, second), motion in CONFUSED_PAIRS.items():
+        shares = [_sine_between(one[first], one[second], _gain_traces(one, first, second)) for one in traces]
         share = float(np.median(shares))
-        if share < APART:
+        if share < MIN_SEPARATION:
             text = (
                 f"q_des: {first} and {second} are separable only through {motion}; "
                 f"here that is {100 * share:.0f} % of what they do to the torque"
             )
-            yield Finding("note" if share > 0.5 * APART else "warning", "q_des", (), text)
+            yield Finding("note" if share > 0.5 * MIN_SEPARATION else "warning", "q_des", (), text)
 
 
 def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
-    """Of each moving joint, what a small change of each parameter does to the torque, (n,); None if none moves."""
-    row = rows_of(log)
+    """Derivative (n,) of each moving joint's torque by each parameter; None if no joint moves."""
+    row = sample_rows(log)
     row = row[log.valid[row].any(axis=1)]
-    reach = max(1, round(HALF_WIDTH / log.period))
+    reach = max(1, round(SLOPE_HALF_WIDTH_S / log.period))
     first, last = np.maximum(row - reach, 0), np.minimum(row + reach, len(log.t) - 1)
     span = (log.t[last] - log.t[first])[:, None]
     command = log.command_rows(log.t[row])
@@ -64,8 +77,11 @@ def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
     dq = log.dq[row].astype(float)
     ddq = (log.dq[last] - log.dq[first]) / span
     slope = (log.q_des[log.command_rows(log.t[last])] - log.q_des[log.command_rows(log.t[first])]) / span
-    kp = KP if log.kp is None or not log.kp.any() else np.asarray(log.kp)[command]
-    kd = KD if log.kd is None or not log.kd.any() else np.asarray(log.kd)[command]
+    kp = DEFAULT_KP if log.kp is None or not log.kp.any() else np.asarray(log.kp)[command]
+    kd = DEFAULT_KD if log.kd is None or not log.kd.any() else np.asarray(log.kd)[command]
+    # Derivatives of tau = kp (q_des(t - d_in - d_out) - q(t - d_out)) - kd dq(t - d_out)
+    #                     - friction sign(dq) + offset
+    # by kp, kd, d_in, d_out, friction and offset, in this order.
     traces = {
         "kp": q_des - log.q[row],
         "kd": -dq,
@@ -78,15 +94,15 @@ def _traces(log: Log) -> list[dict[str, NDArray[np.float64]]] | None:
     return [{name: values[:, j] for name, values in traces.items()} for j in moving] or None
 
 
-def _others(traces: dict[str, NDArray[np.float64]], *but: str) -> NDArray[np.float64]:
-    """The gains' own traces, as they are always fitted too."""
+def _gain_traces(traces: dict[str, NDArray[np.float64]], *but: str) -> NDArray[np.float64]:
+    """Traces (n, K) of the gains other than `but`; gains are always fitted as well."""
     return np.stack([traces[name] for name in ("kp", "kd") if name not in but], axis=1)
 
 
-def _apart(a: NDArray[np.float64], b: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Sine of the angle between two traces once the others are taken out of both.
+def _sine_between(a: NDArray[np.float64], b: NDArray[np.float64], others: NDArray[np.float64]) -> float:
+    """Sine of the angle between two traces after projecting out the others.
 
-    1 where one of them is nothing at all, 0 where the others leave nothing of it.
+    1 if one of them is 0; 0 if the others explain one of them entirely.
     """
     whole = np.linalg.norm(a) * np.linalg.norm(b)
     if whole < 1e-12:

@@ -1,4 +1,4 @@
-"""Checks of time: clocks, rates, gaps and rows that were lost."""
+"""Checks of the time stamps: units, clocks that were set, rates, gaps and lost rows."""
 
 from __future__ import annotations
 
@@ -7,30 +7,39 @@ from collections.abc import Iterator
 import numpy as np
 
 from .findings import Finding
-from .log import GAP, Log
+from .log import GAP_FACTOR, Log
 
-PAUSE = 0.1
-"""s without a command, where they come regularly, from which it is a gap."""
-LONGEST_GAP = 86_400.0
-"""s; a longer one is no pause, but a clock that was set."""
-LONGEST_SPAN = 30.0
-"""Times that of the states, of the commands: beyond, the two are of different units or recordings."""
-SLOWEST, FASTEST = 0.5, 1e-5
-"""s between two rows: no joint is commanded more slowly, none logged faster. Other spacings are of another unit of time."""
+COMMAND_GAP_S = 0.1
+"""s without a command that make a gap in a regular stream of commands."""
+MAX_GAP_S = 86_400.0
+"""s; a longer step means that the clock was set."""
+MAX_SPAN_RATIO = 30.0
+"""Span of the commands over that of the states, above which they have different units or recordings."""
+MAX_PERIOD_S, MIN_PERIOD_S = 0.5, 1e-5
+"""s between two rows, from `MIN_PERIOD_S` to `MAX_PERIOD_S`; another spacing means another unit of
+time.
+"""
 
 
-def clocks(log: Log) -> Iterator[Finding]:
-    """Clocks that were set in the middle, that count in another unit, and two that have nothing in common."""
+def time_bases(log: Log) -> Iterator[Finding]:
+    """Clocks that were set during the log, have another unit, or nothing in common.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        Refusals.
+    """
     period = log.period
-    if not FASTEST <= period <= SLOWEST:
-        unit = "milliseconds, microseconds or nanoseconds" if period > SLOWEST else "hours"
+    if not MIN_PERIOD_S <= period <= MAX_PERIOD_S:
+        unit = "milliseconds, microseconds or nanoseconds" if period > MAX_PERIOD_S else "hours"
         text = f"t: a row comes every {period:.4g} s; is t in {unit}? expected seconds"
         yield Finding("refusal", "t", (), text)
         return
     for field, time in (("t", log.t), ("t_cmd", log.t_cmd)):
         row = int(np.argmax(np.diff(time)))
         step = float(time[row + 1] - time[row])
-        if step > max(LONGEST_GAP, 1e3 * float(np.median(np.diff(time)))):
+        if step > max(MAX_GAP_S, 1e3 * float(np.median(np.diff(time)))):
             text = (
                 f"{field}: jumps by {step:.6g} s from row {row} to row {row + 1}; expected one clock, in seconds: "
                 "was it set while this was recorded?"
@@ -40,13 +49,20 @@ def clocks(log: Log) -> Iterator[Finding]:
     ratio = (log.t_cmd[-1] - log.t_cmd[0]) / (log.t[-1] - log.t[0])
     if log.t_cmd[0] > log.t[-1] or log.t_cmd[-1] < log.t[0]:
         yield Finding("refusal", "t_cmd", (), f"{spans}: nothing in common, expected one clock for both")
-    elif ratio > LONGEST_SPAN:
+    elif ratio > MAX_SPAN_RATIO:
         text = f"{spans}: {ratio:.3g} times as long, expected both in seconds and of the same recording"
         yield Finding("refusal", "t_cmd", (), text)
 
 
-def rates(log: Log) -> Iterator[Finding]:
-    """Rate, jitter, gaps and lost rows of both time bases."""
+def sampling_rates(log: Log) -> Iterator[Finding]:
+    """Rate, jitter, gaps and lost rows of both time bases.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        Notes and warnings.
+    """
     for field, time in (("t", log.t), ("t_cmd", log.t_cmd)):
         if field == "t_cmd" and time is log.t:
             continue
@@ -58,7 +74,7 @@ def rates(log: Log) -> Iterator[Finding]:
         )
         yield Finding("note", field, (), text)
         regular = high < 2.0 * usual
-        gaps = np.flatnonzero(steps > max(GAP * usual, PAUSE if field == "t_cmd" else 0.0))
+        gaps = np.flatnonzero(steps > max(GAP_FACTOR * usual, COMMAND_GAP_S if field == "t_cmd" else 0.0))
         if gaps.size and (regular or field == "t"):
             longest = int(gaps[np.argmax(steps[gaps])])
             text = (
@@ -66,11 +82,13 @@ def rates(log: Log) -> Iterator[Finding]:
                 f"at {time[longest]:.2f} s"
             )
             yield Finding("warning", field, (), text)
-        missing = int(np.sum(np.round(steps[steps < GAP * usual] / usual) - 1.0)) if regular else 0
+        missing = int(np.sum(np.round(steps[steps < GAP_FACTOR * usual] / usual) - 1.0)) if regular else 0
         if missing > 0.001 * len(time):
             text = f"{field}: about {missing} rows were dropped, one at a time"
             yield Finding("warning", field, (), text)
-    if log.t_cmd[-1] < log.t[-1] - PAUSE:
+    if log.t_cmd[-1] < log.t[-1] - COMMAND_GAP_S:
         late = log.t[-1] - log.t_cmd[-1]
-        text = f"t_cmd: the last command came {late:.2f} s before the last state; it is taken to be held"
+        text = (
+            f"t_cmd: the last command came {late:.2f} s before the last state; it is assumed to stay in force"
+        )
         yield Finding("warning", "t_cmd", (), text)

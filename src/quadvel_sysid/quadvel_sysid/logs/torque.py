@@ -1,4 +1,4 @@
-"""Checks of the measured torque alone with its command: single rows far off all others, and torque without its sign."""
+"""Checks of the measured torque against its command: isolated spikes, and torque without a sign."""
 
 from __future__ import annotations
 
@@ -8,37 +8,50 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .channels import TURN, names, rows_of
-from .findings import Finding, some
+from .channels import TURN_RAD, joints_where, sample_rows
+from .findings import Finding, format_names
 from .log import Array, Bools, Log
-from .response import CLEAR, ROUNDING, motion
+from .response import EXPLAINED_ERROR_SHARE, TIME_ROUNDING_S, motion_regressors
 
 Numbers = NDArray[np.float64]
 
-LAGS = (0.0, 0.005, 0.01, 0.02, 0.04)
-"""s between a command and its torque that are tried."""
-BULK = 0.8
-"""Share of the rows whose largest deviation gives its scale: up to a tenth of the rows may be spikes, as many at rest."""
-FAR = 8.0
-"""Standard deviations: normal noise exceeds them in none of 10^14 rows."""
-LARGE = 2.0
-"""Standard deviations of the torque itself that a spike has at least: what friction and a coarse speed do in one row is less."""
-FEWEST = 3
-"""Rows of a joint: one or two that stand far off may be a foot that strikes between two samples of a slow log."""
-FITTED = 4000
-"""Rows that a law is fitted to."""
-ROUNDS = 4
-"""Of fits without the rows that the one before left far off."""
-BOTH_WAYS = 0.05
-"""Share of the rows in which a signed quantity has the rarer of its signs, where it goes both ways."""
-DOWN_TO_ZERO = 0.1
-"""Of its usual largest size: what a quantity comes below in one row of twenty where it comes down to 0."""
-CLEARLY = 0.9
-"""Of the squared error with which a sum of signals explains a quantity: what the size of such a sum has to leave at most."""
+LAGS_S = (0.0, 0.005, 0.01, 0.02, 0.04)
+"""s; lags from a command to its torque that are tried."""
+BULK_QUANTILE = 0.8
+"""Quantile of the deviations that gives their scale: a tenth of the rows may be spikes, another
+tenth at rest.
+"""
+SPIKE_SIGMAS = 8.0
+"""Standard deviations from which a row is a spike: normal noise exceeds them once in 10^14 rows."""
+MIN_SPIKE_SIGMAS = 2.0
+"""Standard deviations of the torque itself that a spike reaches at least; friction and a coarse
+speed change less in one row.
+"""
+MIN_SPIKES = 3
+"""Fewest spikes of a joint; one or two may be a foot that strikes between two samples of a slow log."""
+MAX_FIT_ROWS = 4000
+"""Rows that a PD law is fitted to, at most."""
+FIT_ROUNDS = 4
+"""Rounds of fits; each one leaves out the outliers of the round before."""
+MIN_SIGN_SHARE = 0.05
+"""Share of the rows with the rarer sign, from which a quantity takes both signs."""
+NEAR_ZERO_SHARE = 0.1
+"""A quantity reaches 0 if its 5th percentile is below this share of its 95th percentile."""
+MAGNITUDE_ERROR_RATIO = 0.9
+"""The magnitude of a sum must leave less than this share of the squared error that the sum itself
+leaves.
+"""
 
 
 def spikes(log: Log) -> Iterator[Finding | Log]:
-    """Single rows of the torque that stand far off the rows around and off what command and motion explain."""
+    """Single rows of the torque far off the rows around and off what command and motion explain.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A warning, and the log with the spikes replaced and left out of `valid`.
+    """
     if log.tau is None:
         return
     tau = np.asarray(log.tau, dtype=float)
@@ -46,9 +59,9 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
     for j in range(len(log.joints)):
         level[:, j], hit[:, j] = _without_spikes(log, j)
     if hit.any():
-        joints, size = names(log, np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
+        joints, size = joints_where(log, np.asarray(hit.any(axis=0))), float(np.abs(tau - level).max())
         text = (
-            f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {some(joints)}: single rows up to "
+            f"tau: spikes in up to {100 * hit.mean(axis=0).max():.2g} % of the rows of {format_names(joints)}: single rows up to "
             f"{size:.3g} N m off the rows around and off what command and motion explain; left out"
         )
         yield Finding("warning", "tau", joints, text)
@@ -56,40 +69,43 @@ def spikes(log: Log) -> Iterator[Finding | Log]:
 
 
 def _without_spikes(log: Log, j: int) -> tuple[Numbers, Bools]:
-    """The torque of a joint with its spikes replaced by the rows around (N,), and which rows these are."""
+    """Replace the spikes of a joint by the median around them; return torque and mask, (N,)."""
     assert log.tau is not None
     tau = np.asarray(log.tau[:, j], dtype=float)
     level, hit = tau.copy(), np.zeros(len(tau), bool)
     sides = np.sign(np.pad(log.dq[:, j], 1, mode="edge"))
-    turns = sides[:-2] != sides[2:]  # friction turns its sign there, which may stand in one row alone
-    for _ in range(ROUNDS):
-        around, alone = _around(level)
+    turns = sides[:-2] != sides[2:]  # friction changes its sign there, perhaps in a single row
+    for _ in range(FIT_ROUNDS):
+        around, alone = _local_median(level)
         alone = np.where(turns, 0.0, alone)
-        found = np.abs(alone) > FAR * _scale(level - around)
+        found = np.abs(alone) > SPIKE_SIGMAS * _robust_std(level - around)
         if found.any():
-            found &= np.abs(alone) > LARGE * _scale(tau - np.median(tau))
+            found &= np.abs(alone) > MIN_SPIKE_SIGMAS * _robust_std(tau - np.median(tau))
         if found.any():
-            laws = [_asked(log, np.arange(len(tau)), j, lag) for lag in LAGS]
-            left = min((level - _explained(law, level, ~found) for law in laws), key=_scale)
-            found &= np.abs(left) > FAR * _scale(left)
+            laws = [_pd_regressors(log, np.arange(len(tau)), j, lag) for lag in LAGS_S]
+            left = min((level - _fitted_torque(law, level, ~found) for law in laws), key=_robust_std)
+            found &= np.abs(left) > SPIKE_SIGMAS * _robust_std(left)
         if not found.any():
             break
         level, hit = np.where(found, around, level), hit | found
-    return (level, hit) if hit.sum() >= FEWEST else (tau, np.zeros(len(tau), bool))
+    return (level, hit) if hit.sum() >= MIN_SPIKES else (tau, np.zeros(len(tau), bool))
 
 
-def _asked(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
-    """What a PD law makes torque of, (R, 5 or more): error, angle, speed, direction, 1; speed and torque fed forward."""
-    sent = log.command_rows(log.t[row] - lag + ROUNDING)
+def _pd_regressors(log: Log, row: NDArray[np.intp], j: int, lag: float) -> Numbers:
+    """Regressors of a PD law, (R, 5 or more): error, angle, speed, friction, 1, feed-forward terms."""
+    sent = log.command_rows(log.t[row] - lag + TIME_ROUNDING_S)
     q, dq = (np.asarray(x[row, j], dtype=float) for x in (log.q, log.dq))
     fed = [x[sent, j] for x in (log.dq_des, log.tau_ff) if x is not None]
-    return np.stack([log.q_des[sent, j] - q, q - q.mean(), *motion(dq).T, *fed], axis=1).astype(float)
+    return np.stack([log.q_des[sent, j] - q, q - q.mean(), *motion_regressors(dq).T, *fed], axis=1).astype(
+        float
+    )
 
 
-def _around(x: Numbers) -> tuple[Numbers, Numbers]:
-    """The median of the two rows before and the two after, and how far a row is beyond all of these but one, (N,).
+def _local_median(x: Numbers) -> tuple[Numbers, Numbers]:
+    """Median (N,) of the four rows around each row, and how far the row exceeds all but one.
 
-    0 where that is less than half of what these four differ by: the peak of a fast motion is no spike.
+    The excess is 0 if it is less than half the range of these four: the peak of a fast motion is
+    no spike.
     """
     padded = np.pad(x, 2, mode="edge")
     sides = np.sort([padded[k : k + len(x)] for k in (0, 1, 3, 4)], axis=0)
@@ -99,77 +115,101 @@ def _around(x: Numbers) -> tuple[Numbers, Numbers]:
     return np.asarray(np.median(sides, axis=0)), alone
 
 
-def _scale(deviation: Numbers) -> float:
-    """The standard deviation of the normal distribution that has the bulk of the deviations."""
-    return float(np.quantile(np.abs(deviation), BULK)) / 1.28 + 1e-9
+def _robust_std(deviation: Numbers) -> float:
+    """Standard deviation of the normal distribution that has the bulk of the deviations."""
+    return float(np.quantile(np.abs(deviation), BULK_QUANTILE)) / 1.28 + 1e-9
 
 
-def _explained(law: Numbers, tau: Numbers, use: Bools) -> Numbers:
-    """The torque (N,) that `law` gives, fitted to rows in `use`, in the end without those that it leaves furthest off."""
+def _fitted_torque(law: Numbers, tau: Numbers, use: Bools) -> Numbers:
+    """Torque (N,) of the law fitted to the rows in `use`, with outliers removed round by round."""
     rows = np.flatnonzero(use)
-    rows = rows[:: max(1, len(rows) // FITTED)]
+    rows = rows[:: max(1, len(rows) // MAX_FIT_ROWS)]
     x, y = law[rows], tau[rows]
     keep = np.ones(len(rows), bool)
-    for _ in range(ROUNDS):
+    for _ in range(FIT_ROUNDS):
         weights = np.linalg.lstsq(x[keep], y[keep], rcond=1e-9)[0]
         left = np.abs(y - x @ weights)
-        keep = left <= FAR * _scale(left)
+        keep = left <= SPIKE_SIGMAS * _robust_std(left)
     return np.asarray(law @ weights)
 
 
-def sign(log: Log) -> Iterator[Finding]:
-    """Torque without its sign: never negative, and the size of what a PD law asks for, not that itself with an offset."""
+def unsigned_torque(log: Log) -> Iterator[Finding]:
+    """Torque without its sign: never negative, and explained by the magnitude of a PD law.
+
+    Args:
+        log: The log to check.
+
+    Yields:
+        A refusal.
+    """
     if log.tau is None:
         return
-    row = rows_of(log)
-    row = row[:: max(1, len(row) // FITTED)]
+    row = sample_rows(log)
+    row = row[:: max(1, len(row) // MAX_FIT_ROWS)]
     tau = np.asarray(log.tau[row], dtype=float)
-    error = np.stack([_asked(log, row, j, 0.0)[:, 0] for j in range(len(log.joints))], axis=1)
-    error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURN)
-    hit = unsigned(tau, error)
+    error = np.stack([_pd_regressors(log, row, j, 0.0)[:, 0] for j in range(len(log.joints))], axis=1)
+    error -= np.median(error, axis=0) * (np.abs(np.median(error, axis=0)) > TURN_RAD)
+    hit = lacks_sign(tau, error)
     for j in np.flatnonzero(hit):
-        hit[j] = any(is_size(tau[:, j], _asked(log, row, int(j), lag)) for lag in LAGS)
+        hit[j] = any(is_magnitude(tau[:, j], _pd_regressors(log, row, int(j), lag)) for lag in LAGS_S)
     if hit.any():
-        joints = names(log, hit)
+        joints = joints_where(log, hit)
         text = (
-            f"tau: has no sign on {some(joints)}: it never changes its sign, and the size of what a PD law asks for "
+            f"tau: has no sign on {format_names(joints)}: it never changes its sign, and the size of what a PD law asks for "
             "explains it better than that with an offset; expected a torque with its sign (leave it out if only its magnitude is "
             "measured)"
         )
         yield Finding("refusal", "tau", joints, text)
 
 
-def unsigned(values: Array, twin: Array) -> Bools:
-    """Joints (J,) whose `values` never change their sign although they come down to 0 and their `twin` has both signs."""
+def lacks_sign(values: Array, twin: Array) -> Bools:
+    """Find joints whose values keep one sign although a related signal changes its sign.
+
+    Args:
+        values: (N, J) values under test.
+        twin: (N, J) signal that should share their sign.
+
+    Returns:
+        (J,) mask.
+    """
     size = np.abs(values)
     one_way = ((values >= 0.0).all(axis=0) | (values <= 0.0).all(axis=0)) & (np.ptp(values, axis=0) > 0.0)
-    touches = np.percentile(size, 5, axis=0) < DOWN_TO_ZERO * np.percentile(size, 95, axis=0)
+    touches = np.percentile(size, 5, axis=0) < NEAR_ZERO_SHARE * np.percentile(size, 95, axis=0)
     scale = 0.1 * np.sqrt(np.mean(twin**2, axis=0))
-    both = np.minimum((twin > scale).mean(axis=0), (twin < -scale).mean(axis=0)) > BOTH_WAYS
+    both = np.minimum((twin > scale).mean(axis=0), (twin < -scale).mean(axis=0)) > MIN_SIGN_SHARE
     return np.asarray(one_way & touches & both)
 
 
-def is_size(values: Numbers, signals: Numbers) -> bool:
-    """Are `values` (N,) the size of a sum of `signals` (N, K), rather than such a sum that happens to have one sign?
+def is_magnitude(values: Numbers, signals: Numbers) -> bool:
+    """Decide whether values are the magnitude of a linear combination of signals.
 
-    The square of that size is linear in the products of the signals; the first eigenvector of their weights gives the signs.
+    If y = |x w|, then y^2 = sum_ab W_ab x_a x_b with W = w w^T. A linear fit gives W; the signs
+    of its first eigenvector's combination start an alternation between signs and weights.
+
+    Args:
+        values: (N,) values y.
+        signals: (N, K) regressors x.
+
+    Returns:
+        True if the magnitude fits clearly better.
     """
-    signed = _left(signals, values)
-    if signed < CLEAR * len(values) * np.var(values):
+    signed = _squared_error(signals, values)
+    if signed < EXPLAINED_ERROR_SHARE * len(values) * np.var(values):
         return False
     signals = signals / (np.sqrt(np.mean(signals**2, axis=0)) + 1e-12)
     a, b = np.triu_indices(signals.shape[1])
+    # y^2 = sum_{a <= b} W_ab x_a x_b; the first eigenvector of W + W^T gives the combination.
     weights = np.zeros((signals.shape[1],) * 2)
     weights[a, b] = np.linalg.lstsq(signals[:, a] * signals[:, b], values**2, rcond=1e-6)[0]
     sizes, vectors = np.linalg.eigh(weights + weights.T)
     total, least = signals @ vectors[:, np.argmax(sizes)], np.inf
-    for _ in range(ROUNDS):
+    for _ in range(FIT_ROUNDS):
         signs = np.where(total < 0.0, -1.0, 1.0)
         total = signals @ np.linalg.lstsq(signals, signs * np.abs(values), rcond=1e-9)[0]
         least = min(least, float(np.sum((np.abs(values) - np.abs(total)) ** 2)))
-    return least < CLEARLY * signed
+    return least < MAGNITUDE_ERROR_RATIO * signed
 
 
-def _left(signals: Numbers, values: Numbers) -> float:
-    """Squared error of the best sum of `signals`."""
+def _squared_error(signals: Numbers, values: Numbers) -> float:
+    """Sum of squared residuals of the least-squares fit of `values` on `signals`."""
     return float(np.sum((values - signals @ np.linalg.lstsq(signals, values, rcond=1e-9)[0]) ** 2))

@@ -1,4 +1,4 @@
-"""Units that a file itself states, in its head or in a row below it, as factors to SI."""
+"""Units that a file states in its head or in the row below, as factors to SI."""
 
 from __future__ import annotations
 
@@ -21,16 +21,30 @@ _FACTORS = {
 _FACTOR_OF = {unit: factor for factor, units in _FACTORS.items() for unit in units}
 
 
-def factor(unit: str) -> float | None:
-    """The factor from a unit to SI (s, rad, N m, V, degrees Celsius), or None for an unknown unit."""
+def si_factor(unit: str) -> float | None:
+    """Look up the factor of a unit to SI (s, rad, N m, V, degrees Celsius).
+
+    Args:
+        unit: The unit as it is written.
+
+    Returns:
+        The factor, or None for an unknown unit.
+    """
     plain = re.sub(r"[\s·*⋅^]|\\cdot", "", unit).replace("μ", "µ").lower()
     plain = plain.replace("s^-1", "/s").replace("°", "deg").replace("º", "deg").replace("sec", "s", 1)
     return _FACTOR_OF.get(plain, _FACTOR_OF.get(unit.strip().lower()))
 
 
-def name_and_unit(head: str) -> tuple[str, str]:
-    """`time [ms]` as `time` and `ms`; a bracket that holds no known unit, as in `q[0]`, is a part of the name."""
+def split_unit(head: str) -> tuple[str, str]:
+    """Split a column's head into name and unit: `time [ms]` into `time` and `ms`.
+
+    Args:
+        head: The head.
+
+    Returns:
+        Name and unit. The unit is empty if the brackets hold none, as in `q[0]`.
+    """
     parts = re.fullmatch(r"(.+?)\s*[\[(]([^\[\]()]+)[\])]", head)
-    if parts is None or parts[2].strip().isdigit() or factor(parts[2]) is None:
+    if parts is None or parts[2].strip().isdigit() or si_factor(parts[2]) is None:
         return head, ""
     return parts[1], parts[2].strip()
