@@ -152,7 +152,7 @@ def test_the_remote_stands_the_robot_up_walks_it_stops_it_and_lays_it_down(
     operator.press(OperatorCommand.STAND_UP)
     operator.spin(1.0)
     assert operator.mode == "passive"
-    operator.order(OperatorCommand.RELEASE, lambda: "the remote says: release the stop" in up.read_text())
+    operator.order(OperatorCommand.RELEASE, lambda: "remote: release the stop" in up.read_text())
     operator.order(OperatorCommand.STAND_UP, lambda: operator.mode == "stance")
     operator.order(OperatorCommand.LIE_DOWN, lambda: operator.mode == "passive")
-    assert "the remote says: stand up" in up.read_text()
+    assert "remote: stand up" in up.read_text()

@@ -445,10 +445,10 @@ def test_no_command_leaves_beyond_a_limit(policy: Any, name: str) -> None:
 
 
 MUTATED = {
-    "torque_jumps": "_after_step",
-    "torque_too_large": "_at_most",
-    "joint_at_speed_limit": "_at_speed",
-    "power_too_large": "_of_power",
+    "torque_jumps": "_limit_step",
+    "torque_too_large": "_limit_torque",
+    "joint_at_speed_limit": "_limit_at_top_speed",
+    "power_too_large": "_limit_power",
 }
 
 

@@ -42,7 +42,7 @@ def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any
     assert run.tick(STILL, 20) == [(False, "passive: waiting for a mode request")]
     run.supervisor.request("stance")
     assert run.tick(STILL, 80) == [
-        (False, "stance: was asked for"),
+        (False, "stance: requested"),
         (False, "ready; waiting for a velocity command"),
     ]
     assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]

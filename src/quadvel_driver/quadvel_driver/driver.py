@@ -149,7 +149,7 @@ class Driver(Node):
                 self._request_mode("passive")
 
     def _execute(self, order: OperatorCommand) -> None:
-        self.get_logger().info(f"the remote says: {order.value}")
+        self.get_logger().info(f"remote: {order.value}")
         if order is OperatorCommand.STOP:
             self._passive_wanted = True
             self._lock.publish(Bool(data=True))
@@ -165,7 +165,7 @@ class Driver(Node):
     def _release(self) -> None:
         why_not = self._link.release()
         if why_not:
-            self.get_logger().warning(f"the stop stays: {why_not}")
+            self.get_logger().warning(f"the stop is not released: {why_not}")
             return
         self._pilot.stopped = self._passive_wanted = False
         self._lock.publish(Bool(data=False))
@@ -176,7 +176,7 @@ class Driver(Node):
     def _call(self, client: Any, request: Any, what: str) -> None:
         """Call a service of the controller and log the result."""
         if not client.service_is_ready():
-            self._log_once(f"{what}: the controller is not there")
+            self._log_once(f"{what}: the controller is not running")
             return
 
         def answered(future: Any) -> None:

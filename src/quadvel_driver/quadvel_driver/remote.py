@@ -62,7 +62,7 @@ class RemoteConfig:
         ValueError: A value is out of range; raised by the constructor.
     """
 
-    stick_dead_zone: float = _setting(0.08, "share of a stick's way, 0 to 1, that counts as let go")
+    stick_dead_zone: float = _setting(0.08, "share of a stick's range, 0 to 1, that counts as released")
     stick_velocity: tuple[float, ...] = _setting(
         (0.8, 0.4, 0.8), "velocity at full stick: forward, sideways, turning, m/s, rad/s"
     )

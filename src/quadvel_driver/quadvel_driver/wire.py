@@ -367,7 +367,7 @@ def _unpack(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
     covered, end = _crc_length(layout), layout.itemsize - 4
     if any(data[covered:end]):
         raise WireError(
-            f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC leaves it out"
+            f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC does not cover it"
         )
     found_crc, expected = int.from_bytes(data[end:], "little"), crc(data[:covered])
     if found_crc != expected:

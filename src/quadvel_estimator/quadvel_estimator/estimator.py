@@ -182,7 +182,7 @@ class EstimatorNode(Node):
         busy = self._busy_s - self._reported.busy
         self._reported = _ReportedCounts(self._count, self._refusals.total, self._busy_s)
         if count == 0:
-            level, summary = DiagnosticStatus.WARN, "no low_state fit to use in the last second"
+            level, summary = DiagnosticStatus.WARN, "no valid low_state in the last second"
         elif refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)

@@ -29,7 +29,7 @@ REALTIME_LIMIT_US = 1_000_000
 watchdog cannot run."""
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class Scheduling:
     """Scheduling parameters that each node of the control loop adds to its own.
 

@@ -145,7 +145,7 @@ class CommandMuxNode(Node):
         elif self._mux.locks:
             self.get_logger().warning(f"stops: locked by {', '.join(sorted(self._mux.locks))}")
         else:
-            why = "stance was requested" if self._mux.stance_requested else "nobody commands a velocity"
+            why = "stance was requested" if self._mux.stance_requested else "no source commands a velocity"
             self.get_logger().info(f"stands still: {why}")
 
     def _report(self) -> None:

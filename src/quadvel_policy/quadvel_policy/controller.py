@@ -239,11 +239,7 @@ class Controller(Node):
 
     def _missing_state_text(self) -> str:
         refusal = self._supervisor.refused.get("low_state")
-        return (
-            f"no message on low_state that is fit to use ({refusal})"
-            if refusal
-            else "no message on low_state"
-        )
+        return f"no valid message on low_state ({refusal})" if refusal else "no message on low_state"
 
     def _status(self) -> tuple[bytes, str]:
         """Return diagnostics level and summary of the last second."""

@@ -83,7 +83,7 @@ class ControllerStopped(Guard):
         limit = data.config.max_state_age
         if min(data.stopped, data.gap) <= limit:
             return None
-        stopped = f"the controller did not run for {1e3 * data.stopped:.0f} ms while the robot went on"
+        stopped = f"the controller did not run for {1e3 * data.stopped:.0f} ms while the robot continued"
         return f"{stopped}, limit {1e3 * limit:.0f} ms"
 
 
@@ -116,7 +116,7 @@ class StateFrozen(Guard):
         self._time = self._time + data.gap if repeats else 0.0
         if self._time < data.config.frozen_tick_time:
             return None
-        return f"the robot's tick has stood at {data.state.tick} for {1e3 * self._time:.0f} ms"
+        return f"the robot's tick has stayed at {data.state.tick} for {1e3 * self._time:.0f} ms"
 
 
 class Tilted(Guard):
@@ -187,9 +187,7 @@ class EncoderInconsistent(Guard):
         error, limit = self._error[i], data.config.max_encoder_error
         if abs(error) <= limit:
             return None
-        return (
-            f"{JOINT_NAMES[i]}'s angle is {error:+.2f} rad off what its speed adds up to, limit {limit:.2f}"
-        )
+        return f"{JOINT_NAMES[i]}'s angle is {error:+.2f} rad off its integrated speed, limit {limit:.2f}"
 
 
 class EncoderFrozen(Guard):
@@ -217,7 +215,7 @@ class EncoderFrozen(Guard):
             self._others_travel > NOTABLE_MOTION_RAD
         )
         for i in np.flatnonzero(suspect & (self._time > data.config.frozen_time)):
-            return f"{JOINT_NAMES[i]}'s encoder has repeated itself for {1e3 * self._time[i]:.0f} ms"
+            return f"{JOINT_NAMES[i]}'s encoder has not changed for {1e3 * self._time[i]:.0f} ms"
         return None
 
 
@@ -248,7 +246,7 @@ class ImuInconsistent(Guard):
         error, limit = math.hypot(*self._error.tolist()), data.config.max_attitude_error
         if error <= limit:
             return None
-        return f"the orientation is {error:.2f} rad off what the gyroscope adds up to, limit {limit:.2f}"
+        return f"the orientation is {error:.2f} rad off the integrated gyroscope, limit {limit:.2f}"
 
 
 class ImuFrozen(Guard):
@@ -276,7 +274,7 @@ class ImuFrozen(Guard):
         )
         if self._time <= data.config.frozen_time or self._joint_travel <= NOTABLE_MOTION_RAD:
             return None
-        return f"the IMU has repeated itself for {1e3 * self._time:.0f} ms while the joints moved"
+        return f"the IMU has not changed for {1e3 * self._time:.0f} ms while the joints moved"
 
 
 class AccelerometerImplausible(Guard):
@@ -331,7 +329,7 @@ class DriveDoesNotAnswer(Guard):
         i = int(np.argmax(error))
         if not error[i] > data.config.max_torque_error:
             return None
-        return f"{JOINT_NAMES[i]} gives {self._reported[i]:+.0f} N m where {self._expected[i]:+.0f} N m were asked for"
+        return f"{JOINT_NAMES[i]} gives {self._reported[i]:+.0f} N m, commanded {self._expected[i]:+.0f} N m"
 
 
 class JointStuck(Guard):
@@ -397,7 +395,7 @@ class FootForceFrozen(Guard):
         same = data.state.foot_force == data.previous.foot_force
         self._time = np.where(same, self._time + data.gap, 0.0)
         for i in np.flatnonzero(self._time > data.config.frozen_foot_time):
-            return f"the force of foot {LEGS[i]} has stood at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
+            return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
         return None
 
 
@@ -410,7 +408,7 @@ class Overruns(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.overruns <= data.config.max_overruns:
             return None
-        return f"{data.overruns} deadlines were missed in a row, limit {data.config.max_overruns}"
+        return f"{data.overruns} consecutive deadlines were missed, limit {data.config.max_overruns}"
 
 
 class EstimateStale(Guard):

@@ -260,10 +260,10 @@ class Supervisor:
             return False, refusal
         self._auto_stand = False
         if mode != self.mode:
-            self._switch(mode, "was asked for")
+            self._switch(mode, "requested")
         elif mode == "stance" and self._latched_stop:
             self._latched_stop, self.fault = None, ""
-            self.reason = "was asked for"
+            self.reason = "requested"
         return True, f"mode is {mode}"
 
     def fail(self, reason: str, fault: str) -> None:
@@ -426,8 +426,9 @@ class Supervisor:
             self.neutral_seen = True
         if numbers[3] >= 0.5 or not (self.neutral_seen and self._is_walking_allowed):
             return STANCE_COMMAND.copy(), ""
-        held = self._command_limits.clamp(numbers[:3])
-        return np.array([*held, 0.0]), "" if np.array_equal(held, numbers[:3]) else "command_out_of_range"
+        clamped = self._command_limits.clamp(numbers[:3])
+        is_within = np.array_equal(clamped, numbers[:3])
+        return np.array([*clamped, 0.0]), "" if is_within else "command_out_of_range"
 
     def _switch(self, mode: str, reason: str) -> None:
         self.mode, self.reason = mode, reason
