@@ -1,8 +1,8 @@
 """Time of the board's states, estimated from the board's counter and the arrival times.
 
-The counter is regular, but its unit is unknown: headers of the SDK for the AlienGo say microseconds up
-to version 3.3 and milliseconds in 3.8.4. Arrival times are on the local clock, but include the delays of
-network and machine. Both together give the unit and the time of each state.
+The counter is regular, but its unit is unknown: headers of the SDK for the AlienGo say microseconds
+up to version 3.3 and milliseconds in 3.8.4. Arrival times are on the local clock, but include the
+delays of network and machine. Both together give the unit and the time of each state.
 """
 
 from __future__ import annotations
@@ -64,8 +64,8 @@ class BoardClock:
             arrival: Arrival time, s, on a monotonic clock.
 
         Returns:
-            The time of the state; None if the state is not newer than the last one, or while the unit and
-            the offset of the clocks are unknown.
+            The time of the state; None if the state is not newer than the last one, or while the
+            unit and the offset of the clocks are unknown.
         """
         if self._count is None:
             self._start_at(counter, arrival)
@@ -81,7 +81,7 @@ class BoardClock:
             return None
         instant = self._board_time(self.unit, arrival)
         self._states += 1
-        return instant if self._states > OFFSET_WINDOW else None  # the offset of the first ones is uncertain
+        return instant if self._states > OFFSET_WINDOW else None  # until the offset is known
 
     def _start_at(self, counter: int, arrival: float) -> None:
         """Start tracking at this state."""
@@ -100,7 +100,7 @@ class BoardClock:
             self.late += 1
 
     def _find_unit(self, arrival: float) -> None:
-        """Identify the unit from the rate of the counter; if none matches, start the next window."""
+        """Identify the unit from the rate of the counter; if none matches, start another window."""
         first_count, first_arrival = self._unit_reference
         assert self._count is not None
         if arrival - first_arrival < UNIT_WINDOW_S:
@@ -113,7 +113,9 @@ class BoardClock:
         self._unit_reference = self._count, arrival
 
     def _board_time(self, unit: float, arrival: float) -> BoardTime:
-        """Convert the counter to local time: t = unit * count + min(arrival - unit * count) over OFFSET_WINDOW."""
+        """Convert the counter to local time: t = unit * count + min(arrival - unit * count) over
+        OFFSET_WINDOW.
+        """
         assert self._count is not None
         time = unit * self._count
         offset = arrival - time

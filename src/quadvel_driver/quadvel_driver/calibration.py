@@ -34,10 +34,12 @@ class Calibration:
 
     Attributes:
         joint_zeros: Encoder readings at the joints' zero angles, (12,), rad.
-        imu_mounting: Tilt of the IMU against the trunk, (2,), rad: roll (about x) and pitch (about y).
+        imu_mounting: Tilt of the IMU against the trunk, (2,), rad: roll (about x) and pitch (about
+            y).
 
     Raises:
-        CalibrationError: An offset is not finite, too large, or of the wrong shape; raised by the constructor.
+        CalibrationError: An offset is not finite, too large, or of the wrong shape; raised by the
+            constructor.
     """
 
     joint_zeros: Array = attrs.field(factory=lambda: np.zeros(12))

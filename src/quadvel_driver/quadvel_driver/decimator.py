@@ -6,8 +6,8 @@ from __future__ import annotations
 class Decimator:
     """Accepts the first sample in each period of the stream's own counter.
 
-    Periods are fixed on the counter, so the accepted samples keep their phase: the next sample replaces a
-    lost one, and the following sample is on time again.
+    Periods are fixed on the counter, so the accepted samples keep their phase: the next sample
+    replaces a lost one, and the following sample is on time again.
     """
 
     def __init__(self, rate: int) -> None:

@@ -1,12 +1,12 @@
 """Calibration of encoder zeros and IMU tilt from a suspended and a standing robot.
 
-Suspended robot, joints moving slowly to and fro: the torque that holds a leg against gravity is a known
-function of the joint angles, so the measured torques determine the encoder zeros. Friction changes its
-sign with the direction of motion and is fitted, too.
+Suspended robot, joints moving slowly to and fro: the torque that holds a leg against gravity is a
+known function of the joint angles, so the measured torques determine the encoder zeros. Friction
+changes its sign with the direction of motion and is fitted, too.
 
-Standing robot on a level floor: the four feet give the vertical in the trunk frame, and the IMU gives its
-own vertical. The gravity model needs the IMU, and the feet need the zeros, so both fits alternate until
-they agree. A rotation of the IMU about the vertical axis is not observable.
+Standing robot on a level floor: the four feet give the vertical in the trunk frame, and the IMU
+gives its own vertical. The gravity model needs the IMU, and the feet need the zeros, so both fits
+alternate until they agree. A rotation of the IMU about the vertical axis is not observable.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ ALTERNATIONS = 6  # equal offsets of four hips resemble a tilted IMU, so the fit
 TORQUE_NOISE_NM = 0.25  # standard deviation of a measured torque
 ZERO_PRIOR_RAD = 0.035  # (2 deg), prior standard deviation of an encoder zero
 TORQUE_SCALE_PRIOR = 0.1  # prior standard deviation of the scale of measured torques
-REVERSAL_MARGIN = 30  # states around a reversal that are left out, because the joint accelerates there
+REVERSAL_MARGIN = 30  # states around a reversal to leave out: the joint accelerates there
 UP = np.array([0.0, 0.0, 1.0])
 Array = NDArray[np.float64]
 
@@ -48,7 +48,8 @@ class CalibrationFit:
     Attributes:
         calibration: The calibration.
         zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not fitted.
-        unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing record.
+        unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
+            record.
     """
 
     calibration: Calibration
@@ -148,17 +149,19 @@ def _leg_torque(q: Array, down: Array, leg: int) -> Array:
 
 
 def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
-    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a leg, trunk frame."""
-    place, turn = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a
+    leg, trunk frame.
+    """
+    position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
     joints, centres, axes, masses = [], [], [], []
     for k, kind in enumerate(robot.KINDS):
         link = next(link for link in robot.LINKS if link.name == f"{leg}_{kind}")
         body = robot.lumped(link.name)
-        place = place + turn @ np.array(link.origin)
-        turn = turn @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
-        joints.append(place)
-        axes.append(turn[:, :, 0 if link.axis == "x" else 1])
-        centres.append(place + turn @ np.array(body.com))
+        position = position + rotation @ np.array(link.origin)
+        rotation = rotation @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
+        joints.append(position)
+        axes.append(rotation[:, :, 0 if link.axis == "x" else 1])
+        centres.append(position + rotation @ np.array(body.com))
         masses.append(float(body.mass))
     return (joints, centres), axes, masses
 
@@ -175,7 +178,9 @@ def _rotation_about(angle: Array, axis: int) -> Array:
 
 
 def _joint_zeros(suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
-    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of `calibration`."""
+    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of
+    `calibration`.
+    """
     down = rotate(calibration.mounting, rotate_inverse(suspended.quaternion, -UP))
     legs = [_leg_zeros(suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
     zeros, errors = np.array(legs).transpose(1, 0, 2).reshape(2, 12)
@@ -185,12 +190,13 @@ def _joint_zeros(suspended: Samples, calibration: Calibration) -> tuple[Array, A
 def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
     """Return zeros and standard errors of one leg, (3,) rad each.
 
-    Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of three joints:
+    Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of
+    three joints:
 
         tau = k tau_hold(q - z) + c sign(dq) + d dq
 
-    weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +- ZERO_PRIOR_RAD.
-    The covariance is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
+    weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +-
+    ZERO_PRIOR_RAD. The covariance is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
 
     Args:
         suspended: States of a suspended robot.
@@ -209,7 +215,9 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
     )
 
     def residuals(x: Array) -> Array:
-        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction, (3,) each."""
+        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction,
+        (3,) each.
+        """
         zeros, scale, dry, viscous = x.reshape(4, 3)
         model = scale * _leg_torque(q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
         return np.concatenate(
@@ -228,7 +236,9 @@ def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple
 
 
 def _is_steady(dq: Array) -> NDArray[np.bool_]:
-    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby, (n,)."""
+    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby,
+    (n,).
+    """
     under_way = np.abs(dq) > MIN_MOVING_SPEED
     same = np.sign(dq[1:]) == np.sign(dq[:-1])
     steady: NDArray[np.bool_] = np.all(under_way, axis=1)
@@ -240,19 +250,19 @@ def _is_steady(dq: Array) -> NDArray[np.bool_]:
 def _imu_mounting(standing: Samples, calibration: Calibration) -> tuple[Array, float]:
     """Return the tilt of the IMU, (2,) rad, and the largest distance of a foot from their plane, m.
 
-    The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the feet (the
-    singular vector of the smallest singular value of the centred foot positions).
+    The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the
+    feet (the singular vector of the smallest singular value of the centred foot positions).
     """
     feet = foot_positions(standing.q - calibration.joint_zeros).mean(axis=0)
     centred = feet - feet.mean(axis=0)
     normal = np.linalg.svd(centred)[2][2]
     normal = normal * np.sign(normal[2])
-    shown = rotate_inverse(standing.quaternion, UP).mean(axis=0)
-    shown = shown / np.linalg.norm(shown)
-    turn = np.cross(shown, normal)
-    size = float(np.linalg.norm(turn))
-    angle = np.arctan2(size, shown @ normal)
-    return turn[:2] * (angle / size if size > 0.0 else 1.0), float(np.abs(centred @ normal).max())
+    imu_up = rotate_inverse(standing.quaternion, UP).mean(axis=0)
+    imu_up = imu_up / np.linalg.norm(imu_up)
+    rotation = np.cross(imu_up, normal)
+    sine = float(np.linalg.norm(rotation))
+    angle = np.arctan2(sine, imu_up @ normal)
+    return rotation[:2] * (angle / sine if sine > 0.0 else 1.0), float(np.abs(centred @ normal).max())
 
 
 def _check_suspended(suspended: Samples) -> None:

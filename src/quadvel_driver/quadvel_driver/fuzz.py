@@ -1,11 +1,13 @@
-"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For developers.
+"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For
+developers.
 
-A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with changed
-bytes, and packets with changed bytes and a valid CRC, which reach the checks of the fields. A decoder must
-return a record or raise WireError. A packet that it accepts must have the right CRC, by an independent
-computation, and finite numbers.
+A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
+changed bytes, and packets with changed bytes and a valid CRC, which reach the checks of the fields.
+A decoder must return a record or raise WireError. A packet that it accepts must have the right CRC,
+by an independent computation, and finite numbers.
 
-With atheris (pip install -e ".[fuzz]"), code coverage guides the bytes; without it, they are random.
+With atheris (pip install -e ".[fuzz]"), code coverage guides the bytes; without it, they are
+random.
 """
 
 from __future__ import annotations

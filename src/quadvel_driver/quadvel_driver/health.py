@@ -63,7 +63,7 @@ class Health:
 
     def _link_problems(self, report: LinkReport) -> Iterator[Status]:
         new = {name: count - self._before.get(name, 0) for name, count in report.counts.items()}
-        why = report.last_refusal if any(new[name] for name in BAD_DATAGRAMS) else ""
+        refusal = report.last_refusal if any(new[name] for name in BAD_DATAGRAMS) else ""
         if report.counter_rate is not None:
             rate = f"{report.counter_rate:.0f} a second"
             yield Level.ERROR, f"the counter of {self._board} runs at {rate}, expected some 1000 or 1000000"
@@ -72,15 +72,15 @@ class Health:
             network = report.last_error if new["network_errors"] else ""
             frozen = "its tick stands still" if new["repeated"] > new["states"] else ""
             reason = (
-                why
+                refusal
                 or frozen
                 or network
                 or "is the robot on and in low-level mode, and is this the right network?"
             )
             yield Level.ERROR, f"no state from {self._board} {since}: {reason}"
-        elif why:
+        elif refusal:
             bad = sum(new[name] for name in BAD_DATAGRAMS)
-            yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {why}"
+            yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {refusal}"
         if new["command_timeouts"]:
             yield Level.WARN, "low_cmd stopped: the joints were damped"
 

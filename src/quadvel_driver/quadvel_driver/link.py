@@ -1,8 +1,9 @@
-"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No ROS.
+"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No
+ROS.
 
-The link runs in its own thread (`run`). It sends each command immediately and repeats the last one every
-2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if the operator stops the robot, and
-at the end. The board itself brakes if packets stop.
+The link runs in its own thread (`run`). It sends each command immediately and repeats the last one
+every 2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if the operator stops
+the robot, and at the end. The board itself brakes if packets stop.
 """
 
 from __future__ import annotations
@@ -125,7 +126,8 @@ class UdpLink:
 
         Args:
             config: Addresses and braking.
-            on_state: Called in the link's thread with each new state; `time` (s) is on `clock`, `tick` in ms.
+            on_state: Called in the link's thread with each new state; `time` (s) is on `clock`,
+                `tick` in ms.
             calibration: Calibration of this robot, which corrects states and commands.
             endpoint: A socket that replaces the connection to the board.
             clock: A monotonic clock, s.
@@ -167,7 +169,9 @@ class UdpLink:
             self._socket.close()
 
     def serve(self) -> None:
-        """Receive pending datagrams and send if due; for callers with a clock of their own instead of `run`."""
+        """Receive pending datagrams and send if due; for callers with a clock of their own instead
+        of `run`.
+        """
         self._receive()
         self._send_if_due()
 
@@ -270,7 +274,7 @@ class UdpLink:
         return datagrams
 
     def _accept(self, datagram: bytes) -> BoardState | None:
-        """Return the state of a datagram, or None if it is unusable or not newer than the last one."""
+        """Return the state of a datagram, or None if it is unusable or not newer."""
         try:
             state = wire.decode_state(datagram)
             _check_plausible(state.robot)
@@ -297,7 +301,9 @@ class UdpLink:
         return min(max(self._send_next - self._clock(), 0.0), SEND_PERIOD_S)
 
     def _send_if_due(self) -> None:
-        """Repeat the present command if SEND_PERIOD_S has passed; send damping without a fresh command."""
+        """Repeat the present command if SEND_PERIOD_S has passed; send damping without a fresh
+        command.
+        """
         with self._lock:
             if self._clock() < self._send_next:
                 return
@@ -359,7 +365,8 @@ COUNTER_NAMES = (
 )
 """Counts of a report, since the start.
 
-states: passed to `on_state`; sent: packets; superseded: states replaced by a newer one in the same turn;
+states: passed to `on_state`; sent: packets; superseded: states replaced by a newer one in the same
+    turn;
 repeated, late: see `BoardClock`; wrong_length, wrong_crc, unusable, from_others: refused datagrams;
 command_timeouts: times that commands stopped; board_restarts: restarts of the board's counter;
 network_errors: errors of the socket.
@@ -367,10 +374,11 @@ network_errors: errors of the socket.
 
 
 def clamp_for_board(command: JointCommand) -> JointCommand:
-    """Clamp a command to the limits of the robot, and replace damping mode by a servo without stiffness.
+    """Clamp a command to the limits of the robot, and replace damping mode by a servo without
+    stiffness.
 
-    The board does not define the damping of mode 0, so braking is sent as mode 10 with kp = 0 and the
-    requested kd.
+    The board does not define the damping of mode 0, so braking is sent as mode 10 with kp = 0 and
+    the requested kd.
 
     Args:
         command: The joint command.
@@ -393,7 +401,9 @@ def clamp_for_board(command: JointCommand) -> JointCommand:
 
 
 def _check_plausible(robot: RobotState) -> None:
-    """Raise WireError if a well-formed state has no meaning, such as one of a board that has not started."""
+    """Raise WireError if a well-formed state has no meaning, such as one of a board that has not
+    started.
+    """
     if robot.tick == 0:
         raise WireError("state: tick is 0, expected a counter that runs: the board has not started")
     length = math.hypot(*robot.quaternion.tolist())

@@ -1,4 +1,5 @@
-"""Commands of the operator from the wireless remote: a velocity, button commands, and a latched stop. No ROS.
+"""Commands of the operator from the wireless remote: a velocity, button commands, and a latched
+stop. No ROS.
 
     B                      stop: the joints are damped until the stop is released
     L1 + R1 + start        release the stop
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 
 from .wire import Button, Remote
 
-ZERO_VELOCITY_S = 0.5  # s of zero velocity after the sticks are released; then other sources take over
+ZERO_VELOCITY_S = 0.5  # zero velocity after the sticks are released; then other sources take over
 
 
 class OperatorCommand(Enum):
@@ -126,8 +127,8 @@ class RemotePilot:
             now: Time, s.
 
         Returns:
-            vx, vy (m/s) and wz (rad/s), (3,); None if the sticks are released for ZERO_VELOCITY_S or the robot
-            is stopped.
+            vx, vy (m/s) and wz (rad/s), (3,); None if the sticks are released for ZERO_VELOCITY_S
+            or the robot is stopped.
         """
         if self.stopped or self._moved_at is None or now - self._moved_at > ZERO_VELOCITY_S:
             return None
@@ -136,6 +137,6 @@ class RemotePilot:
 
 def _apply_dead_zone(sticks: NDArray[np.float64], dead_zone: float) -> NDArray[np.float64]:
     """Clip sticks to -1..1 and remove the dead zone d: sign(s) max(|s| - d, 0) / (1 - d)."""
-    way = np.clip(np.abs(sticks), 0.0, 1.0) - dead_zone
-    share: NDArray[np.float64] = np.sign(sticks) * np.maximum(way, 0.0) / (1.0 - dead_zone)
+    deflection = np.clip(np.abs(sticks), 0.0, 1.0) - dead_zone
+    share: NDArray[np.float64] = np.sign(sticks) * np.maximum(deflection, 0.0) / (1.0 - dead_zone)
     return share

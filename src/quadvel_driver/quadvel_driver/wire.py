@@ -1,11 +1,12 @@
-"""Encoding and decoding of the packets of the AlienGo's board: commands (610 bytes) and states (771 bytes).
+"""Encoding and decoding of the packets of the AlienGo's board: commands (610 bytes) and states (771
+bytes).
 
-The formats are those of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and newer).
-The functions convert bytes to plain records and back; `link` handles sockets and time.
+The formats are those of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and
+newer). The functions convert bytes to plain records and back; `link` handles sockets and time.
 
-Only whole packets are accepted. The CRC covers whole 4-byte words from the start; the remaining bytes, at
-the end of the field `reserve`, are not covered. They must be zero, as the SDK sends them, so that no
-flipped bit passes.
+Only whole packets are accepted. The CRC covers whole 4-byte words from the start; the remaining
+bytes, at the end of the field `reserve`, are not covered. They must be zero, as the SDK sends them,
+so that no flipped bit passes.
 """
 
 from __future__ import annotations
@@ -114,7 +115,8 @@ LENGTH, CRC, CONTENT = "length", "CRC", "content"
 
 
 class WireError(ValueError):
-    """A packet must not be used, or a record cannot be sent; the text names the value found and expected.
+    """A packet must not be used, or a record cannot be sent; the text names the value found and
+    expected.
 
     Attributes:
         kind: LENGTH, CRC or CONTENT.
@@ -176,7 +178,8 @@ class BoardState:
 
 
 def crc(data: bytes) -> int:
-    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit first.
+    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit
+    first.
 
     Args:
         data: Whole words.
@@ -194,8 +197,8 @@ def crc(data: bytes) -> int:
 def encode_command(command: JointCommand) -> bytes:
     """Encode a joint command; its `tick` is not part of the packet.
 
-    Values are clamped to the range of their fields, because fixed-point fields would wrap (200 N m would
-    become -56); negative gains become zero.
+    Values are clamped to the range of their fields, because fixed-point fields would wrap (200 N m
+    would become -56); negative gains become zero.
 
     Args:
         command: Angles rad, speeds rad/s, torques N m, gains N m/rad and N m s/rad, each (12,).
@@ -224,8 +227,8 @@ def encode_command(command: JointCommand) -> bytes:
 def decode_command(data: bytes) -> JointCommand:
     """Decode a command packet.
 
-    The mode of the command is damping if all motors are in damping mode. If only some are, those have zero
-    stiffness, target speed and torque; `commanded_modes` returns the mode of each.
+    The mode of the command is damping if all motors are in damping mode. If only some are, those
+    have zero stiffness, target speed and torque; `commanded_modes` returns the mode of each.
 
     Args:
         data: The packet.
@@ -242,7 +245,7 @@ def decode_command(data: bytes) -> JointCommand:
         raise WireError(f"command: levelFlag is {found}, expected 0x{LOW_LEVEL:02X}: the low level")
     motors = packet["motors"][:JOINTS]
     numbers = np.concatenate((motors["q"], motors["dq"]))
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # check before the cast, which warns of NaN
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
         raise _not_finite("command", {"q": motors["q"], "dq": motors["dq"]})
     q, dq = numbers.astype(float).reshape(2, JOINTS)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
@@ -273,8 +276,8 @@ def commanded_modes(data: bytes) -> NDArray[np.uint8]:
 def encode_state(state: BoardState) -> bytes:
     """Encode a board state, with values clamped to the range of their fields.
 
-    Redundant fields are derived: roll, pitch and yaw, raw angles and speeds, estimated foot forces. Joint
-    accelerations are 0.
+    Redundant fields are derived: roll, pitch and yaw, raw angles and speeds, estimated foot forces.
+    Joint accelerations are 0.
 
     Args:
         state: The state.
@@ -290,7 +293,7 @@ def encode_state(state: BoardState) -> bytes:
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
         raise _not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES})
     numbers = np.minimum(np.maximum(numbers, -_FLOAT32_MAX), _FLOAT32_MAX)
-    clipped = {field: numbers[place] for field, place in _STATE_SLICES.items()}
+    clipped = {field: numbers[part] for field, part in _STATE_SLICES.items()}
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
         packet[field] = clipped[field]
@@ -331,7 +334,7 @@ def decode_state(data: bytes) -> BoardState:
     motors = packet["motors"][:JOINTS]
     imu = np.frombuffer(data, "<f4", _IMU_NUMBERS, offset=_IMU_OFFSET)
     numbers = np.concatenate((motors["q"], motors["dq"], imu))
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # check before the cast, which warns of NaN
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
         fields = ("quaternion", "angular_velocity", "linear_acceleration")
         found = {"q": motors["q"], "dq": motors["dq"], **{field: packet[field] for field in fields}}
         raise _not_finite("state", found)
@@ -388,7 +391,7 @@ def _crc_length(layout: np.dtype[Any]) -> int:
 
 
 def _mode(modes: NDArray[np.uint8]) -> int:
-    """Return servo mode if any motor is in it, else damping; raise WireError for an unknown mode."""
+    """Return servo mode if any motor is in it, else damping; WireError for an unknown mode."""
     unknown = (modes != MODE_DAMPING) & (modes != MODE_SERVO)
     if unknown.any():
         i = int(np.argmax(unknown))
@@ -399,7 +402,9 @@ def _mode(modes: NDArray[np.uint8]) -> int:
 
 
 def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero quaternion."""
+    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero
+    quaternion.
+    """
     length = math.hypot(*quaternion.tolist())
     w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
     return (
@@ -422,7 +427,9 @@ def _remote_bytes(remote: Remote) -> np.void:
 
 
 def _remote(data: bytes) -> Remote:
-    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for them."""
+    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for
+    them.
+    """
     fields = np.frombuffer(data, _REMOTE)[0]
     sticks = {stick: float(fields[stick]) for stick in ("lx", "ly", "rx", "ry")}
     if not np.isfinite(list(sticks.values())).all():

@@ -106,7 +106,8 @@ def metadata(
         state_shape: Shape of `h_in` and `c_in`: (layers, 1, hidden).
         recipe: How the network was trained, as JSON.
         commit: Commit of the training code.
-        output_scale: s, with velocity = s * output (m/s) and variance = s^2 exp(log_variance) ((m/s)^2).
+        output_scale: s, with velocity = s * output (m/s) and variance = s^2 exp(log_variance)
+            ((m/s)^2).
         layout: Terms of the input.
 
     Returns:

@@ -1,12 +1,12 @@
 """Contact-aided linear Kalman filter for the trunk velocity, from inertia and planted feet.
 
-The state has the 18 numbers of Bloesch et al. (2012, "State estimation for legged robots") and of the
-MIT Cheetah's estimator (Bledt et al. 2018), in the world frame: trunk position p, trunk velocity v,
-foot centres f_1..f_4. The orientation R (body to world) comes from the IMU.
+The state has the 18 numbers of Bloesch et al. (2012, "State estimation for legged robots") and of
+the MIT Cheetah's estimator (Bledt et al. 2018), in the world frame: trunk position p, trunk
+velocity v, foot centres f_1..f_4. The orientation R (body to world) comes from the IMU.
 
 All noise is isotropic. The axes x, y, z are then independent and share one covariance, which a
-rotation does not change. So the state x is an array (..., 6, 3) and the covariance P is (..., 6, 6).
-The filter does not estimate the accelerometer bias; the legs bound its effect.
+rotation does not change. So the state x is an array (..., 6, 3) and the covariance P is (..., 6,
+6). The filter does not estimate the accelerometer bias; the legs bound its effect.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ Array = NDArray[np.float64]
 VELOCITY_ROW = 1  # row of v in the state; row 0 is p, rows 2 to 5 are f_1..f_4
 FOOT_ROWS = slice(2, 6)
 SWING_SPEED_STD = 10.0  # m/s, standard deviation of the unknown speed of a foot in the air
-SPEED_CORRELATION_S = 1.0  # s, converts the variance of a foot's speed to the intensity of its random walk
-INITIAL_COVARIANCE = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # m^2, (m/s)^2, 4 m^2; p starts at the origin
+SPEED_CORRELATION_S = 1.0  # from the variance of a foot's speed to its random walk
+INITIAL_COVARIANCE = np.diag([0.0, 1.0, 1.0, 1.0, 1.0, 1.0])  # m^2, (m/s)^2, 4 m^2
 # H, with z = H x: z_1..z_4 = f_i - p (feet relative to the trunk), z_5 = v.
 MEASUREMENT_MATRIX = np.zeros((5, 6))
 MEASUREMENT_MATRIX[:4, 0], MEASUREMENT_MATRIX[:4, FOOT_ROWS], MEASUREMENT_MATRIX[4, VELOCITY_ROW] = (
@@ -130,7 +130,8 @@ class KalmanEstimator:
         """Reset the state and the covariance.
 
         Args:
-            ids: Robots to reset, an index into the leading axes; None resets all robots and the time.
+            ids: Robots to reset, an index into the leading axes; None resets all robots and the
+                time.
         """
         if ids is None:
             self._time: float | None = None
@@ -147,7 +148,8 @@ class KalmanEstimator:
             previous_action: Not used; the learned estimator has the same signature.
 
         Returns:
-            Velocity of the trunk in the body frame, (..., 3), m/s, and its covariance, (..., 3, 3), (m/s)^2.
+            Velocity of the trunk in the body frame, (..., 3), m/s, and its covariance, (..., 3, 3),
+            (m/s)^2.
 
         Raises:
             ValueError: Time went back.
@@ -176,7 +178,9 @@ class KalmanEstimator:
         return velocity, self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None, None] * np.eye(3)
 
     def _contact_trust(self, state: RobotState, rotation: Array, jacobians: Array) -> Array:
-        """Return the contact confidence of each foot, (..., 4): 0 in the air, 1 planted, linear in the force."""
+        """Return the contact confidence of each foot, (..., 4): 0 in the air, 1 planted, linear in
+        the force.
+        """
         if self.config.contact_source == "foot_force":
             force = np.asarray(state.foot_force)
         else:
@@ -200,16 +204,19 @@ class KalmanEstimator:
         self._covariance = transition @ self._covariance @ transition.T + noise
 
     def _foot_speed_variance(self, leg_velocity: Array, trust: Array) -> Array:
-        """Return the variance of each foot's unmodelled speed, (..., 4), (m/s)^2: swing, or slip on the ground.
+        """Return the variance of each foot's unmodelled speed, (..., 4), (m/s)^2: swing, or slip on
+        the ground.
 
         sigma^2 = P_vv + sigma_foot^2            (expected variance of v_leg - v)
         e = |v_leg - v|^2 / (3 gate^2 sigma^2)   (excess over the slip gate)
         result = sigma^2 max(e^2 - 1, 0) + (1 - trust) SWING_SPEED_STD^2
         """
-        known = self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None] + self.config.foot_velocity**2
-        surprise = np.square(leg_velocity - self._state[..., VELOCITY_ROW, None, :]).sum(-1) / 3.0
-        excess = surprise / (self.config.slip_gate**2 * known)
-        slip: Array = known * np.maximum(excess**2 - 1.0, 0.0)
+        expected_variance = (
+            self._covariance[..., VELOCITY_ROW, VELOCITY_ROW, None] + self.config.foot_velocity**2
+        )
+        deviation = np.square(leg_velocity - self._state[..., VELOCITY_ROW, None, :]).sum(-1) / 3.0
+        excess = deviation / (self.config.slip_gate**2 * expected_variance)
+        slip: Array = expected_variance * np.maximum(excess**2 - 1.0, 0.0)
         return slip + (1.0 - trust) * SWING_SPEED_STD**2
 
     def _predict_feet(self, rolling: Array, speed_variance: Array, dt: float) -> None:
@@ -218,8 +225,8 @@ class KalmanEstimator:
             f_i' = f_i + v_roll,i dt
             P_ii' = P_ii + (sigma_walk^2 + max(s_i before, s_i now) SPEED_CORRELATION_S) dt
 
-        The larger of the two speed variances counts: only a foot that is planted at both ends of `dt`
-        stayed in place in between.
+        The larger of the two speed variances counts: only a foot that is planted at both ends of
+        `dt` stayed in place in between.
         """
         self._state[..., FOOT_ROWS, :] += rolling * dt
         before, self._speed_variance = self._speed_variance, speed_variance
@@ -230,8 +237,8 @@ class KalmanEstimator:
     def _correct(self, feet: Array, leg_velocity: Array, speed_variance: Array) -> None:
         """Correct with the feet (z_1..z_4) and the trunk velocity from the legs (z_5).
 
-        The four leg velocities enter as their weighted mean, w_i = 1 / (sigma_foot^2 + s_i), which is
-        equivalent to four measurements:
+        The four leg velocities enter as their weighted mean, w_i = 1 / (sigma_foot^2 + s_i), which
+        is equivalent to four measurements:
 
             S = H P H^T + R,   K = P H^T S^-1
             x' = x + K (z - H x),   P' = P - K H P

@@ -1,4 +1,4 @@
-"""Learned velocity estimator at run time: a recurrent network in an ONNX file, one step per sample."""
+"""Learned velocity estimator at run time: a recurrent network, one step per sample."""
 
 from __future__ import annotations
 
@@ -29,7 +29,8 @@ class LearnedEstimator:
             path: The ONNX file.
 
         Raises:
-            NetworkFileError: The file is missing or is not a velocity estimator for this robot and rate.
+            NetworkFileError: The file is missing or is not a velocity estimator for this robot and
+                rate.
         """
         self._network = RecurrentNetwork(path, features.OUTPUTS, features.METADATA_FIELDS)
         metadata = self._network.metadata

@@ -1,7 +1,7 @@
 """Leg odometry: the trunk's velocity from a planted foot that rolls on level ground.
 
-Both estimators use it and decide themselves which foot is planted. Arrays may have leading axes (...);
-legs are FR, FL, RR, RL.
+Both estimators use it and decide themselves which foot is planted. Arrays may have leading axes
+(...); legs are FR, FL, RR, RL.
 """
 
 from __future__ import annotations

@@ -21,7 +21,9 @@ from .features import RATE_HZ
 Array = NDArray[np.float64]
 
 MAX_STALE_STATES = 10
-"""Number of consecutive ordered states, all older than the newest, after which the clock counts as set back."""
+"""Number of consecutive ordered states, all older than the newest, after which the clock counts as
+set back.
+"""
 
 
 class Estimator(Protocol):
@@ -128,7 +130,9 @@ class VelocityTracker:
         return Estimate(velocity, covariance, self._position, self._deviation)
 
     def _check_order(self, time: float) -> None:
-        """Accept `time` (s) as the newest, refuse an older state, or reset the estimator after a gap."""
+        """Accept `time` (s) as the newest, refuse an older state, or reset the estimator after a
+        gap.
+        """
         if self._newest is not None and time <= self._newest:
             self._refused_in_order = self._refused_in_order + 1 if time > self._last_refused else 1
             self._last_refused = time

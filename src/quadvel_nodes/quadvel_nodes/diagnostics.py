@@ -8,7 +8,8 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 QUIET = 5.0
-"""s, shortest interval between two log lines about a lasting condition, such as refused messages."""
+"""s, shortest interval between two log lines about a lasting condition, such as refused messages.
+"""
 
 
 def diagnostics(

@@ -1,4 +1,5 @@
-"""Conversion of quadvel_msgs messages to the records of `quadvel_description.state`, with validation.
+"""Conversion of quadvel_msgs messages to the records of `quadvel_description.state`, with
+validation.
 
 The functions use the fields of a message without importing its class. Generated message classes
 check no values, so every node reads its inputs with these functions.
@@ -34,7 +35,7 @@ LOW_CMD_SIZES = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), 12)
 
 
 class MessageError(ValueError):
-    """A message must not be used; the text names the field, the value found and the value expected."""
+    """A message must not be used; the text names field, value found and value expected."""
 
 
 class NotFiniteError(MessageError):
@@ -99,7 +100,7 @@ class _NumericFields:
         if list(map(len, values)) != self._sizes or np.count_nonzero(np.isfinite(block)) < len(block):
             for field, size in zip(self._fields, self._sizes, strict=True):
                 numbers(message, field, size)
-        return [block[place] for place in self._slices]
+        return [block[part] for part in self._slices]
 
 
 _LOW_STATE_FIELDS, _LOW_CMD_FIELDS = _NumericFields(LOW_STATE_SIZES), _NumericFields(LOW_CMD_SIZES)

@@ -26,7 +26,9 @@ from .topic_types import CHECK_PERIOD_S, ConflictWatch
 Config = TypeVar("Config")
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 MAX_SPIN_WAIT_S = 60.0
-"""s, longest wait of the executor for an event; without a limit the EventsExecutor of rclpy 7.1.6 spins."""
+"""s, longest wait of the executor for an event; without a limit the EventsExecutor of rclpy 7.1.6
+spins.
+"""
 
 
 class StartError(ValueError):
@@ -143,7 +145,8 @@ def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
 
 
 def _serve(node: Node, signals: socket, waker: socket) -> None:
-    """Run callbacks until a byte from `signals`, a call of `request_exit`, or the context's shutdown.
+    """Run callbacks until a byte from `signals`, a call of `request_exit`, or the context's
+    shutdown.
 
     An EventsExecutor that is still alive when the interpreter exits crashes it, so this function
     shuts its executor down.
@@ -175,7 +178,8 @@ def _serve(node: Node, signals: socket, waker: socket) -> None:
 
 
 def _executor() -> Any:
-    """Return an EventsExecutor where ROS 2 has one (Jazzy from April 2025 on), else the standard one.
+    """Return an EventsExecutor where ROS 2 has one (Jazzy from April 2025 on), else the standard
+    one.
 
     The standard executors iterate over all entities of a node, in Python, for each message
     (docs/decisions/0013), which is too slow for the control loop.

@@ -19,14 +19,18 @@ THREADS_DIR = Path("/proc/self/task")
 WATCHDOG_PERIOD_S = 0.05
 """s between two checks of the watchdog: ten periods of the control loop."""
 MAX_BUSY_FRACTION = 0.9
-"""Share of WATCHDOG_PERIOD_S that a real-time thread may compute; the watchdog demotes busier threads."""
+"""Share of WATCHDOG_PERIOD_S that a real-time thread may compute; the watchdog demotes busier
+threads.
+"""
 TIME_SLICE_NS = 100_000
-"""ns, the shortest time slice of Linux. The scheduler (EEVDF) runs threads with a short slice before
-threads with a longer one, such as programs that compute without a pause."""
+"""ns, the shortest time slice of Linux. The scheduler (EEVDF) runs threads with a short slice
+before threads with a longer one, such as programs that compute without a pause.
+"""
 AUTOGROUP_FILE = Path("/proc/self/autogroup")
 REALTIME_LIMIT_US = 1_000_000
-"""us of computing without a pause after which the kernel ends the process (RLIMIT_RTTIME), in case the
-watchdog cannot run."""
+"""us of computing without a pause after which the kernel ends the process (RLIMIT_RTTIME), in case
+the watchdog cannot run.
+"""
 
 
 @attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
@@ -63,14 +67,17 @@ class Scheduling:
             raise ValueError(f"cpus is {value!r}, expected some of {','.join(map(str, sorted(there)))}")
 
     def apply(self, warn: Callable[[str], object]) -> None:
-        """Apply the parameters to this process: cores and time slice to all threads, priority to the caller's.
+        """Apply the parameters to this process: cores and time slice to all threads, priority to
+        the caller's.
 
-        The short time slice needs no privilege, and Linux 6.12; older kernels ignore it. Threads that
-        start later inherit cores and slice, but not the priority. A real-time thread that never pauses
-        would block its core for all other threads, so a watchdog takes the priority back from it.
+        The short time slice needs no privilege, and Linux 6.12; older kernels ignore it. Threads
+        that start later inherit cores and slice, but not the priority. A real-time thread that
+        never pauses would block its core for all other threads, so a watchdog takes the priority
+        back from it.
 
         Args:
-            warn: Called with a sentence if the system refuses the priority, and if the watchdog acts.
+            warn: Called with a sentence if the system refuses the priority, and if the watchdog
+                acts.
         """
         for thread in (int(one.name) for one in THREADS_DIR.iterdir()):
             if self.cpus:
@@ -96,9 +103,9 @@ class Scheduling:
 def run_after_others(niceness: int) -> None:
     """Lower the priority of this process, so that other processes run first.
 
-    Where Linux groups processes by session (sched_autogroup_enabled), the niceness of a process counts
-    only within its session, and the session has a niceness of its own. This function sets the niceness
-    of the session, too, if this process leads it, as nodes of `quadvel up` do.
+    Where Linux groups processes by session (sched_autogroup_enabled), the niceness of a process
+    counts only within its session, and the session has a niceness of its own. This function sets
+    the niceness of the session, too, if this process leads it, as nodes of `quadvel up` do.
 
     Args:
         niceness: 1 to 19; a larger value means less CPU time.
@@ -119,7 +126,8 @@ class _SchedulingAttributes(ctypes.Structure):
 
 
 _SYSCALL_NUMBERS = {"x86_64": (314, 315), "aarch64": (274, 275)}
-"""Numbers of the system calls sched_setattr and sched_getattr, which the C library does not wrap."""
+"""Numbers of the system calls sched_setattr and sched_getattr, which the C library does not wrap.
+"""
 
 
 def request_time_slice(thread: int) -> None:

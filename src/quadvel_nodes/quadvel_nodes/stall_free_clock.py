@@ -1,8 +1,10 @@
-"""Time of the robot without stalls: stamps of states, minus the time in which a simulated robot stood still.
+"""Time of the robot without stalls: stamps of states, minus the time in which a simulated robot
+stood still.
 
 Stamps come from the clock of the machine, ticks from the clock of the robot. If the machine stalls
 together with its simulated robot, stamps advance but ticks do not: the next state follows the last
-one, and no reaction is late. A real robot moves on during a stall of the machine, and so do its ticks.
+one, and no reaction is late. A real robot moves on during a stall of the machine, and so do its
+ticks.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ import math
 STAMP_JITTER_S = 0.01
 """s, deviation of stamps from ticks that does not count as a stall."""
 _TICK_MODULUS = 2**32
-_MAX_TICK_STEP_S = 1e-3 * _TICK_MODULUS / 2  # s; a larger difference of ticks means that the tick went back
+_MAX_TICK_STEP_S = 1e-3 * _TICK_MODULUS / 2  # a larger difference means that the tick went back
 
 
 class StallFreeClock:
@@ -44,28 +46,32 @@ class StallFreeClock:
 
         Args:
             stamp: Time of the state, s.
-            tick: Clock of the robot, ms, modulo 2^32. If it does not advance, only the stamp counts.
+            tick: Clock of the robot, ms, modulo 2^32. If it does not advance, only the stamp
+                counts.
             max_stall: Longest standstill to leave out, s.
-            is_waiting: Whether the robot reports that its time stands still; then any standstill is left out.
+            is_waiting: Whether the robot reports that its time stands still; then any standstill is
+                left out.
 
         Returns:
             Stall-free time of the state, s.
         """
         time = stamp - self.stalled
         if self._last is not None:
-            lived = 1e-3 * ((tick - self._last[1]) % _TICK_MODULUS)
-            standstill = stamp - self._last[0] - lived
+            tick_elapsed = 1e-3 * ((tick - self._last[1]) % _TICK_MODULUS)
+            standstill = stamp - self._last[0] - tick_elapsed
             tolerance = 0.0 if is_waiting or self._was_waiting else STAMP_JITTER_S
-            if (is_waiting and lived < _MAX_TICK_STEP_S) or (
-                lived > 0.0 and tolerance < standstill <= max_stall
+            if (is_waiting and tick_elapsed < _MAX_TICK_STEP_S) or (
+                tick_elapsed > 0.0 and tolerance < standstill <= max_stall
             ):
-                time = self._time + lived
+                time = self._time + tick_elapsed
                 self._exclude_stall(stamp - time - self.stalled, time if is_waiting else self._time)
         self._last, self._time, self._was_waiting = (stamp, tick), time, is_waiting
         return time
 
     def _exclude_stall(self, standstill: float, began: float) -> None:
-        """Leave out a standstill (s) that began at the stall-free time `began` (s), or extend the last one."""
+        """Leave out a standstill (s) that began at the stall-free time `began` (s), or extend the
+        last one.
+        """
         if began != self._stall_began:
             self._stalled_before, self._stall_began = self.stalled, began
         self.stalled += standstill
@@ -84,8 +90,8 @@ class StallFreeClock:
     def time_at(self, stamp: float) -> float:
         """Convert a stamp to stall-free time, back to the standstill before the last one.
 
-        A message about a state can arrive after the state that ended a standstill. During the standstill,
-        stall-free time is constant.
+        A message about a state can arrive after the state that ended a standstill. During the
+        standstill, stall-free time is constant.
 
         Args:
             stamp: Time of the message, s.

@@ -11,7 +11,7 @@ DRIFT_TOLERANCE_NS = 10**6  # ns; stamps follow the system clock only after a la
 
 
 class SystemTime:
-    """Tracks the offset from the monotonic clock to the system clock, without copying its jitter."""
+    """Tracks the offset from the monotonic to the system clock, without copying its jitter."""
 
     def __init__(self) -> None:
         self._offset_ns, self._error_ns = _clock_offset_ns()

@@ -5,15 +5,17 @@ from __future__ import annotations
 import math
 
 PHASE_GAIN = 0.02
-"""Gain with which the deadlines follow the samples. The clock of the samples drifts; with fixed deadlines,
-the samples would drift to the border between two periods, where jitter loses or doubles a tick."""
+"""Gain with which the deadlines follow the samples. The clock of the samples drifts; with fixed
+deadlines, the samples would drift to the border between two periods, where jitter loses or doubles
+a tick.
+"""
 
 
 class TickGrid:
     """Selects one sample per period of the samples' own clock, at any sample rate.
 
-    Deadlines lie on a grid and do not depend on when samples are answered: neither jitter nor computing
-    time accumulates.
+    Deadlines lie on a grid and do not depend on when samples are answered: neither jitter nor
+    computing time accumulates.
     """
 
     def __init__(self, period: float) -> None:
@@ -31,11 +33,12 @@ class TickGrid:
         )  # s from sample to sample in the mean, and how many it is the mean of
 
     def periods_due(self, stamp: float) -> int:
-        """Return how many periods have passed since the last answer, and count this sample as the answer if any.
+        """Return how many periods have passed since the last answer, and count this sample as the
+        answer if any.
 
         With period T, deadline d and mean spacing s of the samples, a sample at t is due if
-        t >= d - min(s, T) / 2: the nearest sample to the deadline answers. Then the deadline moves to the
-        next period, plus PHASE_GAIN times the deviation of the sample from its deadline.
+        t >= d - min(s, T) / 2: the nearest sample to the deadline answers. Then the deadline moves
+        to the next period, plus PHASE_GAIN times the deviation of the sample from its deadline.
 
         Args:
             stamp: Time of the sample, s; a stamp that goes back restarts the grid.
@@ -50,7 +53,7 @@ class TickGrid:
             self._spacing_count += 1
             share = max(1.0 / self._spacing_count, PHASE_GAIN)
             self._spacing += share * (min(elapsed, 2.0 * self._period) - self._spacing)
-        early = 0.5 * min(self._spacing, self._period)  # the nearest sample, be it a little before its time
+        early = 0.5 * min(self._spacing, self._period)  # the nearest sample answers
         due = math.floor((stamp - self._deadline + early) / self._period) + 1
         if due > 0:
             deadline = self._deadline + (due - 1) * self._period

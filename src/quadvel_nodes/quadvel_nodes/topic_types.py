@@ -1,4 +1,4 @@
-"""Detection of publishers whose type differs from the subscriptions of their topic. For node files."""
+"""Detection of publishers whose type differs from the subscriptions. For node files."""
 
 from __future__ import annotations
 

@@ -39,8 +39,9 @@ class Estimator(Protocol):
 class BackupVelocity:
     """Runs a filter of its own, independent of the velocity estimator and of the accelerometer.
 
-    The filter receives the acceleration of a trunk at rest, within the noise that it assumes for the
-    accelerometer. The legs alone give the velocity to within 0.02 m/s of the result with an accelerometer.
+    The filter receives the acceleration of a trunk at rest, within the noise that it assumes for
+    the accelerometer. The legs alone give the velocity to within 0.02 m/s of the result with an
+    accelerometer.
 
     Attributes:
         velocity: Velocity at the newest state, body frame, (3,), m/s; None if there is none.
@@ -51,7 +52,8 @@ class BackupVelocity:
         self.velocity: Array | None = None
 
     def update(self, state: RobotState) -> None:
-        """Process the next state; if the filter fails, reset it, without a velocity until the next state.
+        """Process the next state; if the filter fails, reset it, without a velocity until the next
+        state.
 
         Args:
             state: The measured state.

@@ -1,7 +1,7 @@
 """Limits on joint commands: target range, torque step, torque, speed and power. Knows no ROS.
 
-All limits act on the torque of a command at the present joint state: a target is moved towards the joint
-until its torque is allowed. Damping commands are never limited.
+All limits act on the torque of a command at the present joint state: a target is moved towards the
+joint until its torque is allowed. Damping commands are never limited.
 """
 
 from __future__ import annotations
@@ -71,13 +71,13 @@ class JointCommandLimiter:
         command.q, torque = within_range(command.q, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", beyond)
-        asked = command.torque(state.q, state.dq)
-        allowed = self._limit_step(asked, previous.torque(state.q, state.dq))
+        requested = command.torque(state.q, state.dq)
+        allowed = self._limit_step(requested, previous.torque(state.q, state.dq))
         allowed = self._limit_torque(allowed)
         allowed = self._limit_at_top_speed(allowed, state.dq)
         allowed = self._limit_power(allowed, state.dq)
-        if np.count_nonzero(allowed != asked):
-            _add_torque(command, allowed - asked)
+        if np.count_nonzero(allowed != requested):
+            _add_torque(command, allowed - requested)
 
     def _count(self, name: str, acts: bool | np.bool_) -> None:
         if acts:
@@ -117,7 +117,7 @@ def _add_torque(command: JointCommand, change: Array) -> None:
 
     The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
     """
-    way = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(way == 0.0, command.q, held(command.q + way))
+    shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
+    q = np.where(shift == 0.0, command.q, held(command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

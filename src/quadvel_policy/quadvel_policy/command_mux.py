@@ -1,4 +1,5 @@
-"""Arbitration between velocity sources by priority, with limits on the rate of change. Knows no ROS.
+"""Arbitration between velocity sources by priority, with limits on the rate of change. Knows no
+ROS.
 
 The supervisor limits the command further to what the policy can follow.
 """
@@ -13,7 +14,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-MAX_RAMP_STEP_S = 0.05  # largest time step of the ramp, so that the command does not jump after a stall
+MAX_RAMP_STEP_S = 0.05
+"""Largest time step of the ramp, so that the command does not jump after a stall."""
 Axes = tuple[float, float, float]
 
 
@@ -172,9 +174,9 @@ class CommandMux:
 
     def _ramp(self, target: Array, step: Array) -> Array:
         """Move straight towards `target` by at most `step` on each axis."""
-        way = target - self._velocity
-        if (np.abs(way) <= step).all():
+        difference = target - self._velocity
+        if (np.abs(difference) <= step).all():
             return target
         if not step.all():  # no time has passed
             return self._velocity
-        return self._velocity + way / np.max(np.abs(way) / step)
+        return self._velocity + difference / np.max(np.abs(difference) / step)

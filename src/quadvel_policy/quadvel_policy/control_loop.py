@@ -1,13 +1,14 @@
-"""Timing of the controller: selects the states that start a tick, and the inputs of the tick. Knows no ROS.
+"""Timing of the controller: selects the states that start a tick, and its inputs. Knows no ROS.
 
-Ticks are locked to the phase of the states: a tick runs when the state that is due arrives, so the latency is
-small and constant. Due times lie on a grid in the time of the states (`TickGrid`), so states may be faster
-than 200 Hz. The deadline of a tick is one period after the time of its state. If states stop, `watch` runs
-the supervisor. With simulated time, the same holds in that time, and the answer waits until estimator and mux
-have processed the state, so the simulator does not outrun them.
+Ticks are locked to the phase of the states: a tick runs when the state that is due arrives, so the
+latency is small and constant. Due times lie on a grid in the time of the states (`TickGrid`), so
+states may be faster than 200 Hz. The deadline of a tick is one period after the time of its state.
+If states stop, `watch` runs the supervisor. With simulated time, the same holds in that time, and
+the answer waits until estimator and mux have processed the state, so the simulator does not outrun
+them.
 
-All times are numbers in s. Except for the clock, they are stall-free times of the robot (`StallFreeClock`):
-a stall of the machine together with its simulator is no gap.
+All times are numbers in s. Except for the clock, they are stall-free times of the robot
+(`StallFreeClock`): a stall of the machine together with its simulator is no gap.
 """
 
 from __future__ import annotations
@@ -40,14 +41,16 @@ PERIOD_S = 1.0 / RATE_HZ
 WATCH_PERIOD_S = 0.02
 """s between two calls of `watch`."""
 MAX_STALL_S = 0.5
-"""s, longest stall of the whole machine that is excused, and longest wait of a simulated robot for a node that
-lags: half of the time for which a simulator waits for its answer."""
+"""s, longest stall of the whole machine that is excused, and longest wait of a simulated robot for
+a node that lags. It is half of the time for which a simulator waits for its answer.
+"""
 LOCKSTEP_WAIT_S = 2.0
 """s of real time, longest wait of a robot in lockstep for a node that lags."""
 
 MIN_CLOCK_STEP_S = 0.02
-"""s, smallest step of the clock against the steady clock that counts as setting it; valid if both clocks are
-read within half of this time."""
+"""s, smallest step of the clock against the steady clock that counts as setting it; valid if both
+clocks are read within half of this time.
+"""
 
 Stamped = tuple[float, Array]
 """Time (s) and value."""
@@ -55,7 +58,9 @@ Stamped = tuple[float, Array]
 
 @attrs.frozen(kw_only=True)
 class ControlConfig(SupervisorConfig, Scheduling):
-    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node parameter."""
+    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node
+    parameter.
+    """
 
     max_velocity_age: float = setting(
         0.05,
@@ -87,7 +92,9 @@ class _LaggingNode:
         self._waiting_since = None
 
     def delays_robot(self, age: float, now: float) -> bool:
-        """Return whether the robot must wait, for the `age` of the newest message (s, stall-free) at `now` (s, steady)."""
+        """Return whether the robot must wait, for the `age` of the newest message (s, stall-free)
+        at `now` (s, steady).
+        """
         if age <= self.max_lag:
             return False
         if self._waiting_since is None:
@@ -121,8 +128,10 @@ class ControlLoop:
             config: Its parameters and the age limits.
             answer: Called with each joint command.
             clock: Clock of the stamps, s.
-            sim_time: Whether that clock is a simulator's in lockstep, which waits for the answer to each state.
-            steady: Clock that nobody sets, s, by which steps of `clock` are detected; None if `clock` has none.
+            sim_time: Whether that clock is a simulator's in lockstep, which waits for the answer to
+                each state.
+            steady: Clock that nobody sets, s, by which steps of `clock` are detected; None if
+                `clock` has none.
         """
         self.supervisor = supervisor
         self.stats = LoopStats()
@@ -234,7 +243,7 @@ class ControlLoop:
             self.supervisor.refused[topic] = why
 
     def watch(self) -> None:
-        """Run the supervisor if no valid state comes any more; to be called every WATCH_PERIOD_S."""
+        """Run the supervisor if no valid state comes; to be called every WATCH_PERIOD_S."""
         now = self._now()
         self.stall_detector.poll(now)
         if self.state is None:
@@ -245,7 +254,9 @@ class ControlLoop:
             self._tick(self.state, now)
 
     def _now(self, stamp: float = 0.0) -> float:
-        """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive late."""
+        """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive
+        late.
+        """
         before, now = self._steady(), self._clock()
         ahead = now - before
         if (
@@ -271,7 +282,9 @@ class ControlLoop:
         return any(last is not None and node.delays_robot(state.time - last[0], now) for last, node in known)
 
     def _answer_if_due(self, state: RobotState, now: float, start: float) -> None:
-        """Run a tick if the state is due; `now` and `start`: begin of the work on the clock and the steady clock, s."""
+        """Run a tick if the state is due; `now` and `start`: begin of the work on the clock and the
+        steady clock, s.
+        """
         self._waiting_state = None
         periods = self._grid.periods_due(state.time)
         if periods:
@@ -285,7 +298,7 @@ class ControlLoop:
             self._publish(self._answer)
 
     def _tick(self, state: RobotState, now: float) -> None:
-        """Run one tick of the supervisor with the inputs known at `now` (s) and publish its command."""
+        """Run one tick with the inputs known at `now` (s) and publish the command."""
         self.supervisor.overruns = 0 if self._config.robot_waits else self.stats.consecutive_overruns
         self.state = state
         now -= self.stalled
@@ -304,7 +317,8 @@ class ControlLoop:
 
 
 def _value_if_fresh(stamped: Stamped | None, now: float, limit: float, ahead: float = 0.0) -> Array | None:
-    """Return the value, or None if its time is more than `limit` (s) off, also into the future after a clock step.
+    """Return the value, or None if its time is more than `limit` (s) off, also into the future
+    after a clock step.
 
     Args:
         stamped: Time (s) and value.

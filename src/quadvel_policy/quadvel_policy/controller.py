@@ -35,10 +35,12 @@ from .received import linear_velocity, planar_velocity
 from .settings import setting
 from .supervisor import MODES, Supervisor
 
-LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # only the newest state is useful
+# Only the newest state is useful.
+LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
 SILENCE_LIMIT_S = 5
-"""s without any state after which the log states that the controller waits for one. In lockstep, where time
-stands still then, a robot that reported before counts as lost."""
+"""s without any state after which the log states that the controller waits for one. In lockstep,
+where time stands still then, a robot that reported before counts as lost.
+"""
 
 
 @attrs.frozen(kw_only=True)
@@ -231,7 +233,9 @@ class Controller(Node):
             log.warning(summary, throttle_duration_sec=QUIET)
 
     def _duplicate_publisher(self) -> str | None:
-        """Return a sentence if more than one node publishes states, which fit no single robot, else None."""
+        """Return a sentence if more than one node publishes states, which fit no single robot, else
+        None.
+        """
         count = self._states.get_publisher_count()
         return (
             f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None

@@ -1,7 +1,7 @@
 """Interface of guards: each checks every control tick for one kind of fault. Knows no ROS.
 
-A guard returns one sentence about the fault, or None. Its `level` determines the response. `guards` holds
-all guards; the supervisor latches faults until the operator clears them.
+A guard returns one sentence about the fault, or None. Its `level` determines the response. `guards`
+holds all guards; the supervisor latches faults until the operator clears them.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class Level(IntEnum):
 
 @attrs.frozen(kw_only=True)
 class GuardConfig:
-    """Limits of the guards; each field is a parameter of the node `controller`, with its description and unit."""
+    """Limits of the guards; each field is a parameter of the node `controller`, with its
+    description and unit.
+    """
 
     max_state_age: float = setting(
         0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME_S
@@ -113,7 +115,9 @@ class GuardConfig:
 
     @property
     def silence_limit(self) -> float:
-        """Longest time without a state, and largest age of the state, s; longer if the robot's time may stand still."""
+        """Longest time without a state, and largest age of the state, s; longer if the robot's time
+        may stand still.
+        """
         return self.max_standstill if self.robot_waits else self.max_state_age
 
 
@@ -147,7 +151,8 @@ class GuardInput:
         is_moving: Whether the robot follows a velocity other than zero.
         overruns: Number of consecutive missed deadlines.
         motors: Status of the motors; None before the first message.
-        duplicate_publisher: Sentence about a second publisher of states, found by the node; None if there is none.
+        duplicate_publisher: Sentence about a second publisher of states, found by the node; None if
+            there is none.
         refused: By topic, the reason why messages since the last valid one were refused.
         stopped: Time that the controller did not run between the two states, s.
     """
@@ -170,7 +175,9 @@ class GuardInput:
 
     @cached_property
     def is_sound(self) -> bool:
-        """Whether all numbers are finite and all joints within their limits; one check for the usual case."""
+        """Whether all numbers are finite and all joints within their limits; one check for the
+        usual case.
+        """
         state, c = self.state, self.config
         low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
         return bool(
@@ -181,12 +188,13 @@ class GuardInput:
 
 
 class Guard:
-    """Detects one kind of fault. The first paragraph of a guard's docstring is its row in docs/faults.md.
+    """Detects one kind of fault. The first paragraph of a guard's docstring is its row in
+    docs/faults.md.
 
     Attributes:
         level: Response to the fault.
-        is_immediate: Whether the guard runs before the answer of the tick. Guards that compare over a time
-            run after the answer and take effect at the next tick, 5 ms later.
+        is_immediate: Whether the guard runs before the answer of the tick. Guards that compare over
+            a time run after the answer and take effect at the next tick, 5 ms later.
         modes: Modes in which the fault has an effect; a guard runs in every mode.
     """
 

@@ -1,7 +1,7 @@
 """Guards: detection of faults of a moving robot. Knows no ROS.
 
-GUARDS lists all guards; `faults` prints their table. The limits have a margin of at least three over
-the values of walking on flat and rough ground, on randomised plants, and in logs of a real Go2
+GUARDS lists all guards; `faults` prints their table. The limits have a margin of at least three
+over the values of walking on flat and rough ground, on randomised plants, and in logs of a real Go2
 (docs/decisions/0046-guards.md).
 """
 
@@ -88,8 +88,8 @@ class ControllerStopped(Guard):
 
 
 class StateStale(Guard):
-    """The state is older than `max_state_age`, or no valid state came for so long; `max_standstill` if the process of a
-    simulated robot, whose time stands still then, is silent.
+    """The state is older than `max_state_age`, or no valid state came for so long; `max_standstill`
+    if the process of a simulated robot, whose time stands still then, is silent.
     """
 
     @override
@@ -157,8 +157,8 @@ class JointTooFast(Guard):
 
 
 class EncoderInconsistent(Guard):
-    """A joint's angle deviates from its integrated speed by more than `max_encoder_error`: a jump, a slip, a constant
-    reading, or a robot that was moved to another place.
+    """A joint's angle deviates from its integrated speed by more than `max_encoder_error`: a jump,
+    a slip, a constant reading, or a robot that was moved to another place.
 
         e' = e exp(-dt / ENCODER_WINDOW_S) + (q' - q) - dt (dq' + dq) / 2
 
@@ -175,12 +175,12 @@ class EncoderInconsistent(Guard):
         if data.mode not in MOVING_MODES or data.previous is None or data.gap <= 0.0 or not data.is_sound:
             self._error[:] = 0.0
             return None
-        moved = data.state.q - data.previous.q
+        motion = data.state.q - data.previous.q
         if data.gap <= 0.01:
-            unexplained = moved - 0.5 * data.gap * (data.state.dq + data.previous.dq)
+            unexplained = motion - 0.5 * data.gap * (data.state.dq + data.previous.dq)
         else:  # after a gap the path is unknown; count only motion beyond the largest speed
-            unexplained = np.sign(moved) * np.maximum(
-                np.abs(moved) - data.config.max_joint_speed * VELOCITY_LIMIT * data.gap, 0.0
+            unexplained = np.sign(motion) * np.maximum(
+                np.abs(motion) - data.config.max_joint_speed * VELOCITY_LIMIT * data.gap, 0.0
             )
         self._error = self._error * math.exp(-data.gap / ENCODER_WINDOW_S) + unexplained
         i = int(np.argmax(np.abs(self._error)))
@@ -191,7 +191,9 @@ class EncoderInconsistent(Guard):
 
 
 class EncoderFrozen(Guard):
-    """Angle and speed of a joint do not change a bit for `frozen_time`, while its target and other joints move."""
+    """Angle and speed of a joint do not change a bit for `frozen_time`, while its target and other
+    joints move.
+    """
 
     is_immediate = False
 
@@ -203,14 +205,14 @@ class EncoderFrozen(Guard):
         if data.previous is None or data.command.mode == MODE_DAMPING:
             self._time[:] = 0.0
             return None
-        moved = np.abs(data.state.q - data.previous.q)
-        same = (moved == 0.0) & (data.state.dq == data.previous.dq)
-        since = same & (self._time > 0.0)
-        self._time = np.where(same, self._time + data.gap, 0.0)
+        motion = np.abs(data.state.q - data.previous.q)
+        is_same = (motion == 0.0) & (data.state.dq == data.previous.dq)
+        since = is_same & (self._time > 0.0)
+        self._time = np.where(is_same, self._time + data.gap, 0.0)
         self._target = np.where(
             since, self._target, data.command.q
         )  # the target when the reading last changed
-        self._others_travel = np.where(since, self._others_travel + moved.max(), 0.0)
+        self._others_travel = np.where(since, self._others_travel + motion.max(), 0.0)
         suspect = (np.abs(data.command.q - self._target) > STUCK_RANGE_RAD) & (
             self._others_travel > NOTABLE_MOTION_RAD
         )
@@ -250,7 +252,9 @@ class ImuInconsistent(Guard):
 
 
 class ImuFrozen(Guard):
-    """Orientation and angular velocity, which is not zero, do not change a bit for `frozen_time`, while the joints move."""
+    """Orientation and angular velocity, which is not zero, do not change a bit for `frozen_time`,
+    while the joints move.
+    """
 
     is_immediate = False
     level = Level.STANCE
@@ -263,14 +267,14 @@ class ImuFrozen(Guard):
         if data.previous is None:
             return None
         gyro = data.state.angular_velocity
-        same = (
+        is_same = (
             np.array_equal(gyro, data.previous.angular_velocity)
             and np.array_equal(data.state.quaternion, data.previous.quaternion)
             and gyro.any()
         )
-        self._time = self._time + data.gap if same else 0.0
+        self._time = self._time + data.gap if is_same else 0.0
         self._joint_travel = (
-            self._joint_travel + float(np.abs(data.state.q - data.previous.q).max()) if same else 0.0
+            self._joint_travel + float(np.abs(data.state.q - data.previous.q).max()) if is_same else 0.0
         )
         if self._time <= data.config.frozen_time or self._joint_travel <= NOTABLE_MOTION_RAD:
             return None
@@ -278,8 +282,8 @@ class ImuFrozen(Guard):
 
 
 class AccelerometerImplausible(Guard):
-    """The acceleration is more than `max_acceleration_error` on the mean of half a second: no robot on legs does that.
-    An accelerometer that shows only zeros is not checked.
+    """The acceleration is more than `max_acceleration_error` on the mean of half a second: no robot
+    on legs does that. An accelerometer that shows only zeros is not checked.
 
         a_mean' = a_mean + (1 - exp(-dt / ACCELERATION_WINDOW_S)) (R a - g - a_mean)
     """
@@ -306,8 +310,9 @@ class AccelerometerImplausible(Guard):
 
 
 class DriveDoesNotAnswer(Guard):
-    """A drive's torque deviates from the commanded one by more than `max_torque_error` on the mean: it has dropped out,
-    commands do not reach it, or its report is wrong. A robot that reports no torque at any joint is not checked.
+    """A drive's torque deviates from the commanded one by more than `max_torque_error` on the mean:
+    it has dropped out, commands do not reach it, or its report is wrong. A robot that reports no
+    torque at any joint is not checked.
 
     Both torques pass the same low-pass filter with the time constant TORQUE_WINDOW_S.
     """
@@ -333,7 +338,9 @@ class DriveDoesNotAnswer(Guard):
 
 
 class JointStuck(Guard):
-    """A joint has pushed with more than `stuck_torque` of its drive's largest torque for `stuck_time` and did not move."""
+    """A joint has pushed with more than `stuck_torque` of its drive's largest torque for
+    `stuck_time` and did not move.
+    """
 
     is_immediate = False
 
@@ -378,7 +385,9 @@ class MotorHot(Guard):
 
 
 class FootForceFrozen(Guard):
-    """The force of a foot does not change for `frozen_foot_time` while the robot walks. The controller does not use it."""
+    """The force of a foot does not change for `frozen_foot_time` while the robot walks. The
+    controller does not use it.
+    """
 
     is_immediate = False
     level = Level.NOTICE
@@ -392,15 +401,17 @@ class FootForceFrozen(Guard):
         if data.previous is None or not data.is_moving or data.mode != "walk":
             self._time[:] = 0.0
             return None
-        same = data.state.foot_force == data.previous.foot_force
-        self._time = np.where(same, self._time + data.gap, 0.0)
+        is_same = data.state.foot_force == data.previous.foot_force
+        self._time = np.where(is_same, self._time + data.gap, 0.0)
         for i in np.flatnonzero(self._time > data.config.frozen_foot_time):
             return f"the force of foot {LEGS[i]} has stayed at {data.state.foot_force[i]:.0f} N for {self._time[i]:.1f} s"
         return None
 
 
 class Overruns(Guard):
-    """More than `max_overruns` consecutive deadlines were missed (on a robot; a simulated one waits)."""
+    """More than `max_overruns` consecutive deadlines were missed (on a robot; a simulated one
+    waits).
+    """
 
     level = Level.STANCE
 
@@ -423,8 +434,8 @@ class EstimateStale(Guard):
 
 
 class EstimateWrong(Guard):
-    """The velocity estimate deviates from the Kalman filter by more than `max_velocity_error`: the Kalman filter replaces it
-    until both have agreed for `velocity_trust_time`.
+    """The velocity estimate deviates from the Kalman filter by more than `max_velocity_error`: the
+    Kalman filter replaces it until both have agreed for `velocity_trust_time`.
     """
 
     level = Level.LIMIT
@@ -438,13 +449,13 @@ class EstimateWrong(Guard):
     def check(self, data: GuardInput) -> str | None:
         if data.velocity is None or data.backup is None:
             return self._found
-        c, error = data.config, math.dist(data.velocity.tolist(), data.backup.tolist())
-        if not error <= c.max_velocity_error:
+        config, error = data.config, math.dist(data.velocity.tolist(), data.backup.tolist())
+        if not error <= config.max_velocity_error:
             self._agreement_time = 0.0
-            self._found = f"the velocity estimate is {error:.1f} m/s off the Kalman filter's, limit {c.max_velocity_error:.1f}"
+            self._found = f"the velocity estimate is {error:.1f} m/s off the Kalman filter's, limit {config.max_velocity_error:.1f}"
         else:
             self._agreement_time += data.gap
-            if self._agreement_time > c.velocity_trust_time:
+            if self._agreement_time > config.velocity_trust_time:
                 self._found = None
         return self._found
 
@@ -487,7 +498,8 @@ GUARDS: tuple[type[Guard], ...] = (
     EstimateWrong,
     FootForceFrozen,
 )
-"""Guards in priority order: the first active one is reported, so causes precede their consequences."""
+"""Guards in priority order: the first active one is reported, so causes precede their consequences.
+"""
 
 
 def ideal_torque(command: JointCommand, state: RobotState) -> Array:
@@ -518,7 +530,8 @@ def _estimate_problem(data: GuardInput) -> str | None:
 
 
 def _rotation_between(before: Array, after: Array) -> Array:
-    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body frame.
+    """Return the rotation vector of a small rotation between two orientations, (3,), rad, body
+    frame.
 
     Twice the vector part of conj(before) * after; the sign selects the shorter rotation.
     """

@@ -11,11 +11,11 @@ from collections import deque
 import attrs
 import numpy as np
 
-MAX_OVERRUN_COUNT = 2**32 - 1  # largest uint32 of quadvel_msgs/ControllerState, where the count stays
+MAX_OVERRUN_COUNT = 2**32 - 1  # largest uint32 (quadvel_msgs/ControllerState), where the count stays
 
 
 class Histogram:
-    """Percentiles of durations in constant memory: logarithmic bins of 1 % width from 1 us to 10 s."""
+    """Percentiles of durations in constant memory: bins of 1 % width from 1 us to 10 s."""
 
     _SHORTEST = 1e-6
     _WIDTH = math.log(1.01)

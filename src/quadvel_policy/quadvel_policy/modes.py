@@ -98,7 +98,8 @@ def blend(a: JointCommand, b: JointCommand, share: float) -> JointCommand:
 
         tau = (1 - s) tau_a + s tau_b  for  tau = kp (q_des - q) + kd (dq_des - dq) + tau_ff
 
-    so kp = (1 - s) kp_a + s kp_b and q_des = ((1 - s) kp_a q_a + s kp_b q_b) / kp; kd and dq_des alike.
+    so kp = (1 - s) kp_a + s kp_b and q_des = ((1 - s) kp_a q_a + s kp_b q_b) / kp; kd and dq_des
+    alike.
 
     Args:
         a: Command at share 0.
@@ -150,26 +151,29 @@ class Damping:
 
 
 def vertical_offset(state: RobotState) -> Array:
-    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m below the origin.
+    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m
+    below the origin.
 
     Args:
         state: The measured state.
 
     Returns:
-        Offset forward and to the left in the trunk frame, (2,), m, limited to an angle of MAX_LEAN_RAD.
+        Offset forward and to the left in the trunk frame, (2,), m, limited to an angle of
+        MAX_LEAN_RAD.
     """
     forward, left, up = -rotate_inverse(state.quaternion, UP)
-    way = np.array([forward, left]) / max(-up, math.cos(MAX_LEAN_RAD))
-    return way * min(1.0, math.tan(MAX_LEAN_RAD) / max(math.hypot(*way), 1e-9))
+    difference = np.array([forward, left]) / max(-up, math.cos(MAX_LEAN_RAD))
+    return difference * min(1.0, math.tan(MAX_LEAN_RAD) / max(math.hypot(*difference), 1e-9))
 
 
 class Posture:
-    """Moves smoothly through postures and holds the last one, with the feet below the trunk on slopes.
+    """Moves smoothly through postures and holds the last one, with the feet below the trunk on
+    slopes.
 
-    The feet are shifted uphill or downhill by the tilt of the trunk, which is low-pass filtered with
-    LEAN_FILTER_S and limited to MAX_LEAN_RAD. The path starts at the targets for which the gains give the torque
-    of the previous command, so the torque does not jump; afterwards its rate is at most kp times the speed of
-    the path.
+    The feet are shifted uphill or downhill by the tilt of the trunk, which is low-pass filtered
+    with LEAN_FILTER_S and limited to MAX_LEAN_RAD. The path starts at the targets for which the
+    gains give the torque of the previous command, so the torque does not jump; afterwards its rate
+    is at most kp times the speed of the path.
     """
 
     def __init__(self, path: Sequence[tuple[float, Array]], kp: float, kd: float) -> None:
@@ -183,7 +187,7 @@ class Posture:
         self._times = np.cumsum([0.0, *(seconds for seconds, _ in path)])
         self._postures = np.array([np.zeros(JOINTS), *(q for _, q in path)])
         self._feet = foot_positions(self._postures[1:])
-        # Difference to the solution of the inverse kinematics, not zero if a knee bends the other way.
+        # Difference to the inverse kinematics, not zero if a knee bends the other way.
         self._offset = self._postures[1:] - inverse_kinematics(self._feet)
         self._kp, self._kd = np.full(JOINTS, kp), np.full(JOINTS, kd)
         self._lean, self._lean_updated_at = np.zeros(2), 0.0
@@ -219,14 +223,15 @@ class Posture:
         Args:
             tick: The first input.
         """
-        measured, asked = tick.state.q, tick.previous
-        self._postures[0] = measured + (asked.kp * (asked.q - measured) + asked.tau) / self._kp
+        measured, requested = tick.state.q, tick.previous
+        self._postures[0] = measured + (requested.kp * (requested.q - measured) + requested.tau) / self._kp
         self._lean, self._lean_updated_at = vertical_offset(tick.state), tick.elapsed
 
     def tick(self, tick: ModeInput) -> JointCommand:
         """Return the posture on the path at this time.
 
-        The tilt is low-pass filtered: lean' = lean + (1 - exp(-dt / LEAN_FILTER_S)) (offset - lean).
+        The tilt is low-pass filtered: lean' = lean + (1 - exp(-dt / LEAN_FILTER_S)) (offset -
+        lean).
 
         Args:
             tick: The input.
@@ -244,14 +249,17 @@ class Posture:
         return JointCommand(q=q, dq=dq, kp=self._kp, kd=self._kd)
 
     def _lean_postures(self, lean: Array) -> Array:
-        """Return the postures of the path, (n, 12), rad, for an offset of the vertical (`vertical_offset`)."""
+        """Return the postures of the path, (n, 12), rad, for an offset of the vertical
+        (`vertical_offset`).
+        """
         feet = self._feet.copy()
         feet[..., :2] -= feet[..., 2:].mean(axis=1, keepdims=True) * lean
         leaning: Array = inverse_kinematics(feet) + self._offset
         return leaning
 
     def _interpolate(self, elapsed: float) -> tuple[Array, Array]:
-        """Interpolate the path with quintic polynomials: q (rad) and dq (rad/s), at rest at each posture.
+        """Interpolate the path with quintic polynomials: q (rad) and dq (rad/s), at rest at each
+        posture.
 
         q(s) = q_a + (10 s^3 - 15 s^4 + 6 s^5) (q_b - q_a),   dq = 30 s^2 (1 - s)^2 (q_b - q_a) / T
         """
@@ -260,10 +268,10 @@ class Posture:
         leg = int(np.searchsorted(self._times, elapsed, side="right"))
         seconds = self._times[leg] - self._times[leg - 1]
         s = (elapsed - self._times[leg - 1]) / seconds
-        way = self._postures[leg] - self._postures[leg - 1]
-        place = s**3 * (10 - 15 * s + 6 * s**2)
+        difference = self._postures[leg] - self._postures[leg - 1]
+        progress = s**3 * (10 - 15 * s + 6 * s**2)
         speed = 30 * s**2 * (1 - s) ** 2 / seconds
-        return self._postures[leg - 1] + place * way, speed * way
+        return self._postures[leg - 1] + progress * difference, speed * difference
 
 
 class Walk:
@@ -333,7 +341,7 @@ class Walk:
         start = time.perf_counter()
         self._previous_action = self._policy.step(observation)
         self.inference_seconds = time.perf_counter() - start
-        asked = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
+        requested = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
         if tick.elapsed < self._blend_time:
-            return blend(self._fade_from, asked, tick.elapsed / self._blend_time)
-        return asked
+            return blend(self._fade_from, requested, tick.elapsed / self._blend_time)
+        return requested

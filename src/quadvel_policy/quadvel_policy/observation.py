@@ -1,7 +1,7 @@
 """Observation and action of a policy: the input of its network and the meaning of its output.
 
-Training, simulation and the robot all use this module, and the policy file contains its parameters as
-metadata, so they cannot disagree. The module runs no network; `policy_file` does.
+Training, simulation and the robot all use this module, and the policy file contains its parameters
+as metadata, so they cannot disagree. The module runs no network; `policy_file` does.
 """
 
 from __future__ import annotations
@@ -66,8 +66,8 @@ def build_observation(
 ) -> NDArray[np.float32]:
     """Build the network input, clip((value - offset) * scale) of each term.
 
-    All arrays have the same leading axes (...). The orientation is either `quaternion` or `roll_pitch`. NaN stays
-    NaN, but clipping hides infinity, so check for it before.
+    All arrays have the same leading axes (...). The orientation is either `quaternion` or
+    `roll_pitch`. NaN stays NaN, but clipping hides infinity, so check for it before.
 
     Args:
         spec: Terms of the observation.
@@ -107,7 +107,9 @@ def build_observation(
 
 
 class MetadataError(ValueError):
-    """Invalid metadata of a policy; the text names the field, the value found and the value expected."""
+    """Invalid metadata of a policy; the text names the field, the value found and the value
+    expected.
+    """
 
 
 def _metadata_error(field: str, found: object, expected: str) -> MetadataError:
@@ -238,7 +240,8 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
 
 @attrs.frozen(kw_only=True, eq=False)
 class PolicyMetadata:
-    """Everything needed to run a policy file: the JSON object under the ONNX metadata key `quadvel`.
+    """Everything needed to run a policy file: the JSON object under the ONNX metadata key
+    `quadvel`.
 
     Fields with one value per joint also accept one number for all joints.
 
@@ -246,8 +249,8 @@ class PolicyMetadata:
         schema: Version of the format.
         joint_names: Names of the joints, in order.
         nominal_q: Nominal posture, (12,), rad.
-        action_offset: Joint targets of a zero action, (12,), rad: the nominal posture plus the joint torques
-            of standing divided by kp.
+        action_offset: Joint targets of a zero action, (12,), rad: the nominal posture plus the
+            joint torques of standing divided by kp.
         action_scale: rad per unit of the network's output, (12,).
         action_clip: Bounds of the network's output, or None.
         kp: Stiffness, (12,), N m/rad.
@@ -255,8 +258,8 @@ class PolicyMetadata:
         rate_hz: Rate of the policy, Hz.
         observation: Terms of the observation.
         command_limits: Commands of the training, (low, high) of vx, vy (m/s) and wz (rad/s).
-        curve_limit: Largest lateral acceleration in curves, m/s^2, see `CommandLimits`; None if the limits of
-            the axes are independent.
+        curve_limit: Largest lateral acceleration in curves, m/s^2, see `CommandLimits`; None if the
+            limits of the axes are independent.
         state_shape: Shape of h_in and of c_in.
         actuator: Actuator model of the training, as JSON.
         recipe: How the policy was trained, as JSON.
@@ -398,7 +401,8 @@ class CommandLimits:
 
 
 class ActionMap:
-    """Conversion of the network's output to joint targets: target = offset + scale * clip(action), rad.
+    """Conversion of the network's output to joint targets: target = offset + scale * clip(action),
+    rad.
 
     `quadvel_description.command_range` defines how targets outside the command range are sent.
     """

@@ -32,8 +32,8 @@ class PolicyFile:
             path: The ONNX file.
 
         Raises:
-            NetworkFileError: The file is missing or is not a policy for this robot and rate; one sentence with
-                the name of the file.
+            NetworkFileError: The file is missing or is not a policy for this robot and rate; one
+                sentence with the name of the file.
         """
         network = RecurrentNetwork(path, {"actions": JOINTS}, REQUIRED_FIELDS)
         try:

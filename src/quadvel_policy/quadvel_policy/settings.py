@@ -13,8 +13,8 @@ def setting(default: Any, description: str, at_most: float | None = None) -> Any
     Args:
         default: Default value; it determines the type.
         description: Meaning of the parameter, with its unit after the last comma.
-        at_most: Largest value of a positive number; a larger limit would protect nothing. None if the
-            parameter is not a number.
+        at_most: Largest value of a positive number; a larger limit would protect nothing. None if
+            the parameter is not a number.
 
     Returns:
         The attrs field. A value out of range raises ValueError with field, value and bounds.

@@ -1,4 +1,5 @@
-"""Supervisor of the controller: transitions between modes, and responses to the faults that `guards` finds.
+"""Supervisor of the controller: transitions between modes, and responses to the faults that
+`guards` finds.
 
 Plain arrays and times in, joint commands out; it knows no ROS. `modes` implements the modes,
 `command_limits` limits the joint commands.
@@ -47,9 +48,12 @@ ALLOWED_FROM = {
 VELOCITY_MODES = ("stance", "walk")
 """Modes in which the robot follows a velocity command."""
 STANCE_COMMAND = np.array([0.0, 0.0, 0.0, 1.0])
-VELOCITY_DECAY_S = 0.2  # decay time of the last known velocity while the robot brakes without an estimate
+VELOCITY_DECAY_S = 0.2
+"""Decay time of the last known velocity while the robot brakes without an estimate."""
 MIN_STEPPING_SPEED = 0.2
-"""m/s, above which a robot that must stand continues stepping: feet that stop under a moving trunk trip it."""
+"""m/s, above which a robot that must stand continues stepping: feet that stop under a moving trunk
+trip it.
+"""
 MAX_STIFFNESS, MAX_DAMPING = 1000.0, 50.0
 """N m/rad and N m s/rad; larger gains make the legs oscillate."""
 MAX_BRAKE_TIME_FACTOR = 1.8  # of `brake_time`, after which a moving robot goes to stance anyway
@@ -90,7 +94,9 @@ Transition = tuple[str, str] | None
 
 @attrs.frozen(kw_only=True)
 class SupervisorConfig(GuardConfig, JointCommandLimits):
-    """Gains and durations of the modes, limits of guards and commands; each field is a node parameter."""
+    """Gains and durations of the modes, limits of guards and commands; each field is a node
+    parameter.
+    """
 
     auto_stand: bool = setting(False, "stand up once, automatically, as soon as the robot reports")
     require_operator: bool = setting(False, "walk only after ~/enable_walking was called (set it on a robot)")
@@ -135,7 +141,8 @@ class Supervisor:
         duplicate_publisher: set from outside; the second source of states, a sentence, or None.
         overruns: set from outside; deadlines missed in a row.
         motors: set from outside; temperatures and errors of the motors.
-        refused: set from outside; by topic, why the messages since the last accepted one were refused.
+        refused: set from outside; by topic, why the messages since the last accepted one were
+            refused.
         stopped: set from outside; time that the controller did not run before the present state, s.
     """
 
@@ -226,9 +233,11 @@ class Supervisor:
         return self._walking_enabled or not self.config.require_operator
 
     def enable_walking(self, enabled: bool) -> tuple[bool, str]:
-        """Allow or forbid walking; a walking robot that is forbidden to walk stands still on its policy.
+        """Allow or forbid walking; a walking robot that is forbidden to walk stands still on its
+        policy.
 
-        The robot ignores a velocity that is commanded at that moment: a zero velocity must come first.
+        The robot ignores a velocity that is commanded at that moment: a zero velocity must come
+        first.
 
         Args:
             enabled: Whether walking is allowed.
@@ -244,8 +253,8 @@ class Supervisor:
     def request(self, mode: str) -> tuple[bool, str]:
         """Request a mode.
 
-        "passive" is always accepted and clears a fault. "stance" clears the stop of a robot that stands, if its
-        cause is gone.
+        "passive" is always accepted and clears a fault. "stance" clears the stop of a robot that
+        stands, if its cause is gone.
 
         Args:
             mode: One of MODES, except "fault".
@@ -267,7 +276,8 @@ class Supervisor:
         return True, f"mode is {mode}"
 
     def fail(self, reason: str, fault: str) -> None:
-        """Latch damping until "passive" is requested, unless the joints are damped already; the first reason stays.
+        """Latch damping until "passive" is requested, unless the joints are damped already; the
+        first reason stays.
 
         Args:
             reason: One sentence.
@@ -282,15 +292,15 @@ class Supervisor:
     ) -> JointCommand:
         """Run one control tick.
 
-        The robot ignores stale commands: after each start, fault and stop, it walks only after it received a zero
-        command while standing.
+        The robot ignores stale commands: after each start, fault and stop, it walks only after it
+        received a zero command while standing.
 
         Args:
             now: Time, s, on the clock of `state.time`.
             state: The measured state.
             velocity: Velocity of the trunk, body frame, (3,), m/s; None without a fresh estimate.
-            command: vx, vy (m/s), wz (rad/s), stance (0 or 1), (4,); None without a fresh command, then the
-                robot stands.
+            command: vx, vy (m/s), wz (rad/s), stance (0 or 1), (4,); None without a fresh command,
+                then the robot stands.
 
         Returns:
             The joint command.
@@ -298,24 +308,24 @@ class Supervisor:
         self.inference_seconds = float("nan")
         self._run_deferred()
         self.command, unfit = self._effective_command(command)
-        sight = self._run_guards(now, state, None if velocity is None else np.asarray(velocity, float))
+        guard_input = self._run_guards(now, state, None if velocity is None else np.asarray(velocity, float))
         if unfit and self.mode == "walk":
             level, modes, sentence = SUPERVISOR_FAULTS[unfit]
             refusal = self.refused.get("command") if command is None else None
             sentence = f"command is refused: {refusal}" if refusal else sentence
             self.findings.append(Finding(unfit, level, modes, sentence))
         self._handle_findings(self.findings, state.time)
-        velocity = self._select_velocity(sight)
+        velocity = self._select_velocity(guard_input)
         if self.mode == "walk" and self._speed > MIN_STEPPING_SPEED:
             self.command[3] = 0.0
-        seen = self._mode_input(state, velocity)
-        if self.config.reset_gap < sight.gap <= self.config.silence_limit:
+        mode_input = self._mode_input(state, velocity)
+        if self.config.reset_gap < guard_input.gap <= self.config.silence_limit:
             self._walk.reset()
-        if self.mode in self._transitions and (following := self._transitions[self.mode](seen)):
+        if self.mode in self._transitions and (following := self._transitions[self.mode](mode_input)):
             self._switch(*following)
-        answer = self._run_mode(seen)
+        answer = self._run_mode(mode_input)
         answer.tick = state.tick
-        self._last_input, self._previous_answer, self._deferred_input = seen, answer, sight
+        self._last_input, self._previous_answer, self._deferred_input = mode_input, answer, guard_input
         return answer
 
     def prepare(self) -> None:
@@ -338,7 +348,7 @@ class Supervisor:
     def _run_guards(self, now: float, state: RobotState, velocity: Array | None) -> GuardInput:
         """Run the immediate guards; `findings` are those that have an effect in this mode."""
         before = self._last_input.state if self._last_input else None
-        sight = GuardInput(
+        guard_input = GuardInput(
             config=self.config,
             mode=self.mode,
             state=state,
@@ -355,9 +365,9 @@ class Supervisor:
             refused=self.refused,
             stopped=self.stopped,
         )
-        self._all_findings = self._guards.check(sight)
+        self._all_findings = self._guards.check(guard_input)
         self.findings = [finding for finding in self._all_findings if self.mode in finding.modes]
-        return sight
+        return guard_input
 
     def _handle_findings(self, findings: list[Finding], time: float) -> None:
         """Latch damping or the stop for the first finding that requires it."""
@@ -372,33 +382,36 @@ class Supervisor:
                 self.neutral_seen = False
                 self.command = STANCE_COMMAND.copy()
 
-    def _select_velocity(self, sight: GuardInput) -> Array | None:
-        """Return the estimate, else the backup velocity; in walk without both, the decaying last velocity.
+    def _select_velocity(self, guard_input: GuardInput) -> Array | None:
+        """Return the estimate, else the backup velocity; in walk without both, the decaying last
+        velocity.
 
         v' = v exp(-dt / VELOCITY_DECAY_S)
         """
         distrusted = any(finding.name in UNTRUSTED_ESTIMATE_FAULTS for finding in self._all_findings)
-        velocity = sight.backup if distrusted else sight.velocity
+        velocity = guard_input.backup if distrusted else guard_input.velocity
         if velocity is not None:
             self._velocity = velocity
         elif self.mode == "walk":
-            velocity = self._velocity = self._velocity * math.exp(-max(sight.gap, 0.0) / VELOCITY_DECAY_S)
+            velocity = self._velocity = self._velocity * math.exp(
+                -max(guard_input.gap, 0.0) / VELOCITY_DECAY_S
+            )
         return velocity
 
-    def _run_mode(self, seen: ModeInput) -> JointCommand:
+    def _run_mode(self, mode_input: ModeInput) -> JointCommand:
         mode = self._modes[self.mode]
         if self._entered_at is None:
-            self._entered_at = seen.state.time
-            seen = attrs.evolve(seen, elapsed=0.0)
-            mode.enter(seen)
+            self._entered_at = mode_input.state.time
+            mode_input = attrs.evolve(mode_input, elapsed=0.0)
+            mode.enter(mode_input)
         try:
-            answer = mode.tick(seen)
+            answer = mode.tick(mode_input)
         except FloatingPointError as error:
             self.fail(str(error), "policy_not_finite")
             return JointCommand.damping(self.config.damping_kd)
         if self.mode == "walk":
             self.inference_seconds = self._walk.inference_seconds
-        self._limiter.apply(answer, self._previous_answer, seen.state)
+        self._limiter.apply(answer, self._previous_answer, mode_input.state)
         return answer
 
     @property
@@ -413,7 +426,8 @@ class Supervisor:
     def _effective_command(self, command: ArrayLike | None) -> tuple[Array, str]:
         """Return the command in effect, and its fault of SUPERVISOR_FAULTS or "".
 
-        Without a valid, finite command that is allowed to move the robot, the effective command is to stand.
+        Without a valid, finite command that is allowed to move the robot, the effective command is
+        to stand.
         """
         if command is None:
             not_finite = isinstance(self.refused.get("command"), NotFiniteError)
@@ -490,48 +504,48 @@ class Supervisor:
             return f"the robot walks ({self._speed:.2f} m/s), command stance first"
         return None
 
-    def _posture_error(self, seen: ModeInput) -> str | None:
+    def _posture_error(self, mode_input: ModeInput) -> str | None:
         """Return a sentence if a joint is far from the nominal posture, else None."""
-        error = seen.state.q - self._stance.final_posture(seen.state)
+        error = mode_input.state.q - self._stance.final_posture(mode_input.state)
         i = int(np.argmax(np.abs(error)))
         if abs(error[i]) <= self.config.max_posture_error:
             return None
         limit = self.config.max_posture_error
         return f"{JOINT_NAMES[i]} is {error[i]:+.2f} rad off the nominal posture, limit {limit:.2f}"
 
-    def _next_from_passive(self, seen: ModeInput) -> Transition:
+    def _next_from_passive(self, mode_input: ModeInput) -> Transition:
         if self._auto_stand and self._blocking_fault("stand_up") is None:
             self._auto_stand = False
             return "stand_up", "stands up by itself at the start"
         return None
 
-    def _next_from_stand_up(self, seen: ModeInput) -> Transition:
-        if not self._stand_up.is_finished(seen.elapsed):
+    def _next_from_stand_up(self, mode_input: ModeInput) -> Transition:
+        if not self._stand_up.is_finished(mode_input.elapsed):
             return None
-        error = self._posture_error(seen)
+        error = self._posture_error(mode_input)
         if error:
             self.fail(f"standing up failed: {error}", "stand_up_failed")
             return None
         return "stance", self._latched_stop.sentence if self._latched_stop else "stood up"
 
-    def _next_from_stance(self, seen: ModeInput) -> Transition:
-        asked = not seen.command[3] and seen.command[:3].any()
-        if asked and seen.velocity is not None and self._stance.is_finished(seen.elapsed):
+    def _next_from_stance(self, mode_input: ModeInput) -> Transition:
+        asked = not mode_input.command[3] and mode_input.command[:3].any()
+        if asked and mode_input.velocity is not None and self._stance.is_finished(mode_input.elapsed):
             return "walk", "a velocity was commanded"
         return None
 
-    def _next_from_walk(self, seen: ModeInput) -> Transition:
+    def _next_from_walk(self, mode_input: ModeInput) -> Transition:
         """After a stop, go to stance once the policy has braked the robot."""
         if self._latched_stop is None:
             return None
-        braked, c = seen.state.time - self._latched_at, self.config
+        braked, c = mode_input.state.time - self._latched_at, self.config
         still = self._speed <= c.max_standing_speed
         if braked < c.brake_time or not (still or braked >= MAX_BRAKE_TIME_FACTOR * c.brake_time):
             return None
         return "stance", self._latched_stop.sentence
 
-    def _next_from_lie_down(self, seen: ModeInput) -> Transition:
-        return ("passive", "lies") if self._lie_down.is_finished(seen.elapsed) else None
+    def _next_from_lie_down(self, mode_input: ModeInput) -> Transition:
+        return ("passive", "lies") if self._lie_down.is_finished(mode_input.elapsed) else None
 
 
 def _all_finite(numbers: Iterable[float]) -> bool:
