@@ -28,7 +28,7 @@ from rclpy.node import Node  # noqa: E402
 from sensor_msgs.msg import Joy  # noqa: E402
 
 from quadvel_bringup.stack import PARAMETERS  # noqa: E402
-from quadvel_driver.remote import BUTTONS, Order  # noqa: E402
+from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
 from quadvel_driver.wire import Button  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
@@ -82,13 +82,13 @@ class Operator:
             assert time.monotonic() < until, f"time is up; {self.mode}: {reason}, {self.speed():.2f} m/s"
             rclpy.spin_once(self.node, timeout_sec=0.05)
 
-    def press(self, order: Order) -> None:
+    def press(self, order: OperatorCommand) -> None:
         """Buttons down for a moment."""
         self.hold(BUTTONS[order])
         self.spin(0.3)
         self.hold()
 
-    def order(self, order: Order, condition: Callable[[], object]) -> None:
+    def order(self, order: OperatorCommand, condition: Callable[[], object]) -> None:
         """Press until it has its effect: on a busy machine the robot may need a while until it can follow."""
         until = time.monotonic() + 60.0
         while not condition():
@@ -141,18 +141,18 @@ def test_the_remote_stands_the_robot_up_walks_it_stops_it_and_lays_it_down(
     assert operator.mode == "stance"  # nobody allowed it to walk
     operator.hold()
     operator.spin(1.0)
-    operator.order(Order.ALLOW_WALKING, lambda: operator.states[-1].walk_allowed)
+    operator.order(OperatorCommand.ALLOW_WALKING, lambda: operator.states[-1].walk_allowed)
     operator.spin(1.0)
     operator.hold(ly=0.6)
     operator.spin_until(lambda: operator.mode == "walk" and operator.speed() > 0.3)
     operator.hold()
     operator.spin_until(lambda: operator.states[-1].stance and abs(operator.speed()) < 0.05)
 
-    operator.order(Order.STOP, lambda: operator.mode == "passive")
-    operator.press(Order.STAND_UP)
+    operator.order(OperatorCommand.STOP, lambda: operator.mode == "passive")
+    operator.press(OperatorCommand.STAND_UP)
     operator.spin(1.0)
     assert operator.mode == "passive"
-    operator.order(Order.RELEASE, lambda: "the remote says: release the stop" in up.read_text())
-    operator.order(Order.STAND_UP, lambda: operator.mode == "stance")
-    operator.order(Order.LIE_DOWN, lambda: operator.mode == "passive")
-    assert "the remote says: stand up" in up.read_text()
+    operator.order(OperatorCommand.RELEASE, lambda: "remote: release the stop" in up.read_text())
+    operator.order(OperatorCommand.STAND_UP, lambda: operator.mode == "stance")
+    operator.order(OperatorCommand.LIE_DOWN, lambda: operator.mode == "passive")
+    assert "remote: stand up" in up.read_text()

@@ -97,7 +97,7 @@ class Shown:
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     robot = Robot(tmp_path_factory.mktemp("up") / "up.log")
     try:
-        robot.says("ready: a velocity makes it walk")
+        robot.says("ready; waiting for a velocity command")
         yield robot
     finally:
         code = robot.end()
@@ -134,7 +134,7 @@ def test_teleop_walks_while_a_key_repeats_and_its_space_bar_stops_for_good(up: R
     teleop.send_signal(signal.SIGINT)
     assert teleop.wait(30.0) == 0
     os.close(terminal)
-    up.says("passive: was asked for")
+    up.says("passive: requested")
     up.stand_up()
 
 
@@ -207,7 +207,7 @@ def test_a_walking_robot_is_reset_through_passive_and_its_odometry_starts_again(
         up.says("walk: a velocity was commanded")
         up.forget()
         assert quadvel("reset") == (0, "the robot is back in posture lie\n")
-        up.says("passive: was asked for")
+        up.says("passive: requested")
         up.says("odometry starts at zero")
         assert driving.wait(180.0) == 1  # it was not followed to the end
     code, text = quadvel("mode", "stand_up")

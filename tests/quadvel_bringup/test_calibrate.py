@@ -47,7 +47,7 @@ def record_standing(path: Path, seconds: float) -> None:
             message = LowState()
             message.stamp.sec, nanoseconds = divmod(round(1e9 * simulator.time), 10**9)
             message.stamp.nanosec = nanoseconds
-            write_low_state(LEANING.reported(simulator.state()), message)
+            write_low_state(LEANING.as_reported(simulator.state()), message)
             publisher.publish(message)
             recorder.serve(executor, 0.001)
     node.destroy_node()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_driver.board_clock import LOOK, WINDOW, BoardClock, Instant
+from quadvel_driver.board_clock import OFFSET_WINDOW, UNIT_WINDOW_S, BoardClock, BoardTime
 
 COUNTS = {1e-3: 1, 1e-6: 1000}  # a ms, by unit
 
@@ -13,7 +13,7 @@ COUNTS = {1e-3: 1, 1e-6: 1000}  # a ms, by unit
 def stream(clock: BoardClock, states: int, unit: float = 1e-3, first: int = 100, delay=lambda i: 0.0) -> list:
     """What a clock says of a state each ms from 50 s on; they arrive by `delay` (s) late."""
     return [
-        clock.follow((first + i * COUNTS[unit]) % 2**32, 50.0 + 1e-3 * i + delay(i)) for i in range(states)
+        clock.update((first + i * COUNTS[unit]) % 2**32, 50.0 + 1e-3 * i + delay(i)) for i in range(states)
     ]
 
 
@@ -22,7 +22,7 @@ def test_it_finds_out_whether_a_board_counts_milli_or_microseconds(unit: float) 
     clock = BoardClock()
     instants = stream(clock, 300, unit)
     assert clock.unit == unit
-    nothing = round(1e3 * LOOK) + WINDOW
+    nothing = round(1e3 * UNIT_WINDOW_S) + OFFSET_WINDOW
     assert instants[: nothing - 1] == (nothing - 1) * [None]
     times = np.array([instant.time for instant in instants[nothing + 1 :]])
     np.testing.assert_allclose(times, 50.0 + 1e-3 * np.arange(nothing + 1, 300), atol=1e-9)
@@ -33,13 +33,13 @@ def test_it_finds_out_whether_a_board_counts_milli_or_microseconds(unit: float) 
 def test_the_unit_is_found_where_board_or_machine_are_slow_or_fast(unit: float, speed: float) -> None:
     clock = BoardClock()
     for i in range(2000):
-        clock.follow(100 + i * COUNTS[unit], 50.0 + 1e-3 * i / speed)
+        clock.update(100 + i * COUNTS[unit], 50.0 + 1e-3 * i / speed)
     assert clock.unit == unit
 
 
 def test_a_counter_of_no_known_unit_is_told_and_gives_no_instants() -> None:
     clock = BoardClock()
-    assert not any(clock.follow(100 + i * 32, 50.0 + 1e-3 * i) for i in range(500))
+    assert not any(clock.update(100 + i * 32, 50.0 + 1e-3 * i) for i in range(500))
     assert clock.unit is None
     assert clock.rate == pytest.approx(32000, rel=0.02)
 
@@ -80,16 +80,16 @@ def test_a_board_that_stood_still_with_its_machine_is_followed_at_once() -> None
 def test_repeated_and_late_states_are_counted_and_give_nothing() -> None:
     clock = BoardClock()
     stream(clock, 300)
-    assert clock.follow(399, 50.3) is None
-    assert clock.follow(398, 50.3) is None
+    assert clock.update(399, 50.3) is None
+    assert clock.update(398, 50.3) is None
     assert (clock.repeated, clock.late, clock.restarts) == (1, 1, 0)
-    assert clock.follow(400, 50.3) == Instant(pytest.approx(50.3), 400)
+    assert clock.update(400, 50.3) == BoardTime(pytest.approx(50.3), 400)
 
 
 def test_a_board_that_starts_anew_is_followed_anew_after_a_moment() -> None:
     clock = BoardClock()
     stream(clock, 300, first=50_000)
-    later = [clock.follow(1 + i, 50.31 + 1e-3 * i) for i in range(300)]
+    later = [clock.update(1 + i, 50.31 + 1e-3 * i) for i in range(300)]
     assert clock.restarts == 1
     assert 0 < clock.late < 120
-    assert later[-1] == Instant(pytest.approx(50.609), 300)
+    assert later[-1] == BoardTime(pytest.approx(50.609), 300)

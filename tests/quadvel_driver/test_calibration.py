@@ -15,7 +15,7 @@ from quadvel_description.mjcf import Plant, load_model
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_driver.calibration import Calibration, CalibrationError
-from quadvel_driver.find_calibration import NotFound, Samples, find, holding_torque
+from quadvel_driver.find_calibration import CalibrationDataError, Samples, fit_calibration, holding_torque
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import Simulator
 from quadvel_sysid.excitation import Creep
@@ -35,21 +35,21 @@ def recorded(hung: bool, seconds: float, off: Calibration) -> list[RobotState]:
     states = []
     for step in range(0, len(targets), 5):
         wanted = JointCommand(q=targets[step], kp=np.full(12, 100.0), kd=np.full(12, 3.0))
-        simulator.command(off.carried_out(wanted))
+        simulator.command(off.as_executed(wanted))
         simulator.step(5)
         if step > 1000:
-            states.append(off.reported(simulator.state()))
+            states.append(off.as_reported(simulator.state()))
     return states
 
 
 @pytest.fixture(scope="module")
 def hung() -> Samples:
-    return Samples.of(recorded(True, 60.0, OFF))
+    return Samples.from_states(recorded(True, 60.0, OFF))
 
 
 @pytest.fixture(scope="module")
 def standing() -> Samples:
-    return Samples.of(recorded(False, 3.0, OFF))
+    return Samples.from_states(recorded(False, 3.0, OFF))
 
 
 def test_the_holding_torque_is_that_of_the_simulator() -> None:
@@ -66,7 +66,7 @@ def test_the_holding_torque_is_that_of_the_simulator() -> None:
 
 
 def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples) -> None:
-    found = find(hung, standing)
+    found = fit_calibration(hung, standing)
     np.testing.assert_allclose(found.calibration.joint_zeros, OFF.joint_zeros, atol=1.5 * DEGREE)
     np.testing.assert_allclose(found.calibration.imu_mounting, OFF.imu_mounting, atol=1.2 * DEGREE)
     assert found.unevenness < 0.005
@@ -77,7 +77,7 @@ def test_zeros_and_mounting_are_found_together(hung: Samples, standing: Samples)
 
 def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None:
     leaning = Calibration(imu_mounting=DEGREE * np.array([2.0, 0.0]))
-    found = find(None, Samples.of(recorded(False, 3.0, leaning)))
+    found = fit_calibration(None, Samples.from_states(recorded(False, 3.0, leaning)))
     np.testing.assert_allclose(found.calibration.imu_mounting, leaning.imu_mounting, atol=0.1 * DEGREE)
     assert not found.calibration.joint_zeros.any()
 
@@ -85,7 +85,9 @@ def test_an_imu_that_leans_by_two_degrees_is_found_from_standing_alone() -> None
 @pytest.mark.long
 def test_a_robot_whose_sensors_are_right_is_found_to_be_so() -> None:
     right = Calibration()
-    found = find(Samples.of(recorded(True, 60.0, right)), Samples.of(recorded(False, 3.0, right)))
+    found = fit_calibration(
+        Samples.from_states(recorded(True, 60.0, right)), Samples.from_states(recorded(False, 3.0, right))
+    )
     assert np.abs(found.calibration.joint_zeros).max() < 1.5 * DEGREE
     assert np.abs(found.calibration.imu_mounting).max() < 1.0 * DEGREE
 
@@ -94,23 +96,23 @@ def test_what_is_set_right_is_what_was(standing: Samples) -> None:
     simulator = Simulator()
     simulator.reset("stand")
     state = simulator.state()
-    back = OFF.apply(OFF.reported(state))
+    back = OFF.apply(OFF.as_reported(state))
     for field in ("q", "quaternion", "angular_velocity", "linear_acceleration"):
         np.testing.assert_allclose(getattr(back, field), getattr(state, field), atol=1e-12)
     command = JointCommand(q=np.array(NOMINAL_Q))
-    np.testing.assert_allclose(OFF.carried_out(OFF.invert(command)).q, command.q)
+    np.testing.assert_allclose(OFF.as_executed(OFF.invert(command)).q, command.q)
 
 
 def test_an_imu_that_leans_to_the_right_shows_a_level_robot_rolling_to_the_right() -> None:
     simulator = Simulator(SimulatorConfig(hung=True))
     simulator.reset("stand")
-    shown = Calibration(imu_mounting=np.array([0.1, 0.0])).reported(simulator.state())
+    shown = Calibration(imu_mounting=np.array([0.1, 0.0])).as_reported(simulator.state())
     np.testing.assert_allclose(roll_pitch(shown.quaternion), [0.1, 0.0], atol=0.01)
 
 
 def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     file = tmp_path / "calibration.yaml"
-    file.write_text(OFF.text())
+    file.write_text(OFF.to_yaml())
     read = Calibration.load(file)
     np.testing.assert_allclose(read.joint_zeros, OFF.joint_zeros, atol=1e-5)
     np.testing.assert_allclose(read.imu_mounting, OFF.imu_mounting, atol=1e-5)
@@ -121,10 +123,10 @@ def test_the_file_is_read_as_it_was_written(tmp_path: Path) -> None:
     [
         ("schema: 2", "expected the fields of a calibration with schema: 1"),
         ("[1, 2]", "expected the fields of a calibration"),
-        (OFF.text().replace("FR_hip_joint", "hip"), "has other names than the twelve joints"),
-        (OFF.text().replace("roll: 0.03491", "roll: .nan"), "imu_mounting is"),
-        (OFF.text().replace("roll: 0.03491", "roll: 1.5"), "expected 2 angles within 0.35 rad"),
-        (OFF.text().replace("roll: 0.03491", "roll: [1]"), "TypeError"),
+        (OFF.to_yaml().replace("FR_hip_joint", "hip"), "has other names than the twelve joints"),
+        (OFF.to_yaml().replace("roll: 0.03491", "roll: .nan"), "imu_mounting is"),
+        (OFF.to_yaml().replace("roll: 0.03491", "roll: 1.5"), "expected 2 angles within 0.35 rad"),
+        (OFF.to_yaml().replace("roll: 0.03491", "roll: [1]"), "TypeError"),
         ("{", "calibration.yaml: no valid YAML"),
     ],
 )
@@ -137,9 +139,11 @@ def test_a_file_that_is_none_is_refused_by_name(tmp_path: Path, text: str, sente
 
 
 def test_recordings_that_tell_nothing_are_refused(hung: Samples, standing: Samples) -> None:
-    with pytest.raises(NotFound, match="FR_hip_joint hardly moves to and fro; record quadvel excite creep"):
-        find(standing, None)
-    with pytest.raises(NotFound, match="rad/s, expected a robot that stands still"):
-        find(None, attrs.evolve(hung, dq=hung.dq + 0.5))
-    with pytest.raises(NotFound, match="3 states, expected 100 at least"):
-        Samples.of(recorded(False, 1.02, OFF)[:3])
+    with pytest.raises(
+        CalibrationDataError, match="FR_hip_joint hardly moves to and fro; record quadvel excite creep"
+    ):
+        fit_calibration(standing, None)
+    with pytest.raises(CalibrationDataError, match="rad/s, expected a robot that stands still"):
+        fit_calibration(None, attrs.evolve(hung, dq=hung.dq + 0.5))
+    with pytest.raises(CalibrationDataError, match="3 states, expected 100 at least"):
+        Samples.from_states(recorded(False, 1.02, OFF)[:3])

@@ -11,7 +11,7 @@ from quadvel_nodes.tick_grid import TickGrid
 
 def passed(ticks: list[int], rate: int = 200) -> list[int]:
     thinning = Decimator(rate)
-    return [tick for tick in ticks if thinning.passes(tick % 2**32)]
+    return [tick for tick in ticks if thinning.accepts(tick % 2**32)]
 
 
 @pytest.mark.parametrize(("rate", "period"), [(200, 5), (500, 2), (1000, 1), (50, 20)])
@@ -33,5 +33,5 @@ def test_a_controller_answers_all_that_passes_though_samples_are_lost_and_stamps
     rng = np.random.default_rng(0)
     sent = passed([tick for tick in range(1000, 61_000) if rng.random() > 0.1])
     grid = TickGrid(0.005)
-    answered = [grid.periods(1e-3 * tick + rng.normal(0.0, 2e-4)) for tick in sent]
+    answered = [grid.periods_due(1e-3 * tick + rng.normal(0.0, 2e-4)) for tick in sent]
     assert np.mean(np.array(answered) == 1) > 0.99

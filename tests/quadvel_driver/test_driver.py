@@ -31,7 +31,7 @@ from quadvel_bringup.nodes import command as node_command  # noqa: E402
 from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver import wire  # noqa: E402
-from quadvel_driver.remote import BUTTONS, Order  # noqa: E402
+from quadvel_driver.remote import BUTTONS, OperatorCommand  # noqa: E402
 from quadvel_driver.wire import Button, Remote  # noqa: E402
 from quadvel_msgs.msg import LowCmd, LowState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
@@ -241,7 +241,7 @@ def test_commands_that_are_not_fit_are_refused_and_named(
     assert running.last() == 0.0
 
 
-def press(running: RunningBoard, controller: Controller, order: Order) -> None:
+def press(running: RunningBoard, controller: Controller, order: OperatorCommand) -> None:
     """Hold the buttons of an order down for a moment, and let go."""
     for remote in (Remote(BUTTONS[order]), NO_REMOTE):
         running.remote = remote
@@ -254,10 +254,10 @@ def test_the_remote_drives_stands_the_robot_up_and_lets_it_walk(
 ) -> None:
     start()
     for order, asked in (
-        (Order.STAND_UP, "stand_up"),
-        (Order.ALLOW_WALKING, True),
-        (Order.FORBID_WALKING, False),
-        (Order.LIE_DOWN, "lie_down"),
+        (OperatorCommand.STAND_UP, "stand_up"),
+        (OperatorCommand.ALLOW_WALKING, True),
+        (OperatorCommand.FORBID_WALKING, False),
+        (OperatorCommand.LIE_DOWN, "lie_down"),
     ):
         while not (controller.asked and controller.asked[-1] == asked):
             press(running, controller, order)  # and again where the driver had not found the controller yet
@@ -280,14 +280,14 @@ def test_a_stop_damps_locks_and_asks_for_passive_and_holds_until_it_is_released(
     controller.kp = 70.0  # a controller that does not listen
     running.remote = NO_REMOTE
     controller.spin_until(lambda: "stopped by the remote" in controller.diagnosed()[0])
-    running.remote = Remote(BUTTONS[Order.RELEASE])
+    running.remote = Remote(BUTTONS[OperatorCommand.RELEASE])
     seen = len(running.commands)
     controller.spin_until(lambda: len(running.commands) > seen + 100)
     assert running.last() == 0.0
     running.remote = NO_REMOTE
     controller.kp = 0.0
     controller.spin_until(lambda: len(running.commands) > seen + 200)
-    running.remote = Remote(BUTTONS[Order.RELEASE])
+    running.remote = Remote(BUTTONS[OperatorCommand.RELEASE])
     controller.spin_until(lambda: not controller.heard["command_lock"][-1].data)
     controller.kp = 70.0
     controller.spin_until(lambda: running.last() == 70.0)

@@ -11,8 +11,8 @@ from quadvel_driver import fuzz, wire
 
 
 def test_some_thousand_datagrams_do_no_harm() -> None:
-    target = fuzz.Target(wire)
-    fuzz.at_random(target, 4000)
+    target = fuzz.FuzzTarget(wire)
+    fuzz.fuzz_at_random(target, 4000)
     assert target.counts["datagrams"] == 4000
     assert target.counts["accepted"] > 400
     assert target.counts["refused"] > 4000
@@ -25,7 +25,7 @@ def weaker(**changes: Any) -> types.SimpleNamespace:
 
 def test_a_decoder_that_lets_a_wrong_crc_pass_is_caught(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(wire, "crc", lambda data: 0)
-    target = fuzz.Target(wire)
+    target = fuzz.FuzzTarget(wire)
     with pytest.raises(AssertionError, match="a wrong CRC was accepted"):
         target(bytes([fuzz.CHANGED, 1]))
 
@@ -34,6 +34,6 @@ def test_a_decoder_that_raises_anything_but_its_own_error_is_caught() -> None:
     def careless(data: bytes) -> object:
         return wire.decode_state(data) if len(data) == wire.STATE_BYTES else data[1000]
 
-    target = fuzz.Target(weaker(decode_state=careless))
+    target = fuzz.FuzzTarget(weaker(decode_state=careless))
     with pytest.raises(IndexError):
-        fuzz.at_random(target, 100)
+        fuzz.fuzz_at_random(target, 100)

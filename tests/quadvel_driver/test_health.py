@@ -5,13 +5,13 @@ from __future__ import annotations
 import attrs
 import pytest
 
-from quadvel_driver.health import Health, Level, figures
-from quadvel_driver.link import COUNTED, LinkReport
+from quadvel_driver.health import Health, Level, diagnostic_values
+from quadvel_driver.link import COUNTER_NAMES, LinkReport
 from quadvel_driver.wire import BoardState
 
 from .conftest import standing
 
-COUNTS = dict.fromkeys(COUNTED, 0)
+COUNTS = dict.fromkeys(COUNTER_NAMES, 0)
 WELL = LinkReport(
     state_rate=500.0,
     send_rate=600.0,
@@ -29,7 +29,7 @@ def judged(
     stopped: bool = False, newest: BoardState | None = None, counts: dict | None = None, **changes: object
 ):
     changed = attrs.evolve(WELL, counts={**WELL.counts, **(counts or {})}, **changes)
-    return Health("192.168.123.10:8007").judge(changed, newest or standing(1), stopped)
+    return Health("192.168.123.10:8007").assess(changed, newest or standing(1), stopped)
 
 
 def test_all_is_well_where_commands_are_followed_and_where_none_come() -> None:
@@ -96,14 +96,14 @@ def test_only_what_is_new_since_the_last_report_counts() -> None:
         Health("board"),
         attrs.evolve(WELL, counts={**WELL.counts, "wrong_crc": 2}, last_refusal="CRC"),
     )
-    assert health.judge(report, standing(1), False)[0] == Level.WARN
-    assert health.judge(report, standing(1), False)[0] == Level.OK
+    assert health.assess(report, standing(1), False)[0] == Level.WARN
+    assert health.assess(report, standing(1), False)[0] == Level.OK
 
 
 def test_the_figures_hold_counts_temperatures_and_modes() -> None:
-    values = figures(WELL, standing(1))
+    values = diagnostic_values(WELL, standing(1))
     assert values["states"] == 100
     assert values["FL_hip_joint temperature"] == 35
     assert values["FL_hip_joint mode"] == 10
     assert values["imu temperature"] == 40
-    assert "FL_hip_joint mode" not in figures(WELL, None)
+    assert "FL_hip_joint mode" not in diagnostic_values(WELL, None)

@@ -12,7 +12,7 @@ import pytest
 from quadvel_description.robot import COMMAND_UPPER, NOMINAL_Q, TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_SERVO, JointCommand
 from quadvel_driver import wire
-from quadvel_driver.link import FAREWELL, LinkConfig, LinkError, UdpLink, for_the_board
+from quadvel_driver.link import SHUTDOWN_PACKETS, LinkConfig, LinkError, UdpLink, clamp_for_board
 
 from .conftest import TestBoard, standing
 
@@ -75,7 +75,7 @@ def test_at_the_end_the_robot_is_left_braking(board: TestBoard, connect: Connect
     board.hear_until(lambda command: command.kp[0] == 100.0)
     linked.stop()
     board.hear_until(brakes)
-    for _ in range(FAREWELL - 1):
+    for _ in range(SHUTDOWN_PACKETS - 1):
         assert brakes(board.hear())
 
 
@@ -232,7 +232,7 @@ def test_an_address_that_is_none_is_told_in_one_sentence() -> None:
 
 def test_nothing_beyond_the_robots_limits_is_sent() -> None:
     wild = JointCommand(*(np.full(12, 1e6) for _ in range(3)), kp=np.full(12, 50.0), kd=np.ones(12))
-    sent = for_the_board(wild)
+    sent = clamp_for_board(wild)
     np.testing.assert_array_equal(sent.q, COMMAND_UPPER)
     np.testing.assert_array_equal(sent.dq, VELOCITY_LIMIT)
     np.testing.assert_array_equal(sent.tau, TORQUE_LIMIT)

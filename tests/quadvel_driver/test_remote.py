@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_driver.remote import AFTERGLOW, BUTTONS, Order, RemoteConfig, RemotePilot
+from quadvel_driver.remote import BUTTONS, ZERO_VELOCITY_S, OperatorCommand, RemoteConfig, RemotePilot
 from quadvel_driver.wire import Button, Remote
 
 CONFIG = RemoteConfig(stick_dead_zone=0.1, stick_velocity=(1.0, 0.5, 2.0))
@@ -16,16 +16,18 @@ def pilot() -> RemotePilot:
     return RemotePilot(CONFIG)
 
 
-def press(pilot: RemotePilot, buttons: Button) -> Order | None:
+def press(pilot: RemotePilot, buttons: Button) -> OperatorCommand | None:
     """What pressing buttons and letting them go orders."""
-    order = pilot.follow(Remote(buttons), 0.0)
-    assert pilot.follow(Remote(buttons), 0.0) is None
-    assert pilot.follow(Remote(), 0.0) is None
+    order = pilot.update(Remote(buttons), 0.0)
+    assert pilot.update(Remote(buttons), 0.0) is None
+    assert pilot.update(Remote(), 0.0) is None
     return order
 
 
-@pytest.mark.parametrize("order", [order for order in Order if order is not Order.RELEASE])
-def test_an_order_is_given_once_when_its_buttons_go_down(pilot: RemotePilot, order: Order) -> None:
+@pytest.mark.parametrize(
+    "order", [order for order in OperatorCommand if order is not OperatorCommand.RELEASE]
+)
+def test_an_order_is_given_once_when_its_buttons_go_down(pilot: RemotePilot, order: OperatorCommand) -> None:
     assert press(pilot, BUTTONS[order]) is order
 
 
@@ -35,23 +37,28 @@ def test_arrows_alone_order_nothing(pilot: RemotePilot) -> None:
 
 
 def test_a_stop_stays_until_it_is_released_and_nothing_else_counts_meanwhile(pilot: RemotePilot) -> None:
-    assert press(pilot, Button.B) is Order.STOP
-    for order in (Order.STAND_UP, Order.LIE_DOWN, Order.ALLOW_WALKING, Order.FORBID_WALKING):
+    assert press(pilot, Button.B) is OperatorCommand.STOP
+    for order in (
+        OperatorCommand.STAND_UP,
+        OperatorCommand.LIE_DOWN,
+        OperatorCommand.ALLOW_WALKING,
+        OperatorCommand.FORBID_WALKING,
+    ):
         assert press(pilot, BUTTONS[order]) is None
     assert pilot.stopped
-    assert press(pilot, BUTTONS[Order.RELEASE]) is Order.RELEASE
+    assert press(pilot, BUTTONS[OperatorCommand.RELEASE]) is OperatorCommand.RELEASE
     assert pilot.stopped  # whoever carries it out decides
     pilot.stopped = False
-    assert press(pilot, BUTTONS[Order.STAND_UP]) is Order.STAND_UP
+    assert press(pilot, BUTTONS[OperatorCommand.STAND_UP]) is OperatorCommand.STAND_UP
 
 
 def test_a_stop_counts_whatever_else_is_held(pilot: RemotePilot) -> None:
-    assert press(pilot, BUTTONS[Order.STAND_UP] | Button.B) is Order.STOP
-    assert press(pilot, BUTTONS[Order.RELEASE] | Button.B) is Order.STOP
+    assert press(pilot, BUTTONS[OperatorCommand.STAND_UP] | Button.B) is OperatorCommand.STOP
+    assert press(pilot, BUTTONS[OperatorCommand.RELEASE] | Button.B) is OperatorCommand.STOP
 
 
 def test_there_is_nothing_to_release_where_nothing_was_stopped(pilot: RemotePilot) -> None:
-    assert press(pilot, BUTTONS[Order.RELEASE]) is None
+    assert press(pilot, BUTTONS[OperatorCommand.RELEASE]) is None
 
 
 @pytest.mark.parametrize(
@@ -68,26 +75,26 @@ def test_there_is_nothing_to_release_where_nothing_was_stopped(pilot: RemotePilo
 def test_sticks_are_velocities_in_the_robots_axes(
     pilot: RemotePilot, sticks: dict[str, float], velocity: tuple[float, ...]
 ) -> None:
-    pilot.follow(Remote(**sticks), 0.0)
+    pilot.update(Remote(**sticks), 0.0)
     np.testing.assert_allclose(pilot.velocity(0.0), velocity, atol=1e-12)
 
 
 def test_sticks_in_the_dead_zone_command_nothing(pilot: RemotePilot) -> None:
-    pilot.follow(Remote(lx=0.09, ly=-0.1, rx=0.05), 0.0)
+    pilot.update(Remote(lx=0.09, ly=-0.1, rx=0.05), 0.0)
     assert pilot.velocity(0.0) is None
 
 
 def test_sticks_let_go_command_zero_for_a_while_and_then_leave_the_robot_to_others(
     pilot: RemotePilot,
 ) -> None:
-    pilot.follow(Remote(ly=1.0), 10.0)
-    pilot.follow(Remote(), 10.1)
+    pilot.update(Remote(ly=1.0), 10.0)
+    pilot.update(Remote(), 10.1)
     np.testing.assert_array_equal(pilot.velocity(10.1), np.zeros(3))
-    assert pilot.velocity(10.0 + AFTERGLOW + 0.01) is None
+    assert pilot.velocity(10.0 + ZERO_VELOCITY_S + 0.01) is None
 
 
 def test_a_stopped_robot_follows_no_stick(pilot: RemotePilot) -> None:
-    pilot.follow(Remote(Button.B, ly=1.0), 0.0)
+    pilot.update(Remote(Button.B, ly=1.0), 0.0)
     assert pilot.velocity(0.0) is None
 
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, RobotState
 from quadvel_estimator import features
-from quadvel_estimator.tracker import PATIENCE, VelocityTracker
+from quadvel_estimator.tracker import MAX_STALE_STATES, VelocityTracker
 from quadvel_nodes.messages import MessageError
 
 State = Callable[..., RobotState]
@@ -53,7 +53,7 @@ def test_states_at_200_hz_are_all_taken(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     times = [5.0 + 0.005 * i for i in range(40)]
-    assert all(tracker.take(standing(t)) is not None for t in times)
+    assert all(tracker.process(standing(t)) is not None for t in times)
     assert estimator.times == times
 
 
@@ -61,7 +61,7 @@ def test_states_at_1_khz_are_taken_at_the_estimator_s_rate(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     for i in range(1000):
-        tracker.take(standing(0.001 * i))
+        tracker.process(standing(0.001 * i))
     assert len(estimator.times) == pytest.approx(200, abs=1)
     np.testing.assert_allclose(np.diff(estimator.times[1:]), 0.005)
 
@@ -69,11 +69,11 @@ def test_states_at_1_khz_are_taken_at_the_estimator_s_rate(
 def test_an_old_state_is_refused_and_changes_nothing(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(standing(1.0))
-    tracker.take(standing(1.005))
+    tracker.process(standing(1.0))
+    tracker.process(standing(1.005))
     with pytest.raises(MessageError, match="stamp is 505 ms older than the newest, expected a later one"):
-        tracker.take(standing(0.5))
-    assert tracker.take(standing(1.010)) is not None
+        tracker.process(standing(0.5))
+    assert tracker.process(standing(1.010)) is not None
     assert estimator.times == [1.0, 1.005, 1.010]
     assert estimator.resets == 0
 
@@ -81,32 +81,32 @@ def test_an_old_state_is_refused_and_changes_nothing(
 def test_a_stamp_that_never_changes_is_refused_for_ever(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(standing(1.0))
-    for _ in range(5 * PATIENCE):
+    tracker.process(standing(1.0))
+    for _ in range(5 * MAX_STALE_STATES):
         with pytest.raises(MessageError):
-            tracker.take(standing(1.0))
+            tracker.process(standing(1.0))
     assert estimator.resets == 0
 
 
 def test_time_that_was_set_back_starts_the_estimator_anew(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(standing(100.0))
-    for i in range(PATIENCE - 1):
+    tracker.process(standing(100.0))
+    for i in range(MAX_STALE_STATES - 1):
         with pytest.raises(MessageError):
-            tracker.take(standing(0.005 * i))
-    assert tracker.take(standing(0.005 * PATIENCE)) is not None
+            tracker.process(standing(0.005 * i))
+    assert tracker.process(standing(0.005 * MAX_STALE_STATES)) is not None
     assert estimator.resets == tracker.restarts == 1
-    assert tracker.take(standing(0.005 * (PATIENCE + 1))) is not None
+    assert tracker.process(standing(0.005 * (MAX_STALE_STATES + 1))) is not None
 
 
 def test_a_gap_starts_the_estimator_anew_and_a_short_one_does_not(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
     for time in (0.0, 0.005, 0.045):
-        tracker.take(standing(time))
+        tracker.process(standing(time))
     assert estimator.resets == 0
-    tracker.take(standing(0.2))
+    tracker.process(standing(0.2))
     assert estimator.resets == tracker.restarts == 1
 
 
@@ -115,7 +115,7 @@ def test_an_estimate_that_is_not_finite_resets_the_estimator(
 ) -> None:
     estimator.velocity = np.full(3, np.nan)
     with pytest.raises(FloatingPointError):
-        tracker.take(standing(0.0))
+        tracker.process(standing(0.0))
     assert estimator.resets == 1
 
 
@@ -127,7 +127,7 @@ def test_the_position_is_what_the_velocity_adds_up_to(
     steps = 400
     for i in range(steps + 1):
         half = 0.5 * (np.pi / 2) * i / steps
-        estimate = tracker.take(
+        estimate = tracker.process(
             standing(0.005 * i, quaternion=np.array([np.cos(half), 0.0, 0.0, np.sin(half)]))
         )
     assert estimate is not None
@@ -138,8 +138,8 @@ def test_the_position_is_what_the_velocity_adds_up_to(
 
 def test_a_restart_leaves_the_position_where_it_was(tracker: VelocityTracker, standing: State) -> None:
     for i in range(201):
-        before = tracker.take(standing(0.005 * i))
-    after = tracker.take(standing(10.0))
+        before = tracker.process(standing(0.005 * i))
+    after = tracker.process(standing(10.0))
     assert before is not None
     assert after is not None
     np.testing.assert_allclose(before.position, [1.0, 0.0, 0.0])
@@ -150,9 +150,9 @@ def test_odometry_starts_at_zero_where_the_robot_was_put_to_another_place(
     tracker: VelocityTracker, standing: State
 ) -> None:
     for time in (0.0, 0.005, 0.01):
-        tracker.take(standing(time))
-    tracker.start_again()
-    first = tracker.take(standing(0.015))
+        tracker.process(standing(time))
+    tracker.reset_position()
+    first = tracker.process(standing(0.015))
     assert first is not None
     assert not first.position.any()
     assert not first.position_deviation.any()
@@ -161,9 +161,9 @@ def test_odometry_starts_at_zero_where_the_robot_was_put_to_another_place(
 def test_the_estimator_sees_the_targets_in_force(
     tracker: VelocityTracker, estimator: Scripted, standing: State
 ) -> None:
-    tracker.take(standing(0.0))
-    tracker.command(features.previous_action(NOMINAL_Q + 0.1, MODE_SERVO))
-    tracker.take(standing(0.005))
-    tracker.command(features.previous_action(NOMINAL_Q + 0.1, MODE_DAMPING))
-    tracker.take(standing(0.010))
+    tracker.process(standing(0.0))
+    tracker.set_previous_action(features.previous_action(NOMINAL_Q + 0.1, MODE_SERVO))
+    tracker.process(standing(0.005))
+    tracker.set_previous_action(features.previous_action(NOMINAL_Q + 0.1, MODE_DAMPING))
+    tracker.process(standing(0.010))
     np.testing.assert_allclose(estimator.actions, np.array([np.zeros(12), np.full(12, 0.1), np.zeros(12)]))

@@ -80,4 +80,7 @@ def test_refusals_are_counted_by_topic_with_the_last_reason() -> None:
     for topic, reason in [("low_state", "too old"), ("low_cmd", "nan"), ("low_state", "too short")]:
         refusals.add(topic, reason)
     assert refusals.total == 3
-    assert refusals.values() == {"refused low_state": "2, last: too short", "refused low_cmd": "1, last: nan"}
+    assert refusals.diagnostic_values() == {
+        "refused low_state": "2, last: too short",
+        "refused low_cmd": "1, last: nan",
+    }

@@ -15,7 +15,7 @@ import sys, threading
 import quadvel_dds
 quadvel_dds.install()
 from rclpy.node import Node
-from quadvel_nodes.node import end, run
+from quadvel_nodes.node import request_exit, run
 
 class Ending(Node):
     def __init__(self):
@@ -29,8 +29,8 @@ class Ending(Node):
             print("ready", flush=True)
 
     def finish(self):
-        end(self, self.sentence)
-        end(self, "what comes later")
+        request_exit(self, self.sentence)
+        request_exit(self, "what comes later")
 
 run(Ending, [])
 """

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from quadvel_nodes.scheduling import AUTOGROUP, SLICE, Scheduling, slice_of
+from quadvel_nodes.scheduling import AUTOGROUP_FILE, TIME_SLICE_NS, Scheduling, time_slice
 
 APPLY = """
 import os, threading, time
@@ -72,7 +72,7 @@ def test_without_being_asked_nothing_has_a_priority() -> None:
 
 
 def test_threads_ask_for_a_short_slice_and_those_that_they_start_do_so_too() -> None:
-    if not slice_of(0):
+    if not time_slice(0):
         pytest.skip("the kernel gives all threads the same slice, as before Linux 6.12")
     code = APPLY.format(priority=0, cpus="", spin=0.0, pause=0.0)
     code = code.replace(
@@ -80,7 +80,7 @@ def test_threads_ask_for_a_short_slice_and_those_that_they_start_do_so_too() -> 
     )
     code = code.replace("return policy,", "return slice_of(thread), policy,")
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert [line.split()[0] for line in result.stdout.splitlines()] == [str(SLICE)] * 4
+    assert [line.split()[0] for line in result.stdout.splitlines()] == [str(TIME_SLICE_NS)] * 4
 
 
 def test_every_thread_stays_on_the_cores_that_were_chosen() -> None:
@@ -112,13 +112,13 @@ print(os.nice(0), AUTOGROUP.read_text().split()[-1])
 
 
 @pytest.mark.skipif(
-    not (AUTOGROUP.exists() and AUTOGROUP.read_text()),
+    not (AUTOGROUP_FILE.exists() and AUTOGROUP_FILE.read_text()),
     reason="this kernel does not group processes by session",
 )
 @pytest.mark.parametrize("own_session", [True, False])
 def test_a_process_that_runs_after_others_does_so_across_sessions_where_it_leads_its_own(
     own_session: bool,
 ) -> None:
-    program, ours = [sys.executable, "-c", YIELDING], AUTOGROUP.read_text().split()[-1]
+    program, ours = [sys.executable, "-c", YIELDING], AUTOGROUP_FILE.read_text().split()[-1]
     done = subprocess.run(program, start_new_session=own_session, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [str(min(os.nice(0) + 10, 19)), "10" if own_session else ours]

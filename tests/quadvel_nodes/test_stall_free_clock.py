@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_nodes.stall_free_clock import JITTER, StallFreeClock
+from quadvel_nodes.stall_free_clock import STAMP_JITTER_S, StallFreeClock
 
 
 def lived(*samples: tuple[float, int]) -> list[float]:
     """The robot's time of each sample (stamp in s, tick in ms)."""
     time = StallFreeClock()
-    return [time.follow(stamp, tick) for stamp, tick in samples]
+    return [time.update(stamp, tick) for stamp, tick in samples]
 
 
 def test_where_stamps_and_ticks_agree_the_time_is_the_stamp() -> None:
@@ -20,13 +20,13 @@ def test_where_stamps_and_ticks_agree_the_time_is_the_stamp() -> None:
 
 def test_what_the_robot_stood_still_is_left_out() -> None:
     time = StallFreeClock()
-    found = [time.follow(*sample) for sample in ((8.0, 40), (8.005, 45), (8.065, 50), (8.07, 55), (8.2, 60))]
+    found = [time.update(*sample) for sample in ((8.0, 40), (8.005, 45), (8.065, 50), (8.07, 55), (8.2, 60))]
     np.testing.assert_allclose(found, 8.0 + 0.005 * np.arange(5))
     assert time.stalled == pytest.approx(0.055 + 0.125)
 
 
 def test_jitter_of_the_stamps_stays_and_does_not_add_up() -> None:
-    jitter = np.random.default_rng(0).uniform(-0.5 * JITTER, 0.5 * JITTER, 1000)
+    jitter = np.random.default_rng(0).uniform(-0.5 * STAMP_JITTER_S, 0.5 * STAMP_JITTER_S, 1000)
     stamps = 0.005 * np.arange(1000) + np.abs(jitter)
     assert lived(*((stamp, 5 * i) for i, stamp in enumerate(stamps.tolist()))) == stamps.tolist()
 
@@ -47,17 +47,17 @@ def test_where_the_tick_stands_or_starts_over_stamps_count(tick: int) -> None:
 
 def test_a_long_standstill_counts() -> None:
     time = StallFreeClock()
-    time.follow(8.0, 40)
-    assert time.follow(8.065, 45, longest=0.05) == 8.065
+    time.update(8.0, 40)
+    assert time.update(8.065, 45, max_stall=0.05) == 8.065
 
 
 def test_a_clock_that_was_set_is_no_event_in_the_robots_life() -> None:
     time = StallFreeClock()
-    time.follow(8.0, 40)
+    time.update(8.0, 40)
     for change in (5.0, -7.0):
-        time.clock_was_set(change)
+        time.on_clock_set(change)
         before = time.stalled
-        assert time.follow(8.005 + before, 45) == pytest.approx(8.005)
+        assert time.update(8.005 + before, 45) == pytest.approx(8.005)
         assert time.stalled == before
 
 
@@ -67,8 +67,8 @@ def test_stamps_that_were_set_back_are_followed() -> None:
 
 def test_a_stamp_from_before_a_standstill_keeps_its_place_after_it() -> None:
     time = StallFreeClock()
-    states = [time.follow(*sample) for sample in ((8.0, 40), (8.005, 45), (8.31, 50))]
-    np.testing.assert_allclose([time.at(8.0), time.at(8.005), time.at(8.31)], states)
-    assert time.at(8.2) == pytest.approx(8.005)  # the robot stood still
-    assert time.at(8.4) == pytest.approx(8.1)
-    assert StallFreeClock().at(3.0) == 3.0
+    states = [time.update(*sample) for sample in ((8.0, 40), (8.005, 45), (8.31, 50))]
+    np.testing.assert_allclose([time.time_at(8.0), time.time_at(8.005), time.time_at(8.31)], states)
+    assert time.time_at(8.2) == pytest.approx(8.005)  # the robot stood still
+    assert time.time_at(8.4) == pytest.approx(8.1)
+    assert StallFreeClock().time_at(3.0) == 3.0

@@ -78,7 +78,7 @@ def test_a_node_warns_once_of_each_conflict(
     said: list[str] = []
     monkeypatch.setattr(listener.get_logger(), "warning", said.append)
     watch = ConflictWatch(listener)
-    assert until(lambda: watch.look() or said)
-    watch.look()
+    assert until(lambda: watch.check() or said)
+    watch.check()
     assert len(said) == 1
     assert "stamped:=true" in said[0]

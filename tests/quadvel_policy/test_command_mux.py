@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from quadvel_policy.command_mux import LONGEST_STEP, CommandMux, MuxConfig, MuxInput, MuxOutput
+from quadvel_policy.command_mux import MAX_RAMP_STEP_S, CommandMux, MuxConfig, MuxInput, MuxOutput
 
 TELEOP, PLANNER = MuxInput("teleop", 100, 0.5), MuxInput("planner", 10, 0.3)
 FORWARD, BACK = (1.0, 0.0, 0.0), (-0.5, 0.0, 0.0)
@@ -211,7 +211,7 @@ class Told:
         """One update after `wait` s, and all that holds of every one."""
         output = self.mux.update(self.now)
         limit = BRISK.stop_acceleration if output.source == "none" else BRISK.acceleration
-        step = np.multiply(limit, np.clip(wait, 0.0, LONGEST_STEP))
+        step = np.multiply(limit, np.clip(wait, 0.0, MAX_RAMP_STEP_S))
         assert np.isfinite(output.velocity).all()
         assert (np.abs(output.velocity) <= BRISK.max_velocity).all()
         assert (np.abs(output.velocity - self.last.velocity) <= step + 1e-9).all()

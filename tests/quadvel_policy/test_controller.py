@@ -27,7 +27,7 @@ from quadvel_msgs.msg import ControllerState, LowCmd, LowState, MotorStatus, Vel
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.messages import write_low_state
 from quadvel_nodes.node import StartError
-from quadvel_policy.control_loop import _fresh
+from quadvel_policy.control_loop import _value_if_fresh
 from quadvel_policy.controller import Controller, ControllerParameters
 
 PERIOD = 0.005
@@ -468,7 +468,7 @@ def test_in_real_time_a_driver_that_sends_as_best_it_can_is_heard(
 
 @pytest.mark.parametrize(("age", "followed"), [(0.1, True), (-0.1, True), (0.6, False), (-60.0, False)])
 def test_a_command_of_another_time_is_not_followed_be_it_old_or_to_come(age: float, followed: bool) -> None:
-    assert (_fresh((100.0 - age, np.ones(4)), 100.0, 0.5) is not None) == followed
+    assert (_value_if_fresh((100.0 - age, np.ones(4)), 100.0, 0.5) is not None) == followed
 
 
 def start(*parameters: str) -> None:

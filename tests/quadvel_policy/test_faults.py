@@ -16,11 +16,11 @@ from rig import FORWARD, PERIOD, STILL, Rig, assert_damping
 from quadvel_description.robot import NOMINAL_Q, TORQUE_LIMIT, UPPER, VELOCITY_LIMIT
 from quadvel_description.state import JointCommand, RobotState
 from quadvel_policy import command_limits
-from quadvel_policy.command_limits import LIMITS, CommandLimits
+from quadvel_policy.command_limits import LIMITS, JointCommandLimiter
 from quadvel_policy.faults import page, table
 from quadvel_policy.guard import Guard, Level, MotorStatus
-from quadvel_policy.guards import GUARDS, EncoderInconsistent, torque_of
-from quadvel_policy.supervisor import OTHER_FAULTS
+from quadvel_policy.guards import GUARDS, EncoderInconsistent, ideal_torque
+from quadvel_policy.supervisor import SUPERVISOR_FAULTS
 
 Changes = dict[str, Any]
 """What is changed of the state of one tick, its age, or the time since the one before"""
@@ -94,7 +94,7 @@ def silent_drive(rig: Rig, k: int) -> Changes:
     return {
         "q": seen.q,
         "dq": seen.dq,
-        "tau": np.where(np.arange(12) == 2, 0.0, torque_of(rig.asked, seen)) + 1e-3,
+        "tau": np.where(np.arange(12) == 2, 0.0, ideal_torque(rig.asked, seen)) + 1e-3,
     }
 
 
@@ -102,7 +102,7 @@ def stuck_joint(rig: Rig, k: int) -> Changes:
     """A knee that was bent by something pushes with all it has and stays where it is."""
     rig.policy.action = np.where(np.arange(12) == 8, 6.0, 0.0).astype(np.float32)
     seen = giving_way(rig, 8, -0.7, k)
-    return {"q": seen.q, "dq": seen.dq, "tau": torque_of(rig.asked, seen)}
+    return {"q": seen.q, "dq": seen.dq, "tau": ideal_torque(rig.asked, seen)}
 
 
 def stopped(rig: Rig, seconds: float) -> Changes:
@@ -445,10 +445,10 @@ def test_no_command_leaves_beyond_a_limit(policy: Any, name: str) -> None:
 
 
 MUTATED = {
-    "torque_jumps": "_after_step",
-    "torque_too_large": "_at_most",
-    "joint_at_speed_limit": "_at_speed",
-    "power_too_large": "_of_power",
+    "torque_jumps": "_limit_step",
+    "torque_too_large": "_limit_torque",
+    "joint_at_speed_limit": "_limit_at_top_speed",
+    "power_too_large": "_limit_power",
 }
 
 
@@ -456,14 +456,14 @@ MUTATED = {
 def test_without_a_limit_a_command_leaves_beyond_it(
     policy: Any, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(CommandLimits, MUTATED[name], lambda self, torque, *_: torque)
+    monkeypatch.setattr(JointCommandLimiter, MUTATED[name], lambda self, torque, *_: torque)
     with pytest.raises(AssertionError):
         check_limit(policy, name)
 
 
 def test_the_table_has_a_row_for_each_guard_limit_and_other_fault() -> None:
     names = [row.name for row in table()]
-    assert sorted(names) == sorted([*CASES, *LIMITS, *OTHER_FAULTS])
+    assert sorted(names) == sorted([*CASES, *LIMITS, *SUPERVISOR_FAULTS])
     assert len(set(names)) == len(names)
 
 

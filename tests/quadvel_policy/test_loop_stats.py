@@ -51,9 +51,9 @@ def test_missed_deadlines_in_a_row_end_with_one_that_is_kept() -> None:
     stats = LoopStats()
     for i, missed in enumerate((0, 1, 2, 1)):
         stats.add(PERIOD * i, compute=1e-3, inference=math.nan, missed=missed)
-    assert (stats.overruns, stats.in_a_row) == (4, 4)
+    assert (stats.overruns, stats.consecutive_overruns) == (4, 4)
     stats.add(1.0, compute=1e-3, inference=math.nan, missed=0)
-    assert (stats.overruns, stats.in_a_row) == (4, 0)
+    assert (stats.overruns, stats.consecutive_overruns) == (4, 0)
 
 
 def test_a_clock_that_leaps_by_decades_still_gives_a_state_that_can_be_sent() -> None:

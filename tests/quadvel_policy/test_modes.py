@@ -8,7 +8,7 @@ import pytest
 from quadvel_description.kinematics import foot_positions, rotate
 from quadvel_description.robot import LIE_Q, NOMINAL_Q
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
-from quadvel_policy.modes import Posture, Tick, blend, upright
+from quadvel_policy.modes import ModeInput, Posture, blend, vertical_offset
 
 
 def torque(command: JointCommand, q: np.ndarray, dq: np.ndarray) -> np.ndarray:
@@ -20,11 +20,11 @@ def some_command(rng: np.random.Generator) -> JointCommand:
     return JointCommand(q=q, dq=dq, tau=tau, kp=rng.uniform(0, 100, 12), kd=rng.uniform(0, 5, 12))
 
 
-def tick_at(elapsed: float, q: np.ndarray, previous: JointCommand) -> Tick:
+def tick_at(elapsed: float, q: np.ndarray, previous: JointCommand) -> ModeInput:
     zeros = np.zeros(12)
     upright = np.array([1.0, 0.0, 0.0, 0.0])
     state = RobotState(elapsed, 0, q, zeros, zeros, upright, np.zeros(3), np.zeros(3), np.zeros(4))
-    return Tick(elapsed, state, np.zeros(3), np.zeros(4), previous)
+    return ModeInput(elapsed, state, np.zeros(3), np.zeros(4), previous)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
@@ -69,8 +69,8 @@ def test_a_posture_passes_its_waypoints_at_rest_and_holds_the_last() -> None:
         command = posture.tick(tick_at(elapsed, start, JointCommand.damping()))
         np.testing.assert_allclose(command.q, expected, atol=1e-12)
         np.testing.assert_allclose(command.dq, 0.0, atol=1e-12)
-    assert not posture.done(1.99)
-    assert posture.done(2.0)
+    assert not posture.is_finished(1.99)
+    assert posture.is_finished(2.0)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0), (0.0, 1.0), (0.6, -0.8)])
@@ -79,7 +79,7 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
     state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(tilt / 2), *(np.sin(tilt / 2) * np.array(axis)), 0.0])
     posture = Posture([(1.0, NOMINAL_Q)], kp=100.0, kd=3.0)
-    feet = foot_positions(posture.goal(state))
+    feet = foot_positions(posture.final_posture(state))
     np.testing.assert_allclose(feet[:, 2], -0.4, atol=1e-4)  # no leg shorter than before
     middle = rotate(state.quaternion, feet.mean(axis=0))
     np.testing.assert_allclose(middle[:2], 0.0, atol=1e-9)
@@ -88,7 +88,7 @@ def test_on_a_slope_a_posture_keeps_the_feet_below_the_trunk(axis: tuple[float, 
 def test_a_posture_leans_no_further_than_20_degrees_ask_for() -> None:
     state = tick_at(0.0, NOMINAL_Q, JointCommand.damping()).state
     state.quaternion = np.array([np.cos(0.5), 0.0, np.sin(0.5), 0.0])  # 1 rad
-    assert np.linalg.norm(upright(state)) == pytest.approx(np.tan(0.35))
+    assert np.linalg.norm(vertical_offset(state)) == pytest.approx(np.tan(0.35))
 
 
 def test_the_speed_of_a_posture_is_the_derivative_of_its_path() -> None:

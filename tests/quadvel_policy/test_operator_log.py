@@ -33,20 +33,20 @@ class Run:
                 time, 5 * self._ticks, NOMINAL_Q, zeros, zeros, upright, zeros[:3], zeros[:3], zeros[:4]
             )
             self.supervisor.tick(time, state, np.zeros(3), command)
-            said += self.announcements.now()
+            said += self.announcements.changes()
         return said
 
 
 def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any) -> None:
     run = Run(policy)
-    assert run.tick(STILL, 20) == [(False, "passive: waits for an order")]
+    assert run.tick(STILL, 20) == [(False, "passive: waiting for a mode request")]
     run.supervisor.request("stance")
     assert run.tick(STILL, 80) == [
-        (False, "stance: was asked for"),
-        (False, "ready: a velocity makes it walk"),
+        (False, "stance: requested"),
+        (False, "ready; waiting for a velocity command"),
     ]
     assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]
-    assert not list(run.announcements.waiting())
+    assert not list(run.announcements.walk_refusals())
     run.supervisor.fail("a test", "test")
     assert run.tick(FORWARD, 20) == [
         (True, "fault: a test; the joints are damped until passive is requested, then stand_up")
@@ -59,6 +59,6 @@ def test_why_a_standing_robot_does_not_walk_is_told_once(policy: Any) -> None:
     run.supervisor.request("stance")
     run.tick(FORWARD, 80)
     expected = ["follows no velocity: a zero velocity has to be commanded first"]
-    assert list(run.announcements.waiting()) == expected
-    assert list(run.announcements.waiting()) == []
-    assert run.tick(STILL) == [(False, "ready: a velocity makes it walk")]
+    assert list(run.announcements.walk_refusals()) == expected
+    assert list(run.announcements.walk_refusals()) == []
+    assert run.tick(STILL) == [(False, "ready; waiting for a velocity command")]

@@ -21,29 +21,29 @@ def pauses() -> StallDetector:
 def test_a_process_that_runs_in_time_has_no_excuse(pauses: StallDetector) -> None:
     for now in (1.024, 1.044, 1.064):
         pauses.poll(now)
-        assert not pauses.excuse(now)
-    assert (pauses.count, pauses.since_heard) == (0, False)
+        assert not pauses.excuses_silence(now)
+    assert (pauses.count, pauses.has_stalled) == (0, False)
 
 
 def test_a_pause_excuses_one_period(pauses: StallDetector) -> None:
     pauses.poll(1.08)
-    assert (pauses.count, pauses.since_heard) == (1, True)
-    assert pauses.excuse(1.08)
-    assert pauses.excuse(1.099)
-    assert not pauses.excuse(1.101)
+    assert (pauses.count, pauses.has_stalled) == (1, True)
+    assert pauses.excuses_silence(1.08)
+    assert pauses.excuses_silence(1.099)
+    assert not pauses.excuses_silence(1.101)
 
 
 def test_pauses_without_a_message_between_excuse_no_more(pauses: StallDetector) -> None:
     for now in (1.08, 1.14, 1.2):
         pauses.poll(now)
     assert pauses.count == 3
-    assert not pauses.excuse(1.14)
+    assert not pauses.excuses_silence(1.14)
 
 
 def test_after_a_message_the_next_pause_is_excused_again(pauses: StallDetector) -> None:
     pauses.poll(1.08)
-    pauses.heard()
-    assert not pauses.since_heard
-    assert not pauses.excuse(1.08)
+    pauses.on_message()
+    assert not pauses.has_stalled
+    assert not pauses.excuses_silence(1.08)
     pauses.poll(1.14)
-    assert pauses.excuse(1.15)
+    assert pauses.excuses_silence(1.15)

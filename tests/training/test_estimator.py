@@ -14,7 +14,7 @@ from quadvel_estimator import features  # noqa: E402
 from quadvel_estimator.kalman import KalmanConfig  # noqa: E402
 from quadvel_estimator.learned import LearnedEstimator  # noqa: E402
 from quadvel_estimator.odometry import leg_velocity  # noqa: E402
-from quadvel_policy.modes import Posture, Tick  # noqa: E402
+from quadvel_policy.modes import ModeInput, Posture  # noqa: E402
 from quadvel_policy.supervisor import SupervisorConfig  # noqa: E402
 from quadvel_training import kalman_tuning, walks  # noqa: E402
 from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
@@ -52,9 +52,9 @@ def test_postures_are_those_of_the_controller(monkeypatch):
     state = RobotState(
         0.0, 0, q, np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), *np.zeros((2, 3)), np.zeros(4)
     )
-    fold.enter(Tick(0.0, state, None, np.zeros(4), JointCommand.damping(c.damping_kd)))
+    fold.enter(ModeInput(0.0, state, None, np.zeros(4), JointCommand.damping(c.damping_kd)))
     for k in range(round(c.fold_time / TICK)):
-        wanted = fold.tick(Tick(k * TICK, state, None, np.zeros(4), JointCommand.damping(1.0)))
+        wanted = fold.tick(ModeInput(k * TICK, state, None, np.zeros(4), JointCommand.damping(1.0)))
         speed = modes.ask(np.zeros((1, 12)), robot.KP, robot.KD)
         np.testing.assert_allclose(modes.target[0], wanted.q, atol=1e-9)
         np.testing.assert_allclose(speed[0], wanted.dq, atol=1e-9)

@@ -80,7 +80,7 @@ class CommandGrid:
         return self.config.hold
 
     def _inside(self, command: np.ndarray) -> bool:
-        return bool(np.allclose(self._limits.held(command.tolist()), command))
+        return bool(np.allclose(self._limits.clamp(command.tolist()), command))
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
@@ -100,7 +100,7 @@ class CommandGrid:
                 :, axis
             ]
             command[ids, one] = command[ids, other] = 0.0
-        command[:, :3] = [self._limits.held(one) for one in command[:, :3].tolist()]
+        command[:, :3] = [self._limits.clamp(one) for one in command[:, :3].tolist()]
         still = rng.random(n) < c.stance
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command

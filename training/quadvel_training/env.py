@@ -73,7 +73,7 @@ class CommandRange:
             limits = CommandLimits(
                 (self.vx[0], -self.vy, -self.wz), (self.vx[1], self.vy, self.wz), self.curve
             )
-            command[:, :3] = [limits.held(one) for one in command[:, :3].tolist()]
+            command[:, :3] = [limits.clamp(one) for one in command[:, :3].tolist()]
         still = rng.random(n) < self.stance
         command[still] = [0.0, 0.0, 0.0, 1.0]
         return command

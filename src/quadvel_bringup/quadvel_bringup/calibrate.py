@@ -13,7 +13,7 @@ from rich.table import Table
 
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
-from quadvel_driver.find_calibration import Found, NotFound, Samples, find
+from quadvel_driver.find_calibration import CalibrationDataError, CalibrationFit, Samples, fit_calibration
 from quadvel_eval.output import output_file, replacing
 from quadvel_nodes.messages import read_low_state
 from quadvel_recordings.reading import read_messages
@@ -56,7 +56,7 @@ def calibrate_command(
     if hung is None and standing is None:
         raise ValueError("nothing to find anything from: name a recording with --hung or --standing, or both")
     output_file(out)
-    found = find(_samples(hung), _samples(standing))
+    found = fit_calibration(_samples(hung), _samples(standing))
     console = Console(soft_wrap=True)
     console.print(_table(found))
     if standing is not None:
@@ -71,7 +71,7 @@ def calibrate_command(
             f"[yellow]the standing feet are {uneven} off one plane: is the floor level, is a joint far off?"
         )
     with replacing(out) as draft:
-        draft.write_text(found.calibration.text())
+        draft.write_text(found.calibration.to_yaml())
     console.print(f"written to {out}", highlight=False)
 
 
@@ -80,8 +80,8 @@ def _samples(path: Path | None) -> Samples | None:
     if path is None:
         return None
     try:
-        return Samples.of(_middle(list(_states(path))))
-    except NotFound as error:
+        return Samples.from_states(_middle(list(_states(path))))
+    except CalibrationDataError as error:
         raise ValueError(f"{path}: {error}") from None
 
 
@@ -97,7 +97,7 @@ def _middle(states: list[RobotState]) -> list[RobotState]:
     return [state for state in states if begin <= state.time <= end]
 
 
-def _table(found: Found) -> Table:
+def _table(found: CalibrationFit) -> Table:
     table = Table("joint", "shows at zero, degrees", "standard error", title="Joints")
     zeros = np.degrees(found.calibration.joint_zeros)
     for name, zero, error in zip(JOINT_NAMES, zeros, np.degrees(found.zero_errors), strict=True):

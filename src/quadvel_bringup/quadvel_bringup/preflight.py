@@ -39,7 +39,9 @@ PARTS = {
     "board": Part(
         "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
     ),
-    "driver": Part("quadvel_driver.parameters:DriverParameters", lambda settings: settings.correction()),
+    "driver": Part(
+        "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()
+    ),
     "estimator": Part(
         "quadvel_estimator.estimator:EstimatorParameters",
         lambda settings: settings.make_estimator() if settings.model else None,

@@ -1,1 +1,1 @@
-"""The real robot: the packets of its board, the link to it, and the node that puts topics around both."""
+"""Driver of the real robot: packets of its board, UDP link, and the node `driver`."""

@@ -1,6 +1,6 @@
-"""What one robot's sensors show where everything is at zero: the file, and how states and commands are set right by it.
+"""Calibration of one robot's encoders and IMU: the file, and the correction of states and commands.
 
-How the numbers are found is `find_calibration`'s matter.
+`find_calibration` computes the numbers.
 """
 
 from __future__ import annotations
@@ -20,18 +20,27 @@ from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import JointCommand, RobotState
 
 SCHEMA = 1
-LARGEST = 0.35  # rad; beyond that a sensor is not off but broken, or in the wrong place
+MAX_OFFSET_RAD = 0.35  # a sensor with a larger offset is broken or mounted wrongly
 Array = NDArray[np.float64]
 
 
 class CalibrationError(ValueError):
-    """A file that is no calibration; one sentence that names file and field."""
+    """A file is not a calibration; the text is one sentence with file and field."""
 
 
 @attrs.frozen(eq=False)
 class Calibration:
-    """joint_zeros: (12,) rad, what each encoder shows at its joint's zero. imu_mounting: (2,) rad, by how much the IMU leans
-    against the trunk, to the right (about x) and forward (about y)."""
+    """Offsets of one robot's sensors.
+
+    Attributes:
+        joint_zeros: Encoder readings at the joints' zero angles, (12,), rad.
+        imu_mounting: Tilt of the IMU against the trunk, (2,), rad: roll (about x) and pitch (about
+            y).
+
+    Raises:
+        CalibrationError: An offset is not finite, too large, or of the wrong shape; raised by the
+            constructor.
+    """
 
     joint_zeros: Array = attrs.field(factory=lambda: np.zeros(12))
     imu_mounting: Array = attrs.field(factory=lambda: np.zeros(2))
@@ -39,13 +48,25 @@ class Calibration:
     def __attrs_post_init__(self) -> None:
         for field, size in (("joint_zeros", 12), ("imu_mounting", 2)):
             value = getattr(self, field)
-            if np.shape(value) != (size,) or not (np.abs(value) <= LARGEST).all():
+            if np.shape(value) != (size,) or not (np.abs(value) <= MAX_OFFSET_RAD).all():
                 found = np.asarray(value).tolist()
-                raise CalibrationError(f"{field} is {found}, expected {size} angles within {LARGEST} rad")
+                raise CalibrationError(
+                    f"{field} is {found}, expected {size} angles within {MAX_OFFSET_RAD} rad"
+                )
 
     @classmethod
     def load(cls, path: str | Path) -> Calibration:
-        """Read a file that `save` wrote. Raises CalibrationError."""
+        """Read a calibration file.
+
+        Args:
+            path: The YAML file.
+
+        Returns:
+            The calibration.
+
+        Raises:
+            CalibrationError: The file cannot be read or is malformed.
+        """
         try:
             content = read_yaml(Path(path), "a YAML file of a calibration")
         except OSError as error:
@@ -61,13 +82,17 @@ class Calibration:
                     "joint_zeros or imu_mounting has other names than the twelve joints, roll and pitch"
                 )
             return cls(_numbers(zeros, JOINT_NAMES), _numbers(mounting, ("roll", "pitch")))
-        except Exception as error:  # of the file's content, whatever it may be
+        except Exception as error:  # the content is arbitrary, and so is the error
             raise CalibrationError(
                 f"{path}: {type(error).__name__}: {' '.join(str(error).split())}"
             ) from None
 
-    def text(self) -> str:
-        """The file."""
+    def to_yaml(self) -> str:
+        """Return the content of the calibration file.
+
+        Returns:
+            YAML, with a comment line at the top.
+        """
         zeros = {
             name: round(zero, 5) for name, zero in zip(JOINT_NAMES, self.joint_zeros.tolist(), strict=True)
         }
@@ -78,13 +103,22 @@ class Calibration:
 
     @property
     def mounting(self) -> Array:
-        """The turn from trunk to IMU as a quaternion, (4,) w, x, y, z."""
+        """Rotation from trunk to IMU as a quaternion (w, x, y, z), (4,)."""
         angle = float(np.hypot(*self.imu_mounting))
         share = 0.5 * np.sinc(0.5 * angle / np.pi)
         return np.array([np.cos(0.5 * angle), *(share * self.imu_mounting), 0.0])
 
     def apply(self, reported: RobotState) -> RobotState:
-        """The state that a robot is in which reports this one."""
+        """Correct a measured state: remove the encoder offsets and the tilt of the IMU.
+
+            q = q_reported - joint_zeros,   R = R_reported R_mounting^T
+
+        Args:
+            reported: The state as the robot reports it.
+
+        Returns:
+            The true state.
+        """
         turn = self.mounting
         return attrs.evolve(
             reported,
@@ -94,8 +128,15 @@ class Calibration:
             linear_acceleration=rotate(turn, reported.linear_acceleration),
         )
 
-    def reported(self, true: RobotState) -> RobotState:
-        """What a robot reports that is in this state."""
+    def as_reported(self, true: RobotState) -> RobotState:
+        """Add the sensor offsets to a true state; the inverse of `apply`.
+
+        Args:
+            true: The true state.
+
+        Returns:
+            The state as this robot would report it.
+        """
         turn = self.mounting
         return attrs.evolve(
             true,
@@ -106,11 +147,25 @@ class Calibration:
         )
 
     def invert(self, wanted: JointCommand) -> JointCommand:
-        """What the drives have to be told so that they do what is wanted."""
+        """Convert a desired command to the command that the drives need: q + joint_zeros.
+
+        Args:
+            wanted: The desired command.
+
+        Returns:
+            The command to send.
+        """
         return attrs.evolve(wanted, q=wanted.q + self.joint_zeros)
 
-    def carried_out(self, sent: JointCommand) -> JointCommand:
-        """What drives do that are told this."""
+    def as_executed(self, sent: JointCommand) -> JointCommand:
+        """Convert a sent command to the motion that the drives execute; the inverse of `invert`.
+
+        Args:
+            sent: The command that was sent.
+
+        Returns:
+            The command in true joint angles.
+        """
         return attrs.evolve(sent, q=sent.q - self.joint_zeros)
 
 
@@ -119,7 +174,7 @@ def _numbers(values: Mapping[str, Any], names: tuple[str, ...]) -> Array:
 
 
 def _product(a: Array, b: Array) -> Array:
-    """Of two quaternions, w first."""
+    """Return the product a * b of two quaternions (w, x, y, z)."""
     w, x, y, z = a
     left = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
     product: Array = left @ b

@@ -1,22 +1,33 @@
-"""Fewer samples of a fast stream, at an even rate. Knows no ROS."""
+"""Decimation of a fast stream to a regular lower rate. Knows no ROS."""
 
 from __future__ import annotations
 
 
 class Decimator:
-    """Lets one sample pass in each period of the stream's own counter: the first that comes in it.
+    """Accepts the first sample in each period of the stream's own counter.
 
-    The periods are fixed on the counter, so that what passes keeps its phase: where a sample was lost, the next one passes
-    in its place, and the one after that is on time again.
+    Periods are fixed on the counter, so the accepted samples keep their phase: the next sample
+    replaces a lost one, and the following sample is on time again.
     """
 
     def __init__(self, rate: int) -> None:
-        """rate: Hz, up to that of the counter, which counts ms."""
+        """Create a decimator.
+
+        Args:
+            rate: Rate of accepted samples, Hz, at most 1000 (the rate of the counter).
+        """
         self._rate = rate
         self._last: int | None = None
 
-    def passes(self, tick: int) -> bool:
-        """Whether the sample with this tick (ms) is the first of its period. Ticks do not go back, but may wrap."""
+    def accepts(self, tick: int) -> bool:
+        """Return whether a sample is the first of its period.
+
+        Args:
+            tick: Counter of the sample, ms; does not go back, but may wrap.
+
+        Returns:
+            True if the sample is accepted.
+        """
         period = tick * self._rate // 1000
         first, self._last = period != self._last, period
         return first

@@ -1,7 +1,8 @@
-"""The node `driver`: the real robot on the topics that the controller knows.
+"""The node `driver`: connects the real robot to the topics of the controller.
 
-Topics around a `UdpLink`, which runs in a thread of its own and hands on the states in it; commands come in the executor's
-thread. What the operator's remote asks for becomes cmd_vel_teleop, command_lock and calls of the controller's services.
+A `UdpLink` runs in its own thread and calls back with each state; commands arrive in the executor's
+thread. Commands of the operator's remote become cmd_vel_teleop, command_lock and calls of the
+controller's services.
 """
 
 from __future__ import annotations
@@ -24,65 +25,65 @@ from quadvel_msgs.msg import LowCmd, LowState, MotorStatus
 from quadvel_msgs.srv import SetMode
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import Refusals, read_low_cmd, write_low_state
-from quadvel_nodes.node import end, read_parameters, run
+from quadvel_nodes.node import read_parameters, request_exit, run
 from quadvel_nodes.robot_view import RobotView
 from quadvel_nodes.system_time import SystemTime
 
 from .decimator import Decimator
 from .dry_run import DryRun
-from .health import DROPPED_OUT, Health, Level, figures
-from .link import SILENCE, UdpLink
+from .health import MOTOR_DROPPED_OUT, Health, Level, diagnostic_values
+from .link import SILENCE_LIMIT_S, UdpLink
 from .parameters import DriverParameters
-from .remote import Order, RemotePilot
+from .remote import OperatorCommand, RemotePilot
 from .wire import BoardState
 
-OPERATOR_PERIOD = 0.02  # s, of looking at the remote's orders and of cmd_vel_teleop
-LOCK_EVERY = 5  # of these periods: a stop is said again, to whoever came later
-GRACE = 3  # reports, one a second, in which a board may be silent that is only being started
-VIEW_RATE = 50  # Hz, of what `RobotView` publishes
-MOTOR_RATE = 10  # Hz, of temperatures and of what the board switched off
-# Standard deviations of the IMU, rad, rad/s, m/s^2: of its class; those of the AlienGo's own are not known.
-ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION = 0.002, 0.01, 0.1
+OPERATOR_PERIOD_S = 0.02  # period of processing the remote and of cmd_vel_teleop
+PERIODS_PER_LOCK = 5  # a stop is published repeatedly, for nodes that start later
+STARTUP_REPORTS = 3  # number of reports (1 Hz) without a warning, while the board may be starting
+VIEW_RATE_HZ = 50  # rate of `RobotView`
+MOTOR_RATE_HZ = 10  # rate of motor_status
+# Standard deviations of the IMU, rad, rad/s, m/s^2: typical values; those of the AlienGo are unknown.
+ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD = 0.002, 0.01, 0.1
 
 
 class Driver(Node):
-    """Topics around one link."""
+    """Publishes the states of a `UdpLink` and forwards commands to it."""
 
     def __init__(self) -> None:
         super().__init__("driver")
         self._settings = settings = read_parameters(self, DriverParameters)
         self._dry_run = DryRun() if settings.dry_run else None
-        self._link = UdpLink(settings, self._on_state, settings.correction(), self._dry_run)
+        self._link = UdpLink(settings, self._on_state, settings.load_calibration(), self._dry_run)
         self._health = Health(f"{settings.board_address}:{settings.board_port}")
         self._pilot = RemotePilot(settings)
-        self._orders: deque[Order] = deque()
+        self._orders: deque[OperatorCommand] = deque()
         self._newest: BoardState | None = None
         self._refusals = Refusals()
         self._system_time = SystemTime()
-        self._thinning, self._view_thinning = Decimator(settings.state_rate), Decimator(VIEW_RATE)
-        self._motor_thinning = Decimator(MOTOR_RATE)
+        self._state_decimator, self._view_decimator = Decimator(settings.state_rate), Decimator(VIEW_RATE_HZ)
+        self._motor_decimator = Decimator(MOTOR_RATE_HZ)
         self._operator_ticks = 0
         self._reports = 0
         self._passive_wanted = False
-        self._said = ""
+        self._last_logged = ""
         self._failure = ""
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable_walking = self.create_client(SetBool, "controller/enable_walking")
         self.create_subscription(LowCmd, "low_cmd", self._on_command, 1)
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if self._dry_run:  # beside a simulator, whose topics are not to be taken for a robot's
-            show = self._dry_run.shown
+        if self._dry_run:  # it may run next to a simulator, so it must not publish as a robot
+            show = self._dry_run.summary
             self.create_timer(1.0, lambda: self.get_logger().info(show()), clock=steady)
         else:
             self._create_publishers()
-            self.create_timer(OPERATOR_PERIOD, self._serve_operator, clock=steady)
+            self.create_timer(OPERATOR_PERIOD_S, self._serve_operator, clock=steady)
             self.create_timer(1.0, self._report, clock=steady)
-        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a period
+        gc.freeze()  # exclude existing objects from garbage collection, which would delay a period
         self._thread = Thread(target=self._serve_link, name="link")
         self._thread.start()
 
     def destroy_node(self) -> None:
-        """Leave the robot braking, then end the node."""
+        """Stop the link, which brakes the robot, then destroy the node."""
         self._link.stop()
         self._thread.join()
         super().destroy_node()
@@ -90,24 +91,24 @@ class Driver(Node):
     def _create_publishers(self) -> None:
         self._low_state = self.create_publisher(LowState, "low_state", 10)
         self._motors = self.create_publisher(MotorStatus, "motor_status", 1)
-        self._view = RobotView(self, ORIENTATION, ANGULAR_VELOCITY, LINEAR_ACCELERATION)
+        self._view = RobotView(self, ORIENTATION_STD_RAD, ANGULAR_VELOCITY_STD, LINEAR_ACCELERATION_STD)
         self._teleop = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._lock = self.create_publisher(Bool, "command_lock", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
 
-    # In the link's thread.
+    # Methods of the link's thread.
 
     def _serve_link(self) -> None:
         try:
             self._settings.apply(self.get_logger().warning)
             self._link.run()
-        except Exception as error:  # whatever it was, the node must not go on without its robot
+        except Exception as error:  # the node must not continue without its robot
             self._failure = f"{type(error).__name__}: {error}"
 
     def _on_state(self, state: BoardState) -> None:
         self._newest = state
-        order = self._pilot.follow(state.remote, time.monotonic())
-        if order is Order.STOP:
+        order = self._pilot.update(state.remote, time.monotonic())
+        if order is OperatorCommand.STOP:
             self._link.brake()
         if order is not None:
             self._orders.append(order)
@@ -115,16 +116,16 @@ class Driver(Node):
             return
         robot = state.robot
         stamp = self._system_time.stamp(robot.time)
-        if self._thinning.passes(robot.tick):
+        if self._state_decimator.accepts(robot.tick):
             message = LowState(stamp=stamp)
             write_low_state(robot, message)
             self._low_state.publish(message)
-        if self._view_thinning.passes(robot.tick):
+        if self._view_decimator.accepts(robot.tick):
             self._view.publish(stamp, robot)
-        if self._motor_thinning.passes(robot.tick):
+        if self._motor_decimator.accepts(robot.tick):
             self._motors.publish(motor_status(stamp, state))
 
-    # In the executor's thread.
+    # Methods of the executor's thread.
 
     def _on_command(self, message: Any) -> None:
         try:
@@ -133,95 +134,111 @@ class Driver(Node):
             self._refusals.add("low_cmd", error)
 
     def _serve_operator(self) -> None:
-        """50 times a second: carry out what the remote asked for."""
+        """Execute the remote's commands and publish its velocity, at 50 Hz."""
         while self._orders:
-            self._carry_out(self._orders.popleft())
+            self._execute(self._orders.popleft())
         velocity = self._pilot.velocity(time.monotonic())
         if velocity is not None and not self._is_silent():
             twist = Twist()
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
             self._teleop.publish(twist)
         self._operator_ticks += 1
-        if self._pilot.stopped and self._operator_ticks % LOCK_EVERY == 0:
+        if self._pilot.stopped and self._operator_ticks % PERIODS_PER_LOCK == 0:
             self._lock.publish(Bool(data=True))
             if self._passive_wanted:
-                self._ask_for_mode("passive")
+                self._request_mode("passive")
 
-    def _carry_out(self, order: Order) -> None:
-        self.get_logger().info(f"the remote says: {order.value}")
-        if order is Order.STOP:
+    def _execute(self, order: OperatorCommand) -> None:
+        self.get_logger().info(f"remote: {order.value}")
+        if order is OperatorCommand.STOP:
             self._passive_wanted = True
             self._lock.publish(Bool(data=True))
-            self._ask_for_mode("passive")
-        elif order is Order.RELEASE:
+            self._request_mode("passive")
+        elif order is OperatorCommand.RELEASE:
             self._release()
-        elif order in (Order.STAND_UP, Order.LIE_DOWN):
-            self._ask_for_mode(order.value.replace(" ", "_"))
+        elif order in (OperatorCommand.STAND_UP, OperatorCommand.LIE_DOWN):
+            self._request_mode(order.value.replace(" ", "_"))
         else:
-            allowed = order is Order.ALLOW_WALKING
+            allowed = order is OperatorCommand.ALLOW_WALKING
             self._call(self._enable_walking, SetBool.Request(data=allowed), order.value)
 
     def _release(self) -> None:
         why_not = self._link.release()
         if why_not:
-            self.get_logger().warning(f"the stop stays: {why_not}")
+            self.get_logger().warning(f"the stop is not released: {why_not}")
             return
         self._pilot.stopped = self._passive_wanted = False
         self._lock.publish(Bool(data=False))
 
-    def _ask_for_mode(self, mode: str) -> None:
+    def _request_mode(self, mode: str) -> None:
         self._call(self._set_mode, SetMode.Request(mode=mode), mode)
 
     def _call(self, client: Any, request: Any, what: str) -> None:
-        """Call a service of the controller and say how it went."""
+        """Call a service of the controller and log the result."""
         if not client.service_is_ready():
-            self._say(f"{what}: the controller is not there")
+            self._log_once(f"{what}: the controller is not running")
             return
 
         def answered(future: Any) -> None:
             response = future.result()
             if what == "passive" and response.success:
                 self._passive_wanted = False
-            self._say(
+            self._log_once(
                 f"{what}: {response.message}" if response.success else f"{what} refused: {response.message}"
             )
 
         client.call_async(request).add_done_callback(answered)
 
-    def _say(self, text: str) -> None:
-        """Log a sentence, once while it stays the same."""
-        if text != self._said:
+    def _log_once(self, text: str) -> None:
+        """Log a sentence if it differs from the last one."""
+        if text != self._last_logged:
             self.get_logger().info(text)
-        self._said = text
+        self._last_logged = text
 
     def _is_silent(self) -> bool:
-        """Whether what the remote said last is of long ago."""
-        return self._newest is None or time.monotonic() - self._newest.robot.time > SILENCE
+        """Return whether the newest data of the remote is too old to be used."""
+        return self._newest is None or time.monotonic() - self._newest.robot.time > SILENCE_LIMIT_S
 
     def _report(self) -> None:
-        """Once a second: /diagnostics."""
+        """Publish /diagnostics, at 1 Hz."""
         if self._failure:
-            end(self, f"driver: {self._failure}")
+            request_exit(self, f"driver: {self._failure}")
             return
         report = self._link.report()
-        level, summary = self._health.judge(report, self._newest, self._pilot.stopped)
-        values = {**figures(report, self._newest), "stopped": self._pilot.stopped, **self._refusals.values()}
+        level, summary = self._health.assess(report, self._newest, self._pilot.stopped)
+        values = {
+            **diagnostic_values(report, self._newest),
+            "stopped": self._pilot.stopped,
+            **self._refusals.diagnostic_values(),
+        }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), bytes([level]), summary, values))
         self._reports += 1
-        if level > Level.OK and self._reports > GRACE:
+        if level > Level.OK and self._reports > STARTUP_REPORTS:
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
 
 
 def motor_status(stamp: Any, state: BoardState) -> Any:
-    """The message."""
+    """Build the motor_status message of a state.
+
+    Args:
+        stamp: Time of the state, a builtin_interfaces/Time.
+        state: State of the board.
+
+    Returns:
+        A quadvel_msgs/MotorStatus.
+    """
     return MotorStatus(
         stamp=stamp,
         temperature=state.temperature.astype(np.float32),
-        dropped_out=(state.motor_mode == DROPPED_OUT).tolist(),
+        dropped_out=(state.motor_mode == MOTOR_DROPPED_OUT).tolist(),
     )
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `driver`.
+
+    Args:
+        args: Command line arguments; None for those of the process.
+    """
     run(Driver, args)

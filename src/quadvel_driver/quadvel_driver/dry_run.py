@@ -1,4 +1,4 @@
-"""Shows what a link would send, to be looked at before a robot is connected. No ROS."""
+"""Dry run: shows the packets that a link would send, for a check without a robot. No ROS."""
 
 from __future__ import annotations
 
@@ -11,28 +11,49 @@ from . import wire
 
 
 class DryRun(socket.socket):
-    """In place of the link's socket: keeps what it is given, sends nothing, and hears nothing."""
+    """Replacement for the link's socket that keeps the last packet, sends nothing and receives
+    nothing.
+    """
 
     def __init__(self) -> None:
-        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)  # bound to no port
+        super().__init__(socket.AF_INET, socket.SOCK_DGRAM)  # not bound to a port
         self.setblocking(False)
         self._packet = b""
         self._count = 0
 
     def send(self, data: Any, flags: int = 0) -> int:
-        """Keep a packet."""
+        """Keep a packet instead of sending it.
+
+        Args:
+            data: The packet.
+            flags: Not used.
+
+        Returns:
+            Number of bytes "sent".
+        """
         self._packet = data
         self._count += 1
         return len(data)
 
-    def shown(self) -> str:
-        """How many packets came since this was asked last, and the last one in words."""
+    def summary(self) -> str:
+        """Describe the packets since the last call.
+
+        Returns:
+            The number of packets and a description of the last one.
+        """
         count, self._count = self._count, 0
-        return f"{count} packets would have been sent, the last: {described(self._packet)}"
+        return f"{count} packets would have been sent, the last: {describe_packet(self._packet)}"
 
 
-def described(packet: bytes) -> str:
-    """A command's packet for people: its bytes at both ends, and what it asks of the joints, a line a leg."""
+def describe_packet(packet: bytes) -> str:
+    """Describe a command packet: its first and last bytes, and one line per leg.
+
+    Args:
+        packet: A packet of `wire.encode_command`.
+
+    Returns:
+        Several lines of text.
+    """
     command = wire.decode_command(packet)
     lines = [
         f"{len(packet)} bytes, {packet[:11].hex()} ... CRC 0x{int.from_bytes(packet[-4:], 'little'):08X}"

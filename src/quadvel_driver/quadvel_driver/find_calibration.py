@@ -1,10 +1,12 @@
-"""Finds what a robot's sensors show at zero, from how it hangs and how it stands.
+"""Calibration of encoder zeros and IMU tilt from a suspended and a standing robot.
 
-Hung, with its joints moving slowly to and fro: the torque that holds a leg against its weight is known at each angle, so the
-angles at which it is found tell the encoders' zeros; friction shows itself by changing its sign with the direction. Standing
-on a level floor: its four feet say where up is in the trunk's frame, and the IMU says where it thinks it is. As the weight
-pulls along what the IMU calls down, both are found in turn until they agree. An IMU that is turned about the vertical axis
-shows in neither.
+Suspended robot, joints moving slowly to and fro: the torque that holds a leg against gravity is a
+known function of the joint angles, so the measured torques determine the encoder zeros. Friction
+changes its sign with the direction of motion and is fitted, too.
+
+Standing robot on a level floor: the four feet give the vertical in the trunk frame, and the IMU
+gives its own vertical. The gravity model needs the IMU, and the feet need the zeros, so both fits
+alternate until they agree. A rotation of the IMU about the vertical axis is not observable.
 """
 
 from __future__ import annotations
@@ -22,27 +24,33 @@ from quadvel_description.state import RobotState
 
 from .calibration import Calibration
 
-MOVING = 0.05  # rad/s, from which on a joint's friction points against its motion
-STILL = 0.1  # rad/s, up to which a robot that stands counts as standing still
-LEVEL = 0.02  # m, that the feet may be off one plane
-SAMPLES = 10000  # of a hung robot, that are enough
-LEAST = 100  # of either
-ROUNDS = 6  # of finding one with the other: four hips that are off alike look much like an IMU that leans
-NOISE = 0.25  # N m, of a measured torque
-USUAL = 0.035  # rad, two degrees, that encoders are off as a rule
-SCALE = 0.1  # by which measured torques may be too large or too small as a whole
-TURN = 30  # states before and after a joint turns round: there it is accelerated, and torque is more than weight and friction
+MIN_MOVING_SPEED = 0.05  # rad/s, above which friction opposes the motion
+MAX_STANDING_SPEED = 0.1  # rad/s, largest joint speed of a robot that stands still
+MAX_ROWS = 10000  # states of a suspended robot that are used
+MIN_ROWS = 100  # states needed of either record
+ALTERNATIONS = 6  # equal offsets of four hips resemble a tilted IMU, so the fits converge slowly
+TORQUE_NOISE_NM = 0.25  # standard deviation of a measured torque
+ZERO_PRIOR_RAD = 0.035  # (2 deg), prior standard deviation of an encoder zero
+TORQUE_SCALE_PRIOR = 0.1  # prior standard deviation of the scale of measured torques
+REVERSAL_MARGIN = 30  # states around a reversal to leave out: the joint accelerates there
 UP = np.array([0.0, 0.0, 1.0])
 Array = NDArray[np.float64]
 
 
-class NotFound(ValueError):
-    """Why a recording tells nothing, in one sentence."""
+class CalibrationDataError(ValueError):
+    """A recording cannot be used for calibration; the text is the reason, in one sentence."""
 
 
 @attrs.frozen(eq=False)
-class Found:
-    """The calibration; standard errors (12,) rad of its zeros, nan where they were not looked for; feet off their plane, m."""
+class CalibrationFit:
+    """Result of a calibration.
+
+    Attributes:
+        calibration: The calibration.
+        zero_errors: Standard errors of the joint zeros, (12,), rad; NaN if they were not fitted.
+        unevenness: Largest distance of a foot from the plane of the feet, m; NaN without a standing
+            record.
+    """
 
     calibration: Calibration
     zero_errors: Array
@@ -51,7 +59,14 @@ class Found:
 
 @attrs.frozen(eq=False)
 class Samples:
-    """Rows of states: q, dq, tau (n, 12), quaternion (n, 4)."""
+    """States as arrays.
+
+    Attributes:
+        q: Joint angles, (n, 12), rad.
+        dq: Joint speeds, (n, 12), rad/s.
+        tau: Joint torques, (n, 12), N m.
+        quaternion: Orientation (w, x, y, z), (n, 4).
+    """
 
     q: Array
     dq: Array
@@ -59,38 +74,71 @@ class Samples:
     quaternion: Array
 
     @classmethod
-    def of(cls, states: Iterable[RobotState]) -> Samples:
-        """From states. Raises NotFound where there are too few."""
+    def from_states(cls, states: Iterable[RobotState]) -> Samples:
+        """Collect states.
+
+        Args:
+            states: Measured states.
+
+        Returns:
+            Their arrays.
+
+        Raises:
+            CalibrationDataError: There are fewer than MIN_ROWS states.
+        """
         rows = [(state.q, state.dq, state.tau, state.quaternion) for state in states]
-        if len(rows) < LEAST:
-            raise NotFound(f"{len(rows)} states, expected {LEAST} at least")
+        if len(rows) < MIN_ROWS:
+            raise CalibrationDataError(f"{len(rows)} states, expected {MIN_ROWS} at least")
         return cls(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def find(hung: Samples | None, standing: Samples | None) -> Found:
-    """What the recordings tell; where there is none of a kind, what it would tell is taken to be right. Raises NotFound."""
+def fit_calibration(suspended: Samples | None, standing: Samples | None) -> CalibrationFit:
+    """Fit the calibration to the records; parameters without a record keep zero offset.
+
+    Args:
+        suspended: States of a suspended robot that moves its joints slowly; None if there are none.
+        standing: States of a robot that stands on a level floor; None if there are none.
+
+    Returns:
+        The calibration and its quality.
+
+    Raises:
+        CalibrationDataError: A joint does not move in both directions, or a standing robot moves.
+    """
     calibration, errors, unevenness = Calibration(), np.full(12, np.nan), float("nan")
-    if hung is not None:
-        _check_hung(hung)
+    if suspended is not None:
+        _check_suspended(suspended)
     if standing is not None:
         _check_standing(standing)
-    for _ in range(ROUNDS):
+    for _ in range(ALTERNATIONS):
         if standing is not None:
             mounting, unevenness = _imu_mounting(standing, calibration)
             calibration = attrs.evolve(calibration, imu_mounting=mounting)
-        if hung is not None:
-            zeros, errors = _joint_zeros(hung, calibration)
+        if suspended is not None:
+            zeros, errors = _joint_zeros(suspended, calibration)
             calibration = attrs.evolve(calibration, joint_zeros=zeros)
-    return Found(calibration, errors, unevenness)
+    return CalibrationFit(calibration, errors, unevenness)
 
 
 def holding_torque(q: Array, down: Array) -> Array:
-    """Torque (n, 12) N m that holds legs in the air at q (n, 12) rad; down: (n, 3), where the weight pulls, trunk frame."""
+    """Compute the joint torques that hold legs in the air against gravity.
+
+        tau_j = -a_j . sum over bodies b beyond j of (c_b - p_j) x (m_b g e_down)
+
+    with joint axis a_j, joint position p_j, and centre of mass c_b.
+
+    Args:
+        q: Joint angles, (n, 12), rad.
+        down: Direction of gravity in the trunk frame, unit vectors, (n, 3).
+
+    Returns:
+        Torques, (n, 12), N m.
+    """
     return np.hstack([_leg_torque(q[:, 3 * leg : 3 * leg + 3], down, leg) for leg in range(4)])
 
 
 def _leg_torque(q: Array, down: Array, leg: int) -> Array:
-    """The same for one leg, (n, 3)."""
+    """Return the holding torque of one leg, (n, 3), N m."""
     (joints, centres), axes, masses = _leg_masses(q, robot.LEGS[leg])
     torque = np.zeros_like(q)
     for joint in range(3):
@@ -101,23 +149,25 @@ def _leg_torque(q: Array, down: Array, leg: int) -> Array:
 
 
 def _leg_masses(q: Array, leg: str) -> tuple[tuple[list[Array], list[Array]], list[Array], list[float]]:
-    """Joints' and bodies' places (n, 3) m, joint axes (n, 3) and the bodies' masses (kg) of a leg, trunk frame."""
-    place, turn = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
+    """Return joint positions and centres of mass (n, 3) m, joint axes (n, 3) and masses (kg) of a
+    leg, trunk frame.
+    """
+    position, rotation = np.zeros((len(q), 3)), np.broadcast_to(np.eye(3), (len(q), 3, 3))
     joints, centres, axes, masses = [], [], [], []
     for k, kind in enumerate(robot.KINDS):
         link = next(link for link in robot.LINKS if link.name == f"{leg}_{kind}")
         body = robot.lumped(link.name)
-        place = place + turn @ np.array(link.origin)
-        turn = turn @ _turned(q[:, k], 0 if link.axis == "x" else 1)
-        joints.append(place)
-        axes.append(turn[:, :, 0 if link.axis == "x" else 1])
-        centres.append(place + turn @ np.array(body.com))
+        position = position + rotation @ np.array(link.origin)
+        rotation = rotation @ _rotation_about(q[:, k], 0 if link.axis == "x" else 1)
+        joints.append(position)
+        axes.append(rotation[:, :, 0 if link.axis == "x" else 1])
+        centres.append(position + rotation @ np.array(body.com))
         masses.append(float(body.mass))
     return (joints, centres), axes, masses
 
 
-def _turned(angle: Array, axis: int) -> Array:
-    """Rotation matrices (n, 3, 3) about x (0) or y (1)."""
+def _rotation_about(angle: Array, axis: int) -> Array:
+    """Return the rotation matrices (n, 3, 3) about x (0) or y (1)."""
     matrices = np.zeros((len(angle), 3, 3))
     a, b = [i for i in range(3) if i != axis]
     sign = 1.0 if axis == 0 else -1.0
@@ -127,26 +177,56 @@ def _turned(angle: Array, axis: int) -> Array:
     return matrices
 
 
-def _joint_zeros(hung: Samples, calibration: Calibration) -> tuple[Array, Array]:
-    """The encoders' zeros and their standard errors, (12,) rad each, with the IMU as `calibration` has it."""
-    down = rotate(calibration.mounting, rotate_inverse(hung.quaternion, -UP))
-    legs = [_leg_zeros(hung, down, leg, calibration.joint_zeros) for leg in range(4)]
+def _joint_zeros(suspended: Samples, calibration: Calibration) -> tuple[Array, Array]:
+    """Return the encoder zeros and their standard errors, (12,) rad each, for the IMU tilt of
+    `calibration`.
+    """
+    down = rotate(calibration.mounting, rotate_inverse(suspended.quaternion, -UP))
+    legs = [_leg_zeros(suspended, down, leg, calibration.joint_zeros) for leg in range(4)]
     zeros, errors = np.array(legs).transpose(1, 0, 2).reshape(2, 12)
     return zeros, errors
 
 
-def _leg_zeros(hung: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
-    """The same for the joints of one leg, (3,) each. down: (n, 3), where the weight pulls, trunk frame."""
+def _leg_zeros(suspended: Samples, down: Array, leg: int, start: Array) -> tuple[Array, Array]:
+    """Return zeros and standard errors of one leg, (3,) rad each.
+
+    Least squares over the zeros z, torque scales k, Coulomb friction c and viscous friction d of
+    three joints:
+
+        tau = k tau_hold(q - z) + c sign(dq) + d dq
+
+    weighted by TORQUE_NOISE_NM, with priors k = 1 +- TORQUE_SCALE_PRIOR and z = 0 +-
+    ZERO_PRIOR_RAD. The covariance is s^2 (J^T J)^-1 with the residual variance s^2, at least 1.
+
+    Args:
+        suspended: States of a suspended robot.
+        down: Direction of gravity in the trunk frame, (n, 3).
+        leg: Index of the leg.
+        start: Initial zeros, (12,), rad.
+    """
     joints = slice(3 * leg, 3 * leg + 3)
-    steady = np.flatnonzero(_is_steady(hung.dq[:, joints]))
-    rows = steady[:: max(1, len(steady) // SAMPLES)]
-    q, dq, tau, down = hung.q[rows, joints], hung.dq[rows, joints], hung.tau[rows, joints], down[rows]
+    steady = np.flatnonzero(_is_steady(suspended.dq[:, joints]))
+    rows = steady[:: max(1, len(steady) // MAX_ROWS)]
+    q, dq, tau, down = (
+        suspended.q[rows, joints],
+        suspended.dq[rows, joints],
+        suspended.tau[rows, joints],
+        down[rows],
+    )
 
     def residuals(x: Array) -> Array:
-        """Of zeros, torque scales, dry and viscous friction, (3,) each."""
+        """Return the weighted residuals for zeros, torque scales, Coulomb and viscous friction,
+        (3,) each.
+        """
         zeros, scale, dry, viscous = x.reshape(4, 3)
         model = scale * _leg_torque(q - zeros, down, leg) + dry * np.sign(dq) + viscous * dq
-        return np.concatenate([((tau - model) / NOISE).ravel(), (scale - 1.0) / SCALE, zeros / USUAL])
+        return np.concatenate(
+            [
+                ((tau - model) / TORQUE_NOISE_NM).ravel(),
+                (scale - 1.0) / TORQUE_SCALE_PRIOR,
+                zeros / ZERO_PRIOR_RAD,
+            ]
+        )
 
     guess = np.concatenate([start[joints], np.ones(3), robot.FRICTION[joints], robot.DAMPING[joints]])
     fit = least_squares(residuals, guess, x_scale=np.repeat([0.1, 0.1, 0.5, 0.5], 3))
@@ -156,42 +236,52 @@ def _leg_zeros(hung: Samples, down: Array, leg: int, start: Array) -> tuple[Arra
 
 
 def _is_steady(dq: Array) -> NDArray[np.bool_]:
-    """Which rows of joint speeds (n, 3) have each joint under way, and not turning round a little before or after."""
-    under_way = np.abs(dq) > MOVING
+    """Return the rows of joint speeds (n, 3) in which all joints move, and none reverses nearby,
+    (n,).
+    """
+    under_way = np.abs(dq) > MIN_MOVING_SPEED
     same = np.sign(dq[1:]) == np.sign(dq[:-1])
     steady: NDArray[np.bool_] = np.all(under_way, axis=1)
     steady = np.logical_and(steady, np.append(True, same.all(axis=1)))
-    around = np.convolve(np.logical_not(steady), np.ones(2 * TURN + 1), mode="same")
+    around = np.convolve(np.logical_not(steady), np.ones(2 * REVERSAL_MARGIN + 1), mode="same")
     return np.asarray(around < 0.5)
 
 
 def _imu_mounting(standing: Samples, calibration: Calibration) -> tuple[Array, float]:
-    """How the IMU leans (2,) rad, and how far the feet are off one plane, m, with the zeros as `calibration` has them."""
+    """Return the tilt of the IMU, (2,) rad, and the largest distance of a foot from their plane, m.
+
+    The tilt is the rotation from the vertical that the IMU shows to the normal of the plane of the
+    feet (the singular vector of the smallest singular value of the centred foot positions).
+    """
     feet = foot_positions(standing.q - calibration.joint_zeros).mean(axis=0)
     centred = feet - feet.mean(axis=0)
     normal = np.linalg.svd(centred)[2][2]
     normal = normal * np.sign(normal[2])
-    shown = rotate_inverse(standing.quaternion, UP).mean(axis=0)
-    shown = shown / np.linalg.norm(shown)
-    turn = np.cross(shown, normal)
-    size = float(np.linalg.norm(turn))
-    angle = np.arctan2(size, shown @ normal)
-    return turn[:2] * (angle / size if size > 0.0 else 1.0), float(np.abs(centred @ normal).max())
+    imu_up = rotate_inverse(standing.quaternion, UP).mean(axis=0)
+    imu_up = imu_up / np.linalg.norm(imu_up)
+    rotation = np.cross(imu_up, normal)
+    sine = float(np.linalg.norm(rotation))
+    angle = np.arctan2(sine, imu_up @ normal)
+    return rotation[:2] * (angle / sine if sine > 0.0 else 1.0), float(np.abs(centred @ normal).max())
 
 
-def _check_hung(hung: Samples) -> None:
-    """Raises NotFound where a joint does not move both ways."""
+def _check_suspended(suspended: Samples) -> None:
+    """Raise CalibrationDataError if a joint does not move in both directions."""
     for i, name in enumerate(robot.JOINT_NAMES):
-        moving = hung.dq[:, i]
-        if min((moving > MOVING).sum(), (moving < -MOVING).sum()) < LEAST // 2:
-            raise NotFound(f"{name} hardly moves to and fro; record quadvel excite creep with the robot hung")
+        moving = suspended.dq[:, i]
+        if min((moving > MIN_MOVING_SPEED).sum(), (moving < -MIN_MOVING_SPEED).sum()) < MIN_ROWS // 2:
+            raise CalibrationDataError(
+                f"{name} hardly moves to and fro; record quadvel excite creep with the robot hung"
+            )
 
 
 def _check_standing(standing: Samples) -> None:
-    """Raises NotFound where a robot moves, or its feet are on no plane."""
+    """Raise CalibrationDataError if the robot moves or does not stand on straight enough legs."""
     speed = float(np.abs(standing.dq.mean(axis=0)).max()), float(np.median(np.abs(standing.dq)))
-    if max(speed) > STILL:
-        raise NotFound(f"the joints move at {max(speed):.2f} rad/s, expected a robot that stands still")
+    if max(speed) > MAX_STANDING_SPEED:
+        raise CalibrationDataError(
+            f"the joints move at {max(speed):.2f} rad/s, expected a robot that stands still"
+        )
     bent = standing.q.mean(axis=0).reshape(4, 3)[:, 2]
     if (bent < -2.2).any():
-        raise NotFound(f"a knee is bent by {bent.min():.2f} rad, expected a robot that stands")
+        raise CalibrationDataError(f"a knee is bent by {bent.min():.2f} rad, expected a robot that stands")

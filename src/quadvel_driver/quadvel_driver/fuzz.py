@@ -1,10 +1,13 @@
-"""Throws datagrams at the decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For developers.
+"""Fuzzer of the packet decoders: `python -m quadvel_driver.fuzz --datagrams 10000000`. For
+developers.
 
-Each datagram is made of bytes that a fuzzer chooses: raw ones, whole packets with bytes changed, and packets whose CRC was
-made to fit what was changed, so that the fields behind it are reached. A decoder may give a record or raise WireError, and
-nothing else. What it accepts must carry the right CRC, by a computation of its own here, and hold finite numbers.
+A fuzzer chooses bytes, from which three kinds of datagrams are made: raw bytes, packets with
+changed bytes, and packets with changed bytes and a valid CRC, which reach the checks of the fields.
+A decoder must return a record or raise WireError. A packet that it accepts must have the right CRC,
+by an independent computation, and finite numbers.
 
-With atheris (pip install -e ".[fuzz]") the bytes are chosen by what code they reach; without, at random from a seed.
+With atheris (pip install -e ".[fuzz]"), code coverage guides the bytes; without it, they are
+random.
 """
 
 from __future__ import annotations
@@ -22,14 +25,14 @@ import numpy as np
 
 from quadvel_description.state import JointCommand, RobotState
 
-RAW, CHANGED, SEALED = range(3)
-HEADER = 2  # bytes that say what kind of datagram the others make, and of which packet
-CHANGE = 3  # bytes a change: two for where, one for what
-LONGEST = 1000  # bytes, longer than any packet
+RAW, CHANGED, VALID_CRC = range(3)
+HEADER_BYTES = 2  # bytes that select the kind of datagram and the packet
+CHANGE_BYTES = 3  # bytes per change: two for the position, one for the value
+MAX_BYTES = 1000  # bytes, longer than any packet
 
 
-def _tables() -> list[int]:
-    """What each byte does to the CRC."""
+def _crc_table() -> list[int]:
+    """Return the CRC update of each byte value, (256,)."""
     table = []
     for byte in range(256):
         value = byte << 24
@@ -39,20 +42,27 @@ def _tables() -> list[int]:
     return table
 
 
-TABLE = _tables()
+CRC_TABLE = _crc_table()
 
 
-def own_crc(data: bytes) -> int:
-    """The CRC of whole 4-byte words, byte by byte; computed otherwise than in `wire`."""
+def reference_crc(data: bytes) -> int:
+    """Compute the CRC of whole 4-byte words byte by byte, independently of `wire.crc`.
+
+    Args:
+        data: The bytes.
+
+    Returns:
+        The CRC.
+    """
     value = 0xFFFFFFFF
     for start in range(0, len(data), 4):
         for byte in data[start + 3 : start - 1 if start else None : -1]:
-            value = value << 8 & 0xFFFFFFFF ^ TABLE[value >> 24 ^ byte]
+            value = value << 8 & 0xFFFFFFFF ^ CRC_TABLE[value >> 24 ^ byte]
     return value
 
 
 def _state(wire: Any) -> Any:
-    """A robot that stands, as the board may report it."""
+    """Return the board state of a standing robot."""
     robot = RobotState(
         *(
             0.0,
@@ -68,8 +78,12 @@ def _state(wire: Any) -> Any:
     return wire.BoardState(robot, twelve, 0 * twelve, 3 * twelve, 40, wire.Remote(wire.Button.L1, lx=0.5))
 
 
-class Target:
-    """Both decoders, and what became of the datagrams: `counts`."""
+class FuzzTarget:
+    """Both decoders under test.
+
+    Attributes:
+        counts: Number of datagrams, accepted and refused.
+    """
 
     def __init__(self, wire: Any) -> None:
         self._wire = wire
@@ -78,23 +92,37 @@ class Target:
         self._decoders = wire.decode_command, wire.decode_state
         self.counts: Counter[str] = Counter()
 
-    def datagram(self, chosen: bytes) -> bytes:
-        """The datagram that the fuzzer's bytes stand for."""
-        kind, which = (*chosen[:HEADER], 0, 0)[:2]
-        rest = chosen[HEADER:]
+    def make_datagram(self, chosen: bytes) -> bytes:
+        """Build a datagram from the bytes of the fuzzer.
+
+        Args:
+            chosen: Bytes that the fuzzer chose.
+
+        Returns:
+            The datagram.
+        """
+        kind, which = (*chosen[:HEADER_BYTES], 0, 0)[:2]
+        rest = chosen[HEADER_BYTES:]
         if kind % 3 == RAW:
             return rest
         packet = bytearray(self._packets[which % 2])
-        for i in range(0, len(rest) - CHANGE + 1, CHANGE):
+        for i in range(0, len(rest) - CHANGE_BYTES + 1, CHANGE_BYTES):
             place = int.from_bytes(rest[i : i + 2], "little") % len(packet)
             packet[place] = rest[i + 2]
-        if kind % 3 == SEALED:
-            packet[-4:] = own_crc(bytes(packet[: _covered(packet)])).to_bytes(4, "little")
+        if kind % 3 == VALID_CRC:
+            packet[-4:] = reference_crc(bytes(packet[: _crc_length(packet)])).to_bytes(4, "little")
         return bytes(packet)
 
     def __call__(self, chosen: bytes) -> None:
-        """One datagram through both decoders. Raises AssertionError, or what a decoder must not raise."""
-        data = self.datagram(chosen)
+        """Decode one datagram with both decoders.
+
+        Args:
+            chosen: Bytes that the fuzzer chose.
+
+        Raises:
+            AssertionError: A decoder accepted a wrong CRC or a number that is not finite.
+        """
+        data = self.make_datagram(chosen)
         for decode in self._decoders:
             try:
                 record = decode(data)
@@ -102,7 +130,7 @@ class Target:
                 self.counts["refused"] += 1
                 continue
             self.counts["accepted"] += 1
-            assert int.from_bytes(data[-4:], "little") == own_crc(data[: _covered(data)]), (
+            assert int.from_bytes(data[-4:], "little") == reference_crc(data[: _crc_length(data)]), (
                 "a wrong CRC was accepted"
             )
             robot = getattr(record, "robot", record)
@@ -112,20 +140,30 @@ class Target:
         self.counts["datagrams"] += 1
 
 
-def _covered(packet: bytes | bytearray) -> int:
+def _crc_length(packet: bytes | bytearray) -> int:
     return len(packet) // 4 * 4 - 4
 
 
-def at_random(target: Target, datagrams: int, seed: int = 0) -> None:
-    """Bytes without guidance: few of them mostly, as most that matters is a packet with little changed."""
+def fuzz_at_random(target: FuzzTarget, datagrams: int, seed: int = 0) -> None:
+    """Run random datagrams; most are packets with few changes, which reach most of the code.
+
+    Args:
+        target: The decoders.
+        datagrams: Number of datagrams.
+        seed: Seed of the random numbers.
+    """
     rng = random.Random(seed)
     for _ in range(datagrams):
-        length = rng.randrange(LONGEST) if rng.random() < 0.05 else HEADER + CHANGE * rng.randrange(5)
+        length = (
+            rng.randrange(MAX_BYTES)
+            if rng.random() < 0.05
+            else HEADER_BYTES + CHANGE_BYTES * rng.randrange(5)
+        )
         target(rng.randbytes(length))
 
 
 def main() -> None:
-    """Entry point. Exit code 0 where no datagram did any harm."""
+    """Run the fuzzer; exit code 0 means that no decoder failed."""
     parser = argparse.ArgumentParser(prog="python -m quadvel_driver.fuzz", description=__doc__)
     parser.add_argument("--datagrams", type=int, default=1_000_000, help="how many; a million by default")
     parser.add_argument("--seed", type=int, default=1, help="of what is tried")
@@ -137,7 +175,7 @@ def main() -> None:
         watched = atheris.instrument_imports(include=["quadvel_driver.wire"])
     with watched:
         from quadvel_driver import wire
-    target, start = Target(wire), time.monotonic()
+    target, start = FuzzTarget(wire), time.monotonic()
 
     def say() -> None:
         elapsed = time.monotonic() - start
@@ -147,7 +185,7 @@ def main() -> None:
         )
 
     if not guided:
-        at_random(target, arguments.datagrams, arguments.seed)
+        fuzz_at_random(target, arguments.datagrams, arguments.seed)
         say()
         return
 
@@ -159,7 +197,7 @@ def main() -> None:
     options = [
         f"-runs={arguments.datagrams}",
         f"-seed={arguments.seed}",
-        f"-max_len={LONGEST}",
+        f"-max_len={MAX_BYTES}",
         "-verbosity=0",
     ]
     atheris.Setup([sys.argv[0], *options], one)

@@ -1,4 +1,4 @@
-"""How robot and link do, in one sentence that a person can act on, and in figures. No ROS."""
+"""Health of robot and link: one sentence for the operator, and values for /diagnostics. No ROS."""
 
 from __future__ import annotations
 
@@ -9,83 +9,109 @@ import numpy as np
 
 from quadvel_description.robot import JOINT_NAMES
 
-from .link import SILENCE, LinkReport
-from .remote import BUTTONS, Order
+from .link import SILENCE_LIMIT_S, LinkReport
+from .remote import BUTTONS, OperatorCommand
 from .wire import BoardState
 
-HOT = 70  # deg C, of a motor; the board's own limit is not published
-DROPPED_OUT = 8  # motor mode of one that the board has switched off
+HOT_MOTOR_C = 70  # deg C, warning limit; the limit of the board is not published
+MOTOR_DROPPED_OUT = 8  # mode of a motor that the board has switched off
 BAD_DATAGRAMS = ("wrong_length", "wrong_crc", "unusable", "from_others")
 
 
 class Level(IntEnum):
-    """As in diagnostic_msgs/DiagnosticStatus."""
+    """Levels of diagnostic_msgs/DiagnosticStatus."""
 
     OK = 0
     WARN = 1
     ERROR = 2
 
 
-Problem = tuple[Level, str]
+Status = tuple[Level, str]
 
 
 class Health:
-    """Judges one link from report to report. board: its address and port, for people."""
+    """Assesses one link from report to report."""
 
     def __init__(self, board: str) -> None:
+        """Create the assessment of a link.
+
+        Args:
+            board: Address and port of the board, for messages.
+        """
         self._board = board
         self._before: dict[str, int] = {}
 
-    def judge(self, report: LinkReport, newest: BoardState | None, stopped: bool) -> Problem:
-        """The worst there is to say. newest: the last state, if there was one. stopped: by the operator."""
-        problems = [*self._of_link(report), *_of_motors(newest, report), *_of_operator(stopped)]
-        self._before = report.counts
-        said = "commands are followed" if report.commanded else "no low_cmd: the joints are damped"
-        return max(problems, key=lambda problem: problem[0], default=(Level.OK, said))
+    def assess(self, report: LinkReport, newest: BoardState | None, stopped: bool) -> Status:
+        """Return the most severe problem of robot and link.
 
-    def _of_link(self, report: LinkReport) -> Iterator[Problem]:
+        Args:
+            report: The report of the link.
+            newest: The newest state, None before the first one.
+            stopped: Whether the operator stopped the robot by the remote.
+
+        Returns:
+            Level and sentence; OK if there is no problem.
+        """
+        problems = [
+            *self._link_problems(report),
+            *_motor_problems(newest, report),
+            *_operator_problems(stopped),
+        ]
+        self._before = report.counts
+        healthy = "commands are followed" if report.commanded else "no low_cmd: the joints are damped"
+        return max(problems, key=lambda problem: problem[0], default=(Level.OK, healthy))
+
+    def _link_problems(self, report: LinkReport) -> Iterator[Status]:
         new = {name: count - self._before.get(name, 0) for name, count in report.counts.items()}
-        why = report.last_refusal if any(new[name] for name in BAD_DATAGRAMS) else ""
+        refusal = report.last_refusal if any(new[name] for name in BAD_DATAGRAMS) else ""
         if report.counter_rate is not None:
             rate = f"{report.counter_rate:.0f} a second"
             yield Level.ERROR, f"the counter of {self._board} runs at {rate}, expected some 1000 or 1000000"
-        elif report.silence > SILENCE:
+        elif report.silence > SILENCE_LIMIT_S:
             since = "yet" if report.silence == float("inf") else f"for {report.silence:.1f} s"
             network = report.last_error if new["network_errors"] else ""
             frozen = "its tick stands still" if new["repeated"] > new["states"] else ""
             reason = (
-                why
+                refusal
                 or frozen
                 or network
                 or "is the robot on and in low-level mode, and is this the right network?"
             )
             yield Level.ERROR, f"no state from {self._board} {since}: {reason}"
-        elif why:
+        elif refusal:
             bad = sum(new[name] for name in BAD_DATAGRAMS)
-            yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {why}"
+            yield Level.WARN, f"{bad} datagrams dropped in the last second, the last: {refusal}"
         if new["command_timeouts"]:
             yield Level.WARN, "low_cmd stopped: the joints were damped"
 
 
-def _of_motors(newest: BoardState | None, report: LinkReport) -> Iterator[Problem]:
-    if newest is None or report.silence > SILENCE:
+def _motor_problems(newest: BoardState | None, report: LinkReport) -> Iterator[Status]:
+    if newest is None or report.silence > SILENCE_LIMIT_S:
         return
-    for i in np.flatnonzero(newest.motor_mode == DROPPED_OUT):
-        error = f"mode {DROPPED_OUT}, error {newest.motor_error[i]}"
+    for i in np.flatnonzero(newest.motor_mode == MOTOR_DROPPED_OUT):
+        error = f"mode {MOTOR_DROPPED_OUT}, error {newest.motor_error[i]}"
         yield Level.ERROR, f"{JOINT_NAMES[i]} has dropped out ({error}): stop the robot and let it cool down"
     hottest = int(np.argmax(newest.temperature))
-    if newest.temperature[hottest] >= HOT:
+    if newest.temperature[hottest] >= HOT_MOTOR_C:
         yield Level.WARN, f"{JOINT_NAMES[hottest]} is at {newest.temperature[hottest]} deg C: let it rest"
 
 
-def _of_operator(stopped: bool) -> Iterator[Problem]:
+def _operator_problems(stopped: bool) -> Iterator[Status]:
     if stopped:
-        release = " + ".join(str(button.name) for button in BUTTONS[Order.RELEASE])
+        release = " + ".join(str(button.name) for button in BUTTONS[OperatorCommand.RELEASE])
         yield Level.WARN, f"stopped by the remote; {release} release it"
 
 
-def figures(report: LinkReport, newest: BoardState | None) -> dict[str, object]:
-    """All there is to know, by name, for /diagnostics."""
+def diagnostic_values(report: LinkReport, newest: BoardState | None) -> dict[str, object]:
+    """Return all values for /diagnostics.
+
+    Args:
+        report: The report of the link.
+        newest: The newest state, None before the first one.
+
+    Returns:
+        Values by name.
+    """
     values: dict[str, object] = {
         "state_rate_hz": f"{report.state_rate:.0f}",
         "send_rate_hz": f"{report.send_rate:.0f}",

@@ -1,8 +1,9 @@
-"""The link to the robot's board over UDP: commands out without a gap, the newest state in. No ROS.
+"""UDP link to the robot's board: sends commands without a gap and receives the newest state. No
+ROS.
 
-The link has a thread of its own (`run`). It hands on each new state, and sends: a command at once when it is given, and the
-last one again and again in between, so that a lost packet costs two milliseconds. Where commands stop, where the operator
-stopped the robot, and at the end it brakes: it sends damping. The board brakes by itself where packets stop.
+The link runs in its own thread (`run`). It sends each command immediately and repeats the last one
+every 2 ms, so a lost packet costs 2 ms. It sends damping if commands stop, if the operator stops
+the robot, and at the end. The board itself brakes if packets stop.
 """
 
 from __future__ import annotations
@@ -29,28 +30,41 @@ from .board_clock import BoardClock
 from .calibration import Calibration
 from .wire import BoardState, WireError
 
-SEND_PERIOD = 0.002  # s, between two packets at most, as Unitree's examples have it
-FAREWELL = 10  # packets of damping at the end: some may be lost
-MAX_AGE = 100  # ms, of the state that a command answers
-MAX_DATAGRAMS = 256  # taken in at once, so that a flood does not keep the link from sending
-SILENCE = 0.1  # s without a new state, after which the board counts as silent
-_WRAP = 2**32
+SEND_PERIOD_S = 0.002  # longest time between two packets, as in Unitree's examples
+SHUTDOWN_PACKETS = 10  # number of damping packets at the end; some may be lost
+MAX_COMMAND_AGE_MS = 100  # largest age of the state that a command answers
+MAX_DATAGRAMS = 256  # received per turn, so that a flood cannot block sending
+SILENCE_LIMIT_S = 0.1  # time without a new state after which the board counts as silent
+_TICK_MODULUS = 2**32
 
 
 NO_CALIBRATION = Calibration()
 
 
 class LinkError(ValueError):
-    """Why there can be no link, in one sentence."""
+    """A link cannot be opened; the text is the reason, in one sentence."""
 
 
 def _setting(default: Any, description: str, *validators: Any) -> Any:
     return attrs.field(default=default, validator=list(validators), metadata={"description": description})
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class LinkConfig:
-    """Where the board is, and when to brake. Raises ValueError where a number can't be."""
+    """Network addresses and braking of the link.
+
+    Attributes:
+        board_address: IP address of the board.
+        board_port: UDP port of the board.
+        local_address: Local IP address; empty for any.
+        local_port: Local UDP port; 0 for any free one.
+        interface: Network interface to use exclusively; empty for any.
+        command_timeout: Time without a command after which the link brakes, s.
+        damping_kd: Damping gain of braking, N m s/rad.
+
+    Raises:
+        ValueError: A number is out of range; raised by the constructor.
+    """
 
     board_address: str = _setting("192.168.123.10", "IP address of the robot's board")
     board_port: int = _setting(8007, "UDP port of the board", ge(1), le(65535))
@@ -72,25 +86,33 @@ class LinkConfig:
 
 @attrs.frozen
 class LinkReport:
-    """How the link does: rates (1/s) and silence (s) now, counts since the start."""
+    """Status of the link.
+
+    Attributes:
+        state_rate: States per second since the last report.
+        send_rate: Sent packets per second since the last report.
+        silence: Time since the last new state, s; inf before the first one.
+        commanded: Whether the board receives commands, not the link's own damping.
+        tick_unit: Unit of the board's counter, "ms" or "us"; "" until it is known.
+        counter_rate: Counts per second if they match neither unit, else None.
+        counts: Events since the start, see COUNTER_NAMES.
+        last_refusal: Why the last refused datagram was not used.
+        last_error: The last network error.
+    """
 
     state_rate: float
     send_rate: float
-    silence: float  # s since the last new state, inf before the first
-    commanded: bool  # whether the board gets commands that came in, and not the link's own damping
-    tick_unit: str  # in which the board counts: "ms", "us", or "" as long as it is not known
-    counter_rate: float | None  # counts a second, where they fit neither
+    silence: float
+    commanded: bool
+    tick_unit: str
+    counter_rate: float | None
     counts: dict[str, int]
-    last_refusal: str  # why the last datagram was not used
-    last_error: str  # what the network said last
+    last_refusal: str
+    last_error: str
 
 
 class UdpLink:
-    """One board. `on_state` is called in the link's thread with each new state, its `time` (s) on `clock`, its `tick` in ms.
-
-    calibration: of this robot; states and commands are set right by it. endpoint: in place of a socket to the board. Raises
-    LinkError where there can be none. All methods but `run` may be called from any thread.
-    """
+    """UDP link to one board. All methods except `run` and `serve` may be called from any thread."""
 
     def __init__(
         self,
@@ -100,73 +122,103 @@ class UdpLink:
         endpoint: socket.socket | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Open a link.
+
+        Args:
+            config: Addresses and braking.
+            on_state: Called in the link's thread with each new state; `time` (s) is on `clock`,
+                `tick` in ms.
+            calibration: Calibration of this robot, which corrects states and commands.
+            endpoint: A socket that replaces the connection to the board.
+            clock: A monotonic clock, s.
+
+        Raises:
+            LinkError: The socket cannot be opened.
+        """
         self._config = config
         self._on_state = on_state
         self._calibration = calibration
         self._clock = clock
-        self._socket = endpoint or _connected(config)
+        self._socket = endpoint or _connect(config)
         self._board_clock = BoardClock()
-        self._lock = threading.Lock()  # around what follows
-        self._damping = self._packed(JointCommand.damping(config.damping_kd))
+        self._lock = threading.Lock()  # guards the attributes below
+        self._damping = self._encode(JointCommand.damping(config.damping_kd))
         self._packet, self._mode = self._damping, MODE_DAMPING
         self._commanded_at = -math.inf
-        self._braked = self._stopped = self._in_command = False
+        self._is_braked = self._is_stopped = self._was_fresh = False
         self._send_next = -math.inf
         self._tick = 0
-        self._heard_at = -math.inf
+        self._last_state_at = -math.inf
         self._counts: Counter[str] = Counter()
         self._last_refusal = self._last_error = ""
         self._reported_at, self._reported = clock(), Counter[str]()
 
     @property
     def local_port(self) -> int:
-        """The own UDP port."""
+        """Local UDP port."""
         return int(self._socket.getsockname()[1])
 
     def run(self) -> None:
-        """Send and receive until `stop`; then brake the robot and close the socket."""
+        """Send and receive until `stop`, then brake the robot and close the socket."""
         try:
-            while not self._stopped:
-                select.select([self._socket], [], [], self._until_sending())
+            while not self._is_stopped:
+                select.select([self._socket], [], [], self._time_until_sending())
                 self.serve()
-            self._say_farewell()
+            self._send_shutdown_packets()
         finally:
             self._socket.close()
 
     def serve(self) -> None:
-        """One turn of `run`: take in what has come, and send if it is time. For those that have a clock of their own."""
+        """Receive pending datagrams and send if due; for callers with a clock of their own instead
+        of `run`.
+        """
         self._receive()
-        self._repeat()
+        self._send_if_due()
 
     def stop(self) -> None:
-        """End `run`."""
-        self._stopped = True
+        """Make `run` return."""
+        self._is_stopped = True
 
     def submit(self, command: JointCommand) -> None:
-        """Send a command and hold it. ValueError says why it is refused: not finite, too old, or of an unknown mode."""
+        """Send a command now and repeat it until the next one.
+
+        Args:
+            command: The joint command; its `tick` is that of the state it answers.
+
+        Raises:
+            ValueError: The command is not finite, too old, or of an unknown mode.
+        """
         self._check_age(command.tick)
-        packet = self._packed(command)
+        packet = self._encode(command)
         with self._lock:
             self._packet, self._mode, self._commanded_at = packet, command.mode, self._clock()
-            if not self._braked:
+            if not self._is_braked:
                 self._send(packet)
 
     def brake(self) -> None:
-        """Brake the joints from now on, whatever is commanded, until `release`."""
+        """Brake the joints and ignore commands until `release`."""
         with self._lock:
-            self._braked = True
+            self._is_braked = True
             self._send(self._damping)
 
     def release(self) -> str:
-        """Follow commands again, if they damp: a robot must not jump. Why not, in one sentence, or ""."""
+        """Follow commands again, unless a fresh command drives the joints: the robot could jump.
+
+        Returns:
+            "" if released, else the reason in one sentence.
+        """
         with self._lock:
             if self._is_fresh() and self._mode != MODE_DAMPING:
                 return "the controller still drives the joints; it has to be passive first"
-            self._braked = False
+            self._is_braked = False
             return ""
 
     def report(self) -> LinkReport:
-        """How it did since the last report."""
+        """Report the status since the last report.
+
+        Returns:
+            Rates since the last report, counts since the start.
+        """
         with self._lock:
             now = self._clock()
             board = self._board_clock
@@ -178,11 +230,11 @@ class UdpLink:
             return LinkReport(
                 state_rate=rates["states"],
                 send_rate=rates["sent"],
-                silence=now - self._heard_at,
-                commanded=self._is_fresh() and not self._braked,
+                silence=now - self._last_state_at,
+                commanded=self._is_fresh() and not self._is_braked,
                 tick_unit="" if board.unit is None else {1e-3: "ms", 1e-6: "us"}[board.unit],
                 counter_rate=board.rate,
-                counts={name: counts[name] for name in COUNTED},
+                counts={name: counts[name] for name in COUNTER_NAMES},
                 last_refusal=self._last_refusal,
                 last_error=self._last_error,
             )
@@ -190,7 +242,7 @@ class UdpLink:
     # Receiving.
 
     def _receive(self) -> None:
-        """Take in all that has come, and hand on the newest."""
+        """Receive all pending datagrams and call `on_state` with the newest state."""
         newest = None
         for datagram in self._datagrams():
             state = self._accept(datagram)
@@ -200,37 +252,37 @@ class UdpLink:
                 self._count("superseded")
             newest = state
         if newest is not None:
-            self._tick, self._heard_at = newest.robot.tick, self._clock()
+            self._tick, self._last_state_at = newest.robot.tick, self._clock()
             self._count("states")
             self._on_state(newest)
 
     def _datagrams(self) -> list[bytes]:
-        """What the board sent since the last time."""
+        """Return the pending datagrams of the board."""
         datagrams = []
         for _ in range(MAX_DATAGRAMS):
             try:
                 data, sender = self._socket.recvfrom(65536)
             except BlockingIOError:
                 break
-            except OSError as error:  # the board's machine has no such port, or the network is down
+            except OSError as error:  # no such port on the board, or the network is down
                 self._note_error(error)
                 continue
             if sender == self._socket.getpeername():
                 datagrams.append(data)
-            else:  # it came between binding and connecting; later ones the kernel keeps away
+            else:  # arrived between bind and connect; afterwards the kernel filters these
                 self._count("from_others")
         return datagrams
 
     def _accept(self, datagram: bytes) -> BoardState | None:
-        """The state in a datagram if it is fit for use and newer than those before."""
+        """Return the state of a datagram, or None if it is unusable or not newer."""
         try:
             state = wire.decode_state(datagram)
-            _check(state.robot)
+            _check_plausible(state.robot)
         except WireError as error:
-            self._count({wire.LENGTH: "wrong_length", wire.CRC: "wrong_crc"}.get(error.about, "unusable"))
+            self._count({wire.LENGTH: "wrong_length", wire.CRC: "wrong_crc"}.get(error.kind, "unusable"))
             self._last_refusal = str(error)
             return None
-        instant = self._board_clock.follow(state.robot.tick, self._clock())
+        instant = self._board_clock.update(state.robot.tick, self._clock())
         if instant is None:
             return None
         state.robot = attrs.evolve(self._calibration.apply(state.robot), time=instant.time, tick=instant.tick)
@@ -240,30 +292,32 @@ class UdpLink:
         with self._lock:
             self._counts[name] += 1
 
-    def _packed(self, command: JointCommand) -> bytes:
-        return wire.encode_command(self._calibration.invert(for_the_board(command)))
+    def _encode(self, command: JointCommand) -> bytes:
+        return wire.encode_command(self._calibration.invert(clamp_for_board(command)))
 
-    # Sending; with the lock held.
+    # Sending. Except for `_send_if_due`, `_note_error` and `_send_shutdown_packets`, the caller locks.
 
-    def _until_sending(self) -> float:
-        return min(max(self._send_next - self._clock(), 0.0), SEND_PERIOD)
+    def _time_until_sending(self) -> float:
+        return min(max(self._send_next - self._clock(), 0.0), SEND_PERIOD_S)
 
-    def _repeat(self) -> None:
-        """Send what the joints are to do once more, if it is time."""
+    def _send_if_due(self) -> None:
+        """Repeat the present command if SEND_PERIOD_S has passed; send damping without a fresh
+        command.
+        """
         with self._lock:
             if self._clock() < self._send_next:
                 return
             fresh = self._is_fresh()
-            if self._in_command and not fresh:
+            if self._was_fresh and not fresh:
                 self._counts["command_timeouts"] += 1
-            self._in_command = fresh
-            self._send(self._packet if fresh and not self._braked else self._damping)
+            self._was_fresh = fresh
+            self._send(self._packet if fresh and not self._is_braked else self._damping)
 
     def _is_fresh(self) -> bool:
         return self._clock() - self._commanded_at <= self._config.command_timeout
 
     def _send(self, packet: bytes) -> None:
-        self._send_next = self._clock() + SEND_PERIOD
+        self._send_next = self._clock() + SEND_PERIOD_S
         try:
             self._socket.send(packet)
             self._counts["sent"] += 1
@@ -271,11 +325,11 @@ class UdpLink:
             self._counts["network_errors"] += 1
             self._last_error = str(error)
 
-    def _say_farewell(self) -> None:
-        for _ in range(FAREWELL):
+    def _send_shutdown_packets(self) -> None:
+        for _ in range(SHUTDOWN_PACKETS):
             with self._lock:
                 self._send(self._damping)
-            time.sleep(SEND_PERIOD)
+            time.sleep(SEND_PERIOD_S)
 
     def _note_error(self, error: OSError) -> None:
         with self._lock:
@@ -283,17 +337,19 @@ class UdpLink:
             self._last_error = str(error)
 
     def _check_age(self, tick: int) -> None:
-        """Raises ValueError where a command answers a state that is to come, or one of long ago."""
-        if self._heard_at == -math.inf:  # it answers somebody else's, in a dry run beside a simulator
+        """Raise ValueError if a command answers a future state or one that is too old."""
+        if self._last_state_at == -math.inf:  # in a dry run, the command answers a simulator
             return
-        age = (self._tick - tick + _WRAP // 2) % _WRAP - _WRAP // 2  # ms
+        age = (self._tick - tick + _TICK_MODULUS // 2) % _TICK_MODULUS - _TICK_MODULUS // 2  # ms
         if age < 0:
             raise ValueError(f"it answers tick {tick}, which is to come: the newest is {self._tick}")
-        if age > MAX_AGE:
-            raise ValueError(f"it answers tick {tick}, {age} ms ago: expected at most {MAX_AGE} ms")
+        if age > MAX_COMMAND_AGE_MS:
+            raise ValueError(
+                f"it answers tick {tick}, {age} ms ago: expected at most {MAX_COMMAND_AGE_MS} ms"
+            )
 
 
-COUNTED = (
+COUNTER_NAMES = (
     *(
         "states",
         "sent",
@@ -307,15 +363,28 @@ COUNTED = (
     ),
     *("command_timeouts", "board_restarts", "network_errors"),
 )
-"""What a report counts: states handed on, packets sent, states that newer ones overtook, that came twice, that came after
-newer ones; datagrams of a wrong length, with a wrong CRC, with unusable content, from somebody else; how often commands
-stopped; how often the board began to count anew; errors that the network told."""
+"""Counts of a report, since the start.
+
+states: passed to `on_state`; sent: packets; superseded: states replaced by a newer one in the same
+    turn;
+repeated, late: see `BoardClock`; wrong_length, wrong_crc, unusable, from_others: refused datagrams;
+command_timeouts: times that commands stopped; board_restarts: restarts of the board's counter;
+network_errors: errors of the socket.
+"""
 
 
-def for_the_board(command: JointCommand) -> JointCommand:
-    """What the board is sent for a command: within the robot's limits, and braking in so many words.
+def clamp_for_board(command: JointCommand) -> JointCommand:
+    """Clamp a command to the limits of the robot, and replace damping mode by a servo without
+    stiffness.
 
-    In mode 0 a board brakes as it likes; a servo without stiffness brakes with the gain that was asked for.
+    The board does not define the damping of mode 0, so braking is sent as mode 10 with kp = 0 and
+    the requested kd.
+
+    Args:
+        command: The joint command.
+
+    Returns:
+        The command to encode.
     """
     braking = command.mode == MODE_DAMPING
     return JointCommand(
@@ -331,8 +400,10 @@ def for_the_board(command: JointCommand) -> JointCommand:
     )
 
 
-def _check(robot: RobotState) -> None:
-    """Raises WireError where a state is well formed but says nothing, as those of a board that has not started."""
+def _check_plausible(robot: RobotState) -> None:
+    """Raise WireError if a well-formed state has no meaning, such as one of a board that has not
+    started.
+    """
     if robot.tick == 0:
         raise WireError("state: tick is 0, expected a counter that runs: the board has not started")
     length = math.hypot(*robot.quaternion.tolist())
@@ -341,8 +412,8 @@ def _check(robot: RobotState) -> None:
         raise WireError(f"state: quaternion has length {length:.3g}, expected 1{zeros}")
 
 
-def _connected(config: LinkConfig) -> socket.socket:
-    """A socket that only the board can reach. Raises LinkError."""
+def _connect(config: LinkConfig) -> socket.socket:
+    """Return a socket connected to the board; raise LinkError on failure."""
     endpoint = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     local = config.local_address, config.local_port
     try:

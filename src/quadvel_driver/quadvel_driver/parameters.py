@@ -1,4 +1,4 @@
-"""The parameters of the node `driver`. Knows no ROS."""
+"""Parameters of the node `driver`. Knows no ROS."""
 
 from __future__ import annotations
 
@@ -10,12 +10,18 @@ from .calibration import Calibration
 from .link import NO_CALIBRATION, LinkConfig
 from .remote import RemoteConfig
 
-FASTEST = 1000  # Hz, of a board's states
+MAX_STATE_RATE_HZ = 1000  # rate of the board
 
 
 @attrs.frozen(kw_only=True)
 class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
-    """Those of link, remote and scheduling, and what the node adds to them."""
+    """Parameters of link, remote and scheduling, and of the node itself.
+
+    Attributes:
+        state_rate: Rate of low_state, Hz.
+        calibration: Calibration file of this robot; empty for none.
+        dry_run: Whether to show packets instead of sending them.
+    """
 
     state_rate: int = attrs.field(
         default=200,
@@ -31,9 +37,16 @@ class DriverParameters(LinkConfig, RemoteConfig, Scheduling):
 
     @state_rate.validator
     def _is_rate(self, attribute: object, value: int) -> None:
-        if not 50 <= value <= FASTEST:
-            raise ValueError(f"state_rate is {value} Hz, expected 50 to {FASTEST}")
+        if not 50 <= value <= MAX_STATE_RATE_HZ:
+            raise ValueError(f"state_rate is {value} Hz, expected 50 to {MAX_STATE_RATE_HZ}")
 
-    def correction(self) -> Calibration:
-        """What states and commands are set right by. CalibrationError names the file that is none."""
+    def load_calibration(self) -> Calibration:
+        """Load the calibration of the robot.
+
+        Returns:
+            The calibration; zero offsets if no file is set.
+
+        Raises:
+            CalibrationError: The file is not a calibration.
+        """
         return Calibration.load(self.calibration) if self.calibration else NO_CALIBRATION

@@ -1,13 +1,14 @@
-"""What the operator wants, told from the wireless remote: a velocity, orders, and a stop that stays. No ROS.
+"""Commands of the operator from the wireless remote: a velocity, button commands, and a latched
+stop. No ROS.
 
-    B                      stop: the joints are damped at once and stay so
+    B                      stop: the joints are damped until the stop is released
     L1 + R1 + start        release the stop
     L1 + up, L1 + down     stand up, lie down
     L1 + right, L1 + left  allow walking, forbid it
     left stick             forward and sideways
     right stick            turn
 
-An order is given when its last button goes down. While the robot is stopped nothing counts but the release.
+A command is given when its last button goes down. A stopped robot accepts only the release.
 """
 
 from __future__ import annotations
@@ -21,11 +22,11 @@ from numpy.typing import NDArray
 
 from .wire import Button, Remote
 
-AFTERGLOW = 0.5  # s of zeros once the sticks are let go; then whoever else commands has its turn
+ZERO_VELOCITY_S = 0.5  # zero velocity after the sticks are released; then other sources take over
 
 
-class Order(Enum):
-    """What buttons ask for, in words that are shown to people."""
+class OperatorCommand(Enum):
+    """Commands that the buttons give, with the texts shown to the operator."""
 
     STOP = "stop"
     RELEASE = "release the stop"
@@ -36,25 +37,33 @@ class Order(Enum):
 
 
 BUTTONS = {
-    Order.STOP: Button.B,
-    Order.RELEASE: Button.L1 | Button.R1 | Button.START,
-    Order.STAND_UP: Button.L1 | Button.UP,
-    Order.LIE_DOWN: Button.L1 | Button.DOWN,
-    Order.ALLOW_WALKING: Button.L1 | Button.RIGHT,
-    Order.FORBID_WALKING: Button.L1 | Button.LEFT,
+    OperatorCommand.STOP: Button.B,
+    OperatorCommand.RELEASE: Button.L1 | Button.R1 | Button.START,
+    OperatorCommand.STAND_UP: Button.L1 | Button.UP,
+    OperatorCommand.LIE_DOWN: Button.L1 | Button.DOWN,
+    OperatorCommand.ALLOW_WALKING: Button.L1 | Button.RIGHT,
+    OperatorCommand.FORBID_WALKING: Button.L1 | Button.LEFT,
 }
-"""What must be held down for each; the first that fits counts."""
+"""Buttons of each command; the first match counts."""
 
 
 def _setting(default: Any, description: str) -> Any:
     return attrs.field(default=default, metadata={"description": description})
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class RemoteConfig:
-    """How sticks become velocities. Raises ValueError where a number can't be."""
+    """Conversion of stick positions to velocities.
 
-    stick_dead_zone: float = _setting(0.08, "share of a stick's way, 0 to 1, that counts as let go")
+    Attributes:
+        stick_dead_zone: Share of the stick range, 0 to 1, that counts as released.
+        stick_velocity: Velocity at full stick: forward, sideways (m/s), turning (rad/s).
+
+    Raises:
+        ValueError: A value is out of range; raised by the constructor.
+    """
+
+    stick_dead_zone: float = _setting(0.08, "share of a stick's range, 0 to 1, that counts as released")
     stick_velocity: tuple[float, ...] = _setting(
         (0.8, 0.4, 0.8), "velocity at full stick: forward, sideways, turning, m/s, rad/s"
     )
@@ -71,7 +80,11 @@ class RemoteConfig:
 
 
 class RemotePilot:
-    """Follows one remote. stopped: whether the robot has to stay braked; whoever releases it sets it back."""
+    """Interprets one remote.
+
+    Attributes:
+        stopped: Whether the robot must stay braked; the caller resets it after a release.
+    """
 
     def __init__(self, config: RemoteConfig = RemoteConfig()) -> None:
         self._config = config
@@ -80,10 +93,20 @@ class RemotePilot:
         self._moved_at: float | None = None
         self.stopped = False
 
-    def follow(self, remote: Remote, now: float) -> Order | None:
-        """Take what is held down now; the order that was given with it. now: s."""
+    def update(self, remote: Remote, now: float) -> OperatorCommand | None:
+        """Process the present buttons and sticks.
+
+        Args:
+            remote: State of the remote.
+            now: Time, s.
+
+        Returns:
+            The command that was given now, or None.
+        """
         sticks = np.array([remote.ly, -remote.lx, -remote.rx])
-        self._sticks = np.array(self._config.stick_velocity) * _beyond(sticks, self._config.stick_dead_zone)
+        self._sticks = np.array(self._config.stick_velocity) * _apply_dead_zone(
+            sticks, self._config.stick_dead_zone
+        )
         if self._sticks.any():
             self._moved_at = now
         before, self._buttons = self._buttons, remote.buttons
@@ -92,20 +115,28 @@ class RemotePilot:
         )
         if order is None or before & BUTTONS[order] == BUTTONS[order]:
             return None
-        if order is Order.STOP:
+        if order is OperatorCommand.STOP:
             self.stopped = True
             return order
-        return order if self.stopped == (order is Order.RELEASE) else None
+        return order if self.stopped == (order is OperatorCommand.RELEASE) else None
 
     def velocity(self, now: float) -> NDArray[np.float64] | None:
-        """vx, vy (m/s), wz (rad/s); None where the sticks have been let go for a while, or the robot is stopped."""
-        if self.stopped or self._moved_at is None or now - self._moved_at > AFTERGLOW:
+        """Return the velocity that the sticks command.
+
+        Args:
+            now: Time, s.
+
+        Returns:
+            vx, vy (m/s) and wz (rad/s), (3,); None if the sticks are released for ZERO_VELOCITY_S
+            or the robot is stopped.
+        """
+        if self.stopped or self._moved_at is None or now - self._moved_at > ZERO_VELOCITY_S:
             return None
         return self._sticks.copy()
 
 
-def _beyond(sticks: NDArray[np.float64], dead_zone: float) -> NDArray[np.float64]:
-    """Sticks held to -1..1, less the dead zone, growing from 0 at its edge to 1 at the stop."""
-    way = np.clip(np.abs(sticks), 0.0, 1.0) - dead_zone
-    share: NDArray[np.float64] = np.sign(sticks) * np.maximum(way, 0.0) / (1.0 - dead_zone)
+def _apply_dead_zone(sticks: NDArray[np.float64], dead_zone: float) -> NDArray[np.float64]:
+    """Clip sticks to -1..1 and remove the dead zone d: sign(s) max(|s| - d, 0) / (1 - d)."""
+    deflection = np.clip(np.abs(sticks), 0.0, 1.0) - dead_zone
+    share: NDArray[np.float64] = np.sign(sticks) * np.maximum(deflection, 0.0) / (1.0 - dead_zone)
     return share

@@ -1,10 +1,12 @@
-"""The packets between a PC and the AlienGo's board, byte for byte: a command of 610 bytes, a state of 771.
+"""Encoding and decoding of the packets of the AlienGo's board: commands (610 bytes) and states (771
+bytes).
 
-These are the formats of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and newer). Bytes in,
-plain records out, and back; sockets and time are `link`'s matter.
+The formats are those of Unitree's SDK for the AlienGo from 3.2 to 3.8.4 (firmware 0.1.35 and
+newer). The functions convert bytes to plain records and back; `link` handles sockets and time.
 
-A packet is accepted only whole. Its CRC covers whole 4-byte words from the start and leaves out what is over, the end of
-the field `reserve` in front of it; these bytes have to be zero here, as the SDK sends them, so that no flipped bit passes.
+Only whole packets are accepted. The CRC covers whole 4-byte words from the start; the remaining
+bytes, at the end of the field `reserve`, are not covered. They must be zero, as the SDK sends them,
+so that no flipped bit passes.
 """
 
 from __future__ import annotations
@@ -23,8 +25,8 @@ from quadvel_description.robot import JOINT_NAMES, LEGS
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 
 JOINTS = len(JOINT_NAMES)
-LOW_LEVEL = 0xFF  # levelFlag of a command that is for the joints
-POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq with which a board leaves that term of its law out
+LOW_LEVEL = 0xFF  # levelFlag of a joint command
+POSITION_OFF, VELOCITY_OFF = 2.146e9, 16000.0  # q and dq that disable the stiffness or damping term
 
 _HEADER = [
     ("level_flag", "u1"),
@@ -56,8 +58,8 @@ _IMU = [
     *(("quaternion", "<f4", 4), ("angular_velocity", "<f4", 3), ("linear_acceleration", "<f4", 3)),
     *(("rpy", "<f4", 3), ("imu_temperature", "i1")),
 ]
-_IMU_OFFSET, _IMU_NUMBERS = 10, 10  # bytes, and the numbers of a state that are used: all but rpy
-_SLOTS = 20  # of motors in a packet, of which the AlienGo uses the first twelve
+_IMU_OFFSET, _IMU_NUMBERS = 10, 10  # byte offset, and count of the IMU numbers before rpy
+_SLOTS = 20  # motors in a packet; the AlienGo uses the first twelve
 _COMMAND: Final = np.dtype([*_HEADER, ("motors", _MOTOR_COMMAND, _SLOTS), ("led", "V12"), *_TAIL])
 _STATE: Final = np.dtype(
     [
@@ -82,23 +84,25 @@ OTHER_FORMATS = {
     730: "the command as the SDK's programs hold it",
     891: "the state as the SDK's programs hold it",
 }
-"""Packets of other robots and versions, by their length."""
+"""Packets of other robots and versions, by length."""
 
-# Counts for one N m, N m/rad, N m s/rad; what a count can't hold is cut off towards zero, as the SDK does.
-_TAU, _KP, _KD = 256.0, 32.0, 16.0
-_SCALES = np.array([[_TAU], [_KP], [_KD]], np.float32)
-_COUNTS = 2**15  # that a field holds, and one less upwards: beyond that it would wrap
-# Of q, dq, tau, kp, kd. No joint goes to 100 rad or 1000 rad/s, and it is far from what switches a term off.
-_LOW = np.array([[-100.0], [-1000.0], [-_COUNTS / _TAU], [0.0], [0.0]])
-_HIGH = np.array([[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU, _KP, _KD))])
-_LAW = ("q", "dq", "tau", "kp", "kd")
-_LARGEST = float(np.finfo(np.float32).max)
+# Counts per N m, N m/rad, N m s/rad. Fractions of a count are truncated towards zero, as in the SDK.
+_TAU_COUNTS_PER_NM, _KP, _KD = 256.0, 32.0, 16.0
+_SCALES = np.array([[_TAU_COUNTS_PER_NM], [_KP], [_KD]], np.float32)
+_COUNTS = 2**15  # range of an int16 field: -2^15 to 2^15 - 1
+# Bounds of q, dq, tau, kp, kd. No joint reaches 100 rad or 1000 rad/s, and POSITION_OFF is far away.
+_COMMAND_MIN = np.array([[-100.0], [-1000.0], [-_COUNTS / _TAU_COUNTS_PER_NM], [0.0], [0.0]])
+_COMMAND_MAX = np.array(
+    [[100.0], [1000.0], *([(_COUNTS - 1) / scale] for scale in (_TAU_COUNTS_PER_NM, _KP, _KD))]
+)
+_COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
+_FLOAT32_MAX = float(np.finfo(np.float32).max)
 _STATE_LENGTHS = {
     **dict.fromkeys(("q", "dq", "tau"), JOINTS),
     **{"quaternion": 4, "angular_velocity": 3, "linear_acceleration": 3, "foot_force": 4},
 }
-# Where each field's numbers are, all of them side by side.
-_STATE_PLACES = {
+# Slice of each field in the concatenated numbers.
+_STATE_SLICES = {
     field: slice(end - length, end)
     for (field, length), end in zip(_STATE_LENGTHS.items(), accumulate(_STATE_LENGTHS.values()), strict=True)
 }
@@ -111,18 +115,20 @@ LENGTH, CRC, CONTENT = "length", "CRC", "content"
 
 
 class WireError(ValueError):
-    """A packet that must not be used, or a record that can't be sent; the text says what was found and expected.
+    """A packet must not be used, or a record cannot be sent; the text names the value found and
+    expected.
 
-    about: what is wrong: LENGTH, CRC or CONTENT.
+    Attributes:
+        kind: LENGTH, CRC or CONTENT.
     """
 
-    def __init__(self, text: str, about: str = CONTENT) -> None:
+    def __init__(self, text: str, kind: str = CONTENT) -> None:
         super().__init__(text)
-        self.about = about
+        self.kind = kind
 
 
 class Button(IntFlag):
-    """The buttons of the wireless remote, as their bits come."""
+    """Buttons of the wireless remote, as bits of the packet."""
 
     R1, L1, START, SELECT = 0x0001, 0x0002, 0x0004, 0x0008
     R2, L2, F1, F2 = 0x0010, 0x0020, 0x0040, 0x0080
@@ -132,7 +138,15 @@ class Button(IntFlag):
 
 @attrs.frozen
 class Remote:
-    """What the operator holds down. Sticks go from -1 to 1, x to the right, y forward; one that is off reads zero."""
+    """State of the wireless remote.
+
+    Attributes:
+        buttons: Pressed buttons.
+        lx: Left stick to the right, -1 to 1.
+        ly: Left stick forward, -1 to 1.
+        rx: Right stick to the right, -1 to 1.
+        ry: Right stick forward, -1 to 1. All sticks are 0 if the remote is off.
+    """
 
     buttons: Button = Button(0)
     lx: float = 0.0
@@ -143,11 +157,16 @@ class Remote:
 
 @attrs.define
 class BoardState:
-    """One state as the board sends it.
+    """State as the board sends it.
 
-    robot: its `tick` is the board's own counter, in whatever unit; its `time` is 0, as the board knows no time; its
-    `foot_force` are the sensors' raw counts. motor_mode: (12,), 10 driven, 0 braking, 8 dropped out. motor_error: (12,), 0
-    where all is well. temperature: (12,) deg C, imu_temperature: deg C.
+    Attributes:
+        robot: State of the robot; `tick` is the board's counter in its own unit, `time` is 0, and
+            `foot_force` holds raw sensor counts.
+        motor_mode: (12,), 10 driven, 0 braking, 8 dropped out.
+        motor_error: Error codes, (12,), 0 for none.
+        temperature: Motor temperatures, (12,), deg C.
+        imu_temperature: deg C.
+        remote: State of the wireless remote.
     """
 
     robot: RobotState
@@ -159,46 +178,74 @@ class BoardState:
 
 
 def crc(data: bytes) -> int:
-    """The board's CRC of whole 4-byte words: CRC-32/MPEG-2 over little-endian words, the highest bit first."""
+    """Compute the CRC of the board: CRC-32/MPEG-2 over little-endian 4-byte words, highest bit
+    first.
+
+    Args:
+        data: Whole words.
+
+    Returns:
+        The CRC.
+    """
+    # zlib computes the reflected CRC-32 (polynomial 0x04C11DB7). Reversing the bits of input bytes and
+    # result gives the CRC without reflection; MPEG-2 has no final inversion.
     words = np.frombuffer(data, "<u4").byteswap().tobytes()
     reflected = zlib.crc32(words.translate(_BITS_REVERSED)) ^ 0xFFFFFFFF
     return int.from_bytes(reflected.to_bytes(4, "little").translate(_BITS_REVERSED), "big")
 
 
 def encode_command(command: JointCommand) -> bytes:
-    """The packet of a command; its `tick` has no place there.
+    """Encode a joint command; its `tick` is not part of the packet.
 
-    What a field can't hold is clamped (the fixed-point fields would wrap: 200 N m would become -56), gains below zero to
-    zero. Raises WireError where a number is not finite or the mode is unknown.
+    Values are clamped to the range of their fields, because fixed-point fields would wrap (200 N m
+    would become -56); negative gains become zero.
+
+    Args:
+        command: Angles rad, speeds rad/s, torques N m, gains N m/rad and N m s/rad, each (12,).
+
+    Returns:
+        The packet, COMMAND_BYTES long.
+
+    Raises:
+        WireError: A number is not finite, or the mode is unknown.
     """
     if command.mode not in (MODE_DAMPING, MODE_SERVO):
         raise WireError(f"command: mode is {command.mode}, expected {MODE_DAMPING} or {MODE_SERVO}")
     numbers = np.array((command.q, command.dq, command.tau, command.kp, command.kd), float)
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise _not_finite("command", dict(zip(_LAW, numbers, strict=True)))
-    numbers = np.minimum(np.maximum(numbers, _LOW), _HIGH).astype(np.float32)
+        raise _not_finite("command", dict(zip(_COMMAND_FIELDS, numbers, strict=True)))
+    numbers = np.minimum(np.maximum(numbers, _COMMAND_MIN), _COMMAND_MAX).astype(np.float32)
     packet = np.zeros(1, _COMMAND)
     packet["level_flag"] = LOW_LEVEL
     motors = packet["motors"][0, :JOINTS]
     motors["mode"] = command.mode
     motors["q"], motors["dq"] = numbers[:2]
     motors["tau"], motors["kp"], motors["kd"] = (numbers[2:] * _SCALES).astype(np.int16)
-    return _sealed(packet)
+    return _pack(packet)
 
 
 def decode_command(data: bytes) -> JointCommand:
-    """The command in a packet. Raises WireError.
+    """Decode a command packet.
 
-    Its mode is damping where all motors are asked for that; of several, one that brakes has neither stiffness nor target speed nor
-    torque. `commanded_modes` has the mode of each.
+    The mode of the command is damping if all motors are in damping mode. If only some are, those
+    have zero stiffness, target speed and torque; `commanded_modes` returns the mode of each.
+
+    Args:
+        data: The packet.
+
+    Returns:
+        The joint command.
+
+    Raises:
+        WireError: The packet is not a valid command.
     """
-    packet = _opened(data, "command", _COMMAND)
+    packet = _unpack(data, "command", _COMMAND)
     if packet["level_flag"] != LOW_LEVEL:
         found = f"0x{packet['level_flag']:02X}"
         raise WireError(f"command: levelFlag is {found}, expected 0x{LOW_LEVEL:02X}: the low level")
     motors = packet["motors"][:JOINTS]
     numbers = np.concatenate((motors["q"], motors["dq"]))
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of some of these
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
         raise _not_finite("command", {"q": motors["q"], "dq": motors["dq"]})
     q, dq = numbers.astype(float).reshape(2, JOINTS)
     no_position, no_velocity = q >= POSITION_OFF, dq >= VELOCITY_OFF
@@ -207,7 +254,7 @@ def decode_command(data: bytes) -> JointCommand:
     return JointCommand(
         q=np.where(no_position, 0.0, q),
         dq=np.where(no_velocity | brakes, 0.0, dq),
-        tau=np.where(brakes, 0.0, motors["tau"] / _TAU),
+        tau=np.where(brakes, 0.0, motors["tau"] / _TAU_COUNTS_PER_NM),
         kp=np.where(no_position | brakes, 0.0, motors["kp"] / _KP),
         kd=np.where(no_velocity, 0.0, motors["kd"] / _KD),
         mode=mode,
@@ -215,49 +262,79 @@ def decode_command(data: bytes) -> JointCommand:
 
 
 def commanded_modes(data: bytes) -> NDArray[np.uint8]:
-    """The mode (12,) that each motor is asked for in a packet that `decode_command` took."""
+    """Return the mode of each motor in a valid command packet.
+
+    Args:
+        data: A packet that `decode_command` accepts.
+
+    Returns:
+        Modes, (12,).
+    """
     return np.array(np.frombuffer(data, _COMMAND)[0]["motors"]["mode"][:JOINTS])
 
 
 def encode_state(state: BoardState) -> bytes:
-    """The packet of a state, clamped to what its fields hold. Raises WireError where a number is not finite.
+    """Encode a board state, with values clamped to the range of their fields.
 
-    Fields that hold the same in other words follow from it: roll, pitch and yaw, the raw angles and speeds, the estimated foot
-    forces. Accelerations stay 0.
+    Redundant fields are derived: roll, pitch and yaw, raw angles and speeds, estimated foot forces.
+    Joint accelerations are 0.
+
+    Args:
+        state: The state.
+
+    Returns:
+        The packet, STATE_BYTES long.
+
+    Raises:
+        WireError: A number is not finite.
     """
     robot = state.robot
-    numbers = np.concatenate([getattr(robot, field) for field in _STATE_PLACES])
+    numbers = np.concatenate([getattr(robot, field) for field in _STATE_SLICES])
     if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
-        raise _not_finite("state", {field: getattr(robot, field) for field in _STATE_PLACES})
-    numbers = np.minimum(np.maximum(numbers, -_LARGEST), _LARGEST)
-    held = {field: numbers[place] for field, place in _STATE_PLACES.items()}
+        raise _not_finite("state", {field: getattr(robot, field) for field in _STATE_SLICES})
+    numbers = np.minimum(np.maximum(numbers, -_FLOAT32_MAX), _FLOAT32_MAX)
+    clipped = {field: numbers[part] for field, part in _STATE_SLICES.items()}
     packet = np.zeros(1, _STATE)
     for field in ("quaternion", "angular_velocity", "linear_acceleration"):
-        packet[field] = held[field]
+        packet[field] = clipped[field]
     packet["level_flag"] = LOW_LEVEL
-    packet["rpy"] = _roll_pitch_yaw(held["quaternion"])
-    packet["foot_force"] = packet["foot_force_estimate"] = _counts(held["foot_force"])
+    packet["rpy"] = _roll_pitch_yaw(clipped["quaternion"])
+    packet["foot_force"] = packet["foot_force_estimate"] = _counts(clipped["foot_force"])
     packet["imu_temperature"] = state.imu_temperature
     packet["tick"] = robot.tick
     packet["remote"] = _remote_bytes(state.remote)
     motors = packet["motors"][0, :JOINTS]
-    motors["q_raw"], motors["dq_raw"] = held["q"], held["dq"]
-    motors["q"], motors["dq"], motors["tau"] = held["q"], held["dq"], _counts(_TAU * held["tau"])
+    motors["q_raw"], motors["dq_raw"] = clipped["q"], clipped["dq"]
+    motors["q"], motors["dq"], motors["tau"] = (
+        clipped["q"],
+        clipped["dq"],
+        _counts(_TAU_COUNTS_PER_NM * clipped["tau"]),
+    )
     motors["mode"], motors["error"], motors["temperature"] = (
         state.motor_mode,
         state.motor_error,
         state.temperature,
     )
-    return _sealed(packet)
+    return _pack(packet)
 
 
 def decode_state(data: bytes) -> BoardState:
-    """The state in a packet. Raises WireError."""
-    packet = _opened(data, "state", _STATE)
+    """Decode a state packet.
+
+    Args:
+        data: The packet.
+
+    Returns:
+        The state.
+
+    Raises:
+        WireError: The packet is not a valid state.
+    """
+    packet = _unpack(data, "state", _STATE)
     motors = packet["motors"][:JOINTS]
     imu = np.frombuffer(data, "<f4", _IMU_NUMBERS, offset=_IMU_OFFSET)
     numbers = np.concatenate((motors["q"], motors["dq"], imu))
-    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of some of these
+    if np.count_nonzero(np.isfinite(numbers)) < numbers.size:  # before the cast, which warns of NaN
         fields = ("quaternion", "angular_velocity", "linear_acceleration")
         found = {"q": motors["q"], "dq": motors["dq"], **{field: packet[field] for field in fields}}
         raise _not_finite("state", found)
@@ -268,7 +345,7 @@ def decode_state(data: bytes) -> BoardState:
         tick=int(packet["tick"]),
         q=numbers[:JOINTS],
         dq=numbers[JOINTS : 2 * JOINTS],
-        tau=motors["tau"] / _TAU,
+        tau=motors["tau"] / _TAU_COUNTS_PER_NM,
         quaternion=imu[:4],
         angular_velocity=imu[4:7],
         linear_acceleration=imu[7:],
@@ -284,16 +361,16 @@ def decode_state(data: bytes) -> BoardState:
     )
 
 
-def _opened(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
-    """The fields of a packet that is whole. Raises WireError."""
+def _unpack(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
+    """Return the fields of a packet with valid length and CRC; raise WireError otherwise."""
     if len(data) != layout.itemsize:
         other = OTHER_FORMATS.get(len(data))
         found = f"{len(data)} bytes" + (f", {other}" if other else "")
         raise WireError(f"{kind}: {found}, expected {layout.itemsize}", LENGTH)
-    covered, end = _covered(layout), layout.itemsize - 4
+    covered, end = _crc_length(layout), layout.itemsize - 4
     if any(data[covered:end]):
         raise WireError(
-            f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC leaves it out"
+            f"{kind}: reserve ends with {data[covered:end].hex()}, expected zeros: the CRC does not cover it"
         )
     found_crc, expected = int.from_bytes(data[end:], "little"), crc(data[:covered])
     if found_crc != expected:
@@ -302,19 +379,19 @@ def _opened(data: bytes, kind: str, layout: np.dtype[Any]) -> np.void:
     return packet
 
 
-def _sealed(packet: NDArray[np.void]) -> bytes:
-    """The bytes of one packet, with its CRC."""
-    packet["crc"] = crc(packet.tobytes()[: _covered(packet.dtype)])
+def _pack(packet: NDArray[np.void]) -> bytes:
+    """Return the bytes of one packet, with its CRC."""
+    packet["crc"] = crc(packet.tobytes()[: _crc_length(packet.dtype)])
     return packet.tobytes()
 
 
-def _covered(layout: np.dtype[Any]) -> int:
-    """How many bytes the CRC covers: whole words, but for the one that holds itself."""
+def _crc_length(layout: np.dtype[Any]) -> int:
+    """Return the number of bytes that the CRC covers: whole words without the CRC itself."""
     return (layout.itemsize // 4 - 1) * 4
 
 
 def _mode(modes: NDArray[np.uint8]) -> int:
-    """Servo where any motor is asked for it, else damping. Raises WireError where a motor is asked for anything else."""
+    """Return servo mode if any motor is in it, else damping; WireError for an unknown mode."""
     unknown = (modes != MODE_DAMPING) & (modes != MODE_SERVO)
     if unknown.any():
         i = int(np.argmax(unknown))
@@ -325,7 +402,9 @@ def _mode(modes: NDArray[np.uint8]) -> int:
 
 
 def _roll_pitch_yaw(quaternion: NDArray[np.float64]) -> tuple[float, float, float]:
-    """Angles (rad) about x, y and z, of turns about z, y and x in this order; zeros where there is no direction."""
+    """Return the angles (rad) of rotations about z, y, x in this order; zeros for a zero
+    quaternion.
+    """
     length = math.hypot(*quaternion.tolist())
     w, x, y, z = (quaternion / length).tolist() if length > 0.0 else (1.0, 0.0, 0.0, 0.0)
     return (
@@ -348,7 +427,9 @@ def _remote_bytes(remote: Remote) -> np.void:
 
 
 def _remote(data: bytes) -> Remote:
-    """The remote; its sticks have no part in what keeps a robot standing, so that no state is refused for them."""
+    """Decode the remote; non-finite sticks read as a remote that is off, as no state is refused for
+    them.
+    """
     fields = np.frombuffer(data, _REMOTE)[0]
     sticks = {stick: float(fields[stick]) for stick in ("lx", "ly", "rx", "ry")}
     if not np.isfinite(list(sticks.values())).all():
@@ -357,18 +438,18 @@ def _remote(data: bytes) -> Remote:
 
 
 def _not_finite(kind: str, numbers: dict[str, NDArray[np.float64]]) -> WireError:
-    """The error that names the first of these fields with a number that is not finite."""
+    """Return the error for the first field with a number that is not finite."""
     for field, values in numbers.items():
         for i, value in enumerate(values):
             if not np.isfinite(value):
                 return WireError(
-                    f"{kind}: {field} of {_place(field, i)} is {value}, expected a finite number"
+                    f"{kind}: {field} of {_location(field, i)} is {value}, expected a finite number"
                 )
     raise AssertionError("all are finite")
 
 
-def _place(field: str, i: int) -> str:
-    """What the i-th number of a field belongs to."""
+def _location(field: str, i: int) -> str:
+    """Return the name of the joint, foot or axis of the i-th number of a field."""
     if field == "foot_force":
         return f"the foot {LEGS[i]}"
     if field == "quaternion":

@@ -1,6 +1,6 @@
-"""The node `estimator`: low_state and low_cmd to velocity_estimate, odom and tf.
+"""The node `estimator`: converts low_state and low_cmd to velocity_estimate, odom and /tf.
 
-How velocity is estimated is `learned`'s and `kalman`'s matter, which states are fit for it `tracker`'s.
+`learned` and `kalman` estimate the velocity; `tracker` selects the states that they process.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from quadvel_msgs.msg import LowCmd, LowState
 from quadvel_nodes.diagnostics import QUIET, diagnostics
 from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_state
 from quadvel_nodes.node import read_parameters, run
-from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transforms
+from quadvel_nodes.robot_view import fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.stall_free_clock import StallFreeClock
 
@@ -38,12 +38,12 @@ from .learned import SHIPPED_MODEL, LearnedEstimator
 from .tracker import Estimate, Estimator, VelocityTracker
 
 KINDS = ("learned", "kalman")
-ODOM_EVERY = 4  # estimates, which makes 50 Hz
+ESTIMATES_PER_ODOMETRY = 4  # odometry at 50 Hz
 GYRO_VARIANCE = 1e-4  # (rad/s)^2, of the angular velocity that is passed on
 ORIENTATION_VARIANCE = 1e-4  # rad^2, of the orientation that is passed on
 HEIGHT_VARIANCE = 1e6
-"""m^2, of z in `odom`: so large that a filter which fuses it leaves z alone"""
-_ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # of x, y, z and the rotations about them
+"""m^2, of z in `odom`: so large that a filter which fuses `odom` ignores z."""
+_ANGULAR = np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])  # selects the rotations about x, y, z
 
 
 def _parameter(default: Any, description: str) -> Any:
@@ -52,11 +52,20 @@ def _parameter(default: Any, description: str) -> Any:
 
 @attrs.frozen
 class EstimatorParameters(Scheduling):
-    """The node's parameters."""
+    """Parameters of the node `estimator`.
+
+    Attributes:
+        kind: "learned" or "kalman".
+        model: ONNX file of the learned estimator; empty for the shipped one.
+        reset_gap: Time without a state after which the estimator is reset, s.
+        odom_frame: Parent frame of the odometry.
+        body_frame: Child frame of the odometry; velocities are in this frame.
+        publish_tf: Whether to publish transforms on /tf.
+    """
 
     kind: str = _parameter("learned", f"how velocity is estimated: {' or '.join(KINDS)}")
     model: str = _parameter("", "file of the learned estimator's network, ONNX; empty: the shipped one")
-    reset_gap: float = _parameter(0.1, "time without a state after which the estimator starts anew, s")
+    reset_gap: float = _parameter(0.1, "time without a state after which the estimator is reset, s")
     odom_frame: str = _parameter(ODOM, "frame of the odometry's pose")
     body_frame: str = _parameter(BASE, "frame of the velocities, the odometry's child")
     publish_tf: bool = _parameter(
@@ -70,14 +79,23 @@ class EstimatorParameters(Scheduling):
             raise ValueError(f"reset_gap is {self.reset_gap}, expected a time above 0 s")
 
     def make_estimator(self) -> Estimator:
-        """The estimator asked for. Raises NetworkFileError."""
+        """Create the estimator that `kind` names.
+
+        Returns:
+            The estimator.
+
+        Raises:
+            NetworkFileError: The file of the network is missing or does not fit.
+        """
         if self.kind == "kalman":
             return KalmanEstimator()
         return LearnedEstimator(Path(self.model) if self.model else SHIPPED_MODEL)
 
 
 class EstimatorNode(Node):
-    """Estimates in the callback of each state, so that the controller's next tick has the newest velocity."""
+    """Publishes an estimate from the callback of each state, before the next tick of the
+    controller.
+    """
 
     def __init__(self) -> None:
         super().__init__("estimator")
@@ -85,25 +103,29 @@ class EstimatorNode(Node):
         self._tracker = VelocityTracker(self._settings.make_estimator(), self._settings.reset_gap)
         self._robot_time = StallFreeClock()
         self._refusals = Refusals()
-        self._reported = _Report()
+        self._reported = _ReportedCounts()
         self._count = 0
-        self._busy = 0.0  # s spent on estimates
+        self._busy_s = 0.0  # computing time of all estimates
         self._velocity = self.create_publisher(TwistWithCovarianceStamped, "velocity_estimate", 10)
         self._odom = self.create_publisher(Odometry, "odom", 10)
         self._tf = self.create_publisher(TFMessage, "/tf", 100)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # The command first: where both wait, it is the answer to the state before the one that waits.
+        # Subscribe to the command first: if both are pending, the command answers the previous state.
         self.create_subscription(LowCmd, "low_cmd", self._on_command, qos_profile_sensor_data)
         self.create_subscription(LowState, "low_state", self._on_state, qos_profile_sensor_data)
         self.create_service(Trigger, "~/reset_odometry", self._on_reset_odometry)
         self.create_timer(1.0, self._report)
-        if not self.get_parameter("use_sim_time").value:  # where time waits for the node there is no hurry
+        if not self.get_parameter(
+            "use_sim_time"
+        ).value:  # simulated time waits for the node, so it needs no priority
             self._settings.apply(self.get_logger().warning)
-        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of an estimate
+        gc.freeze()  # exclude existing objects from garbage collection, which would delay an estimate
 
     def _on_command(self, message: Any) -> None:
         try:
-            self._tracker.command(features.previous_action(numbers(message, "q", 12), message.mode))
+            self._tracker.set_previous_action(
+                features.previous_action(numbers(message, "q", 12), message.mode)
+            )
         except MessageError as error:
             self._refusals.add("low_cmd", error)
 
@@ -111,8 +133,8 @@ class EstimatorNode(Node):
         start = perf_counter()
         try:
             state = read_low_state(message)
-            state.time = self._robot_time.follow(state.time, state.tick)
-            estimate = self._tracker.take(state)
+            state.time = self._robot_time.update(state.time, state.tick)
+            estimate = self._tracker.process(state)
         except (MessageError, FloatingPointError) as error:
             self._refusals.add("low_state", error)
             return
@@ -120,12 +142,12 @@ class EstimatorNode(Node):
             return
         self._publish_velocity(message.stamp, state, estimate)
         self._count += 1
-        self._busy += perf_counter() - start
-        if self._count % ODOM_EVERY == 0:
+        self._busy_s += perf_counter() - start
+        if self._count % ESTIMATES_PER_ODOMETRY == 0:
             self._publish_odometry(message.stamp, state, estimate)
 
     def _on_reset_odometry(self, request: Any, response: Any) -> Any:
-        self._tracker.start_again()
+        self._tracker.reset_position()
         response.success, response.message = True, "odometry starts at zero"
         self.get_logger().info(response.message)
         return response
@@ -138,7 +160,9 @@ class EstimatorNode(Node):
         self._velocity.publish(message)
 
     def _publish_odometry(self, stamp: Any, state: RobotState, estimate: Estimate) -> None:
-        """x and y by dead reckoning, orientation from the IMU. Height is not estimated: z is the trunk's above its lowest foot."""
+        """Publish x and y by dead reckoning and the orientation of the IMU; z is the height above
+        the lowest foot.
+        """
         floor = footprint(state.q, state.quaternion)
         position = np.array([*estimate.position[:2], -rotate(state.quaternion, floor.position)[2]])
         variances = np.array([*estimate.position_deviation[:2] ** 2, HEIGHT_VARIANCE])
@@ -154,15 +178,15 @@ class EstimatorNode(Node):
             frames = self._settings
             base = Placed(frames.odom_frame, frames.body_frame, position, state.quaternion)
             below = attrs.evolve(floor, parent=frames.body_frame)
-            self._tf.publish(TFMessage(transforms=transforms(stamp, [base, below])))
+            self._tf.publish(TFMessage(transforms=transform_messages(stamp, [base, below])))
 
     def _report(self) -> None:
-        """Once a second: how the last second went."""
+        """Publish /diagnostics about the last second."""
         count, refused = self._count - self._reported.count, self._refusals.total - self._reported.refused
-        busy = self._busy - self._reported.busy
-        self._reported = _Report(self._count, self._refusals.total, self._busy)
+        busy = self._busy_s - self._reported.busy
+        self._reported = _ReportedCounts(self._count, self._refusals.total, self._busy_s)
         if count == 0:
-            level, summary = DiagnosticStatus.WARN, "no low_state fit to use in the last second"
+            level, summary = DiagnosticStatus.WARN, "no valid low_state in the last second"
         elif refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
@@ -174,15 +198,15 @@ class EstimatorNode(Node):
             "compute_mean_us": f"{1e6 * busy / count:.0f}" if count else "",
             "restarts": self._tracker.restarts,
             "stalled_s": f"{self._robot_time.stalled:.3f}",
-            **self._refusals.values(),
+            **self._refusals.diagnostic_values(),
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 
 
 @attrs.frozen
-class _Report:
-    """What had been counted when the last report was made."""
+class _ReportedCounts:
+    """Counters at the last report: estimates, refused messages, computing time (s)."""
 
     count: int = 0
     refused: int = 0
@@ -190,19 +214,25 @@ class _Report:
 
 
 def _fill_twist(twist: Any, state: RobotState, estimate: Estimate) -> None:
-    """A TwistWithCovariance: the velocity estimated, the angular velocity measured."""
+    """Fill a TwistWithCovariance with the estimated linear and the measured angular velocity."""
     fill_vector(twist.twist.linear, estimate.velocity)
     fill_vector(twist.twist.angular, state.angular_velocity)
     twist.covariance = _covariance(estimate.covariance, GYRO_VARIANCE)
 
 
 def _covariance(linear: NDArray[np.float64], angular_variance: float) -> NDArray[np.float64]:
-    """The 36 numbers, row by row, of x, y, z and the rotations about them."""
+    """Return the 36 numbers of a 6 x 6 covariance, row by row: x, y, z and the rotations about
+    them.
+    """
     matrix = angular_variance * _ANGULAR
     matrix[:3, :3] = linear
     return matrix.ravel()
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `estimator`.
+
+    Args:
+        args: Command line arguments; None for those of the process.
+    """
     run(EstimatorNode, args)

@@ -1,6 +1,7 @@
-"""What the learned velocity estimator sees, and how its network file says so; for training and run time.
+"""Input features and file metadata of the learned velocity estimator, for training and run time.
 
-Nothing here needs torch, onnxruntime or ROS. Body frame x forward, y left, z up; joint order FR, FL, RR, RL.
+This module needs neither torch, onnxruntime nor ROS. Body frame: x forward, y left, z up. Joint
+order: FR, FL, RR, RL.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from .odometry import leg_velocity
 RATE_HZ = 200
 KIND = "velocity_estimator"
 METADATA_FIELDS = ("kind", "nominal_q", "rate_hz", "inputs", "output_scale")
-OUTPUTS = {"velocity": 3, "log_variance": 3}  # and the memory that `recurrent_network` names
+OUTPUTS = {"velocity": 3, "log_variance": 3}
+"""Outputs of the network and their lengths, besides the recurrent state (`recurrent_network`)."""
 
-# Clips lie beyond anything that walking shows; they only keep a shock from throwing the memory far off.
+# Clips lie beyond all values of walking. They limit the effect of a shock on the recurrent state.
 DEFAULT_LAYOUT = InputLayout(
     [
         InputTerm("q", 12, offset=NOMINAL_Q, clip=4.0),  # rad
@@ -33,7 +35,7 @@ DEFAULT_LAYOUT = InputLayout(
         InputTerm("gravity", 3),  # unit vector pointing down, body frame
         InputTerm("previous_action", 12, clip=4.0),  # rad, joint targets minus NOMINAL_Q
         InputTerm("torque", 12, scale=0.05, clip=4.0),  # N m
-        InputTerm("leg_velocity", 12, scale=0.5, clip=4.0),  # m/s, the trunk's by each leg if it is planted
+        InputTerm("leg_velocity", 12, scale=0.5, clip=4.0),  # m/s, trunk velocity from each leg, if planted
     ]
 )
 KNOWN_INPUTS = {term.name: term.size for term in DEFAULT_LAYOUT.terms}
@@ -62,16 +64,32 @@ _QUANTITIES: dict[str, Callable[[RobotState, ArrayLike], ArrayLike]] = {
 def build(
     state: RobotState, previous_action: ArrayLike, layout: InputLayout = DEFAULT_LAYOUT
 ) -> NDArray[np.float32]:
-    """The network input (..., 69) of a state whose arrays carry leading axes (...); other layouts, other sizes.
+    """Build the network input from a state, whose arrays may have leading batch axes (...).
 
-    `previous_action` (..., 12) is the joint targets in force when the state was taken, minus `NOMINAL_Q`, in
-    rad: the answer to the state before this one.
+    Each term is clip((value - offset) * scale), as `layout` defines it.
+
+    Args:
+        state: The state, arrays (..., 12), (..., 4), (..., 3).
+        previous_action: Joint targets in force when the state was measured, minus `NOMINAL_Q`,
+            (..., 12), rad; that is, the answer to the previous state.
+        layout: Terms of the input.
+
+    Returns:
+        The input, (..., layout.size), float32; size 69 for the default layout.
     """
     return layout.build({name: _QUANTITIES[name](state, previous_action) for name in layout.names})
 
 
 def previous_action(q_target: ArrayLike, mode: int) -> NDArray[np.float64]:
-    """What `build` takes, from joint targets (12,) and mode of the last command; zeros while damping."""
+    """Compute the `previous_action` of `build` from the last joint command.
+
+    Args:
+        q_target: Joint targets, (12,), rad.
+        mode: Mode of the command.
+
+    Returns:
+        Targets minus `NOMINAL_Q`, (12,), rad; zeros in damping mode.
+    """
     return np.asarray(q_target, np.float64) - NOMINAL_Q if mode == MODE_SERVO else np.zeros(12)
 
 
@@ -82,10 +100,18 @@ def metadata(
     output_scale: float = 1.0,
     layout: InputLayout = DEFAULT_LAYOUT,
 ) -> dict[str, Any]:
-    """The JSON object that an estimator's ONNX file carries, see `quadvel_description.recurrent_network`.
+    """Build the metadata of an estimator's ONNX file, see `quadvel_description.recurrent_network`.
 
-    `state_shape` is the shape of `h_in` and of `c_in` (layers, 1, hidden); `output_scale` turns the network's
-    `velocity` into m/s, and its square the exponential of `log_variance` into (m/s)^2.
+    Args:
+        state_shape: Shape of `h_in` and `c_in`: (layers, 1, hidden).
+        recipe: How the network was trained, as JSON.
+        commit: Commit of the training code.
+        output_scale: s, with velocity = s * output (m/s) and variance = s^2 exp(log_variance)
+            ((m/s)^2).
+        layout: Terms of the input.
+
+    Returns:
+        The JSON object.
     """
     return {
         "schema": 1,

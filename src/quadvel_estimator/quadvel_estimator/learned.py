@@ -1,4 +1,4 @@
-"""The learned velocity estimator at run time: a recurrent network in an ONNX file, one step a sample."""
+"""Learned velocity estimator at run time: a recurrent network, one step per sample."""
 
 from __future__ import annotations
 
@@ -20,13 +20,18 @@ SHIPPED_MODEL = Path(__file__).parent / "models" / "estimator.onnx"
 
 
 class LearnedEstimator:
-    """Runs a velocity network on samples that come at the rate it was trained for, `features.RATE_HZ`.
-
-    Raises NetworkFileError, one sentence with the file's name, where the file is missing or is not a velocity
-    estimator for this robot and rate.
-    """
+    """Runs a velocity network on samples at the rate of its training, `features.RATE_HZ`."""
 
     def __init__(self, path: str | Path = SHIPPED_MODEL) -> None:
+        """Load a network and check its metadata.
+
+        Args:
+            path: The ONNX file.
+
+        Raises:
+            NetworkFileError: The file is missing or is not a velocity estimator for this robot and
+                rate.
+        """
         self._network = RecurrentNetwork(path, features.OUTPUTS, features.METADATA_FIELDS)
         metadata = self._network.metadata
         self._expect("metadata field kind", metadata["kind"], features.KIND)
@@ -42,16 +47,25 @@ class LearnedEstimator:
             raise self._network.refuse("metadata field output_scale", self._scale, "a positive number")
 
     def reset(self) -> None:
-        """Forget what was seen so far."""
+        """Reset the recurrent state of the network."""
         self._network.reset()
 
     def update(
         self, state: RobotState, previous_action: ArrayLike
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Take one sample; returns velocity (3,) in m/s and its covariance (3, 3), body frame.
+        """Process one sample.
 
-        `previous_action` as in `features.build`. Raises FloatingPointError where the result is not finite; a
-        reset is needed then.
+            v = s * output,   covariance = diag(s^2 exp(log_variance)),   s = output_scale
+
+        Args:
+            state: The measured state.
+            previous_action: As in `features.build`, (12,), rad.
+
+        Returns:
+            Velocity of the trunk in the body frame, (3,), m/s, and its covariance, (3, 3), (m/s)^2.
+
+        Raises:
+            FloatingPointError: The result is not finite; call `reset` before the next sample.
         """
         velocity, log_variance = self._network.step(features.build(state, previous_action, self._layout))
         covariance = np.zeros((3, 3))

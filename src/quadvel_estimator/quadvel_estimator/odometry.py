@@ -1,6 +1,7 @@
-"""What the legs say of the trunk's velocity: a foot that is planted and rolls on level ground gives it away.
+"""Leg odometry: the trunk's velocity from a planted foot that rolls on level ground.
 
-For both estimators; which foot is planted is their matter. Arrays carry leading axes (...), legs FR, FL, RR, RL.
+Both estimators use it and decide themselves which foot is planted. Arrays may have leading axes
+(...); legs are FR, FL, RR, RL.
 """
 
 from __future__ import annotations
@@ -15,35 +16,66 @@ from quadvel_description.state import RobotState
 Array = NDArray[np.float64]
 
 # (a @ CROSS).reshape(3, 3) is the matrix by which a row vector b becomes a x b.
-CROSS = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
+CROSS_PRODUCT_TENSOR = np.cross(np.eye(3)[:, None], np.eye(3)).reshape(3, 9)
 
 
 def leg_velocity(state: RobotState) -> Array:
-    """Velocity (..., 4, 3) of the trunk's origin, m/s, body frame, if the foot of that leg is planted."""
-    return rolling(state, rotation_matrix(state.quaternion)) - against_trunk(state, *foot_kinematics(state.q))
+    """Compute the velocity of the trunk's origin from each leg, as if its foot were planted.
 
+        v = v_roll - (w x s + J dq)
 
-def rolling(state: RobotState, rotation: Array) -> Array:
-    """Velocity (..., 4, 3), body frame, of each foot's centre that rolls on level ground: w_calf x (r up).
+    Args:
+        state: The measured state, arrays (..., 12), (..., 4), (..., 3).
 
-    At a brisk walk this makes some six per cent of the trunk's velocity.
+    Returns:
+        Velocity in the body frame, (..., 4, 3), m/s.
     """
+    return rolling_velocity(state, rotation_matrix(state.quaternion)) - foot_velocity_in_trunk(
+        state, *foot_kinematics(state.q)
+    )
+
+
+def rolling_velocity(state: RobotState, rotation: Array) -> Array:
+    """Compute the velocity of the centre of each foot that rolls on level ground without slip.
+
+        v_roll = w_calf x (r e_up)
+
+    In a brisk walk, this is about 6 % of the trunk's velocity.
+
+    Args:
+        state: The measured state.
+        rotation: Rotation matrix from body to world, (..., 3, 3).
+
+    Returns:
+        Velocity in the body frame, (..., 4, 3), m/s.
+    """
+    # Angular velocity of the calf: the hip joint turns about x, thigh and calf about the tilted y axis:
+    # w_calf = w + (dq_hip, (dq_thigh + dq_calf) cos q_hip, (dq_thigh + dq_calf) sin q_hip).
     dq = np.reshape(state.dq, (*np.shape(state.dq)[:-1], 4, 3))
     hip = np.asarray(state.q)[..., ::3]
     knee = dq[..., 1] + dq[..., 2]
     calf = np.empty(dq.shape)
     calf[..., 0], calf[..., 1], calf[..., 2] = dq[..., 0], knee * np.cos(hip), knee * np.sin(hip)
     calf += np.asarray(state.angular_velocity)[..., None, :]
-    velocity: Array = -calf @ _cross(FOOT_RADIUS * rotation[..., 2, :])
+    velocity: Array = -calf @ _cross_matrix(FOOT_RADIUS * rotation[..., 2, :])
     return velocity
 
 
-def against_trunk(state: RobotState, feet: Array, jacobians: Array) -> Array:
-    """Velocity (..., 4, 3), body frame, of each foot's centre against the trunk's origin: w x s + J dq."""
+def foot_velocity_in_trunk(state: RobotState, feet: Array, jacobians: Array) -> Array:
+    """Compute the velocity of the centre of each foot relative to the trunk's origin: w x s + J dq.
+
+    Args:
+        state: The measured state.
+        feet: Foot centres s in the trunk frame, (..., 4, 3), m.
+        jacobians: Foot Jacobians J, (..., 4, 3, 3), m/rad.
+
+    Returns:
+        Velocity in the body frame, (..., 4, 3), m/s.
+    """
     dq = np.reshape(state.dq, (*feet.shape, 1))
-    return feet @ _cross(np.asarray(state.angular_velocity)) + (jacobians @ dq)[..., 0]
+    return feet @ _cross_matrix(np.asarray(state.angular_velocity)) + (jacobians @ dq)[..., 0]
 
 
-def _cross(a: Array) -> Array:
-    """The matrix (..., 3, 3) by which a row vector b becomes a x b."""
-    return (a @ CROSS).reshape(*a.shape[:-1], 3, 3)
+def _cross_matrix(a: Array) -> Array:
+    """Return the matrix (..., 3, 3) that maps a row vector b to a x b."""
+    return (a @ CROSS_PRODUCT_TENSOR).reshape(*a.shape[:-1], 3, 3)

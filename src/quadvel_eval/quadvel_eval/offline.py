@@ -83,13 +83,13 @@ def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple
     topics = ("/low_state", "/low_cmd")
     for topic, receipt, message in read_messages(path, lambda topic, _: topic in topics, lambda _: None):
         if topic == "/low_cmd":
-            tracker.command(previous_action(np.asarray(message.q, float), message.mode))
+            tracker.set_previous_action(previous_action(np.asarray(message.q, float), message.mode))
             continue
         try:
             state = read_low_state(message)
             state.time = 1e-9 * receipt if received else state.time
-            stamp, state.time = state.time, clock.follow(state.time, state.tick)
-            estimate = tracker.take(state)
+            stamp, state.time = state.time, clock.update(state.time, state.tick)
+            estimate = tracker.process(state)
         except (MessageError, FloatingPointError):
             continue
         if estimate is not None:

@@ -11,7 +11,7 @@ from std_msgs.msg import String
 
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
-from quadvel_nodes.node import end, read_parameters, run
+from quadvel_nodes.node import read_parameters, request_exit, run
 
 from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 
@@ -54,10 +54,10 @@ class ScriptedPlanner(Node):
         try:
             action = self._runner.update(1e-9 * self.get_clock().now().nanoseconds, self._mode, self._reason)
         except ScriptError as error:
-            end(self, f"planner: {error}")
+            request_exit(self, f"planner: {error}")
             return
         if action is None:
-            end(self)
+            request_exit(self)
             return
         if action.step != self._step:
             self._step = action.step

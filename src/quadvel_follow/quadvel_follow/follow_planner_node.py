@@ -124,7 +124,10 @@ class FollowPlannerNode(Node):
         if refused:
             level, summary = DiagnosticStatus.WARN, f"{refused} messages refused in the last second"
             self.get_logger().warning(summary, throttle_duration_sec=QUIET)
-        values = {"state": self._plan.state.value if self._plan else "none", **self._refusals.values()}
+        values = {
+            "state": self._plan.state.value if self._plan else "none",
+            **self._refusals.diagnostic_values(),
+        }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 

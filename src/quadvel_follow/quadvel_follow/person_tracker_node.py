@@ -197,7 +197,7 @@ class PersonTrackerNode(Node):
         else:
             level, summary = DiagnosticStatus.WARN, "no scan in the last second"
         persons = sum(track.confirmed for track in self._tracks)
-        values = {"rate_hz": used, "persons": persons, **self._refusals.values()}
+        values = {"rate_hz": used, "persons": persons, **self._refusals.diagnostic_values()}
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 

@@ -13,7 +13,7 @@ from rclpy.node import Node
 from rclpy.qos import qos_profile_sensor_data
 
 from quadvel_nodes.messages import MessageError, Refusals
-from quadvel_nodes.node import end, read_parameters, run
+from quadvel_nodes.node import read_parameters, request_exit, run
 
 from .planar import planar_pose
 from .trajectory import SHIPPED, STEP, Trajectory, TrajectoryFollower, load
@@ -75,7 +75,7 @@ class TrajectoryPlanner(Node):
         now = self._now()
         if self._closed and now - self._heard > SILENT:
             if self._began is not None:
-                end(self, f"trajectory_planner: odom is silent for more than {SILENT} s")
+                request_exit(self, f"trajectory_planner: odom is silent for more than {SILENT} s")
             return
         if self._began is None:
             self._began = now
@@ -83,11 +83,11 @@ class TrajectoryPlanner(Node):
         try:
             velocity = self._follower.step(now - self._began, self._pose)
         except ValueError as error:
-            end(self, f"trajectory_planner: {error}")
+            request_exit(self, f"trajectory_planner: {error}")
             return
         twist = Twist()
         if velocity is None:
-            end(self)
+            request_exit(self)
         else:
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
         self._velocity.publish(twist)

@@ -1,4 +1,4 @@
-"""What a node reports on /diagnostics, in one message. For node files only: it needs diagnostic_msgs."""
+"""Diagnostics messages for /diagnostics. For node files only: this module needs diagnostic_msgs."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
 QUIET = 5.0
-"""s between two lines of a node's log about what goes on and on, such as refused messages"""
+"""s, shortest interval between two log lines about a lasting condition, such as refused messages.
+"""
 
 
 def diagnostics(
     stamp: Any, name: str, level: bytes, summary: str, values: Mapping[str, object]
 ) -> DiagnosticArray:
-    """One status: `level` is a constant of DiagnosticStatus, `summary` a sentence that a person can act on.
+    """Build a DiagnosticArray that holds one status.
 
-    `stamp` is a builtin_interfaces/Time, `name` the node's.
+    Args:
+        stamp: Time of the report, a builtin_interfaces/Time.
+        name: Name of the node.
+        level: A level constant of DiagnosticStatus.
+        summary: One sentence that tells an operator what to do.
+        values: Values by name; each is converted with `str`.
+
+    Returns:
+        The message, ready to publish on /diagnostics.
     """
     pairs = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
     status = DiagnosticStatus(level=level, name=name, message=summary, hardware_id="quadvel", values=pairs)

@@ -1,7 +1,8 @@
-"""From messages to the plain records of `state` and back, and the refusal of what is not fit to use.
+"""Conversion of quadvel_msgs messages to the records of `quadvel_description.state`, with
+validation.
 
-Works on the fields of `quadvel_msgs` messages without importing them: generated classes check no field, so
-every node reads what it receives through here.
+The functions use the fields of a message without importing its class. Generated message classes
+check no values, so every node reads its inputs with these functions.
 """
 
 from __future__ import annotations
@@ -17,8 +18,9 @@ from numpy.typing import NDArray
 
 from quadvel_description.state import JointCommand, RobotState
 
-QUATERNION_TOLERANCE = 0.05  # by which the length of a quaternion may be off one
-LOW_STATE = {
+QUATERNION_TOLERANCE = 0.05
+"""Largest accepted deviation of a quaternion's norm from 1."""
+LOW_STATE_SIZES = {
     "q": 12,
     "dq": 12,
     "tau": 12,
@@ -27,12 +29,13 @@ LOW_STATE = {
     "linear_acceleration": 3,
     "foot_force": 4,
 }
-LOW_CMD = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), 12)
-"""The fields of these messages that hold numbers, and how many."""
+"""Numeric fields of a LowState, and the length of each."""
+LOW_CMD_SIZES = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), 12)
+"""Numeric fields of a LowCmd, and the length of each."""
 
 
 class MessageError(ValueError):
-    """A message that must not be used; the text names the field, the value found and what was expected."""
+    """A message must not be used; the text names field, value found and value expected."""
 
 
 class NotFiniteError(MessageError):
@@ -40,20 +43,40 @@ class NotFiniteError(MessageError):
 
 
 class NotUnitError(MessageError):
-    """The length of a quaternion is not 1."""
+    """The norm of a quaternion is not 1."""
 
 
 class BackInTimeError(MessageError):
-    """The message is older than one before it."""
+    """The message is older than an earlier message."""
 
 
 def seconds(stamp: Any) -> float:
-    """A builtin_interfaces/Time in seconds."""
+    """Convert a stamp to seconds.
+
+    Args:
+        stamp: A builtin_interfaces/Time.
+
+    Returns:
+        The time, s.
+    """
     return float(stamp.sec + 1e-9 * stamp.nanosec)
 
 
 def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
-    """The field as (size,) finite numbers. Raises MessageError."""
+    """Read one field of a message as an array of finite numbers.
+
+    Args:
+        message: Any message that has the field.
+        field: Name of the field.
+        size: Expected length.
+
+    Returns:
+        A copy of the field, shape (size,), in the unit of the message.
+
+    Raises:
+        MessageError: The field has another length.
+        NotFiniteError: A number is NaN or infinite.
+    """
     value = np.array(getattr(message, field), np.float64)
     if value.shape != (size,):
         raise MessageError(f"{field} has {value.size} numbers, expected {size}")
@@ -62,30 +85,44 @@ def numbers(message: Any, field: str, size: int) -> NDArray[np.float64]:
     return value
 
 
-class _Block:
-    """The fields of a message that hold numbers, read in one piece: the control loop does this every tick."""
+class _NumericFields:
+    """Reads all numeric fields of a message at once, which is faster than one by one at 200 Hz."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._fields, self._sizes = tuple(sizes), list(sizes.values())
-        self._places = [slice(*ends) for ends in pairwise(accumulate(self._sizes, initial=0))]
+        self._slices = [slice(*ends) for ends in pairwise(accumulate(self._sizes, initial=0))]
 
     def read(self, message: Any) -> list[NDArray[np.float64]]:
-        """`numbers` of each field. Raises MessageError."""
+        """Return the array of each field; raise MessageError as `numbers` does."""
         values = [getattr(message, field) for field in self._fields]
         block = np.concatenate(values, dtype=np.float64)
-        # Counting is quicker than `all`, which is Python inside.
+        # np.count_nonzero is faster than np.all for short arrays.
         if list(map(len, values)) != self._sizes or np.count_nonzero(np.isfinite(block)) < len(block):
             for field, size in zip(self._fields, self._sizes, strict=True):
                 numbers(message, field, size)
-        return [block[place] for place in self._places]
+        return [block[part] for part in self._slices]
 
 
-_LOW_STATE, _LOW_CMD = _Block(LOW_STATE), _Block(LOW_CMD)
+_LOW_STATE_FIELDS, _LOW_CMD_FIELDS = _NumericFields(LOW_STATE_SIZES), _NumericFields(LOW_CMD_SIZES)
 
 
 def read_low_state(message: Any) -> RobotState:
-    """LowState to RobotState, the quaternion normalised. Raises MessageError."""
-    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _LOW_STATE.read(message)
+    """Convert a LowState to a RobotState and normalise its quaternion.
+
+    Args:
+        message: The LowState.
+
+    Returns:
+        The state; its `time` is the stamp of the message, s.
+
+    Raises:
+        MessageError: A field has another length.
+        NotFiniteError: A number is NaN or infinite.
+        NotUnitError: The norm of the quaternion is not 1 within QUATERNION_TOLERANCE.
+    """
+    q, dq, tau, quaternion, angular_velocity, linear_acceleration, foot_force = _LOW_STATE_FIELDS.read(
+        message
+    )
     norm = math.hypot(*quaternion.tolist())
     if abs(norm - 1.0) > QUATERNION_TOLERANCE:
         raise NotUnitError(f"orientation_wxyz has norm {norm:.3g}, expected a unit quaternion")
@@ -103,7 +140,12 @@ def read_low_state(message: Any) -> RobotState:
 
 
 def write_low_state(state: RobotState, message: Any) -> None:
-    """Fill a LowState; its stamp is the caller's matter."""
+    """Fill a LowState from a RobotState; the caller sets the stamp.
+
+    Args:
+        state: The state to write.
+        message: The LowState to fill, changed in place.
+    """
     message.tick = state.tick
     message.orientation_wxyz = np.asarray(state.quaternion, np.float32)
     for field in ("q", "dq", "tau", "angular_velocity", "linear_acceleration", "foot_force"):
@@ -111,37 +153,62 @@ def write_low_state(state: RobotState, message: Any) -> None:
 
 
 def read_low_cmd(message: Any) -> JointCommand:
-    """LowCmd to JointCommand. Raises MessageError."""
-    fields = zip(LOW_CMD, _LOW_CMD.read(message), strict=True)
+    """Convert a LowCmd to a JointCommand.
+
+    Args:
+        message: The LowCmd.
+
+    Returns:
+        The joint command.
+
+    Raises:
+        MessageError: A field has another length.
+        NotFiniteError: A number is NaN or infinite.
+    """
+    fields = zip(LOW_CMD_SIZES, _LOW_CMD_FIELDS.read(message), strict=True)
     return JointCommand(**dict(fields), mode=message.mode, tick=message.tick)
 
 
 def write_low_cmd(command: JointCommand, message: Any) -> None:
-    """Fill a LowCmd; its stamp is the caller's matter."""
+    """Fill a LowCmd from a JointCommand; the caller sets the stamp.
+
+    Args:
+        command: The command to write.
+        message: The LowCmd to fill, changed in place.
+    """
     message.mode = command.mode
     message.tick = command.tick
-    for field in LOW_CMD:
+    for field in LOW_CMD_SIZES:
         setattr(message, field, np.asarray(getattr(command, field), np.float32))
 
 
 class Refusals:
-    """Counts refused messages by topic and remembers why the last one of each was refused."""
+    """Counts refused messages by topic and keeps the latest reason for each topic."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._reasons: dict[str, str] = {}
 
     def add(self, topic: str, reason: object) -> None:
-        """Count one."""
+        """Count one refused message.
+
+        Args:
+            topic: Topic of the message.
+            reason: Why the message was refused; its text is kept.
+        """
         self._counts[topic] += 1
         self._reasons[topic] = str(reason)
 
     @property
     def total(self) -> int:
-        """All refused messages since the start."""
+        """Number of refused messages on all topics since the start."""
         return self._counts.total()
 
-    def values(self) -> dict[str, str]:
-        """What `/diagnostics` shows: for each topic how many and the last reason."""
+    def diagnostic_values(self) -> dict[str, str]:
+        """Return the counts for /diagnostics.
+
+        Returns:
+            For each topic with refused messages: its count and the latest reason.
+        """
         counts = self._counts.items()
         return {f"refused {topic}": f"{count}, last: {self._reasons[topic]}" for topic, count in counts}

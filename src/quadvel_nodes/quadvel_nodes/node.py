@@ -1,4 +1,4 @@
-"""What every node does in the same way: its parameters, and its main. For node files only: it needs rclpy."""
+"""Parameters, start and shutdown of a node. For node files only: this module needs rclpy."""
 
 from __future__ import annotations
 
@@ -21,24 +21,36 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-from .topic_types import PERIOD, ConflictWatch
+from .topic_types import CHECK_PERIOD_S, ConflictWatch
 
 Config = TypeVar("Config")
-STOPS = (signal.SIGINT, signal.SIGTERM)
-LONGEST_WAIT = 60.0
-"""s, between two looks whether a node goes on; without a limit the executor of events of rclpy 7.1.6 spins"""
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+MAX_SPIN_WAIT_S = 60.0
+"""s, longest wait of the executor for an event; without a limit the EventsExecutor of rclpy 7.1.6
+spins.
+"""
 
 
 class StartError(ValueError):
-    """Why a node cannot start, in one sentence."""
+    """A node cannot start; the text is the reason, in one sentence."""
 
 
 def read_parameters(node: Node, config: type[Config]) -> Config:
-    """Declare each field of the attrs class `config` as a parameter and return what was set for them.
+    """Declare each field of an attrs class as a ROS parameter and return the values that were set.
 
-    A field's default is the parameter's and decides its type, its metadata `description` says what it means
-    and in which unit; tuples are lists. Parameters are fixed once the node runs. Raises StartError for a
-    parameter that the node does not have, one of another type, and one that the class refuses.
+    The default of a field is the default of its parameter and decides the type. The metadata
+    `description` of a field describes the parameter and its unit. Tuples become lists. Parameters
+    are read-only while the node runs.
+
+    Args:
+        node: The node that declares the parameters.
+        config: An attrs class; each field has the metadata `description`.
+
+    Returns:
+        An instance of `config`.
+
+    Raises:
+        StartError: A parameter is unknown, has the wrong type, or is rejected by the class.
     """
     fields = attrs.fields(config)  # type: ignore[arg-type]
     names = [field.name for field in fields]
@@ -51,7 +63,7 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         except ParameterException as error:
             raise StartError(f"parameter {field.name}: {error}") from error
         values[field.name] = tuple(value) if isinstance(field.default, tuple) else value
-    for name in node._parameter_overrides:  # rclpy keeps silent about parameters that nobody declares
+    for name in node._parameter_overrides:  # rclpy ignores undeclared parameters silently
         if not node.has_parameter(name) and not name.startswith("qos_overrides."):
             raise StartError(f"unknown parameter {name}, expected one of {', '.join(names)}")
     try:
@@ -60,32 +72,45 @@ def read_parameters(node: Node, config: type[Config]) -> Config:
         raise StartError(f"parameters: {error.args[0]}") from error
 
 
-_endings: WeakKeyDictionary[Node, str] = WeakKeyDictionary()
+_exit_requests: WeakKeyDictionary[Node, str] = WeakKeyDictionary()
 
 
-def end(node: Node, error: str = "") -> None:
-    """Have `run` end the node: with exit code 0, or with 1 and the sentence `error` if there is one.
+def request_exit(node: Node, error: str = "") -> None:
+    """Make `run` stop the node, with exit code 0, or 1 if there is an error.
 
-    What a callback does instead of sys.exit, which under rclpy may abort the process. Comes back to its caller.
+    Callbacks use this instead of sys.exit, which can abort the process under rclpy. The function
+    returns to its caller; the first request counts.
+
+    Args:
+        node: The node to stop.
+        error: One sentence that `run` prints, or "" for a regular exit.
     """
-    _endings.setdefault(node, error)
+    _exit_requests.setdefault(node, error)
     if (executor := node.executor) is not None:
-        executor.create_task(lambda: None)  # ends its wait, if another thread calls
+        executor.create_task(lambda: None)  # wakes the executor if another thread calls this
 
 
 def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
-    """Start a node and serve it until Ctrl-C, shutdown, or `end`. If it cannot start: one sentence, exit code 2.
+    """Start a node and run its callbacks until Ctrl-C, shutdown, or `request_exit`.
 
-    For the main of a process, which ends with it. SIGINT and SIGTERM end it between two callbacks, instead of
-    pulling the context away under them as rclpy's own handlers do: they may come at any moment, and again, and cut
-    neither start nor end short (Ctrl-C comes twice where a launcher forwards it).
+    This is the main function of a node's process. SIGINT and SIGTERM stop the node between two
+    callbacks; the handlers of rclpy would invalidate the context during a callback. A signal can
+    arrive at any time and more than once (a launcher may forward Ctrl-C), and interrupts neither
+    the start nor the shutdown.
+
+    Args:
+        make_node: Creates the node, usually its class.
+        args: Command line arguments; None for those of the process.
+
+    Raises:
+        SystemExit: Code 2 if the node cannot start; code 1 if `request_exit` gave an error.
     """
     receiver, sender = socketpair()
     sender.setblocking(False)
     signal.set_wakeup_fd(sender.fileno(), warn_on_full_buffer=False)
-    for number in STOPS:
-        signal.signal(number, _nothing_more)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOPS)
+    for number in STOP_SIGNALS:
+        signal.signal(number, _ignore_signal)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, STOP_SIGNALS)
     node = None
     try:
         node = _start(make_node, args)
@@ -96,43 +121,56 @@ def run(make_node: Callable[[], Node], args: list[str] | None = None) -> None:
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
-        for number in STOPS:
+        for number in STOP_SIGNALS:
             signal.signal(number, signal.SIG_IGN)  # while the interpreter ends
-    if error := _endings.get(node, ""):
+    if error := _exit_requests.get(node, ""):
         sys.exit(error)
 
 
 def _start(make_node: Callable[[], Node], args: list[str] | None) -> Node:
+    """Initialise rclpy and create the node; exit with code 2 if that fails."""
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
-        node.create_timer(PERIOD, ConflictWatch(node).look, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(
+            CHECK_PERIOD_S, ConflictWatch(node).check, clock=Clock(clock_type=ClockType.STEADY_TIME)
+        )
         return node
-    except (ValueError, RuntimeError) as error:  # ours, and rclpy's for malformed arguments and files
+    except (
+        ValueError,
+        RuntimeError,
+    ) as error:  # from quadvel, or from rclpy for malformed arguments and files
         print(" ".join(str(error).split()), file=sys.stderr)
         sys.exit(2)
 
 
 def _serve(node: Node, signals: socket, waker: socket) -> None:
-    """Run the node's callbacks until the first byte from `signals`, `end`, or the context's shutdown.
+    """Run callbacks until a byte from `signals`, a call of `request_exit`, or the context's
+    shutdown.
 
-    waker: the other end of `signals`. An executor of events that outlives this crashes the end of the interpreter.
+    An EventsExecutor that is still alive when the interpreter exits crashes it, so this function
+    shuts its executor down.
+
+    Args:
+        node: The node to run.
+        signals: Socket to which signal handlers write.
+        waker: The other end of `signals`.
     """
     executor, stopped = _executor(), Event()
 
     def stop_at_signal() -> None:
         signals.recv(1)
         stopped.set()
-        executor.create_task(lambda: None)  # ends its wait
+        executor.create_task(lambda: None)  # wakes the executor
 
     executor.add_node(node)
     listener = Thread(target=stop_at_signal, daemon=True)
     listener.start()
     try:
-        while rclpy.ok() and not stopped.is_set() and node not in _endings:
-            executor.spin_once(timeout_sec=LONGEST_WAIT)
+        while rclpy.ok() and not stopped.is_set() and node not in _exit_requests:
+            executor.spin_once(timeout_sec=MAX_SPIN_WAIT_S)
     finally:
-        with suppress(BlockingIOError):  # so many signals that nothing more fits: the listener has woken
+        with suppress(BlockingIOError):  # the buffer is full of signals: the listener is already awake
             waker.send(b"\0")
         listener.join()
         executor.remove_node(node)
@@ -140,9 +178,11 @@ def _serve(node: Node, signals: socket, waker: socket) -> None:
 
 
 def _executor() -> Any:
-    """ROS 2's executor of events where it has one (Jazzy from April 2025 on), which the control loop needs there.
+    """Return an EventsExecutor where ROS 2 has one (Jazzy from April 2025 on), else the standard
+    one.
 
-    rclpy's usual ones walk through all that a node has, in Python, for each message: docs/decisions/0013.
+    The standard executors iterate over all entities of a node, in Python, for each message
+    (docs/decisions/0013), which is too slow for the control loop.
     """
     try:
         from rclpy.experimental import EventsExecutor
@@ -151,5 +191,5 @@ def _executor() -> Any:
     return EventsExecutor()
 
 
-def _nothing_more(number: int, frame: FrameType | None) -> None:
-    """The handler of a signal, which has already written to the wake-up socket."""
+def _ignore_signal(number: int, frame: FrameType | None) -> None:
+    """Handle a signal by doing nothing: the wake-up socket has already received it."""

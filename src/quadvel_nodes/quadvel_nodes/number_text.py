@@ -1,4 +1,4 @@
-"""Numbers for people: a number that is not there is a dash, never "nan"."""
+"""Numbers as text: missing and non-finite values are shown as a dash."""
 
 from __future__ import annotations
 
@@ -8,5 +8,13 @@ DASH = "–"
 
 
 def number_text(value: float | None, spec: str) -> str:
-    """`value` by the format `spec`, such as ".2f"; a dash where it is None or not finite."""
+    """Format a number, or return a dash if it is missing.
+
+    Args:
+        value: The number; None, NaN or infinity count as missing.
+        spec: Format specification, such as ".2f".
+
+    Returns:
+        The text.
+    """
     return DASH if value is None or not math.isfinite(value) else format(value, spec)

@@ -1,7 +1,7 @@
-"""The robot on the standard topics, so that RViz, Foxglove and Nav2 see it without knowing quadvel. Needs rclpy.
+"""The robot on standard ROS topics, for RViz, Foxglove and Nav2. Needs rclpy.
 
-Joint angles and IMU as messages of sensor_msgs, the links' transforms, and the robot's description for whoever
-comes later. What serves `low_state`, a simulator or a driver, publishes this beside it.
+A node that serves `low_state` (simulator or driver) also publishes joint angles and IMU data as
+sensor_msgs, the transforms of the links, and the robot description.
 """
 
 from __future__ import annotations
@@ -27,12 +27,21 @@ LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class RobotView:
-    """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, in the name of a node."""
+    """Publishes imu, joint_states, /tf, and once /tf_static and robot_description, on behalf of a
+    node.
+    """
 
     def __init__(
         self, node: Node, orientation: float, angular_velocity: float, linear_acceleration: float
     ) -> None:
-        """The numbers are the IMU's standard deviations: rad about each axis, rad/s, m/s^2."""
+        """Create the publishers and publish the latched topics.
+
+        Args:
+            node: The node that owns the publishers.
+            orientation: Standard deviation of the IMU's orientation about each axis, rad.
+            angular_velocity: Standard deviation of the angular velocity, rad/s.
+            linear_acceleration: Standard deviation of the acceleration, m/s^2.
+        """
         self._joint_states = node.create_publisher(JointState, "joint_states", 10)
         self._tf = node.create_publisher(TFMessage, "/tf", 100)
         self._imu = node.create_publisher(Imu, "imu", 10)
@@ -45,17 +54,22 @@ class RobotView:
             node.create_publisher(String, "robot_description", LATCHED),
         ]
         stamp = node.get_clock().now().to_msg()
-        self._latched[0].publish(TFMessage(transforms=transforms(stamp, fixed_links())))
+        self._latched[0].publish(TFMessage(transforms=transform_messages(stamp, fixed_links())))
         self._latched[1].publish(String(data=urdf()))
 
     def publish(self, stamp: Any, state: RobotState) -> None:
-        """One sample; `stamp` (builtin_interfaces/Time) is the instant at which it held."""
+        """Publish one state.
+
+        Args:
+            stamp: Time of the state, a builtin_interfaces/Time.
+            state: The state.
+        """
         joints = JointState(name=list(robot.JOINT_NAMES))
         joints.header.stamp = stamp
         joints.position, joints.velocity = state.q.tolist(), state.dq.tolist()
         joints.effort = state.tau.tolist()
         self._joint_states.publish(joints)
-        self._tf.publish(TFMessage(transforms=transforms(stamp, moving_links(state.q))))
+        self._tf.publish(TFMessage(transforms=transform_messages(stamp, moving_links(state.q))))
         imu = self._noise
         imu.header.stamp = stamp
         imu.header.frame_id = IMU
@@ -65,8 +79,16 @@ class RobotView:
         self._imu.publish(imu)
 
 
-def transforms(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
-    """Frames as geometry_msgs/TransformStamped with this stamp."""
+def transform_messages(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
+    """Convert frames to transform messages.
+
+    Args:
+        stamp: Stamp of the messages, a builtin_interfaces/Time.
+        placed: Frames, each with its parent, position (m) and quaternion.
+
+    Returns:
+        One geometry_msgs/TransformStamped per frame.
+    """
     messages = []
     for frame in placed:
         message = TransformStamped(child_frame_id=frame.child)
@@ -79,12 +101,22 @@ def transforms(stamp: Any, placed: Sequence[Placed]) -> list[Any]:
 
 
 def fill_vector(message: Any, vector: NDArray[np.float64]) -> None:
-    """Fill a geometry_msgs Vector3 or Point from (3,) numbers."""
+    """Fill a geometry_msgs Vector3 or Point.
+
+    Args:
+        message: The message, changed in place.
+        vector: x, y, z, shape (3,).
+    """
     message.x, message.y, message.z = vector.tolist()
 
 
 def fill_quaternion(message: Any, wxyz: NDArray[np.float64]) -> None:
-    """Fill a geometry_msgs/Quaternion from (4,) numbers, w first."""
+    """Fill a geometry_msgs/Quaternion.
+
+    Args:
+        message: The message, changed in place.
+        wxyz: Quaternion (w, x, y, z), shape (4,).
+    """
     message.w, message.x, message.y, message.z = wxyz.tolist()
 
 

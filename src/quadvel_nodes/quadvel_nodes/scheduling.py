@@ -1,4 +1,4 @@
-"""When a node runs: those of the control loop before others, and on which cores; the page after them. Needs Linux, not ROS."""
+"""Real-time priority, time slice and CPU affinity of nodes. Needs Linux, not ROS."""
 
 from __future__ import annotations
 
@@ -14,25 +14,35 @@ from pathlib import Path
 
 import attrs
 
-HIGHEST = 99
-THREADS = Path("/proc/self/task")
-LOOK = 0.05
-"""s, ten periods of the control loop: a thread that computes this long without a pause is not waiting for a robot"""
-BUSY = 0.9
-"""share of LOOK that a thread computed, from which on it counts as one that does not pause"""
-SLICE = 100_000
-"""ns, the shortest that there is: a thread that asks for so little of a core at once is let in before those that ask for
-more, such as programs that compute without a pause beside it."""
-AUTOGROUP = Path("/proc/self/autogroup")
-LAST_RESORT = 1_000_000
-"""us of computing without a pause after which the kernel ends the process: the watchdog could not run"""
+MAX_REALTIME_PRIORITY = 99
+THREADS_DIR = Path("/proc/self/task")
+WATCHDOG_PERIOD_S = 0.05
+"""s between two checks of the watchdog: ten periods of the control loop."""
+MAX_BUSY_FRACTION = 0.9
+"""Share of WATCHDOG_PERIOD_S that a real-time thread may compute; the watchdog demotes busier
+threads.
+"""
+TIME_SLICE_NS = 100_000
+"""ns, the shortest time slice of Linux. The scheduler (EEVDF) runs threads with a short slice
+before threads with a longer one, such as programs that compute without a pause.
+"""
+AUTOGROUP_FILE = Path("/proc/self/autogroup")
+REALTIME_LIMIT_US = 1_000_000
+"""us of computing without a pause after which the kernel ends the process (RLIMIT_RTTIME), in case
+the watchdog cannot run.
+"""
 
 
-@attrs.frozen(kw_only=True, slots=False)  # to stand beside another base
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
 class Scheduling:
-    """Parameters that a node of the control loop adds to its own, and what puts them into force.
+    """Scheduling parameters that each node of the control loop adds to its own.
 
-    Raises ValueError where one of them is malformed.
+    Attributes:
+        realtime_priority: SCHED_FIFO priority of the control thread, 1 to 99; 0 for none.
+        cpus: Cores that the node may use, such as "2,3"; empty for any.
+
+    Raises:
+        ValueError: A parameter is malformed; raised by the constructor.
     """
 
     realtime_priority: int = attrs.field(
@@ -47,8 +57,8 @@ class Scheduling:
 
     @realtime_priority.validator
     def _is_priority(self, attribute: object, value: int) -> None:
-        if not 0 <= value <= HIGHEST:
-            raise ValueError(f"realtime_priority is {value}, expected 0 to {HIGHEST}")
+        if not 0 <= value <= MAX_REALTIME_PRIORITY:
+            raise ValueError(f"realtime_priority is {value}, expected 0 to {MAX_REALTIME_PRIORITY}")
 
     @cpus.validator
     def _are_cores(self, attribute: object, value: str) -> None:
@@ -56,51 +66,58 @@ class Scheduling:
         if value and not all(word.strip().isdecimal() and int(word) in there for word in value.split(",")):
             raise ValueError(f"cpus is {value!r}, expected some of {','.join(map(str, sorted(there)))}")
 
-    def apply(self, say: Callable[[str], object]) -> None:
-        """The cores and a short time slice to all threads of this process, the priority to the thread that calls.
+    def apply(self, warn: Callable[[str], object]) -> None:
+        """Apply the parameters to this process: cores and time slice to all threads, priority to
+        the caller's.
 
-        The slice takes no privilege, and Linux 6.12; before, nothing changes. Threads that are started later inherit it, but
-        not the priority. A watchdog takes it back from a thread that does not pause,
-        since a real-time thread that spins takes its core from everybody else. `say` is told of that, and of a system
-        that refuses the priority.
+        The short time slice needs no privilege, and Linux 6.12; older kernels ignore it. Threads
+        that start later inherit cores and slice, but not the priority. A real-time thread that
+        never pauses would block its core for all other threads, so a watchdog takes the priority
+        back from it.
+
+        Args:
+            warn: Called with a sentence if the system refuses the priority, and if the watchdog
+                acts.
         """
-        for thread in (int(one.name) for one in THREADS.iterdir()):
+        for thread in (int(one.name) for one in THREADS_DIR.iterdir()):
             if self.cpus:
                 os.sched_setaffinity(thread, {int(word) for word in self.cpus.split(",")})
-            ask_for_slice(thread)
+            request_time_slice(thread)
         if not self.realtime_priority:
             return
         try:
-            _become_realtime(self.realtime_priority)
+            _set_realtime_priority(self.realtime_priority)
         except PermissionError:
-            say(
+            warn(
                 "runs without real-time priority: the limit rtprio of this user or container does not allow it"
             )
             return
-        resource.setrlimit(resource.RLIMIT_RTTIME, (LAST_RESORT, LAST_RESORT))
+        resource.setrlimit(resource.RLIMIT_RTTIME, (REALTIME_LIMIT_US, REALTIME_LIMIT_US))
         watched = threading.get_native_id(), time.pthread_getcpuclockid(threading.get_ident())
-        above = min(self.realtime_priority + 1, HIGHEST)
-        threading.Thread(target=_watch, args=(*watched, above, say), name="watchdog", daemon=True).start()
+        above = min(self.realtime_priority + 1, MAX_REALTIME_PRIORITY)
+        threading.Thread(
+            target=_demote_busy_thread, args=(*watched, above, warn), name="watchdog", daemon=True
+        ).start()
 
 
 def run_after_others(niceness: int) -> None:
-    """Let other processes run first.
+    """Lower the priority of this process, so that other processes run first.
 
-    Where Linux groups processes by session (sched_autogroup_enabled), a process's niceness counts within its session alone;
-    the session has a niceness of its own, which is set where this process leads it, as the nodes of `quadvel up` do. A shell's
-    session is left as it is.
+    Where Linux groups processes by session (sched_autogroup_enabled), the niceness of a process
+    counts only within its session, and the session has a niceness of its own. This function sets
+    the niceness of the session, too, if this process leads it, as nodes of `quadvel up` do.
 
     Args:
-        niceness: 1 to 19, the weaker the larger.
+        niceness: 1 to 19; a larger value means less CPU time.
     """
     os.nice(niceness)
     if os.getsid(0) == os.getpid():
-        with suppress(OSError):  # a kernel that forms no such groups
-            AUTOGROUP.write_text(str(niceness))
+        with suppress(OSError):  # a kernel without autogroups
+            AUTOGROUP_FILE.write_text(str(niceness))
 
 
-class _Attributes(ctypes.Structure):
-    """Linux' struct sched_attr, of its first version."""
+class _SchedulingAttributes(ctypes.Structure):
+    """First version of Linux's struct sched_attr, see sched_setattr(2)."""
 
     _fields_ = (
         ("size", ctypes.c_uint32), ("policy", ctypes.c_uint32), ("flags", ctypes.c_uint64), ("nice", ctypes.c_int32),
@@ -108,48 +125,73 @@ class _Attributes(ctypes.Structure):
     )  # fmt: skip
 
 
-_CALLS = {"x86_64": (314, 315), "aarch64": (274, 275)}
-"""The numbers of the system calls sched_setattr and sched_getattr, for which the C library has no name yet"""
+_SYSCALL_NUMBERS = {"x86_64": (314, 315), "aarch64": (274, 275)}
+"""Numbers of the system calls sched_setattr and sched_getattr, which the C library does not wrap.
+"""
 
 
-def ask_for_slice(thread: int) -> None:
-    """Ask that `thread` gets a core for no more than SLICE at once, and the sooner for it, where it has no real-time priority."""
-    write, _ = _CALLS.get(platform.machine(), (0, 0))
-    attributes = _attributes(thread)
+def request_time_slice(thread: int) -> None:
+    """Set the time slice of a thread to TIME_SLICE_NS, unless the thread has real-time priority.
+
+    Args:
+        thread: Native id of the thread.
+    """
+    write, _ = _SYSCALL_NUMBERS.get(platform.machine(), (0, 0))
+    attributes = _read_attributes(thread)
     if attributes is not None and attributes.policy in (os.SCHED_OTHER, os.SCHED_BATCH):
-        attributes.runtime = SLICE
+        attributes.runtime = TIME_SLICE_NS
         ctypes.CDLL(None).syscall(write, thread, ctypes.byref(attributes), 0)
 
 
-def slice_of(thread: int) -> int | None:
-    """ns that `thread` gets a core for at once; None where this system does not say, 0 before Linux 6.12."""
-    attributes = _attributes(thread)
+def time_slice(thread: int) -> int | None:
+    """Return the time slice of a thread.
+
+    Args:
+        thread: Native id of the thread.
+
+    Returns:
+        The slice, ns; 0 before Linux 6.12, None where the system call fails.
+    """
+    attributes = _read_attributes(thread)
     return None if attributes is None else int(attributes.runtime)
 
 
-def _attributes(thread: int) -> _Attributes | None:
-    _, read = _CALLS.get(platform.machine(), (0, 0))
-    found = _Attributes()
+def _read_attributes(thread: int) -> _SchedulingAttributes | None:
+    """Return the scheduling attributes of a thread, or None where the system call fails."""
+    _, read = _SYSCALL_NUMBERS.get(platform.machine(), (0, 0))
+    found = _SchedulingAttributes()
     size = ctypes.sizeof(found)
     failed = not read or ctypes.CDLL(None).syscall(read, thread, ctypes.byref(found), size, 0)
     found.size = size
     return None if failed else found
 
 
-def _become_realtime(priority: int) -> None:
+def _set_realtime_priority(priority: int) -> None:
+    """Give the calling thread a SCHED_FIFO priority, which its children do not inherit."""
     os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
 
 
-def _watch(thread: int, cpu_clock: int, priority: int, say: Callable[[str], object]) -> None:
-    """Take the real-time priority of a thread back once it computes without a pause. Runs before that thread."""
-    _become_realtime(priority)
+def _demote_busy_thread(thread: int, cpu_clock: int, priority: int, warn: Callable[[str], object]) -> None:
+    """Take the real-time priority from a thread once it computes without a pause.
+
+    Runs in a thread of its own with a higher priority than the watched one.
+
+    Args:
+        thread: Native id of the watched thread.
+        cpu_clock: Id of the CPU clock of that thread.
+        priority: Real-time priority of the watchdog.
+        warn: Called with a sentence when the priority is taken.
+    """
+    _set_realtime_priority(priority)
     try:
         while True:
             began, used = time.monotonic(), time.clock_gettime(cpu_clock)
-            time.sleep(LOOK)
-            if time.clock_gettime(cpu_clock) - used >= BUSY * (time.monotonic() - began):
+            time.sleep(WATCHDOG_PERIOD_S)
+            if time.clock_gettime(cpu_clock) - used >= MAX_BUSY_FRACTION * (time.monotonic() - began):
                 os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
-                say(f"computed for {LOOK:g} s without a pause: its real-time priority was taken back")
+                warn(
+                    f"computed for {WATCHDOG_PERIOD_S:g} s without a pause: its real-time priority was taken back"
+                )
                 return
     except OSError:  # the thread has ended
         return

@@ -1,74 +1,102 @@
-"""The robot's own time: that of its stamps, less what it stood still itself.
+"""Time of the robot without stalls: stamps of states, minus the time in which a simulated robot
+stood still.
 
-Stamps are on the clock of the machine, ticks on the robot's own. Where a machine stalls together with the robot that it
-simulates, its clock goes on without the robot: what the robot does next follows what it did last, and nobody missed
-anything. A real robot lives on meanwhile, and its ticks tell so.
+Stamps come from the clock of the machine, ticks from the clock of the robot. If the machine stalls
+together with its simulated robot, stamps advance but ticks do not: the next state follows the last
+one, and no reaction is late. A real robot moves on during a stall of the machine, and so do its
+ticks.
 """
 
 from __future__ import annotations
 
 import math
 
-JITTER = 0.01  # s, by which stamps may be off the ticks for other reasons
-_WRAP = 2**32
-_LONGEST_LIFE = 1e-3 * _WRAP / 2  # s from state to state; a tick that is further on went back
+STAMP_JITTER_S = 0.01
+"""s, deviation of stamps from ticks that does not count as a stall."""
+_TICK_MODULUS = 2**32
+_MAX_TICK_STEP_S = 1e-3 * _TICK_MODULUS / 2  # a larger difference means that the tick went back
 
 
 class StallFreeClock:
-    """Follows the states of one robot. stalled: s that it stood still and that were left out, since the start."""
+    """Converts the stamps of one robot's states to stall-free time.
+
+    Attributes:
+        stalled: Time that the robot stood still and that is left out, since the start, s.
+    """
 
     def __init__(self) -> None:
         self.stalled = 0.0
-        self._last: tuple[float, int] | None = None  # stamp, s, and tick
-        self._time = 0.0  # s, the robot's, of the last state
-        self._waited = False  # whether that state said that the robot's time stood still
-        # Of the last standstill: what had been left out before it, and the robot's time at which it began, s.
-        self._stalled_before, self._began = 0.0, math.inf
+        self._last: tuple[float, int] | None = None  # stamp (s) and tick (ms) of the last state
+        self._time = 0.0  # s, stall-free time of the last state
+        self._was_waiting = False  # whether the robot's time stood still at that state
+        # Before the last stall: the time left out until then, and the stall-free time of its begin, s.
+        self._stalled_before, self._stall_began = 0.0, math.inf
 
     @property
     def tick(self) -> int | None:
-        """Of the last state, ms; None before the first one."""
+        """Tick of the last state, ms; None before the first state."""
         return None if self._last is None else self._last[1]
 
-    def follow(self, stamp: float, tick: int, longest: float = math.inf, waiting: bool = False) -> float:
-        """The robot's time of the next state.
+    def update(self, stamp: float, tick: int, max_stall: float = math.inf, is_waiting: bool = False) -> float:
+        """Take the next state and return its stall-free time.
+
+            standstill = (stamp - stamp of the last state) - (tick - tick of the last state)
+
+        A standstill beyond STAMP_JITTER_S, up to `max_stall`, is left out.
 
         Args:
-            stamp: When the state held, s.
-            tick: The robot's own clock, ms, which wraps at 2^32. One that does not move is no clock: then stamps count.
-            longest: The longest standstill to leave out, s.
-            waiting: Whether the robot itself says that its time stands still at this state: then any standstill is left out.
+            stamp: Time of the state, s.
+            tick: Clock of the robot, ms, modulo 2^32. If it does not advance, only the stamp
+                counts.
+            max_stall: Longest standstill to leave out, s.
+            is_waiting: Whether the robot reports that its time stands still; then any standstill is
+                left out.
 
         Returns:
-            The robot's time, s.
+            Stall-free time of the state, s.
         """
         time = stamp - self.stalled
         if self._last is not None:
-            lived = 1e-3 * ((tick - self._last[1]) % _WRAP)
-            standstill = stamp - self._last[0] - lived
-            tolerance = 0.0 if waiting or self._waited else JITTER
-            if (waiting and lived < _LONGEST_LIFE) or (lived > 0.0 and tolerance < standstill <= longest):
-                time = self._time + lived
-                self._leave_out(stamp - time - self.stalled, time if waiting else self._time)
-        self._last, self._time, self._waited = (stamp, tick), time, waiting
+            tick_elapsed = 1e-3 * ((tick - self._last[1]) % _TICK_MODULUS)
+            standstill = stamp - self._last[0] - tick_elapsed
+            tolerance = 0.0 if is_waiting or self._was_waiting else STAMP_JITTER_S
+            if (is_waiting and tick_elapsed < _MAX_TICK_STEP_S) or (
+                tick_elapsed > 0.0 and tolerance < standstill <= max_stall
+            ):
+                time = self._time + tick_elapsed
+                self._exclude_stall(stamp - time - self.stalled, time if is_waiting else self._time)
+        self._last, self._time, self._was_waiting = (stamp, tick), time, is_waiting
         return time
 
-    def _leave_out(self, standstill: float, began: float) -> None:
-        """Leave out a standstill (s) that began at the robot's time `began` (s); it may go on from the one before."""
-        if began != self._began:
-            self._stalled_before, self._began = self.stalled, began
+    def _exclude_stall(self, standstill: float, began: float) -> None:
+        """Leave out a standstill (s) that began at the stall-free time `began` (s), or extend the
+        last one.
+        """
+        if began != self._stall_began:
+            self._stalled_before, self._stall_began = self.stalled, began
         self.stalled += standstill
 
-    def clock_was_set(self, change: float) -> None:
-        """The clock of the stamps was set by `change` (s), which is no event in the robot's life."""
+    def on_clock_set(self, change: float) -> None:
+        """Account for a step of the clock of the stamps.
+
+        Args:
+            change: The step, s, positive if the clock was set forward.
+        """
         self.stalled += change
         self._stalled_before += change
         if self._last is not None:
             self._last = self._last[0] + change, self._last[1]
 
-    def at(self, stamp: float) -> float:
-        """The robot's time at any stamp (s) since the standstill before the last one.
+    def time_at(self, stamp: float) -> float:
+        """Convert a stamp to stall-free time, back to the standstill before the last one.
 
-        A message about a state may come after the state that ended a standstill. While that lasted, the robot's time stood.
+        A message about a state can arrive after the state that ended a standstill. During the
+        standstill, stall-free time is constant.
+
+        Args:
+            stamp: Time of the message, s.
+
+        Returns:
+            Stall-free time, s.
         """
-        return max(stamp - self.stalled, min(stamp - self._stalled_before, self._began))
+        return max(stamp - self.stalled, min(stamp - self._stalled_before, self._stall_began))

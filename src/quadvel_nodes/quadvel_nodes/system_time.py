@@ -1,4 +1,4 @@
-"""Instants of a steady clock as stamps of messages, which are in the system's time. For node files only."""
+"""Conversion of the monotonic clock to stamps of messages in system time. For node files only."""
 
 from __future__ import annotations
 
@@ -7,33 +7,47 @@ from typing import Any
 
 from builtin_interfaces.msg import Time
 
-TOLERANCE = 10**6  # ns that system and monotonic clock may drift apart before the stamps follow
+DRIFT_TOLERANCE_NS = 10**6  # ns; stamps follow the system clock only after a larger drift
 
 
 class SystemTime:
-    """Follows how far the system's clock is from the monotonic one, without taking over its jitter."""
+    """Tracks the offset from the monotonic to the system clock, without copying its jitter."""
 
     def __init__(self) -> None:
-        self._shift, self._error = _shift()
+        self._offset_ns, self._error_ns = _clock_offset_ns()
 
     def stamp(self, instant: float) -> Any:
-        """An instant of the monotonic clock, s, as a builtin_interfaces/Time."""
-        shift, error = _shift()
-        was_set = abs(shift - self._shift) > TOLERANCE + self._error + error
-        if was_set or error + TOLERANCE < self._error:
-            self._shift, self._error = shift, error
-        return as_time(round(instant * 1e9) + self._shift)
+        """Convert a time of the monotonic clock to a stamp.
+
+        Args:
+            instant: Time on the monotonic clock, s.
+
+        Returns:
+            The system time, a builtin_interfaces/Time.
+        """
+        shift, error = _clock_offset_ns()
+        was_set = abs(shift - self._offset_ns) > DRIFT_TOLERANCE_NS + self._error_ns + error
+        if was_set or error + DRIFT_TOLERANCE_NS < self._error_ns:
+            self._offset_ns, self._error_ns = shift, error
+        return as_time(round(instant * 1e9) + self._offset_ns)
 
 
-def _shift() -> tuple[int, int]:
-    """How far the system's clock is ahead of the monotonic one, ns, and by how much that may be wrong.
+def _clock_offset_ns() -> tuple[int, int]:
+    """Return the offset of the system clock from the monotonic clock, and its largest error, ns.
 
-    The process may be paused between two readings, for tens of ms on a loaded machine.
+    A loaded machine may pause the process for tens of ms between two readings.
     """
     before, now, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
     return now - before, after - before
 
 
 def as_time(nanoseconds: int) -> Any:
-    """A builtin_interfaces/Time."""
+    """Convert nanoseconds to a stamp.
+
+    Args:
+        nanoseconds: System time, ns.
+
+    Returns:
+        A builtin_interfaces/Time.
+    """
     return Time(sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)

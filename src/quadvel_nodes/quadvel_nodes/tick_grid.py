@@ -1,42 +1,62 @@
-"""Which samples of a stream a periodic loop answers."""
+"""Selection of the samples of a stream that a periodic loop answers."""
 
 from __future__ import annotations
 
 import math
 
-FOLLOW = 0.02
-"""Share of how far a sample is off its deadline by which the deadlines after it move: samples have a clock of their own,
-which drifts away from any that stands still, and at the border between two periods every jitter would lose or double one"""
+PHASE_GAIN = 0.02
+"""Gain with which the deadlines follow the samples. The clock of the samples drifts; with fixed
+deadlines, the samples would drift to the border between two periods, where jitter loses or doubles
+a tick.
+"""
 
 
 class TickGrid:
-    """Picks the samples to answer: one each `period` (s) of the samples' own clock, however often they come.
+    """Selects one sample per period of the samples' own clock, at any sample rate.
 
-    Deadlines do not depend on when samples are answered: neither jitter nor the time that the work takes adds up.
+    Deadlines lie on a grid and do not depend on when samples are answered: neither jitter nor
+    computing time accumulates.
     """
 
     def __init__(self, period: float) -> None:
+        """Create a grid.
+
+        Args:
+            period: Period of the loop, s.
+        """
         self._period = period
-        self._next: float | None = None
-        self._last = self._before = -math.inf  # stamps of the last answer, and of the sample before
-        self._spacing, self._seen = (
+        self._deadline: float | None = None
+        self._last_answered = self._previous_sample = -math.inf  # s
+        self._spacing, self._spacing_count = (
             period,
             0,
         )  # s from sample to sample in the mean, and how many it is the mean of
 
-    def periods(self, stamp: float) -> int:
-        """Periods since the last answer: 0 means not due, 1 on time, more that some were missed. stamp: s."""
-        if self._next is None or stamp < self._last:
-            self._next = self._before = stamp
-        elapsed, self._before = stamp - self._before, stamp
+    def periods_due(self, stamp: float) -> int:
+        """Return how many periods have passed since the last answer, and count this sample as the
+        answer if any.
+
+        With period T, deadline d and mean spacing s of the samples, a sample at t is due if
+        t >= d - min(s, T) / 2: the nearest sample to the deadline answers. Then the deadline moves
+        to the next period, plus PHASE_GAIN times the deviation of the sample from its deadline.
+
+        Args:
+            stamp: Time of the sample, s; a stamp that goes back restarts the grid.
+
+        Returns:
+            0 if the sample is not due, 1 if it is due, more if periods were missed.
+        """
+        if self._deadline is None or stamp < self._last_answered:
+            self._deadline = self._previous_sample = stamp
+        elapsed, self._previous_sample = stamp - self._previous_sample, stamp
         if elapsed > 0.0:
-            self._seen += 1
-            share = max(1.0 / self._seen, FOLLOW)
+            self._spacing_count += 1
+            share = max(1.0 / self._spacing_count, PHASE_GAIN)
             self._spacing += share * (min(elapsed, 2.0 * self._period) - self._spacing)
-        early = 0.5 * min(self._spacing, self._period)  # the nearest sample, be it a little before its time
-        due = math.floor((stamp - self._next + early) / self._period) + 1
+        early = 0.5 * min(self._spacing, self._period)  # the nearest sample answers
+        due = math.floor((stamp - self._deadline + early) / self._period) + 1
         if due > 0:
-            deadline = self._next + (due - 1) * self._period
-            self._next = deadline + self._period + FOLLOW * (stamp - deadline)
-            self._last = stamp
+            deadline = self._deadline + (due - 1) * self._period
+            self._deadline = deadline + self._period + PHASE_GAIN * (stamp - deadline)
+            self._last_answered = stamp
         return max(due, 0)

@@ -1,4 +1,4 @@
-"""Publishers whose messages nobody hears, as they are of another type than the subscriptions of their topic. For node files."""
+"""Detection of publishers whose type differs from the subscriptions. For node files."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from typing import Any
 
 import attrs
 
-PERIOD = 2.0
-"""s between two looks of a node at its topics"""
+CHECK_PERIOD_S = 2.0
+"""s between two checks of the topics of a node."""
 REMEDIES = {
     (
         "geometry_msgs/msg/TwistStamped",
@@ -23,7 +23,13 @@ REMEDIES = {
 
 @attrs.frozen
 class TypeConflict:
-    """A topic, the type that is published on it, and the type that is expected (both as `geometry_msgs/msg/Twist`)."""
+    """A topic whose published type is not the expected one.
+
+    Attributes:
+        topic: Name of the topic.
+        published: Type that is published, such as `geometry_msgs/msg/Twist`.
+        expected: Type that is subscribed.
+    """
 
     topic: str
     published: str
@@ -35,12 +41,26 @@ class TypeConflict:
 
 
 def conflicts_of(node: Any) -> list[TypeConflict]:
-    """Those on the topics to which this node subscribes."""
-    return _conflicts(node, ((one.topic_name, _name(one.msg_type)) for one in node.subscriptions))
+    """Find type conflicts on the topics to which a node subscribes.
+
+    Args:
+        node: The node.
+
+    Returns:
+        The conflicts, sorted by topic.
+    """
+    return _conflicts(node, ((one.topic_name, _type_name(one.msg_type)) for one in node.subscriptions))
 
 
 def all_conflicts(node: Any) -> list[TypeConflict]:
-    """Those on all topics that `node` knows of."""
+    """Find type conflicts on all topics that a node knows.
+
+    Args:
+        node: The node that queries the ROS graph.
+
+    Returns:
+        The conflicts, sorted by topic.
+    """
     doubtful = [topic for topic, types in node.get_topic_names_and_types() if len(types) > 1]
     expected = (
         (topic, one.topic_type) for topic in doubtful for one in node.get_subscriptions_info_by_topic(topic)
@@ -49,6 +69,7 @@ def all_conflicts(node: Any) -> list[TypeConflict]:
 
 
 def _conflicts(node: Any, expected: Iterable[tuple[str, str]]) -> list[TypeConflict]:
+    """Return the conflicts between the expected (topic, type) pairs and the publishers, sorted."""
     found = {
         TypeConflict(topic, publisher.topic_type, kind)
         for topic, kind in expected
@@ -58,20 +79,20 @@ def _conflicts(node: Any, expected: Iterable[tuple[str, str]]) -> list[TypeConfl
     return sorted(found, key=str)
 
 
-def _name(kind: type) -> str:
-    """The name of a message class."""
+def _type_name(kind: type) -> str:
+    """Return the ROS name of a message class."""
     return f"{kind.__module__.partition('.')[0]}/msg/{kind.__name__}"
 
 
 class ConflictWatch:
-    """Warns of each conflict on the topics of a node when it begins."""
+    """Logs a warning when a new type conflict appears on a topic of a node."""
 
     def __init__(self, node: Any) -> None:
         self._node = node
         self._known: set[TypeConflict] = set()
 
-    def look(self) -> None:
-        """To be called every PERIOD."""
+    def check(self) -> None:
+        """Log each new conflict; to be called every CHECK_PERIOD_S."""
         found = set(conflicts_of(self._node))
         for conflict in sorted(found - self._known, key=str):
             self._node.get_logger().warning(str(conflict))

@@ -1,1 +1,3 @@
-"""The controller: observation and action, policy file, modes and their safety, command mux, and the nodes."""
+"""The controller: observation and action, policy file, modes and safety, command mux, and the
+nodes.
+"""

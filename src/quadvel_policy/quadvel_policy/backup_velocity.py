@@ -1,4 +1,4 @@
-"""The velocity that is followed where the estimator's is missing or wrong. Knows no ROS."""
+"""Backup velocity that replaces a missing or wrong velocity estimate. Knows no ROS."""
 
 from __future__ import annotations
 
@@ -14,36 +14,54 @@ from quadvel_description.state import RobotState
 
 Array = NDArray[np.float64]
 
-UP = np.array([0.0, 0.0, GRAVITY])
-"""m/s^2, what an accelerometer at rest shows, world"""
+REST_ACCELERATION = np.array([0.0, 0.0, GRAVITY])
+"""Reading of an accelerometer at rest, world frame, m/s^2."""
 
 
 class Estimator(Protocol):
-    """What a filter has to be; `quadvel_estimator.kalman.KalmanEstimator` is one."""
+    """Interface of a velocity filter, such as `quadvel_estimator.kalman.KalmanEstimator`."""
 
-    def reset(self) -> None: ...
+    def reset(self) -> None:
+        """Reset the filter."""
 
-    def update(self, state: RobotState, previous_action: ArrayLike) -> tuple[Array, Array]: ...
+    def update(self, state: RobotState, previous_action: ArrayLike) -> tuple[Array, Array]:
+        """Process one sample.
+
+        Args:
+            state: The measured state.
+            previous_action: Not used by the Kalman filter.
+
+        Returns:
+            Velocity of the trunk, body frame, (3,), m/s, and its covariance, (3, 3), (m/s)^2.
+        """
 
 
 class BackupVelocity:
-    """Follows the states with a filter of its own, beside the estimator and independent of it, and of the accelerometer.
+    """Runs a filter of its own, independent of the velocity estimator and of the accelerometer.
 
-    The filter is told that the trunk does not accelerate, within the noise that it ascribes to the accelerometer: the legs
-    alone give the velocity to within 0.02 m/s of what they give with it.
-    velocity: (3,) m/s, body frame, at the newest state that was followed; None where there is none.
+    The filter receives the acceleration of a trunk at rest, within the noise that it assumes for
+    the accelerometer. The legs alone give the velocity to within 0.02 m/s of the result with an
+    accelerometer.
+
+    Attributes:
+        velocity: Velocity at the newest state, body frame, (3,), m/s; None if there is none.
     """
 
     def __init__(self, filter: Estimator | None) -> None:
         self._filter = filter
         self.velocity: Array | None = None
 
-    def follow(self, state: RobotState) -> None:
-        """Take the next state. Where that fails the filter starts anew, without a velocity until the next one."""
+    def update(self, state: RobotState) -> None:
+        """Process the next state; if the filter fails, reset it, without a velocity until the next
+        state.
+
+        Args:
+            state: The measured state.
+        """
         if self._filter is None:
             return
         try:
-            at_rest = rotate_inverse(state.quaternion, UP)
+            at_rest = rotate_inverse(state.quaternion, REST_ACCELERATION)
             self.velocity, _ = self._filter.update(
                 attrs.evolve(state, linear_acceleration=at_rest), np.zeros(12)
             )
@@ -51,7 +69,7 @@ class BackupVelocity:
             self.reset()
 
     def reset(self) -> None:
-        """Start anew."""
+        """Reset the filter; there is no velocity until the next state."""
         if self._filter is not None:
             self._filter.reset()
         self.velocity = None

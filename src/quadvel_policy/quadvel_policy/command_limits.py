@@ -1,7 +1,7 @@
-"""The last look at what the joints are asked for: no target, torque, speed or power beyond the limits leaves the controller.
+"""Limits on joint commands: target range, torque step, torque, speed and power. Knows no ROS.
 
-All limits act on the torque that a command gives where the joints are now; a target moves towards the joint until it asks
-for what is allowed. Braking is never limited. Knows no ROS.
+All limits act on the torque of a command at the present joint state: a target is moved towards the
+joint until its torque is allowed. Damping commands are never limited.
 """
 
 from __future__ import annotations
@@ -21,77 +21,87 @@ from .settings import setting
 Array = NDArray[np.float64]
 
 LIMITS = {
-    "target_out_of_range": "A target lies beyond the range of commands: it is held there, the rest goes as torque.",
-    "torque_jumps": "The torque asked for changes by more than `max_torque_step` in one tick.",
-    "torque_too_large": "More torque is asked for than the drive can give.",
-    "joint_at_speed_limit": "A joint is at the speed that its drive can do: nothing drives it faster.",
-    "power_too_large": "The joints are asked for more than `max_power` together.",
+    "target_out_of_range": "A target lies beyond the command range: it is clamped, and the rest is sent as torque.",
+    "torque_jumps": "The commanded torque changes by more than `max_torque_step` in one tick.",
+    "torque_too_large": "The commanded torque exceeds the limit of the drive.",
+    "joint_at_speed_limit": "A joint is at the speed limit of its drive: no torque accelerates it further.",
+    "power_too_large": "The commanded power of all joints exceeds `max_power`.",
 }
-"""Name and what is noticed of each limit, in the order in which they act"""
+"""Condition of each limit by name, in the order in which they act."""
 
 
-@attrs.frozen(kw_only=True, slots=False)  # for classes that have other bases besides
-class CommandLimitsConfig:
-    """What the joints may be asked for beyond the robot's own limits."""
+@attrs.frozen(kw_only=True, slots=False)  # for multiple inheritance
+class JointCommandLimits:
+    """Limits on joint commands besides those of the robot; each field is a node parameter."""
 
     max_torque_step: float = setting(
         30.0,
         "largest change of a joint's torque from tick to tick, N m",
-        at_most=2.0 * float(TORQUE_LIMIT.max()),  # from one end of what a drive can do to the other
+        at_most=2.0 * float(TORQUE_LIMIT.max()),  # from one torque limit to the other
     )
     max_power: float = setting(
         1800.0,
         "largest mechanical power of all joints together, W",
-        at_most=float(TORQUE_LIMIT @ VELOCITY_LIMIT),  # of drives that give all they can
+        at_most=float(TORQUE_LIMIT @ VELOCITY_LIMIT),  # of all drives at their limits
     )
 
 
-class CommandLimits:
-    """Holds commands within the limits. counts: in how many ticks each of LIMITS acted since the start."""
+class JointCommandLimiter:
+    """Applies the limits to joint commands.
 
-    def __init__(self, config: CommandLimitsConfig) -> None:
+    Attributes:
+        counts: Number of ticks in which each of LIMITS acted, since the start.
+    """
+
+    def __init__(self, config: JointCommandLimits) -> None:
         self._config = config
         self.counts: Counter[str] = Counter()
 
     def apply(self, command: JointCommand, previous: JointCommand, state: RobotState) -> None:
-        """Change `command`, which is to answer `state` after `previous`, where it is beyond a limit."""
+        """Limit a command in place.
+
+        Args:
+            command: The command that answers `state`; changed in place.
+            previous: The command of the previous tick.
+            state: The measured state.
+        """
         if command.mode == MODE_DAMPING:
             return
         beyond = (command.q != held(command.q)).any()
         command.q, torque = within_range(command.q, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", beyond)
-        asked = command.torque(state.q, state.dq)
-        allowed = self._after_step(asked, previous.torque(state.q, state.dq))
-        allowed = self._at_most(allowed)
-        allowed = self._at_speed(allowed, state.dq)
-        allowed = self._of_power(allowed, state.dq)
-        if np.count_nonzero(allowed != asked):
-            _ask_for(command, allowed - asked)
+        requested = command.torque(state.q, state.dq)
+        allowed = self._limit_step(requested, previous.torque(state.q, state.dq))
+        allowed = self._limit_torque(allowed)
+        allowed = self._limit_at_top_speed(allowed, state.dq)
+        allowed = self._limit_power(allowed, state.dq)
+        if np.count_nonzero(allowed != requested):
+            _add_torque(command, allowed - requested)
 
     def _count(self, name: str, acts: bool | np.bool_) -> None:
         if acts:
             self.counts[name] += 1
 
-    def _after_step(self, torque: Array, before: Array) -> Array:
+    def _limit_step(self, torque: Array, before: Array) -> Array:
         step = self._config.max_torque_step
         held_torque: Array = np.minimum(np.maximum(torque, before - step), before + step)
         self._count("torque_jumps", np.count_nonzero(held_torque != torque) > 0)
         return held_torque
 
-    def _at_most(self, torque: Array) -> Array:
+    def _limit_torque(self, torque: Array) -> Array:
         held_torque: Array = np.minimum(np.maximum(torque, -TORQUE_LIMIT), TORQUE_LIMIT)
         self._count("torque_too_large", np.count_nonzero(held_torque != torque) > 0)
         return held_torque
 
-    def _at_speed(self, torque: Array, speed: Array) -> Array:
+    def _limit_at_top_speed(self, torque: Array, speed: Array) -> Array:
         faster = (np.abs(speed) >= VELOCITY_LIMIT) & (torque * speed > 0.0)
         if not np.count_nonzero(faster):
             return torque
         self._count("joint_at_speed_limit", True)
         return np.where(faster, 0.0, torque)
 
-    def _of_power(self, torque: Array, speed: Array) -> Array:
+    def _limit_power(self, torque: Array, speed: Array) -> Array:
         power = torque * speed
         total, limit = float(np.maximum(power, 0.0).sum()), self._config.max_power
         if total <= limit:
@@ -100,9 +110,14 @@ class CommandLimits:
         return np.where(power > 0.0, torque * limit / total, torque)
 
 
-def _ask_for(command: JointCommand, change: Array) -> None:
-    """Change the torque by `change` (12,) N m: by the target as far as there is stiffness and range, else by feed-forward."""
-    way = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(way == 0.0, command.q, held(command.q + way))
+def _add_torque(command: JointCommand, change: Array) -> None:
+    """Change the torque of a command by `change` (12,) N m.
+
+        q_des' = clamp(q_des + change / kp),   tau_ff' = tau_ff + change - kp (q_des' - q_des)
+
+    The target changes as far as stiffness and range allow; feed-forward torque gives the rest.
+    """
+    shift = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
+    q = np.where(shift == 0.0, command.q, held(command.q + shift))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

@@ -1,6 +1,7 @@
-"""Which of several velocity sources is followed, how fast the command may change, and when to stand still.
+"""Arbitration between velocity sources by priority, with limits on the rate of change. Knows no
+ROS.
 
-Plain numbers and times; it knows no ROS. What a policy can follow is the supervisor's matter.
+The supervisor limits the command further to what the policy can follow.
 """
 
 from __future__ import annotations
@@ -13,13 +14,20 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
-LONGEST_STEP = 0.05  # s, of the ramp at one update: a process that could not run for longer does not jump
+MAX_RAMP_STEP_S = 0.05
+"""Largest time step of the ramp, so that the command does not jump after a stall."""
 Axes = tuple[float, float, float]
 
 
 @attrs.frozen
 class MuxInput:
-    """A source of velocities: the highest priority among those heard from within `timeout` (s) wins."""
+    """A velocity source.
+
+    Attributes:
+        name: Name of the source.
+        priority: Priority; the highest among the active sources wins.
+        timeout: Time after which a silent source is inactive, s.
+    """
 
     name: str
     priority: int
@@ -33,7 +41,14 @@ def _axes(instance: object, field: attrs.Attribute[Axes], value: Axes) -> None:
 
 @attrs.frozen(kw_only=True)
 class MuxConfig:
-    """Bounds of the command, each for vx, vy (m/s) and wz (rad/s)."""
+    """Limits of the command, each for vx, vy (m/s) and wz (rad/s).
+
+    Attributes:
+        max_velocity: Largest velocity.
+        acceleration: Largest rate of change away from zero, m/s^2 and rad/s^2.
+        stop_acceleration: Largest rate of change towards zero, m/s^2 and rad/s^2.
+        dead_zone: Velocity that counts as zero if all axes are below it.
+    """
 
     max_velocity: Axes = attrs.field(
         default=(4.5, 2.2, 6.3),
@@ -61,7 +76,13 @@ class MuxConfig:
 
 @attrs.frozen
 class MuxOutput:
-    """What to track: velocity (3,), whether to stand still, and the input that won or "none"."""
+    """Command of the mux.
+
+    Attributes:
+        velocity: vx, vy (m/s), wz (rad/s), (3,).
+        stance: Whether the robot must stand still.
+        source: Name of the active source, or "none".
+    """
 
     velocity: Array
     stance: bool
@@ -69,42 +90,68 @@ class MuxOutput:
 
 
 class CommandMux:
-    """Arbitrates `inputs`; `receive` takes what arrives, `update` says what to track now.
+    """Selects the active velocity source with the highest priority.
 
-    locks: names of those that are set. stance_requested: whether the operator asks to stand still.
-    Raises ValueError where two inputs share a name or a priority.
+    Attributes:
+        locks: Names of the active locks; any lock stops the robot.
+        stance_requested: Whether the operator requested to stand still.
     """
 
     def __init__(self, inputs: Sequence[MuxInput], config: MuxConfig = MuxConfig()) -> None:
+        """Create a mux.
+
+        Args:
+            inputs: Velocity sources.
+            config: Limits of the command.
+
+        Raises:
+            ValueError: Two sources share a name or a priority.
+        """
         for field in ("name", "priority"):
             values = [getattr(i, field) for i in inputs]
             if not values or len(set(values)) != len(values):
                 raise ValueError(f"inputs have the {field} list {values}, expected each {field} once")
         self._inputs = sorted(inputs, key=lambda i: -i.priority)
         self._config = config
-        self._heard: dict[str, tuple[float, Array]] = {}
+        self._received: dict[str, tuple[float, Array]] = {}
         self._velocity = np.zeros(3)
         self._updated: float | None = None
         self.locks: set[str] = set()
         self.stance_requested = False
 
     def receive(self, name: str, now: float, velocity: ArrayLike) -> None:
-        """A velocity (vx, vy, wz) from the input `name` at `now` (s). Raises ValueError if not finite."""
+        """Receive a velocity.
+
+        Args:
+            name: Name of the source.
+            now: Time, s.
+            velocity: vx, vy (m/s), wz (rad/s), (3,).
+
+        Raises:
+            ValueError: A number is not finite.
+        """
         value = np.array(velocity, float)
         if not np.isfinite(value).all():
             raise ValueError(f"{name}: the velocity is {value.tolist()}, expected finite numbers")
-        self._heard[name] = (now, value)
+        self._received[name] = (now, value)
 
     def update(self, now: float) -> MuxOutput:
-        """What to track at `now` (s): at most a step away from the update before; stance once at zero."""
-        # What was heard before the clock was set back would be fresh once more when its time comes again.
-        self._heard = {name: heard for name, heard in self._heard.items() if heard[0] <= now}
-        source = self._winner(now)
+        """Compute the command: the active velocity, at most one ramp step from the last command.
+
+        Args:
+            now: Time, s.
+
+        Returns:
+            The command; its stance is set once the velocity is zero.
+        """
+        # If the clock was set back, drop messages from the future: they would become fresh later.
+        self._received = {name: heard for name, heard in self._received.items() if heard[0] <= now}
+        source = self._active_input(now)
         if source is None or self.locks or self.stance_requested:
             source, target = None, np.zeros(3)
         else:
-            target = self._target(self._heard[source.name][1])
-        elapsed = 0.0 if self._updated is None else min(max(now - self._updated, 0.0), LONGEST_STEP)
+            target = self._target(self._received[source.name][1])
+        elapsed = 0.0 if self._updated is None else min(max(now - self._updated, 0.0), MAX_RAMP_STEP_S)
         self._updated = now
         slower = np.abs(target) < np.abs(self._velocity)
         limit = np.where(slower, self._config.stop_acceleration, self._config.acceleration)
@@ -112,10 +159,10 @@ class CommandMux:
         stance = not target.any() and not self._velocity.any()
         return MuxOutput(self._velocity.copy(), stance, source.name if source else "none")
 
-    def _winner(self, now: float) -> MuxInput | None:
-        """The first that is fresh."""
+    def _active_input(self, now: float) -> MuxInput | None:
+        """Return the active source with the highest priority, or None."""
         for source in self._inputs:
-            if source.name in self._heard and now - self._heard[source.name][0] <= source.timeout:
+            if source.name in self._received and now - self._received[source.name][0] <= source.timeout:
                 return source
         return None
 
@@ -126,10 +173,10 @@ class CommandMux:
         return np.clip(velocity, np.negative(c.max_velocity), c.max_velocity)
 
     def _ramp(self, target: Array, step: Array) -> Array:
-        """Straight towards `target` by at most `step` on each axis."""
-        way = target - self._velocity
-        if (np.abs(way) <= step).all():
+        """Move straight towards `target` by at most `step` on each axis."""
+        difference = target - self._velocity
+        if (np.abs(difference) <= step).all():
             return target
         if not step.all():  # no time has passed
             return self._velocity
-        return self._velocity + way / np.max(np.abs(way) / step)
+        return self._velocity + difference / np.max(np.abs(difference) / step)

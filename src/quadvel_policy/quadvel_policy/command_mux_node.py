@@ -1,4 +1,4 @@
-"""The node `command_mux`: topics and services around `command_mux`, which decides."""
+"""The node `command_mux`: topics and services of `command_mux.CommandMux`."""
 
 from __future__ import annotations
 
@@ -21,22 +21,40 @@ from quadvel_nodes.node import read_parameters, run
 from .command_mux import CommandMux, MuxConfig, MuxInput, MuxOutput
 from .received import StampCheck, planar_velocity
 
-PERIOD = 0.02  # s, of command
+PERIOD_S = 0.02  # period of the topic `command`
 
 
-def _listed(default: tuple[Any, ...], description: str) -> Any:
+def _list_parameter(default: tuple[Any, ...], description: str) -> Any:
     return attrs.field(default=default, metadata={"description": description})
 
 
 @attrs.frozen(kw_only=True)
 class MuxParameters(MuxConfig):
-    """The mux's settings and its inputs; the lists of the inputs have one entry for each."""
+    """Parameters of the node; the lists of the inputs have one entry per input.
 
-    names: tuple[str, ...] = _listed(("teleop", "follow", "planner"), "name of each input")
-    topics: tuple[str, ...] = _listed(("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input")
-    priorities: tuple[int, ...] = _listed((100, 50, 10), "priority of each input, the highest wins")
-    timeouts: tuple[float, ...] = _listed((0.5, 0.15, 0.5), "silence after which each input is out, s")
-    lock_topics: tuple[str, ...] = _listed(("command_lock",), "std_msgs/Bool topics: true stops the robot")
+    Attributes:
+        names: Name of each input.
+        topics: Topic of each input.
+        priorities: Priority of each input; the highest wins.
+        timeouts: Time after which a silent input is inactive, s.
+        lock_topics: Topics of type std_msgs/Bool that stop the robot while true.
+        stamped: Whether the inputs are TwistStamped instead of Twist.
+
+    Raises:
+        ValueError: The lists have different lengths; raised by the constructor.
+    """
+
+    names: tuple[str, ...] = _list_parameter(("teleop", "follow", "planner"), "name of each input")
+    topics: tuple[str, ...] = _list_parameter(
+        ("cmd_vel_teleop", "cmd_vel_follow", "cmd_vel"), "topic of each input"
+    )
+    priorities: tuple[int, ...] = _list_parameter((100, 50, 10), "priority of each input, the highest wins")
+    timeouts: tuple[float, ...] = _list_parameter(
+        (0.5, 0.15, 0.5), "silence after which each input is out, s"
+    )
+    lock_topics: tuple[str, ...] = _list_parameter(
+        ("command_lock",), "std_msgs/Bool topics: true stops the robot"
+    )
     stamped: bool = attrs.field(
         default=False, metadata={"description": "inputs are TwistStamped instead of Twist"}
     )
@@ -48,13 +66,20 @@ class MuxParameters(MuxConfig):
                 raise ValueError(f"{field} has {found} entries, expected {len(self.names)} as names has")
 
     def inputs(self) -> list[MuxInput]:
-        """The inputs, in the order of the lists. Raises ValueError for a timeout that makes no sense."""
+        """Return the inputs, in the order of the lists.
+
+        Returns:
+            The inputs.
+
+        Raises:
+            ValueError: A timeout is not positive.
+        """
         lists = zip(self.names, self.priorities, self.timeouts, strict=True)
         return [MuxInput(name, priority, timeout) for name, priority, timeout in lists]
 
 
 class CommandMuxNode(Node):
-    """Topics and services around a CommandMux."""
+    """Connects a CommandMux to topics and services."""
 
     def __init__(self) -> None:
         super().__init__("command_mux")
@@ -72,9 +97,9 @@ class CommandMuxNode(Node):
         self.create_service(SetBool, "~/stance", self._on_stance)
         self._command = self.create_publisher(VelocityCommand, "command", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where the system's clock is set back
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # continues if the system clock is set back
         simulated = self.get_parameter("use_sim_time").value
-        self.create_timer(PERIOD, self._update, clock=self.get_clock() if simulated else steady)
+        self.create_timer(PERIOD_S, self._update, clock=self.get_clock() if simulated else steady)
         self.create_timer(1.0, self._report, clock=steady)
 
     def _now(self) -> float:
@@ -105,7 +130,7 @@ class CommandMuxNode(Node):
         before, output = self._output, self._mux.update(self._now())
         self._output = output
         if before is not None and output.source != before.source:
-            self._tell(output.source)
+            self._log_source(output.source)
         message = VelocityCommand(
             stamp=self.get_clock().now().to_msg(), stance=output.stance, source=output.source
         )
@@ -113,18 +138,18 @@ class CommandMuxNode(Node):
         twist.linear.x, twist.linear.y, twist.angular.z = output.velocity.tolist()
         self._command.publish(message)
 
-    def _tell(self, source: str) -> None:
-        """Log who commands from now on, and why nobody does."""
+    def _log_source(self, source: str) -> None:
+        """Log the new source, or why there is none."""
         if source != "none":
             self.get_logger().info(f"follows {source}")
         elif self._mux.locks:
             self.get_logger().warning(f"stops: locked by {', '.join(sorted(self._mux.locks))}")
         else:
-            why = "stance was requested" if self._mux.stance_requested else "nobody commands a velocity"
+            why = "stance was requested" if self._mux.stance_requested else "no source commands a velocity"
             self.get_logger().info(f"stands still: {why}")
 
     def _report(self) -> None:
-        """Once a second: /diagnostics."""
+        """Publish /diagnostics, at 1 Hz."""
         refused = self._refusals.total - self._refused_before
         self._refused_before = self._refusals.total
         source = self._output.source if self._output else "none"
@@ -140,12 +165,16 @@ class CommandMuxNode(Node):
             "source": source,
             "locks": ", ".join(sorted(self._mux.locks)) or "none",
             "stance_requested": self._mux.stance_requested,
-            **self._refusals.values(),
+            **self._refusals.diagnostic_values(),
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `command_mux`.
+
+    Args:
+        args: Command line arguments; None for those of the process.
+    """
     run(CommandMuxNode, args)

@@ -1,13 +1,14 @@
-"""When the controller ticks, and what it knows then: states, velocities and commands as they come in, a command out.
+"""Timing of the controller: selects the states that start a tick, and its inputs. Knows no ROS.
 
-It is locked to the phase of the states: a tick runs when the state that is due arrives, so that the latency is small and
-constant. What is due lies on an absolute grid in the states' own time (`TickGrid`), so that states may come faster than
-200 Hz; the deadline of a tick is one period after its state held. When states stop, `watch` notices. With simulated time the
-same holds on that time, and the answer waits until estimator and mux have kept up, so that no node is outrun. What a tick
-decides is the supervisor's matter. Knows no ROS: times come in as numbers, in s.
+Ticks are locked to the phase of the states: a tick runs when the state that is due arrives, so the
+latency is small and constant. Due times lie on a grid in the time of the states (`TickGrid`), so
+states may be faster than 200 Hz. The deadline of a tick is one period after the time of its state.
+If states stop, `watch` runs the supervisor. With simulated time, the same holds in that time, and
+the answer waits until estimator and mux have processed the state, so the simulator does not outrun
+them.
 
-All times but that of the clock are the robot's own (`RobotTime`): a stall of the whole machine, simulator included, is no gap
-in them.
+All times are numbers in s. Except for the clock, they are stall-free times of the robot
+(`StallFreeClock`): a stall of the machine together with its simulator is no gap.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from quadvel_nodes.scheduling import Scheduling
 from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_nodes.tick_grid import TickGrid
 
-from .guard import FALL_TIME
+from .guard import FALL_TIME_S
 from .loop_stats import LoopStats
 from .observation import RATE_HZ
 from .received import StampCheck
@@ -36,66 +37,79 @@ from .supervisor import Supervisor, SupervisorConfig
 
 Array = NDArray[np.float64]
 
-PERIOD = 1.0 / RATE_HZ
-WATCH_PERIOD = 0.02
-"""s from one `watch` to the next"""
-LONGEST = 0.5
-"""s that a robot may have stood still, with all of the machine, before its next state, and that a simulated robot waits for a
-node that is behind: half of the time for which a simulator waits for its answer"""
-LOCKSTEP_PATIENCE = 2.0
-"""s of real time that a robot in lockstep waits for a node that is behind"""
+PERIOD_S = 1.0 / RATE_HZ
+WATCH_PERIOD_S = 0.02
+"""s between two calls of `watch`."""
+MAX_STALL_S = 0.5
+"""s, longest stall of the whole machine that is excused, and longest wait of a simulated robot for
+a node that lags. It is half of the time for which a simulator waits for its answer.
+"""
+LOCKSTEP_WAIT_S = 2.0
+"""s of real time, longest wait of a robot in lockstep for a node that lags."""
 
-CLOCK_STEP = 0.02
-"""s by which a clock has to run away from the steady one at once to have been set; both have to be read within half of it"""
+MIN_CLOCK_STEP_S = 0.02
+"""s, smallest step of the clock against the steady clock that counts as setting it; valid if both
+clocks are read within half of this time.
+"""
 
 Stamped = tuple[float, Array]
-"""Time (s) and value"""
+"""Time (s) and value."""
 
 
 @attrs.frozen(kw_only=True)
 class ControlConfig(SupervisorConfig, Scheduling):
-    """The supervisor's settings and the scheduling, and how old what comes in may be."""
+    """Parameters of supervisor and scheduling, and age limits of the inputs; each field is a node
+    parameter.
+    """
 
     max_velocity_age: float = setting(
         0.05,
-        "oldest velocity estimate that is followed; after that it is the Kalman filter's, s",
-        at_most=FALL_TIME,
+        "oldest velocity estimate that is used; after that the Kalman filter replaces it, s",
+        at_most=FALL_TIME_S,
     )
     command_timeout: float = setting(
-        0.5, "oldest command that is followed; after that the robot stands, s", at_most=FALL_TIME
+        0.5, "oldest command that is used; after that the robot stands, s", at_most=FALL_TIME_S
     )
 
 
 @attrs.define
-class _Companion:
-    """A node whose messages a simulated robot waits for, so that it does not outrun it: not for ever, and no more then until
-    the node is heard again.
+class _LaggingNode:
+    """A node that a simulated robot waits for, so that it does not outrun it.
 
-    behind: s that its newest message may be behind the robot. patience: s that the robot waits.
+    After `max_wait`, the robot no longer waits until the node sends a message again.
+
+    Attributes:
+        max_lag: Largest accepted lag of the node's newest message behind the robot, s.
+        max_wait: Longest wait of the robot, s.
     """
 
-    behind: float
-    patience: float
-    _since: float | None = None
+    max_lag: float
+    max_wait: float
+    _waiting_since: float | None = None
 
-    def heard(self) -> None:
-        """A message came."""
-        self._since = None
+    def on_message(self) -> None:
+        """Record that a message arrived."""
+        self._waiting_since = None
 
-    def holds_up(self, age: float, now: float) -> bool:
-        """Whether the robot is to wait. age: s, of the newest message, in the robot's time. now: s, steady."""
-        if age <= self.behind:
+    def delays_robot(self, age: float, now: float) -> bool:
+        """Return whether the robot must wait, for the `age` of the newest message (s, stall-free)
+        at `now` (s, steady).
+        """
+        if age <= self.max_lag:
             return False
-        if self._since is None:
-            self._since = now
-        return now - self._since <= self.patience
+        if self._waiting_since is None:
+            self._waiting_since = now
+        return now - self._waiting_since <= self.max_wait
 
 
 class ControlLoop:
-    """One supervisor in time. `answer` is called with each command; `clock` (s) is that of the stamps.
+    """Runs one supervisor at the right times.
 
-    sim_time: whether that clock is a simulator's in lockstep, which waits for the answer to each of its states. steady: a clock
-    (s) that nobody sets, by which one learns that the other one was set; None where that one cannot be.
+    Attributes:
+        supervisor: The supervisor.
+        stats: Timing statistics.
+        stall_detector: Detector of stalls of this process.
+        state: The newest state that was answered; None before the first.
     """
 
     def __init__(
@@ -107,100 +121,150 @@ class ControlLoop:
         sim_time: bool = False,
         steady: Callable[[], float] | None = None,
     ) -> None:
+        """Create a loop.
+
+        Args:
+            supervisor: The supervisor.
+            config: Its parameters and the age limits.
+            answer: Called with each joint command.
+            clock: Clock of the stamps, s.
+            sim_time: Whether that clock is a simulator's in lockstep, which waits for the answer to
+                each state.
+            steady: Clock that nobody sets, s, by which steps of `clock` are detected; None if
+                `clock` has none.
+        """
         self.supervisor = supervisor
         self.stats = LoopStats()
-        self.pauses = StallDetector(WATCH_PERIOD, PERIOD)
+        self.stall_detector = StallDetector(WATCH_PERIOD_S, PERIOD_S)
         self.state: RobotState | None = None
         self._config, self._publish, self._sim_time = config, answer, sim_time
         self._clock, self._steady = clock, steady or clock
-        self._ahead_of_steady = self._clock() - self._steady()
-        self._patience = (
+        self._clock_offset = self._clock() - self._steady()
+        self._velocity_lead = (
             math.inf if config.robot_waits else 0.0
-        )  # s by which a velocity may be late as nobody ran
-        self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD)
-        self._waiting: RobotState | None = None  # for the estimator or the mux
-        patience = LOCKSTEP_PATIENCE if sim_time else LONGEST
-        self._estimator = _Companion(1.5 * PERIOD, patience)
-        self._mux = _Companion(0.5 * config.command_timeout if sim_time else math.inf, patience)
+        )  # s, by which a velocity may be ahead of the state during a stall
+        self._robot_time, self._grid = StallFreeClock(), TickGrid(PERIOD_S)
+        self._waiting_state: RobotState | None = None  # the state that waits for estimator or mux
+        patience = LOCKSTEP_WAIT_S if sim_time else MAX_STALL_S
+        self._estimator = _LaggingNode(1.5 * PERIOD_S, patience)
+        self._mux = _LaggingNode(0.5 * config.command_timeout if sim_time else math.inf, patience)
         self._answer = JointCommand.damping()
         self._velocity: Stamped | None = None
         self._command: Stamped | None = None
         self._checks = {
-            "low_state": StampCheck(config.max_silence),
-            "waiting": StampCheck(config.max_silence),
-            "velocity_estimate": StampCheck(config.max_velocity_age + self._patience),
+            "low_state": StampCheck(config.silence_limit),
+            "waiting": StampCheck(config.silence_limit),
+            "velocity_estimate": StampCheck(config.max_velocity_age + self._velocity_lead),
             "command": StampCheck(config.command_timeout),
         }
 
     @property
     def stalled(self) -> float:
-        """s that the robot stood still together with the machine, since the start."""
+        """Time that the robot stood still together with the machine, since the start, s."""
         return self._robot_time.stalled
 
     def on_state(self, state: RobotState) -> None:
-        """A state whose `time` is its stamp. Raises MessageError where that is not fit."""
+        """Receive a state; answer it if it is due.
+
+        Args:
+            state: The state; its `time` is its stamp, s.
+
+        Raises:
+            MessageError: The stamp is too old, in the future, or older than the one before.
+        """
         start = time.perf_counter()
         now = self._accept("low_state", state.time)
-        self.pauses.poll(now)
-        longest = max(LONGEST if self.pauses.since_heard else 0.0, self._config.max_silence)
-        state.time = self._robot_time.follow(state.time, state.tick, longest)
-        self.supervisor.stopped += self.pauses.lost
-        self.pauses.heard()
+        self.stall_detector.poll(now)
+        longest = max(MAX_STALL_S if self.stall_detector.has_stalled else 0.0, self._config.silence_limit)
+        state.time = self._robot_time.update(state.time, state.tick, longest)
+        self.supervisor.stopped += self.stall_detector.stalled_s
+        self.stall_detector.on_message()
         if self._outruns_others(state):
-            self._waiting = state
+            self._waiting_state = state
         else:
-            self._take(state, now, start)
+            self._answer_if_due(state, now, start)
 
     def on_waiting(self, stamp: float, tick: int) -> None:
-        """The robot says at `stamp` (s) that its time stands still at `tick`; an unknown tick excuses nothing.
+        """Receive the robot's report that its time stands still; an unknown tick is ignored.
 
-        Raises MessageError where the stamp is not fit.
+        Args:
+            stamp: Time of the report, s.
+            tick: Tick at which the robot waits, ms.
+
+        Raises:
+            MessageError: The stamp is invalid.
         """
         now = self._accept("waiting", stamp)
         if self.state is not None and tick == self._robot_time.tick:
-            self._robot_time.follow(stamp, tick, waiting=True)
+            self._robot_time.update(stamp, tick, is_waiting=True)
         self._resume(now)
 
     def on_velocity(self, stamp: float, velocity: Array) -> None:
-        """A velocity estimate, (3,) m/s, body frame. Raises MessageError where its stamp is not fit."""
+        """Receive a velocity estimate.
+
+        Args:
+            stamp: Time of the estimate, s.
+            velocity: Velocity of the trunk, body frame, (3,), m/s.
+
+        Raises:
+            MessageError: The stamp is invalid.
+        """
         now = self._accept("velocity_estimate", stamp)
-        self._velocity = self._robot_time.at(stamp), velocity
-        self._estimator.heard()
+        self._velocity = self._robot_time.time_at(stamp), velocity
+        self._estimator.on_message()
         self._resume(now)
 
     def on_command(self, stamp: float, velocity: ArrayLike, stance: bool) -> None:
-        """A command, vx, vy (m/s), wz (rad/s), and whether to stand. Raises MessageError where its stamp is not fit."""
+        """Receive a velocity command.
+
+        Args:
+            stamp: Time of the command, s.
+            velocity: vx, vy (m/s), wz (rad/s), (3,).
+            stance: Whether the robot must stand.
+
+        Raises:
+            MessageError: The stamp is invalid.
+        """
         now = self._accept("command", stamp)
-        self._command = self._robot_time.at(stamp), np.append(velocity, float(stance))
-        self._mux.heard()
+        self._command = self._robot_time.time_at(stamp), np.append(velocity, float(stance))
+        self._mux.on_message()
         self._resume(now)
 
     def refuse(self, topic: str, why: MessageError) -> None:
-        """A message of one of these topics was refused: the guards learn why, until a fit one comes.
+        """Record a refused message for the guards, until a valid one comes.
 
-        What refused messages have in common in the end, that they are old, does not hide what was wrong with the first of them.
+        A later refusal for age does not replace an earlier, more specific reason.
+
+        Args:
+            topic: Topic of the message.
+            why: The reason.
         """
         if type(why) is not MessageError or topic not in self.supervisor.refused:
             self.supervisor.refused[topic] = why
 
     def watch(self) -> None:
-        """Every WATCH_PERIOD: let the supervisor learn when states stop, or when none is fit to use any more."""
+        """Run the supervisor if no valid state comes; to be called every WATCH_PERIOD_S."""
         now = self._now()
-        self.pauses.poll(now)
+        self.stall_detector.poll(now)
         if self.state is None:
             return
         refused = "low_state" in self.supervisor.refused
-        limit = self._config.max_state_age if refused else self._config.max_silence
-        if now - self.stalled - self.state.time > limit and not self.pauses.excuse(now):
+        limit = self._config.max_state_age if refused else self._config.silence_limit
+        if now - self.stalled - self.state.time > limit and not self.stall_detector.excuses_silence(now):
             self._tick(self.state, now)
 
     def _now(self, stamp: float = 0.0) -> float:
-        """The clock of the stamps, s. Simulated time may reach this node after what was stamped with it."""
+        """Return the clock of the stamps, s, at least `stamp` in simulated time, which may arrive
+        late.
+        """
         before, now = self._steady(), self._clock()
         ahead = now - before
-        if abs(ahead - self._ahead_of_steady) > CLOCK_STEP and self._steady() - before < 0.5 * CLOCK_STEP:
-            self._robot_time.clock_was_set(ahead - self._ahead_of_steady)
-            self._ahead_of_steady = ahead
+        if (
+            abs(ahead - self._clock_offset) > MIN_CLOCK_STEP_S
+            and self._steady() - before < 0.5 * MIN_CLOCK_STEP_S
+        ):
+            self._robot_time.on_clock_set(ahead - self._clock_offset)
+            self._clock_offset = ahead
         return max(now, stamp) if self._sim_time else now
 
     def _accept(self, topic: str, stamp: float) -> float:
@@ -210,21 +274,23 @@ class ControlLoop:
         return now
 
     def _outruns_others(self, state: RobotState) -> bool:
-        """Whether a simulator shall wait until the estimator, and in lockstep the mux, have kept up."""
+        """Return whether the simulator must wait for the estimator, or in lockstep for the mux."""
         if not (self._sim_time or self._config.robot_waits):
             return False
         now = time.monotonic()
         known = ((self._velocity, self._estimator), (self._command, self._mux))
-        return any(last is not None and node.holds_up(state.time - last[0], now) for last, node in known)
+        return any(last is not None and node.delays_robot(state.time - last[0], now) for last, node in known)
 
-    def _take(self, state: RobotState, now: float, start: float) -> None:
-        """Answer the state if it is due. now, start: when that began, s, on the clock and on the steady clock."""
-        self._waiting = None
-        periods = self._grid.periods(state.time)
+    def _answer_if_due(self, state: RobotState, now: float, start: float) -> None:
+        """Run a tick if the state is due; `now` and `start`: begin of the work on the clock and the
+        steady clock, s.
+        """
+        self._waiting_state = None
+        periods = self._grid.periods_due(state.time)
         if periods:
             self._tick(state, now)
             compute = time.perf_counter() - start
-            late = self._now() - self.stalled - state.time > PERIOD
+            late = self._now() - self.stalled - state.time > PERIOD_S
             self.stats.add(start, compute, self.supervisor.inference_seconds, periods - 1 + late)
             self.supervisor.prepare()
         elif self._sim_time:  # a simulator in lockstep waits for the answer to each of its states
@@ -232,25 +298,32 @@ class ControlLoop:
             self._publish(self._answer)
 
     def _tick(self, state: RobotState, now: float) -> None:
-        """One tick of the supervisor, and its command. now: s, on the clock; it is judged by what was known then."""
-        self.supervisor.overruns = 0 if self._config.robot_waits else self.stats.in_a_row
+        """Run one tick with the inputs known at `now` (s) and publish the command."""
+        self.supervisor.overruns = 0 if self._config.robot_waits else self.stats.consecutive_overruns
         self.state = state
         now -= self.stalled
-        velocity = _fresh(self._velocity, state.time, self._config.max_velocity_age, self._patience)
-        command = _fresh(self._command, now, self._config.command_timeout)
+        velocity = _value_if_fresh(
+            self._velocity, state.time, self._config.max_velocity_age, self._velocity_lead
+        )
+        command = _value_if_fresh(self._command, now, self._config.command_timeout)
         self._answer = self.supervisor.tick(now, state, velocity, command)
         self.supervisor.stopped = 0.0
         self._publish(self._answer)
 
     def _resume(self, now: float) -> None:
-        """Answer the state that waited, if nothing is behind any more."""
-        if self._waiting is not None and not self._outruns_others(self._waiting):
-            self._take(self._waiting, now, time.perf_counter())
+        """Answer the waiting state if no node lags any more."""
+        if self._waiting_state is not None and not self._outruns_others(self._waiting_state):
+            self._answer_if_due(self._waiting_state, now, time.perf_counter())
 
 
-def _fresh(stamped: Stamped | None, now: float, limit: float, ahead: float = 0.0) -> Array | None:
-    """The value, unless its time is more than `limit` (s) off, to come where the clock was set back.
+def _value_if_fresh(stamped: Stamped | None, now: float, limit: float, ahead: float = 0.0) -> Array | None:
+    """Return the value, or None if its time is more than `limit` (s) off, also into the future
+    after a clock step.
 
-    ahead: how much more it may be to come, s: of a state after a standstill that this loop does not know of yet.
+    Args:
+        stamped: Time (s) and value.
+        now: Present time, s.
+        limit: Age limit, s.
+        ahead: Additional limit into the future, s: for a stall that this loop does not know yet.
     """
     return stamped[1] if stamped is not None and -limit - ahead <= now - stamped[0] <= limit else None

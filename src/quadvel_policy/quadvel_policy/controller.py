@@ -1,6 +1,6 @@
-"""The node `controller`: answers the robot's states with joint commands, 200 times a second.
+"""The node `controller`: answers the robot's states with joint commands at 200 Hz.
 
-When it ticks is `ControlLoop`'s matter, what a tick decides the supervisor's.
+`ControlLoop` decides when to tick, the supervisor what to command.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from quadvel_nodes.messages import MessageError, Refusals, numbers, read_low_sta
 from quadvel_nodes.node import read_parameters, run
 from quadvel_nodes.number_text import number_text
 
-from .control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
+from .control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from .guard import MotorStatus as Motors
 from .operator_log import OperatorLog
 from .policy_file import SHIPPED_POLICY, PolicyFile
@@ -35,27 +35,29 @@ from .received import linear_velocity, planar_velocity
 from .settings import setting
 from .supervisor import MODES, Supervisor
 
-NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)  # a state is of use only while it is new
-PATIENCE = 5
-"""s without any state after which the log says that the controller waits for one, and in lockstep, whose time stands still
-then, a robot that reported before is lost"""
+# Only the newest state is useful.
+LATEST_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE)
+SILENCE_LIMIT_S = 5
+"""s without any state after which the log states that the controller waits for one. In lockstep,
+where time stands still then, a robot that reported before counts as lost.
+"""
 
 
 @attrs.frozen(kw_only=True)
 class ControllerParameters(ControlConfig):
-    """What the loop is told, and the node's own."""
+    """Parameters of the loop and of the node; each field is a node parameter."""
 
     policy: str = setting("", "ONNX file of the policy; empty: the one that is shipped")
 
 
 class Controller(Node):
-    """Topics and services around a ControlLoop."""
+    """Connects a ControlLoop to topics and services."""
 
     def __init__(self) -> None:
         super().__init__("controller")
         self._settings = read_parameters(self, ControllerParameters)
         policy = PolicyFile(self._settings.policy or SHIPPED_POLICY)
-        policy.prepare()  # now, as the first time is slow
+        policy.prepare()  # the first run is slow
         self._supervisor = Supervisor(policy, self._settings, KalmanEstimator())
         self._sim_time: bool = self.get_parameter("use_sim_time").value
         self._loop = ControlLoop(
@@ -68,30 +70,32 @@ class Controller(Node):
         )
         self._refusals, self._message = Refusals(), LowCmd()
         self._refused_before = self._overruns_before = self._pauses_before = 0
-        self._announcements = OperatorLog(self._supervisor)
-        self._reports = self._silent_reports = 0  # the latter since the last message on low_state
+        self._operator_log = OperatorLog(self._supervisor)
+        self._reports = self._silent_reports = 0  # total, and since the last low_state
         self._create_interfaces()
-        if not self._sim_time:  # where time waits for the node there is no hurry
+        if not self._sim_time:  # simulated time waits for the node, so it needs no priority
             self._settings.apply(self.get_logger().warning)
-        gc.freeze()  # what exists by now stays: the collector need not look at it in the middle of a tick
+        gc.freeze()  # exclude existing objects from garbage collection, which would delay a tick
 
     def _create_interfaces(self) -> None:
         self._low_cmd = self.create_publisher(LowCmd, "low_cmd", 1)
         self._controller_state = self.create_publisher(ControllerState, "controller/state", 10)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        # A robot's driver may send its states as best it can; a simulator in lockstep waits for the answer to each.
+        # Best effort suits a robot's driver; a simulator in lockstep waits for the answer to each state.
         of_states = (
-            NEWEST if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+            LATEST_QOS if self._sim_time else QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
         )
         self._states = self.create_subscription(LowState, "low_state", self._on_state, of_states)
-        self.create_subscription(Waiting, "waiting", self._on_waiting, NEWEST)
-        self.create_subscription(TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, NEWEST)
-        self.create_subscription(VelocityCommand, "command", self._on_command, NEWEST)
+        self.create_subscription(Waiting, "waiting", self._on_waiting, LATEST_QOS)
+        self.create_subscription(
+            TwistWithCovarianceStamped, "velocity_estimate", self._on_velocity, LATEST_QOS
+        )
+        self.create_subscription(VelocityCommand, "command", self._on_command, LATEST_QOS)
         self.create_subscription(MotorStatus, "motor_status", self._on_motors, 1)
         self.create_service(SetMode, "~/set_mode", self._on_set_mode)
         self.create_service(SetBool, "~/enable_walking", self._on_enable_walking)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)  # goes on where the system's clock is set back
-        self.create_timer(WATCH_PERIOD, self._watch, clock=self.get_clock() if self._sim_time else steady)
+        steady = Clock(clock_type=ClockType.STEADY_TIME)  # continues if the system clock is set back
+        self.create_timer(WATCH_PERIOD_S, self._watch, clock=self.get_clock() if self._sim_time else steady)
         self.create_timer(1.0, self._report, clock=steady)
 
     def _now(self) -> float:
@@ -139,35 +143,35 @@ class Controller(Node):
         self._message.stamp = self.get_clock().now().to_msg()
         write_low_cmd(answer, self._message)
         self._low_cmd.publish(self._message)
-        self._tell()
+        self._log_changes()
 
     def _on_set_mode(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.request(request.mode)
         if not response.success:
             self.get_logger().warning(f"refused mode {request.mode}: {response.message}")
-        self._tell()
+        self._log_changes()
         return response
 
     def _on_enable_walking(self, request: Any, response: Any) -> Any:
         response.success, response.message = self._supervisor.enable_walking(request.data)
         self.get_logger().info(f"the operator {'allows' if request.data else 'forbids'} walking")
-        self._tell()
+        self._log_changes()
         return response
 
-    def _tell(self) -> None:
+    def _log_changes(self) -> None:
         log = self.get_logger()
-        for is_fault, sentence in self._announcements.now():
+        for is_fault, sentence in self._operator_log.changes():
             if is_fault:
                 log.error(sentence)
-            else:  # rclpy wants each place in the program to log with one severity
+            else:  # rclpy requires one severity per call site
                 log.info(sentence)
 
     def _watch(self) -> None:
-        """50 times a second: the loop learns when states stop, and controller/state is published."""
+        """Run the watchdog of the loop and publish controller/state, at 50 Hz."""
         self._loop.watch()
-        self._controller_state.publish(self._describe())
+        self._controller_state.publish(self._state_message())
 
-    def _describe(self) -> Any:
+    def _state_message(self) -> Any:
         supervisor, stats = self._supervisor, self._loop.stats.summary(time.perf_counter())
         message = ControllerState(
             stamp=self.get_clock().now().to_msg(),
@@ -187,12 +191,14 @@ class Controller(Node):
         return message
 
     def _report(self) -> None:
-        """Once a second: /diagnostics, and a look whether the robot is alone."""
-        self._supervisor.duplicate_publisher = self._rival()
+        """Publish /diagnostics and check for a second publisher of states, at 1 Hz."""
+        self._supervisor.duplicate_publisher = self._duplicate_publisher()
         self._silent_reports += 1
-        if self._sim_time and self._loop.state is not None and self._silent_reports > PATIENCE:
-            self._supervisor.fail(f"no state came for {PATIENCE} s: the simulator is silent", "state_stale")
-        level, summary = self._judge()
+        if self._sim_time and self._loop.state is not None and self._silent_reports > SILENCE_LIMIT_S:
+            self._supervisor.fail(
+                f"no state came for {SILENCE_LIMIT_S} s: the simulator is silent", "state_stale"
+            )
+        level, summary = self._status()
         values = {
             "mode": self._supervisor.mode,
             "reason": self._supervisor.reason,
@@ -201,58 +207,58 @@ class Controller(Node):
                 name: number_text(value, ".4g")
                 for name, value in attrs.asdict(self._loop.stats.summary(time.perf_counter())).items()
             },
-            "pauses": self._loop.pauses.count,
+            "pauses": self._loop.stall_detector.count,
             "stalled_s": f"{self._loop.stalled:.3f}",
             **{f"limit {name}": f"acted in {count} ticks" for name, count in self._supervisor.limits.items()},
-            **self._refusals.values(),
+            **self._refusals.diagnostic_values(),
         }
         stamp = self.get_clock().now().to_msg()
         self._diagnostics.publish(diagnostics(stamp, self.get_name(), level, summary, values))
-        self._log(level, summary)
+        self._log_status(level, summary)
 
-    def _log(self, level: bytes, summary: str) -> None:
-        """Once a second: what keeps the robot from moving, and what an operator should look at, now and then."""
+    def _log_status(self, level: bytes, summary: str) -> None:
+        """Log what keeps the robot from moving, and warnings, at 1 Hz or less."""
         log = self.get_logger()
         self._reports += 1
-        for sentence in self._announcements.waiting():
+        for sentence in self._operator_log.walk_refusals():
             log.info(sentence)
         if self._supervisor.duplicate_publisher:
             log.error(self._supervisor.duplicate_publisher, throttle_duration_sec=QUIET)
         elif self._loop.state is None:
-            if self._reports == PATIENCE:
-                log.warning(f"{self._no_state()} in {PATIENCE} s: is a simulator or a driver running?")
+            if self._reports == SILENCE_LIMIT_S:
+                log.warning(
+                    f"{self._missing_state_text()} in {SILENCE_LIMIT_S} s: is a simulator or a driver running?"
+                )
         elif level == DiagnosticStatus.WARN:
             log.warning(summary, throttle_duration_sec=QUIET)
 
-    def _rival(self) -> str | None:
-        """A sentence where more than one robot reports: what the states say then fits neither."""
+    def _duplicate_publisher(self) -> str | None:
+        """Return a sentence if more than one node publishes states, which fit no single robot, else
+        None.
+        """
         count = self._states.get_publisher_count()
         return (
             f"low_state has {count} publishers, expected 1: stop the other simulator" if count > 1 else None
         )
 
-    def _no_state(self) -> str:
+    def _missing_state_text(self) -> str:
         refusal = self._supervisor.refused.get("low_state")
-        return (
-            f"no message on low_state that is fit to use ({refusal})"
-            if refusal
-            else "no message on low_state"
-        )
+        return f"no valid message on low_state ({refusal})" if refusal else "no message on low_state"
 
-    def _judge(self) -> tuple[bytes, str]:
-        """Level and summary of the last second."""
+    def _status(self) -> tuple[bytes, str]:
+        """Return diagnostics level and summary of the last second."""
         refused = self._refusals.total - self._refused_before
         missed = self._loop.stats.overruns - self._overruns_before
-        paused = self._loop.pauses.count - self._pauses_before
+        paused = self._loop.stall_detector.count - self._pauses_before
         self._refused_before, self._overruns_before = self._refusals.total, self._loop.stats.overruns
-        self._pauses_before = self._loop.pauses.count
+        self._pauses_before = self._loop.stall_detector.count
         status = f"{self._supervisor.mode}: {self._supervisor.reason}"
         if self._supervisor.fault:
             return DiagnosticStatus.ERROR, status
         if self._supervisor.duplicate_publisher:
             return DiagnosticStatus.ERROR, self._supervisor.duplicate_publisher
         if self._loop.state is None:
-            return DiagnosticStatus.WARN, f"{self._no_state()} yet"
+            return DiagnosticStatus.WARN, f"{self._missing_state_text()} yet"
         if self._supervisor.findings:
             return DiagnosticStatus.WARN, f"{self._supervisor.findings[0].sentence}; {status}"
         if refused:
@@ -267,5 +273,9 @@ class Controller(Node):
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node `controller`.
+
+    Args:
+        args: Command line arguments; None for those of the process.
+    """
     run(Controller, args)

@@ -1,4 +1,6 @@
-"""The table of faults, out of the guards themselves: `python -m quadvel_policy.faults` prints docs/faults.md."""
+"""Table of all faults, generated from the guards: `python -m quadvel_policy.faults` prints
+docs/faults.md.
+"""
 
 from __future__ import annotations
 
@@ -8,96 +10,115 @@ from collections.abc import Iterator
 import attrs
 
 from .command_limits import LIMITS
-from .guard import MOVING, Level
+from .guard import MOVING_MODES, Level
 from .guards import GUARDS
-from .supervisor import OTHER_FAULTS, SupervisorConfig
+from .supervisor import SUPERVISOR_FAULTS, SupervisorConfig
 
-WHAT_IS_DONE = {
-    Level.DAMPING: "every joint brakes at once",
-    Level.STANCE: "a walking robot brakes on its policy and stands; standing up and lying down go on",
-    Level.LIMIT: "the robot goes on within bounds",
-    Level.NOTICE: "it is told",
+RESPONSES = {
+    Level.DAMPING: "all joints brake immediately",
+    Level.STANCE: "a walking robot brakes on its policy and stands; standing up and lying down continue",
+    Level.LIMIT: "the robot continues within limits",
+    Level.NOTICE: "the fault is reported",
 }
-HOW_IT_ENDS = {
+RECOVERIES = {
     Level.DAMPING: "`quadvel mode passive`, then `stand_up`",
-    Level.STANCE: "once the cause is gone: `quadvel mode stance`, and a zero velocity",
-    Level.LIMIT: "by itself",
-    Level.NOTICE: "by itself",
+    Level.STANCE: "when the cause is gone: `quadvel mode stance`, and a zero velocity",
+    Level.LIMIT: "automatically",
+    Level.NOTICE: "automatically",
 }
 PAGE = """\
-# What can go wrong, and what the robot does then
+# Faults and the robot's responses
 
-The supervisor looks at every control tick, 200 times a second, at what the robot reports and at what its joints are to be asked
-for. What it finds is told in words: in the log of `quadvel up`, by `quadvel status`, on `/diagnostics`, and in `fault`
-and `reason` of `controller/state`. Every limit is a parameter of the node `controller`; its default stands in brackets. Where a
-robot is passive or in fault, its joints brake and nothing more happens to it.
+The supervisor checks the reported state and the joint command at every control tick, 200 times per second. It
+describes each fault in one sentence: in the log of `quadvel up`, in `quadvel status`, on `/diagnostics`, and in
+`fault` and `reason` of `controller/state`. Every limit is a parameter of the node `controller`; its default is in
+brackets. The joints of a robot in passive or fault mode only brake.
 
-A state that cannot be used is refused and counted. If no fit one comes for `max_state_age`, the fault is named after what was
-wrong. A simulated robot whose time stands still, since it is paused or waits for an answer, says so on the topic `waiting`, and
-that is no fault.
+An unusable state is refused and counted. If no usable state comes for `max_state_age`, the fault is named after the
+reason of the refusal. A simulated robot whose time stands still, because it is paused or waits for an answer, reports
+this on the topic `waiting`; that is no fault.
 
-This page is printed by `python -m quadvel_policy.faults`; a test brings about every row, and another one sees the first fail
-without its guard. `python -m quadvel_bringup.topic_faults` brings them about on the topics of a running robot. `make faults`
-lets sensors, links and processes fail at random instants of a simulated robot's life, and measures
-[how soon it reacts](results/faults.md).
+`python -m quadvel_policy.faults` prints this page. One test causes every row, and another one checks that the first
+test fails without the guard. `python -m quadvel_bringup.topic_faults` causes the faults on the topics of a running
+robot. `make faults` makes sensors, links and processes of a simulated robot fail at random times, and measures the
+[reaction times](results/faults.md).
 
 {tables}
 
-What it cannot see: a sensor that is late but agrees with itself, as an IMU or an encoder whose readings come 80 ms late; a
-gyroscope or an orientation alone that stands still while the trunk hardly turns; a command that somebody did not mean. A robot
-whose IMU freezes while it walks brakes blind, and falls in about one of three cases.
+Faults that are not detected: a sensor that is late but consistent, such as an IMU or an encoder with a delay of 80 ms;
+a gyroscope or an orientation that alone stays constant while the trunk hardly turns; an unintended command. A robot
+whose IMU freezes while it walks brakes without orientation, and falls in about one of three cases.
 
-Where nobody commands the joints any more, because the controller has died or hangs, the next in line brakes: the driver after
-its `command_timeout`, the robot's board and the simulator by themselves 20 ms after the last packet.
+If the controller dies or hangs and sends no commands, the next component brakes: the driver after its
+`command_timeout`, the robot's board and the simulator 20 ms after the last packet.
 """
 
 
 @attrs.frozen
 class Row:
-    """One fault. notices: when it is found, one or more sentences."""
+    """One row of the table.
+
+    Attributes:
+        name: Name of the fault.
+        level: Response.
+        modes: Modes in which it has an effect.
+        condition: When it is found, one or more sentences.
+    """
 
     name: str
     level: Level
     modes: tuple[str, ...]
-    notices: str
+    condition: str
 
 
 def table() -> list[Row]:
-    """Every fault there is, those of guards first."""
+    """Return all faults.
+
+    Returns:
+        The rows, those of guards first.
+    """
     return [
-        *(Row(guard.name(), guard.level, guard.modes, _sentence(guard.__doc__ or "")) for guard in GUARDS),
-        *(Row(name, *fields) for name, fields in OTHER_FAULTS.items()),
-        *(Row(name, Level.LIMIT, MOVING, notices) for name, notices in LIMITS.items()),
+        *(
+            Row(guard.name(), guard.level, guard.modes, _first_paragraph(guard.__doc__ or ""))
+            for guard in GUARDS
+        ),
+        *(Row(name, *fields) for name, fields in SUPERVISOR_FAULTS.items()),
+        *(Row(name, Level.LIMIT, MOVING_MODES, notices) for name, notices in LIMITS.items()),
     ]
 
 
 def page() -> str:
-    """docs/faults.md."""
-    return PAGE.format(tables="\n\n".join(_of_level(level) for level in sorted(Level, reverse=True)))
+    """Return the text of docs/faults.md.
+
+    Returns:
+        Markdown.
+    """
+    return PAGE.format(tables="\n\n".join(_level_table(level) for level in sorted(Level, reverse=True)))
 
 
-def _of_level(level: Level) -> str:
+def _level_table(level: Level) -> str:
     rows = [row for row in table() if row.level is level]
-    head = f"## {level.name.capitalize()}: {WHAT_IS_DONE[level]}\n\nHow it ends: {HOW_IT_ENDS[level]}."
-    lines = [f"| `{row.name}` | {_with_values(row.notices)} | {_where(row.modes)} |" for row in rows]
+    head = f"## {level.name.capitalize()}: {RESPONSES[level]}\n\nHow it ends: {RECOVERIES[level]}."
+    lines = [f"| `{row.name}` | {_add_defaults(row.condition)} | {_mode_names(row.modes)} |" for row in rows]
     return "\n".join([head, "", "| fault | found when | in |", "|---|---|---|", *lines])
 
 
-def _where(modes: tuple[str, ...]) -> str:
-    return "every mode that moves" if modes == MOVING else ", ".join(modes)
+def _mode_names(modes: tuple[str, ...]) -> str:
+    return "every mode that moves" if modes == MOVING_MODES else ", ".join(modes)
 
 
-def _sentence(docstring: str) -> str:
-    return " ".join(docstring.split())
+def _first_paragraph(docstring: str) -> str:
+    """Return the first paragraph of a docstring as one line."""
+    return " ".join(docstring.partition("\n\n")[0].split())
 
 
-def _with_values(text: str) -> str:
-    """Each parameter that is named with its default and unit, as `max_tilt` (1.05 rad)."""
-    values = dict(_settings())
+def _add_defaults(text: str) -> str:
+    """Add default and unit to each parameter in backticks, as in `max_tilt` (1.05 rad)."""
+    values = dict(_parameter_defaults())
     return re.sub(r"`(\w+)`", lambda name: f"{name[0]} ({values[name[1]]})", text)
 
 
-def _settings() -> Iterator[tuple[str, str]]:
+def _parameter_defaults() -> Iterator[tuple[str, str]]:
     for field in attrs.fields(SupervisorConfig):
         *_, unit = field.metadata["description"].rpartition(", ")
         yield (

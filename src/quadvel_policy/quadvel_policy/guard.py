@@ -1,6 +1,7 @@
-"""What a guard is: it looks at every control tick and says in one sentence what is wrong, or nothing. Knows no ROS.
+"""Interface of guards: each checks every control tick for one kind of fault. Knows no ROS.
 
-Its `level` says what follows. All of them are in `guards`; what an operator has to clear is the supervisor's matter.
+A guard returns one sentence about the fault, or None. Its `level` determines the response. `guards`
+holds all guards; the supervisor latches faults until the operator clears them.
 """
 
 from __future__ import annotations
@@ -22,37 +23,46 @@ from .settings import setting
 
 Array = NDArray[np.float64]
 
-MOVING = ("stand_up", "stance", "walk", "lie_down")
-"""The modes in which the joints do more than brake"""
-WALK = ("walk",)
-FALL_TIME = 5.0
-"""s after which a robot lies that was going to fall: a limit that waits longer protects nothing"""
+MOVING_MODES = ("stand_up", "stance", "walk", "lie_down")
+"""Modes in which the joints do more than brake."""
+WALK_MODES = ("walk",)
+FALL_TIME_S = 5.0
+"""Duration of a fall, s; a limit that waits longer protects nothing."""
 
 
 class Level(IntEnum):
-    """What follows when a guard finds something; the higher one wins."""
+    """Response to a fault; the highest level wins.
 
-    NOTICE = 0  # it is told, as nothing depends on it
-    LIMIT = 1  # the robot goes on within bounds, or on a substitute, and comes back by itself
-    STANCE = 2  # the policy brakes the robot, then it stands until the operator clears it
-    DAMPING = 3  # every joint brakes at once, until the operator clears it
+    Attributes:
+        NOTICE: The fault is only reported.
+        LIMIT: The robot continues within limits or on a substitute, and recovers automatically.
+        STANCE: The policy brakes the robot, then it stands until the operator clears the fault.
+        DAMPING: All joints brake immediately, until the operator clears the fault.
+    """
+
+    NOTICE = 0
+    LIMIT = 1
+    STANCE = 2
+    DAMPING = 3
 
 
 @attrs.frozen(kw_only=True)
 class GuardConfig:
-    """The limits beyond which a guard finds something."""
+    """Limits of the guards; each field is a parameter of the node `controller`, with its
+    description and unit.
+    """
 
     max_state_age: float = setting(
-        0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME
+        0.05, "oldest state, and longest time without one, before a fault, s", at_most=FALL_TIME_S
     )
     max_standstill: float = setting(
         1.0,
         "the same for a simulated robot, whose time stands still while its process does, s",
-        at_most=FALL_TIME,
+        at_most=FALL_TIME_S,
     )
     robot_waits: bool = setting(
         False,
-        "whether the robot's time stands still until a late answer comes, as a simulator's does: then lateness is no fault",
+        "whether the robot's time stands still until a late answer comes, as in a simulator; then lateness is no fault",
     )
     max_tilt: float = setting(
         1.05, "largest angle between the trunk's and the world's vertical, rad", at_most=0.5 * math.pi
@@ -64,39 +74,39 @@ class GuardConfig:
         0.2, "how far a measured angle may lie outside the mechanical range, rad", at_most=1.0
     )
     max_encoder_error: float = setting(
-        0.35, "by how much a joint's angle may be off what its speed adds up to over 0.1 s, rad", at_most=1.5
+        0.35, "largest deviation of a joint's angle from its integrated speed over 0.1 s, rad", at_most=1.5
     )
     max_attitude_error: float = setting(
         0.15,
-        "by how much the orientation may be off what the gyroscope adds up to over 0.2 s, rad",
+        "largest deviation of the orientation from the integrated gyroscope over 0.2 s, rad",
         at_most=0.5 * math.pi,
     )
     max_torque_error: float = setting(
         12.0,
-        "by how much a drive's torque may be off the one asked for, on the mean of 0.1 s, N m",
+        "largest deviation of a drive's torque from the commanded one, mean over 0.1 s, N m",
         at_most=float(TORQUE_LIMIT.max()),
     )
     max_acceleration_error: float = setting(
-        5.0, "largest mean acceleration of the trunk over 0.5 s, gravity left out, m/s^2", at_most=50.0
+        5.0, "largest mean acceleration of the trunk over 0.5 s, without gravity, m/s^2", at_most=50.0
     )
     frozen_time: float = setting(
-        0.1, "after which a sensor that repeats itself to the bit is at fault, s", at_most=FALL_TIME
+        0.1, "time after which a sensor whose bits do not change is faulty, s", at_most=FALL_TIME_S
     )
     frozen_tick_time: float = setting(
-        0.025, "after which a robot whose tick stands still is at fault, s", at_most=FALL_TIME
+        0.025, "time after which a tick that does not change is a fault, s", at_most=FALL_TIME_S
     )
     frozen_foot_time: float = setting(1.0, "the same for a foot's force while walking, s", at_most=60.0)
     stuck_time: float = setting(
-        0.5, "after which a joint that pushes hard and does not move is stuck, s", at_most=FALL_TIME
+        0.5, "time after which a joint that pushes hard and does not move is stuck, s", at_most=FALL_TIME_S
     )
     stuck_torque: float = setting(
-        0.8, "what pushing hard is, as a share of the drive's largest torque", at_most=1.0
+        0.8, "torque that counts as pushing hard, as a share of the drive's largest torque", at_most=1.0
     )
     max_velocity_error: float = setting(
-        0.8, "by how much the velocity estimate may be off the Kalman filter's, m/s", at_most=5.0
+        0.8, "largest difference of the velocity estimate and the Kalman filter, m/s", at_most=5.0
     )
     velocity_trust_time: float = setting(
-        1.0, "after which an estimate that is right again is followed again, s", at_most=60.0
+        1.0, "time after which an estimate that is right again is used again, s", at_most=60.0
     )
     max_temperature: float = setting(
         80.0, "hottest motor before the robot has to stand, deg C", at_most=120.0
@@ -104,53 +114,70 @@ class GuardConfig:
     max_overruns: int = setting(20, "deadlines missed in a row before the robot has to stand", at_most=1000)
 
     @property
-    def max_silence(self) -> float:
-        """The longest time (s) without a state, and the oldest state: longer ones for a robot whose time may stand still."""
+    def silence_limit(self) -> float:
+        """Longest time without a state, and largest age of the state, s; longer if the robot's time
+        may stand still.
+        """
         return self.max_standstill if self.robot_waits else self.max_state_age
 
 
 @attrs.frozen
 class MotorStatus:
-    """What a board tells of its motors now and then."""
+    """Slow status of the motors, as the board reports it.
 
-    temperature: Array  # (12,) deg C
-    dropped_out: NDArray[np.bool_]  # (12,) whether the board has switched it off
+    Attributes:
+        temperature: Motor temperatures, (12,), deg C.
+        dropped_out: Whether the board has switched the motor off, (12,).
+    """
+
+    temperature: Array
+    dropped_out: NDArray[np.bool_]
 
 
 @attrs.define
 class GuardInput:
-    """What a guard sees at one tick."""
+    """Input of the guards at one tick.
+
+    Attributes:
+        config: Limits.
+        mode: Present mode of the supervisor.
+        state: State of this tick.
+        previous: State of the previous tick; None at the first one.
+        age: Age of the state, s.
+        gap: Time between the two states, s; 0 without a previous one.
+        command: Joint command of the previous tick.
+        velocity: Velocity estimate, body frame, (3,), m/s; None without a fresh one.
+        backup: Velocity of the backup Kalman filter, body frame, (3,), m/s; None if there is none.
+        is_moving: Whether the robot follows a velocity other than zero.
+        overruns: Number of consecutive missed deadlines.
+        motors: Status of the motors; None before the first message.
+        duplicate_publisher: Sentence about a second publisher of states, found by the node; None if
+            there is none.
+        refused: By topic, the reason why messages since the last valid one were refused.
+        stopped: Time that the controller did not run between the two states, s.
+    """
 
     config: GuardConfig
     mode: str
     state: RobotState
-    before: RobotState | None
-    """the state of the tick before"""
+    previous: RobotState | None
     age: float
-    """s, of the state"""
     gap: float
-    """s between the two states, 0 where there is one alone"""
-    asked: JointCommand
-    """what the joints were asked for at the tick before"""
+    command: JointCommand
     velocity: Array | None
-    """(3,) m/s, body frame: the velocity estimate; None without a fresh one"""
     backup: Array | None
-    """(3,) m/s, body frame: the Kalman filter's; None where there is none"""
-    moves: bool
-    """whether a velocity other than zero is followed"""
+    is_moving: bool
     overruns: int
-    """deadlines missed in a row"""
     motors: MotorStatus | None
     duplicate_publisher: str | None
-    """what somebody else found that forbids moving, a sentence"""
     refused: Mapping[str, MessageError] = attrs.field(factory=dict)
-    """by topic, why the messages that came since the last fit one were refused"""
     stopped: float = 0.0
-    """s in which the controller did not run between the two states"""
 
     @cached_property
     def is_sound(self) -> bool:
-        """Whether every number is finite and every joint within its limits: all in one look, as it mostly is."""
+        """Whether all numbers are finite and all joints within their limits; one check for the
+        usual case.
+        """
         state, c = self.state, self.config
         low, high = LOWER - c.joint_margin, UPPER + c.joint_margin
         return bool(
@@ -161,29 +188,54 @@ class GuardInput:
 
 
 class Guard:
-    """Finds one kind of fault. `modes`: in which it acts; it looks in every mode. `at_once`: whether it looks before the
-    tick is answered; one that compares over a time does so after that, and acts at the next tick, 5 ms later.
+    """Detects one kind of fault. The first paragraph of a guard's docstring is its row in
+    docs/faults.md.
 
-    The docstring of each is its row in the table of faults.
+    Attributes:
+        level: Response to the fault.
+        is_immediate: Whether the guard runs before the answer of the tick. Guards that compare over
+            a time run after the answer and take effect at the next tick, 5 ms later.
+        modes: Modes in which the fault has an effect; a guard runs in every mode.
     """
 
     level = Level.DAMPING
-    at_once = True
-    modes: tuple[str, ...] = MOVING
+    is_immediate = True
+    modes: tuple[str, ...] = MOVING_MODES
 
-    def check(self, see: GuardInput) -> str | None:
-        """What is wrong, in one sentence, or None."""
+    def check(self, data: GuardInput) -> str | None:
+        """Check one tick.
+
+        Args:
+            data: The state and the context of the tick.
+
+        Returns:
+            The fault, in one sentence, or None.
+
+        Raises:
+            NotImplementedError: A subclass must implement this method.
+        """
         raise NotImplementedError
 
     @classmethod
     def name(cls) -> str:
-        """The name in the table, in lower case with underscores."""
+        """Return the name of the fault.
+
+        Returns:
+            The class name in lower case with underscores.
+        """
         return "".join(f"_{c.lower()}" if c.isupper() else c for c in cls.__name__).lstrip("_")
 
 
 @attrs.frozen
 class Finding:
-    """What is wrong at this tick: the name in the table of faults, what follows, in which modes, and a sentence."""
+    """Fault at the present tick.
+
+    Attributes:
+        name: Name in the table of faults.
+        level: Response.
+        modes: Modes in which it has an effect.
+        sentence: Description for the operator.
+    """
 
     name: str
     level: Level
@@ -192,27 +244,43 @@ class Finding:
 
 
 class GuardSet:
-    """Guards over one robot."""
+    """Runs guards on one robot."""
 
     def __init__(self, guards: Iterable[type[Guard]]) -> None:
+        """Create the guards.
+
+        Args:
+            guards: Guard classes, in the order of their findings.
+        """
         made = [guard() for guard in guards]
-        self._at_once = [guard for guard in made if guard.at_once]
-        self._later = [guard for guard in made if not guard.at_once]
-        self._found_later: list[Finding] = []
+        self._immediate = [guard for guard in made if guard.is_immediate]
+        self._deferred = [guard for guard in made if not guard.is_immediate]
+        self._deferred_findings: list[Finding] = []
 
-    def check(self, see: GuardInput) -> list[Finding]:
-        """What is wrong now, and what `look_again` found at the tick before, whatever the mode."""
-        return _findings(self._at_once, see) + self._found_later
+    def check(self, data: GuardInput) -> list[Finding]:
+        """Run the immediate guards.
 
-    def check_deferred(self, see: GuardInput) -> None:
-        """After the answer: let those look at the same tick that take their time."""
-        self._found_later = _findings(self._later, see)
+        Args:
+            data: The state and the context of the tick.
+
+        Returns:
+            Their findings, then those of `check_deferred` at the previous tick, in any mode.
+        """
+        return _findings(self._immediate, data) + self._deferred_findings
+
+    def check_deferred(self, data: GuardInput) -> None:
+        """Run the deferred guards, after the answer of the tick.
+
+        Args:
+            data: The state and the context of the same tick.
+        """
+        self._deferred_findings = _findings(self._deferred, data)
 
 
-def _findings(guards: Iterable[Guard], see: GuardInput) -> list[Finding]:
+def _findings(guards: Iterable[Guard], data: GuardInput) -> list[Finding]:
     found = []
     for guard in guards:
-        sentence = guard.check(see)
+        sentence = guard.check(data)
         if sentence:
             found.append(Finding(guard.name(), guard.level, guard.modes, sentence))
     return found

@@ -1,6 +1,6 @@
-"""How well a periodic loop keeps time: percentiles of its times since the start.
+"""Timing statistics of a periodic loop: rate, percentiles and overruns since the start.
 
-It measures nothing itself; the controller hands it what it measured.
+The module takes no time itself; the controller passes the measured times.
 """
 
 from __future__ import annotations
@@ -11,11 +11,11 @@ from collections import deque
 import attrs
 import numpy as np
 
-MOST_OVERRUNS = 2**32 - 1  # what a uint32 of quadvel_msgs/ControllerState holds; the count stays there
+MAX_OVERRUN_COUNT = 2**32 - 1  # largest uint32 (quadvel_msgs/ControllerState), where the count stays
 
 
 class Histogram:
-    """Durations from 1 us to 10 s in bins 1 % wide: percentiles since the start in constant memory."""
+    """Percentiles of durations in constant memory: bins of 1 % width from 1 us to 10 s."""
 
     _SHORTEST = 1e-6
     _WIDTH = math.log(1.01)
@@ -24,12 +24,23 @@ class Histogram:
         self._counts = np.zeros(math.ceil(math.log(10.0 / self._SHORTEST) / self._WIDTH) + 1, np.int64)
 
     def add(self, seconds: float) -> None:
-        """Count one duration, s; shorter or longer ones go to the first or last bin."""
+        """Count one duration.
+
+        Args:
+            seconds: Duration, s; shorter or longer ones count in the first or last bin.
+        """
         bin = int(math.log(max(seconds, self._SHORTEST) / self._SHORTEST) / self._WIDTH)
         self._counts[min(bin, len(self._counts) - 1)] += 1
 
     def percentile(self, percent: float) -> float:
-        """In s, within 1 %; nan before the first `add`."""
+        """Return a percentile of all durations.
+
+        Args:
+            percent: 0 to 100.
+
+        Returns:
+            The duration, s, within 1 %; NaN before the first `add`.
+        """
         cumulated = self._counts.cumsum()
         total = int(cumulated[-1])
         if not total:
@@ -40,7 +51,16 @@ class Histogram:
 
 @attrs.frozen
 class LoopSummary:
-    """One look at the loop, in the units of quadvel_msgs/ControllerState."""
+    """Statistics of the loop, in the units of quadvel_msgs/ControllerState.
+
+    Attributes:
+        rate_hz: Ticks in the last second.
+        period_p99_ms: 99th percentile of the time between ticks, ms.
+        inference_p50_us: Median duration of the network, us.
+        compute_p50_us: Median duration of a tick, us.
+        compute_p99_us: 99th percentile of the duration of a tick, us.
+        overruns: Number of missed deadlines since the start.
+    """
 
     rate_hz: float = 0.0
     period_p99_ms: float = math.nan
@@ -51,31 +71,50 @@ class LoopSummary:
 
 
 class LoopStats:
-    """Collects the loop's times. overruns: deadlines missed since the start; in_a_row: none kept between."""
+    """Collects the times of a loop.
+
+    Attributes:
+        overruns: Number of missed deadlines since the start.
+        consecutive_overruns: Number of missed deadlines since the last tick in time.
+    """
 
     def __init__(self) -> None:
         self._period, self._inference, self._compute = Histogram(), Histogram(), Histogram()
         self._starts: deque[float] = deque()  # of the last second
         self._last = math.nan
         self.overruns = 0
-        self.in_a_row = 0
+        self.consecutive_overruns = 0
 
     def add(self, start: float, compute: float, inference: float, missed: int) -> None:
-        """One tick: start on a steady clock, what it and the network alone took (s), deadlines missed."""
+        """Count one tick.
+
+        Args:
+            start: Start of the tick on a steady clock, s.
+            compute: Duration of the tick, s.
+            inference: Duration of the network step, s; NaN if there was none.
+            missed: Number of missed deadlines.
+        """
         if not math.isnan(self._last):
             self._period.add(start - self._last)
         self._last = start
         self._starts.append(start)
-        self._forget_until(start - 1.0)
+        self._drop_before(start - 1.0)
         self._compute.add(compute)
         if not math.isnan(inference):
             self._inference.add(inference)
-        self.overruns = min(self.overruns + missed, MOST_OVERRUNS)
-        self.in_a_row = self.in_a_row + missed if missed else 0
+        self.overruns = min(self.overruns + missed, MAX_OVERRUN_COUNT)
+        self.consecutive_overruns = self.consecutive_overruns + missed if missed else 0
 
     def summary(self, now: float) -> LoopSummary:
-        """Rate over the second before `now` (the clock of `add`); the rest since the start."""
-        self._forget_until(now - 1.0)
+        """Summarise the statistics.
+
+        Args:
+            now: Time on the clock of `add`, s.
+
+        Returns:
+            The rate over the last second, the rest since the start.
+        """
+        self._drop_before(now - 1.0)
         return LoopSummary(
             rate_hz=float(len(self._starts)),
             period_p99_ms=1e3 * self._period.percentile(99),
@@ -85,6 +124,6 @@ class LoopStats:
             overruns=self.overruns,
         )
 
-    def _forget_until(self, start: float) -> None:
+    def _drop_before(self, start: float) -> None:
         while self._starts and self._starts[0] <= start:
             self._starts.popleft()

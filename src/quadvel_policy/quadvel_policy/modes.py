@@ -1,6 +1,6 @@
-"""What the controller does in each of its modes: brake, move to a posture, let the policy drive.
+"""Modes of the controller: damping, motion to a posture, and walking with the policy.
 
-A mode has `enter` and `tick`. When one may follow another, and what is unsafe, is the supervisor's matter.
+A mode has `enter` and `tick`. The supervisor decides which mode runs and what is unsafe.
 """
 
 from __future__ import annotations
@@ -21,48 +21,94 @@ from .observation import JOINTS, PolicyMetadata, build_observation
 
 Array = NDArray[np.float64]
 
-LEAN_TIME = 1.0  # s: shorter, it drives the sway of a standing robot on its own joints (decision 50)
-MAX_LEAN = 0.35  # rad
+LEAN_FILTER_S = 1.0
+"""Time constant of the lean; a shorter one amplifies the sway of a standing robot (decision 50)."""
+MAX_LEAN_RAD = 0.35
 UP = np.array([0.0, 0.0, 1.0])
 
 
 class Policy(Protocol):
-    """What a mode needs of a policy; `PolicyFile` is one."""
+    """Interface of a policy; `PolicyFile` implements it.
+
+    Attributes:
+        metadata: Gains, layout of the observation, and action map.
+    """
 
     metadata: PolicyMetadata
 
-    def reset(self) -> None: ...
+    def reset(self) -> None:
+        """Reset the recurrent state."""
 
-    def prepare(self) -> None: ...
+    def prepare(self) -> None:
+        """Compute the part of the next step that needs no observation."""
 
-    def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
+    def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Run one step.
+
+        Args:
+            observation: The network input, (n,), as `build_observation` makes it.
+
+        Returns:
+            The raw action, (12,).
+        """
 
 
 @attrs.frozen
-class Tick:
-    """What a mode sees at one control tick."""
+class ModeInput:
+    """Input of a mode at one tick.
+
+    Attributes:
+        elapsed: Time since the mode was entered, s.
+        state: The measured state.
+        velocity: Velocity of the trunk, body frame, (3,), m/s; None without a fresh estimate.
+        command: vx, vy (m/s), wz (rad/s), stance (0 or 1), within limits, (4,).
+        previous: Joint command of the previous tick.
+    """
 
     elapsed: float
-    """s since the mode was entered"""
     state: RobotState
     velocity: Array | None
-    """(3,) m/s, body frame; None where there is no fresh estimate"""
     command: Array
-    """(4,): vx, vy (m/s), wz (rad/s), stance, within limits"""
     previous: JointCommand
-    """what the joints were asked for at the tick before"""
 
 
 class Mode(Protocol):
-    """One way to drive the joints."""
+    """Interface of a mode."""
 
-    def enter(self, tick: Tick) -> None: ...
+    def enter(self, tick: ModeInput) -> None:
+        """Initialise the mode.
 
-    def tick(self, tick: Tick) -> JointCommand: ...
+        Args:
+            tick: The first input.
+        """
+
+    def tick(self, tick: ModeInput) -> JointCommand:
+        """Compute the joint command of one tick.
+
+        Args:
+            tick: The input.
+
+        Returns:
+            The joint command.
+        """
 
 
 def blend(a: JointCommand, b: JointCommand, share: float) -> JointCommand:
-    """The command whose torque is (1 - share) times a's plus share times b's, wherever the joints are."""
+    """Interpolate two joint commands so that the torque is interpolated at any joint state.
+
+        tau = (1 - s) tau_a + s tau_b  for  tau = kp (q_des - q) + kd (dq_des - dq) + tau_ff
+
+    so kp = (1 - s) kp_a + s kp_b and q_des = ((1 - s) kp_a q_a + s kp_b q_b) / kp; kd and dq_des
+    alike.
+
+    Args:
+        a: Command at share 0.
+        b: Command at share 1.
+        share: s, 0 to 1.
+
+    Returns:
+        The joint command.
+    """
     kp_a, kp_b, kd_a, kd_b = (1 - share) * a.kp, share * b.kp, (1 - share) * a.kd, share * b.kd
     kp, kd = kp_a + kp_b, kd_a + kd_b
     return JointCommand(
@@ -75,119 +121,212 @@ def blend(a: JointCommand, b: JointCommand, share: float) -> JointCommand:
 
 
 class Damping:
-    """Every joint brakes."""
+    """Damps all joints."""
 
     def __init__(self, kd: float) -> None:
+        """Create the mode.
+
+        Args:
+            kd: Damping gain, N m s/rad.
+        """
         self._kd = kd
 
-    def enter(self, tick: Tick) -> None:
-        """Nothing to prepare."""
+    def enter(self, tick: ModeInput) -> None:
+        """Do nothing.
 
-    def tick(self, tick: Tick) -> JointCommand:
-        """Damping, whatever the state."""
+        Args:
+            tick: Not used.
+        """
+
+    def tick(self, tick: ModeInput) -> JointCommand:
+        """Return the damping command.
+
+        Args:
+            tick: Not used.
+
+        Returns:
+            The joint command.
+        """
         return JointCommand.damping(self._kd)
 
 
-def upright(state: RobotState) -> Array:
-    """Where the vertical through the trunk's origin goes, 1 m below it in the trunk's frame: forward and left, (2,) m."""
+def vertical_offset(state: RobotState) -> Array:
+    """Compute how far the vertical through the trunk's origin is off the trunk's own axis, 1 m
+    below the origin.
+
+    Args:
+        state: The measured state.
+
+    Returns:
+        Offset forward and to the left in the trunk frame, (2,), m, limited to an angle of
+        MAX_LEAN_RAD.
+    """
     forward, left, up = -rotate_inverse(state.quaternion, UP)
-    way = np.array([forward, left]) / max(-up, math.cos(MAX_LEAN))
-    return way * min(1.0, math.tan(MAX_LEAN) / max(math.hypot(*way), 1e-9))
+    difference = np.array([forward, left]) / max(-up, math.cos(MAX_LEAN_RAD))
+    return difference * min(1.0, math.tan(MAX_LEAN_RAD) / max(math.hypot(*difference), 1e-9))
 
 
 class Posture:
-    """Moves smoothly through postures and holds the last one, leaning against slopes.
+    """Moves smoothly through postures and holds the last one, with the feet below the trunk on
+    slopes.
 
-    path: (seconds, q (12,) rad) for each posture on level ground; kp (N m/rad), kd (N m s/rad): gains of every joint. The
-    feet go as far uphill or downhill of where a posture has them as keeps them below the trunk, by the trunk's tilt, smoothed
-    over LEAN_TIME and bounded by MAX_LEAN. It starts from the targets at which these gains ask for the torque that the mode
-    before asked for, so that no torque jumps; from there on torque changes no faster than kp times the path's speed.
+    The feet are shifted uphill or downhill by the tilt of the trunk, which is low-pass filtered
+    with LEAN_FILTER_S and limited to MAX_LEAN_RAD. The path starts at the targets for which the
+    gains give the torque of the previous command, so the torque does not jump; afterwards its rate
+    is at most kp times the speed of the path.
     """
 
     def __init__(self, path: Sequence[tuple[float, Array]], kp: float, kd: float) -> None:
+        """Create the mode.
+
+        Args:
+            path: Duration (s) and joint angles (12,) rad of each posture, on level ground.
+            kp: Stiffness of each joint, N m/rad.
+            kd: Damping of each joint, N m s/rad.
+        """
         self._times = np.cumsum([0.0, *(seconds for seconds, _ in path)])
         self._postures = np.array([np.zeros(JOINTS), *(q for _, q in path)])
         self._feet = foot_positions(self._postures[1:])
-        # Not zero where a knee bends the other way.
+        # Difference to the inverse kinematics, not zero if a knee bends the other way.
         self._offset = self._postures[1:] - inverse_kinematics(self._feet)
         self._kp, self._kd = np.full(JOINTS, kp), np.full(JOINTS, kd)
-        self._lean, self._leant_at = np.zeros(2), 0.0
+        self._lean, self._lean_updated_at = np.zeros(2), 0.0
 
-    def goal(self, state: RobotState) -> Array:
-        """The posture at the end, (12,) rad, for a trunk that is tilted like this one."""
-        goal: Array = self._leaning(upright(state))[-1]
+    def final_posture(self, state: RobotState) -> Array:
+        """Compute the last posture for the present tilt of the trunk.
+
+        Args:
+            state: The measured state.
+
+        Returns:
+            Joint angles, (12,), rad.
+        """
+        goal: Array = self._lean_postures(vertical_offset(state))[-1]
         return goal
 
-    def done(self, elapsed: float) -> bool:
-        """Whether the path has ended `elapsed` seconds after the entry."""
+    def is_finished(self, elapsed: float) -> bool:
+        """Return whether the path has ended.
+
+        Args:
+            elapsed: Time since the mode was entered, s.
+
+        Returns:
+            True at the end of the path.
+        """
         return bool(elapsed >= self._times[-1])
 
-    def enter(self, tick: Tick) -> None:
-        """Take the start of the path from the joints and from what they were asked for."""
-        measured, asked = tick.state.q, tick.previous
-        self._postures[0] = measured + (asked.kp * (asked.q - measured) + asked.tau) / self._kp
-        self._lean, self._leant_at = upright(tick.state), tick.elapsed
+    def enter(self, tick: ModeInput) -> None:
+        """Set the start of the path from the measured joints and the previous command.
 
-    def tick(self, tick: Tick) -> JointCommand:
-        """The posture on the path at this time."""
-        share = 1.0 - math.exp(-max(tick.elapsed - self._leant_at, 0.0) / LEAN_TIME)
-        self._lean, self._leant_at = self._lean + share * (upright(tick.state) - self._lean), tick.elapsed
-        self._postures[1:] = self._leaning(self._lean)
-        q, dq = self._at(tick.elapsed)
+            q_0 = q + (kp_prev (q_des,prev - q) + tau_ff,prev) / kp
+
+        Args:
+            tick: The first input.
+        """
+        measured, requested = tick.state.q, tick.previous
+        self._postures[0] = measured + (requested.kp * (requested.q - measured) + requested.tau) / self._kp
+        self._lean, self._lean_updated_at = vertical_offset(tick.state), tick.elapsed
+
+    def tick(self, tick: ModeInput) -> JointCommand:
+        """Return the posture on the path at this time.
+
+        The tilt is low-pass filtered: lean' = lean + (1 - exp(-dt / LEAN_FILTER_S)) (offset -
+        lean).
+
+        Args:
+            tick: The input.
+
+        Returns:
+            The joint command.
+        """
+        share = 1.0 - math.exp(-max(tick.elapsed - self._lean_updated_at, 0.0) / LEAN_FILTER_S)
+        self._lean, self._lean_updated_at = (
+            self._lean + share * (vertical_offset(tick.state) - self._lean),
+            tick.elapsed,
+        )
+        self._postures[1:] = self._lean_postures(self._lean)
+        q, dq = self._interpolate(tick.elapsed)
         return JointCommand(q=q, dq=dq, kp=self._kp, kd=self._kd)
 
-    def _leaning(self, lean: Array) -> Array:
-        """The postures of the path, (n, 12) rad, for this `upright`."""
+    def _lean_postures(self, lean: Array) -> Array:
+        """Return the postures of the path, (n, 12), rad, for an offset of the vertical
+        (`vertical_offset`).
+        """
         feet = self._feet.copy()
         feet[..., :2] -= feet[..., 2:].mean(axis=1, keepdims=True) * lean
         leaning: Array = inverse_kinematics(feet) + self._offset
         return leaning
 
-    def _at(self, elapsed: float) -> tuple[Array, Array]:
-        """Quintic between postures: q (rad) and dq (rad/s), at rest with no acceleration in each of them."""
-        if self.done(elapsed):
+    def _interpolate(self, elapsed: float) -> tuple[Array, Array]:
+        """Interpolate the path with quintic polynomials: q (rad) and dq (rad/s), at rest at each
+        posture.
+
+        q(s) = q_a + (10 s^3 - 15 s^4 + 6 s^5) (q_b - q_a),   dq = 30 s^2 (1 - s)^2 (q_b - q_a) / T
+        """
+        if self.is_finished(elapsed):
             return self._postures[-1].copy(), np.zeros(JOINTS)
         leg = int(np.searchsorted(self._times, elapsed, side="right"))
         seconds = self._times[leg] - self._times[leg - 1]
         s = (elapsed - self._times[leg - 1]) / seconds
-        way = self._postures[leg] - self._postures[leg - 1]
-        place = s**3 * (10 - 15 * s + 6 * s**2)
+        difference = self._postures[leg] - self._postures[leg - 1]
+        progress = s**3 * (10 - 15 * s + 6 * s**2)
         speed = 30 * s**2 * (1 - s) ** 2 / seconds
-        return self._postures[leg - 1] + place * way, speed * way
+        return self._postures[leg - 1] + progress * difference, speed * difference
 
 
 class Walk:
-    """The policy drives; on entry its torques fade in over `blend_time` (s).
+    """Runs the policy; its torques fade in over `blend_time` after the entry.
 
-    inference_seconds: what the last step of the network took.
+    Attributes:
+        inference_seconds: Duration of the last network step, s; NaN before the first.
     """
 
     def __init__(self, policy: Policy, blend_time: float) -> None:
+        """Create the mode.
+
+        Args:
+            policy: The policy.
+            blend_time: Duration of the fade-in, s.
+        """
         self._policy = policy
         self._blend_time = blend_time
         meta = policy.metadata
         self._observation, self._action = meta.observation, meta.action
         self._kp, self._kd = np.array(meta.kp), np.array(meta.kd)
-        self._before = JointCommand.damping()
+        self._fade_from = JointCommand.damping()
         self.inference_seconds = float("nan")
         self.reset()
 
     def reset(self) -> None:
-        """Start the policy over: its memory and the action that it is told it took."""
+        """Reset the recurrent state and the previous action of the policy."""
         self._policy.reset()
         self._previous_action = np.zeros(JOINTS, np.float32)
 
     def prepare(self) -> None:
-        """Let the policy do ahead what it can of its next step."""
+        """Compute the part of the next step that needs no observation."""
         self._policy.prepare()
 
-    def enter(self, tick: Tick) -> None:
-        """Start the policy over, and remember what to fade from."""
-        self.reset()
-        self._before = tick.previous
+    def enter(self, tick: ModeInput) -> None:
+        """Reset the policy and keep the previous command for the fade-in.
 
-    def tick(self, tick: Tick) -> JointCommand:
-        """One step of the policy, with a velocity. Raises FloatingPointError if its output is not finite."""
+        Args:
+            tick: The first input.
+        """
+        self.reset()
+        self._fade_from = tick.previous
+
+    def tick(self, tick: ModeInput) -> JointCommand:
+        """Run one step of the policy.
+
+        Args:
+            tick: The input, with a velocity.
+
+        Returns:
+            The joint command.
+
+        Raises:
+            FloatingPointError: The output of the policy is not finite.
+        """
         assert tick.velocity is not None  # the supervisor does not walk without one
         observation = build_observation(
             self._observation,
@@ -202,7 +341,7 @@ class Walk:
         start = time.perf_counter()
         self._previous_action = self._policy.step(observation)
         self.inference_seconds = time.perf_counter() - start
-        asked = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
+        requested = JointCommand(q=self._action.targets(self._previous_action), kp=self._kp, kd=self._kd)
         if tick.elapsed < self._blend_time:
-            return blend(self._before, asked, tick.elapsed / self._blend_time)
-        return asked
+            return blend(self._fade_from, requested, tick.elapsed / self._blend_time)
+        return requested

@@ -1,7 +1,7 @@
-"""The observation and the action of a policy: what its network reads and what its output means.
+"""Observation and action of a policy: the input of its network and the meaning of its output.
 
-Training, simulation and the robot all go through this module, and the policy file carries it along as
-metadata, so that none of them can disagree with another. It runs no network; `policy_file` does.
+Training, simulation and the robot all use this module, and the policy file contains its parameters
+as metadata, so they cannot disagree. The module runs no network; `policy_file` does.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ OBSERVATION_SIZES = {
     "dq": JOINTS,  # rad/s
     "linear_velocity": 3,  # m/s, body frame
     "angular_velocity": 3,  # rad/s, body frame
-    "previous_action": JOINTS,  # the raw network output of the tick before
+    "previous_action": JOINTS,  # raw network output of the previous tick
 }
 
 DEFAULT_OBSERVATION = ObservationSpec(
@@ -45,7 +45,7 @@ DEFAULT_OBSERVATION = ObservationSpec(
         ObservationTerm("previous_action", JOINTS, clip=10.0),
     )
 )
-"""The 48 numbers of the paper's Section 4.1, each of about unit size in a walk."""
+"""The 48 numbers of the paper's Section 4.1, each with a magnitude of about 1 in a walk."""
 
 Vector = tuple[float, ...]
 Bounds = tuple[float, float]
@@ -64,13 +64,28 @@ def build_observation(
     roll_pitch: ArrayLike | None = None,
     out: NDArray[np.float32] | None = None,
 ) -> NDArray[np.float32]:
-    """The network's input clip((value - offset) * scale), (..., spec.size), float32; into `out` if given.
+    """Build the network input, clip((value - offset) * scale) of each term.
 
-    command (..., 4): vx, vy (m/s), wz (rad/s), stance (0 or 1). q, dq (..., 12): rad, rad/s. linear_velocity,
-    angular_velocity (..., 3): m/s, rad/s, body frame. previous_action (..., 12): the raw network output of
-    the tick before. The attitude as quaternion (..., 4), (w, x, y, z), body to world, or as roll_pitch (...,
-    2), rad: one of both. All leading axes are the same. NaN stays NaN; infinity may be clipped away, so check
-    before.
+    All arrays have the same leading axes (...). The orientation is either `quaternion` or
+    `roll_pitch`. NaN stays NaN, but clipping hides infinity, so check for it before.
+
+    Args:
+        spec: Terms of the observation.
+        command: vx, vy (m/s), wz (rad/s), stance (0 or 1), (..., 4).
+        q: Joint angles, (..., 12), rad.
+        dq: Joint speeds, (..., 12), rad/s.
+        linear_velocity: Velocity of the trunk, body frame, (..., 3), m/s.
+        angular_velocity: Angular velocity of the trunk, body frame, (..., 3), rad/s.
+        previous_action: Raw network output of the previous tick, (..., 12).
+        quaternion: Orientation (w, x, y, z), body to world, (..., 4).
+        roll_pitch: Roll and pitch, (..., 2), rad.
+        out: Array to write to, (..., spec.size).
+
+    Returns:
+        The observation, (..., spec.size), float32; `out` if given.
+
+    Raises:
+        TypeError: Not exactly one of `quaternion` and `roll_pitch` is given.
     """
     if (quaternion is None) == (roll_pitch is None):
         raise TypeError("build_observation() needs exactly one of quaternion and roll_pitch")
@@ -92,17 +107,19 @@ def build_observation(
 
 
 class MetadataError(ValueError):
-    """Metadata that does not fit. The message names the field, what was found and what was expected."""
+    """Invalid metadata of a policy; the text names the field, the value found and the value
+    expected.
+    """
 
 
-def _refusal(field: str, found: object, expected: str) -> MetadataError:
+def _metadata_error(field: str, found: object, expected: str) -> MetadataError:
     shown = repr(found)
     shown = shown if len(shown) <= 120 else f"{shown[:117]}..."
     return MetadataError(f"metadata field {field} is {shown}, expected {expected}")
 
 
-def _numbers(value: Any) -> NDArray[np.float64]:
-    """`value` as an array of finite numbers, empty where it is something else."""
+def _finite_array(value: Any) -> NDArray[np.float64]:
+    """Return `value` as an array of finite numbers, empty if it is something else."""
     if isinstance(value, bool | str):
         return np.empty(0)
     try:
@@ -113,49 +130,49 @@ def _numbers(value: Any) -> NDArray[np.float64]:
 
 
 def _per_joint(field: str, value: Any) -> Vector:
-    array = _numbers(value)
+    array = _finite_array(value)
     if array.shape not in ((), (JOINTS,)):
-        raise _refusal(field, value, f"a finite number or {JOINTS} of them")
+        raise _metadata_error(field, value, f"a finite number or {JOINTS} of them")
     return tuple(float(x) for x in np.broadcast_to(array, (JOINTS,)))
 
 
 def _bounds(field: str, value: Any) -> Bounds | None:
-    """None (no bound), one number b for (-b, b), or a pair (low, high)."""
-    array = _numbers(value) if value is not None else None
+    """Parse a bound: None (no bound), a number b for (-b, b), or a pair (low, high)."""
+    array = _finite_array(value) if value is not None else None
     if array is None:
         return None
     low, high = (-array, array) if array.shape == () else array if array.shape == (2,) else (0.0, 0.0)
     if not low < high:
-        raise _refusal(field, value, "a positive bound, a pair (low, high) or null")
+        raise _metadata_error(field, value, "a positive bound, a pair (low, high) or null")
     return (float(low), float(high))
 
 
 def _joint_names(field: str, value: Any) -> tuple[str, ...]:
     names = tuple(value) if isinstance(value, list | tuple) else ()
     if len(names) != JOINTS:
-        raise _refusal(field, value, f"{JOINTS} names")
+        raise _metadata_error(field, value, f"{JOINTS} names")
     for i, (found, expected) in enumerate(zip(names, JOINT_NAMES, strict=True)):
         if found != expected:
-            raise _refusal(f"{field}[{i}]", found, f"'{expected}'")
+            raise _metadata_error(f"{field}[{i}]", found, f"'{expected}'")
     return names
 
 
 def _command_limits(field: str, value: Any) -> dict[str, Bounds]:
     if not isinstance(value, Mapping) or set(value) != set(COMMAND_AXES):
-        raise _refusal(field, value, f"a pair (low, high) for each of {', '.join(COMMAND_AXES)}")
+        raise _metadata_error(field, value, f"a pair (low, high) for each of {', '.join(COMMAND_AXES)}")
     limits = {}
     for axis in COMMAND_AXES:
         bounds = _bounds(f"{field}.{axis}", value[axis])
         if bounds is None or not bounds[0] <= 0.0 <= bounds[1]:
-            raise _refusal(f"{field}.{axis}", value[axis], "a pair (low, high) with zero between")
+            raise _metadata_error(f"{field}.{axis}", value[axis], "a pair (low, high) with zero between")
         limits[axis] = bounds
     return limits
 
 
 def _positive(field: str, value: Any, expected: str) -> float:
-    array = _numbers(value)
+    array = _finite_array(value)
     if array.shape != () or not array > 0.0:
-        raise _refusal(field, value, expected)
+        raise _metadata_error(field, value, expected)
     return float(array)
 
 
@@ -165,7 +182,7 @@ def _curve_limit(field: str, value: Any) -> float | None:
 
 def _state_shape(field: str, value: Any) -> tuple[int, ...]:
     if not isinstance(value, list | tuple) or not value or not all(type(n) is int and n > 0 for n in value):
-        raise _refusal(field, value, "the shape of h_in, whole numbers above 0")
+        raise _metadata_error(field, value, "the shape of h_in, whole numbers above 0")
     return tuple(value)
 
 
@@ -176,13 +193,13 @@ def _rate(field: str, value: Any) -> float:
 def _gains(field: str, value: Any) -> Vector:
     gains, most = _per_joint(field, value), MAX_GAINS[field]
     if not 0.0 <= min(gains) <= max(gains) <= most:
-        raise _refusal(field, value, f"gains from 0 to {most:g}")
+        raise _metadata_error(field, value, f"gains from 0 to {most:g}")
     return gains
 
 
 def _schema(field: str, value: Any) -> int:
     if value != SCHEMA:
-        raise _refusal(field, value, str(SCHEMA))
+        raise _metadata_error(field, value, str(SCHEMA))
     return SCHEMA
 
 
@@ -197,11 +214,11 @@ def _observation(field: str, value: Any) -> ObservationSpec:
 
 def _text(field: str, value: Any) -> str:
     if not isinstance(value, str):
-        raise _refusal(field, value, "a text")
+        raise _metadata_error(field, value, "a text")
     return value
 
 
-MAX_GAINS = {"kp": 500.0, "kd": 20.0}  # N m/rad, N m s/rad: above all that drives of such robots are run with
+MAX_GAINS = {"kp": 500.0, "kd": 20.0}  # N m/rad, N m s/rad; larger than usual gains of such robots
 
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "schema": _schema,
@@ -223,38 +240,50 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
 
 @attrs.frozen(kw_only=True, eq=False)
 class PolicyMetadata:
-    """All that is needed to run a policy file; the JSON object under the ONNX metadata key `quadvel`.
+    """Everything needed to run a policy file: the JSON object under the ONNX metadata key
+    `quadvel`.
 
-    Where one value for each joint is asked for, one number for all of them will do.
-    Raises MetadataError with the field's name, what was found and what was expected.
+    Fields with one value per joint also accept one number for all joints.
+
+    Attributes:
+        schema: Version of the format.
+        joint_names: Names of the joints, in order.
+        nominal_q: Nominal posture, (12,), rad.
+        action_offset: Joint targets of a zero action, (12,), rad: the nominal posture plus the
+            joint torques of standing divided by kp.
+        action_scale: rad per unit of the network's output, (12,).
+        action_clip: Bounds of the network's output, or None.
+        kp: Stiffness, (12,), N m/rad.
+        kd: Damping, (12,), N m s/rad.
+        rate_hz: Rate of the policy, Hz.
+        observation: Terms of the observation.
+        command_limits: Commands of the training, (low, high) of vx, vy (m/s) and wz (rad/s).
+        curve_limit: Largest lateral acceleration in curves, m/s^2, see `CommandLimits`; None if the
+            limits of the axes are independent.
+        state_shape: Shape of h_in and of c_in.
+        actuator: Actuator model of the training, as JSON.
+        recipe: How the policy was trained, as JSON.
+        commit: Commit of the training code.
+
+    Raises:
+        MetadataError: A field is malformed; raised by the constructor.
     """
 
     schema: int = SCHEMA
     joint_names: tuple[str, ...] = JOINT_NAMES
     nominal_q: Vector = tuple(NOMINAL_Q)
-    """rad"""
     action_offset: Vector
-    """rad; the nominal posture plus the joint torques of standing over kp, so that a zero action stands"""
     action_scale: Vector
-    """rad a unit of the network's output"""
     action_clip: Bounds | None = None
-    """in the unit of the network's output"""
     kp: Vector
-    """N m/rad"""
     kd: Vector
-    """N m s/rad"""
     rate_hz: float = RATE_HZ
     observation: ObservationSpec = DEFAULT_OBSERVATION
     command_limits: dict[str, Bounds]
-    """what the policy was trained to follow: vx, vy (m/s), wz (rad/s), each (low, high)"""
     curve_limit: float | None = None
-    """m/s^2, how fast it turns as it walks: `CommandLimits`; null, or not there: the limits hold one by one"""
     state_shape: tuple[int, ...]
-    """of h_in and of c_in"""
     actuator: Any = None
-    """the actuator model that it was trained on, as JSON"""
     recipe: Any = None
-    """how it was trained, as JSON"""
     commit: str = ""
 
     def __attrs_post_init__(self) -> None:
@@ -263,23 +292,37 @@ class PolicyMetadata:
 
     @property
     def action(self) -> ActionMap:
-        """What the network's output means."""
+        """Conversion of the network's output to joint targets."""
         return ActionMap(self.action_offset, self.action_scale, self.action_clip)
 
     @property
     def limits(self) -> CommandLimits:
-        """The commands that it follows."""
+        """Velocity commands that the policy can follow."""
         vx, vy, wz = (self.command_limits[axis] for axis in COMMAND_AXES)
         return CommandLimits((vx[0], vy[0], wz[0]), (vx[1], vy[1], wz[1]), self.curve_limit)
 
     def to_json(self) -> str:
-        """The JSON object of the policy file."""
+        """Return the JSON object of the policy file.
+
+        Returns:
+            JSON text.
+        """
         data = {field: getattr(self, field) for field in METADATA_FIELDS}
         return json.dumps(data | {"observation": self.observation.to_metadata()}, allow_nan=False)
 
     @classmethod
     def from_json(cls, text: str) -> PolicyMetadata:
-        """Read `to_json`'s text."""
+        """Parse the JSON object of a policy file.
+
+        Args:
+            text: JSON text, as `to_json` writes it.
+
+        Returns:
+            The metadata.
+
+        Raises:
+            MetadataError: The text is not JSON, or a field is missing, unknown or malformed.
+        """
         try:
             data = json.loads(text)
         except json.JSONDecodeError as error:
@@ -288,7 +331,17 @@ class PolicyMetadata:
 
     @classmethod
     def from_fields(cls, data: Any) -> PolicyMetadata:
-        """From the JSON object as read; every one of REQUIRED_FIELDS has to be there, and no other."""
+        """Create metadata from a parsed JSON object with all REQUIRED_FIELDS and no unknown field.
+
+        Args:
+            data: The JSON object.
+
+        Returns:
+            The metadata.
+
+        Raises:
+            MetadataError: A field is missing, unknown or malformed.
+        """
         if not isinstance(data, dict):
             raise MetadataError(f"metadata is {data!r}, expected an object")
         for field in REQUIRED_FIELDS:
@@ -308,18 +361,33 @@ REQUIRED_FIELDS = tuple(field for field in METADATA_FIELDS if field != "curve_li
 
 @attrs.frozen
 class CommandLimits:
-    """What a policy follows: the lowest and the highest (vx, vy, wz), m/s and rad/s; held together where `curve` is given.
+    """Limits of velocity commands (vx, vy, wz), m/s and rad/s; coupled if `curve` is given.
 
-    Then vx and vy keep to the ellipse that their limits span, and |wz| to `curve` (1 - r^2) / (|vx| + |vy|), r being how far
-    out in this ellipse they are: who runs as fast as he can does not turn. curve: m/s^2.
+    With `curve`, vx and vy stay in the ellipse of their limits, at the normalised radius r, and
+
+        |wz| <= curve (1 - r^2) / (|vx| + |vy|)
+
+    so the largest turn rate decreases with speed.
+
+    Attributes:
+        low: Lower limits.
+        high: Upper limits.
+        curve: Largest lateral acceleration, m/s^2; None for independent limits.
     """
 
     low: tuple[float, float, float]
     high: tuple[float, float, float]
     curve: float | None = None
 
-    def held(self, command: Iterable[float]) -> tuple[float, float, float]:
-        """The command (vx, vy, wz) held to these limits."""
+    def clamp(self, command: Iterable[float]) -> tuple[float, float, float]:
+        """Clamp a command to the limits.
+
+        Args:
+            command: vx, vy (m/s), wz (rad/s).
+
+        Returns:
+            The clamped command.
+        """
         bounds = zip(command, self.low, self.high, strict=True)
         vx, vy, wz = (min(max(value, low), high) for value, low, high in bounds)
         if self.curve is None or not (vx or vy):
@@ -333,19 +401,33 @@ class CommandLimits:
 
 
 class ActionMap:
-    """What an output means: target = offset + scale * clip(action), rad.
+    """Conversion of the network's output to joint targets: target = offset + scale * clip(action),
+    rad.
 
-    offset, scale: a number or 12; clip: None, a bound or a pair, in the unit of the network's output. How targets
-    beyond the range of commands are sent: `quadvel_description.command_range`.
+    `quadvel_description.command_range` defines how targets outside the command range are sent.
     """
 
     def __init__(self, offset: ArrayLike, scale: ArrayLike, clip: float | Bounds | None = None) -> None:
+        """Create a map.
+
+        Args:
+            offset: Joint targets of a zero action, a number or (12,), rad.
+            scale: rad per unit of the output, a number or (12,).
+            clip: Bounds of the output: None, a number b for (-b, b), or a pair (low, high).
+        """
         self.offset = np.array(_per_joint("action_offset", offset))
         self.scale = np.array(_per_joint("action_scale", scale))
         self.clip = _bounds("action_clip", clip)
 
     def targets(self, action: ArrayLike) -> NDArray[np.float64]:
-        """Joint targets (..., 12), rad, of the raw network output (..., 12)."""
+        """Convert a network output to joint targets.
+
+        Args:
+            action: Raw network output, (..., 12).
+
+        Returns:
+            Joint targets, (..., 12), rad.
+        """
         if self.clip is not None:
             action = np.clip(action, *self.clip)
         targets: NDArray[np.float64] = self.offset + self.scale * np.asarray(action)

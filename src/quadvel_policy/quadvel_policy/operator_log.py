@@ -1,4 +1,4 @@
-"""What the operator is told of the supervisor: a sentence for each change, none while nothing changes. Knows no ROS."""
+"""Log of the supervisor for the operator: one sentence for each change. Knows no ROS."""
 
 from __future__ import annotations
 
@@ -7,36 +7,47 @@ import time
 from collections.abc import Callable, Iterator
 
 from .guard import Level
-from .supervisor import POSTURE_AFTER, Supervisor
+from .supervisor import VELOCITY_MODES, Supervisor
 
-AGAIN = 5.0
-"""s for which something has to be right before it is told again that it is wrong"""
+REPEAT_AFTER_S = 5.0
+"""s without a finding before the same finding is logged again."""
 
 
 class OperatorLog:
-    """Remembers what was told; the sentences are for a log."""
+    """Generates log sentences from changes of the supervisor."""
 
     def __init__(self, supervisor: Supervisor, clock: Callable[[], float] = time.monotonic) -> None:
+        """Create a log.
+
+        Args:
+            supervisor: The supervisor to observe.
+            clock: A steady clock, s.
+        """
         self._supervisor = supervisor
         self._mode: tuple[str, str] | None = None
         self._refusal: str | None = None
-        self._findings: dict[str, float] = {}  # by name: when it was told last, s
+        self._last_seen: dict[str, float] = {}  # by name: time of the last occurrence, s
         self._clock = clock
 
-    def now(self) -> Iterator[tuple[bool, str]]:
-        """After each tick and request: whether it is a fault, and the sentence."""
+    def changes(self) -> Iterator[tuple[bool, str]]:
+        """Generate the sentences about changes; to be called after each tick and request.
+
+        Yields:
+            Whether it is a fault, and the sentence.
+        """
         mode, reason = self._supervisor.mode, self._supervisor.reason
         if (mode, reason) != self._mode:
             self._mode = mode, reason
-            yield bool(self._supervisor.fault), f"{mode}: {reason}{self._way_out()}"
+            yield bool(self._supervisor.fault), f"{mode}: {reason}{self._recovery_hint()}"
         yield from self._new_findings()
-        if mode not in POSTURE_AFTER:
+        if mode not in VELOCITY_MODES:
             self._refusal = None
         elif self._refusal != "" and not self._supervisor.walk_refusal:
             self._refusal = ""
-            yield False, "ready: a velocity makes it walk"
+            yield False, "ready; waiting for a velocity command"
 
-    def _way_out(self) -> str:
+    def _recovery_hint(self) -> str:
+        """Return how the operator recovers from the present fault."""
         if self._supervisor.mode == "fault":
             return "; the joints are damped until passive is requested, then stand_up"
         if self._supervisor.fault and self._supervisor.mode == "walk":
@@ -44,18 +55,25 @@ class OperatorLog:
         return "; it stands until stance is requested" if self._supervisor.fault else ""
 
     def _new_findings(self) -> Iterator[tuple[bool, str]]:
-        """What is wrong without stopping the robot, each kind once in a while."""
+        """Yield findings that do not stop the robot, each again only after REPEAT_AFTER_S without
+        it.
+        """
         for finding in self._supervisor.findings:
             if finding.level > Level.LIMIT:
                 continue
             now = self._clock()
-            if now - self._findings.get(finding.name, -math.inf) > AGAIN:
+            if now - self._last_seen.get(finding.name, -math.inf) > REPEAT_AFTER_S:
                 yield False, finding.sentence
-            self._findings[finding.name] = now
+            self._last_seen[finding.name] = now
 
-    def waiting(self) -> Iterator[str]:
-        """Now and then: why a standing robot follows no velocity, once for each reason."""
+    def walk_refusals(self) -> Iterator[str]:
+        """Generate the reason why a standing robot does not follow a velocity, once per reason;
+        call it at 1 Hz.
+
+        Yields:
+            The sentence.
+        """
         refusal = self._supervisor.walk_refusal
-        if self._supervisor.mode in POSTURE_AFTER and refusal not in ("", self._refusal):
+        if self._supervisor.mode in VELOCITY_MODES and refusal not in ("", self._refusal):
             self._refusal = refusal
             yield f"follows no velocity: {refusal}"

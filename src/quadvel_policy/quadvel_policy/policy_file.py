@@ -1,6 +1,6 @@
-"""The policy as a file: one ONNX network that carries all that is needed to run it.
+"""Policy file: one ONNX network with metadata that contain everything needed to run it.
 
-What its input and output mean is `observation`'s matter; when it may run is the supervisor's.
+`observation` defines input and output; the supervisor decides when the policy runs.
 """
 
 from __future__ import annotations
@@ -19,13 +19,22 @@ SHIPPED_POLICY = Path(__file__).parent / "policies" / "crl_eam.onnx"
 
 
 class PolicyFile:
-    """A policy with its memory: inputs `obs, h_in, c_in`, outputs `actions, h_out, c_out`, and metadata.
+    """A recurrent policy: inputs `obs, h_in, c_in`, outputs `actions, h_out, c_out`, and metadata.
 
-    metadata: PolicyMetadata, checked. Raises NetworkFileError, one sentence with the file's name, where the
-    file is missing or is not a policy for this robot and rate.
+    Attributes:
+        metadata: The validated metadata.
     """
 
     def __init__(self, path: str | Path = SHIPPED_POLICY) -> None:
+        """Load and validate a policy file.
+
+        Args:
+            path: The ONNX file.
+
+        Raises:
+            NetworkFileError: The file is missing or is not a policy for this robot and rate; one
+                sentence with the name of the file.
+        """
         network = RecurrentNetwork(path, {"actions": JOINTS}, REQUIRED_FIELDS)
         try:
             self.metadata = PolicyMetadata.from_fields(network.metadata)
@@ -38,17 +47,24 @@ class PolicyFile:
         self._network = network
 
     def reset(self) -> None:
-        """Forget everything seen so far."""
+        """Reset the recurrent state."""
         self._network.reset()
 
     def prepare(self) -> None:
-        """Do of the next step what needs no observation, so that it takes less time; may be left out."""
+        """Compute the part of the next step that needs no observation; optional."""
         self._network.prepare()
 
     def step(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """One tick: the network's input, as `build_observation` makes it, to its raw output (12,).
+        """Run one step.
 
-        Raises FloatingPointError where the output is not finite; the memory then is of no use until `reset`.
+        Args:
+            observation: The network input, (n,), as `build_observation` makes it.
+
+        Returns:
+            The raw action, (12,).
+
+        Raises:
+            FloatingPointError: The output is not finite; call `reset` before the next step.
         """
         (action,) = self._network.step(observation)
         return action

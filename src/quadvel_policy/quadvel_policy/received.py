@@ -1,4 +1,4 @@
-"""What the nodes accept of the velocities and time stamps that they receive."""
+"""Validation of received velocities and time stamps."""
 
 from __future__ import annotations
 
@@ -14,14 +14,28 @@ Array = NDArray[np.float64]
 
 
 class StampCheck:
-    """Refuses a stamp that is off the clock by more than `limit` (s), or older than the one before."""
+    """Refuses stamps that are far from the clock, or older than the stamp before."""
 
     def __init__(self, limit: float) -> None:
+        """Create a check.
+
+        Args:
+            limit: Largest deviation of a stamp from the clock, s.
+        """
         self._limit = limit
         self._stamp = self._now = -math.inf
 
     def check(self, stamp: float, now: float) -> None:
-        """Raises MessageError. stamp, now: s on the same clock; where that was set back, it starts over."""
+        """Check one stamp; a clock that was set back restarts the check of the order.
+
+        Args:
+            stamp: Stamp of the message, s.
+            now: Time on the same clock, s.
+
+        Raises:
+            MessageError: The stamp is too far from the clock.
+            BackInTimeError: The stamp is older than the one before.
+        """
         if now < self._now:
             self._stamp = -math.inf
         self._now = now
@@ -34,12 +48,32 @@ class StampCheck:
 
 
 def linear_velocity(twist: Any) -> Array:
-    """The linear part of a geometry_msgs/Twist, (3,) m/s. Raises MessageError if it is not finite."""
+    """Read the linear part of a twist.
+
+    Args:
+        twist: A geometry_msgs/Twist.
+
+    Returns:
+        Velocity, (3,), m/s.
+
+    Raises:
+        NotFiniteError: A number is not finite.
+    """
     return _finite("linear", [twist.linear.x, twist.linear.y, twist.linear.z])
 
 
 def planar_velocity(twist: Any) -> Array:
-    """vx, vy (m/s) and wz (rad/s) of a geometry_msgs/Twist. Raises MessageError if a number is not finite."""
+    """Read the planar part of a twist.
+
+    Args:
+        twist: A geometry_msgs/Twist.
+
+    Returns:
+        vx, vy (m/s) and wz (rad/s), (3,).
+
+    Raises:
+        NotFiniteError: A number is not finite.
+    """
     linear = linear_velocity(twist)
     angular = _finite("angular", [twist.angular.x, twist.angular.y, twist.angular.z])
     return np.array([linear[0], linear[1], angular[2]])

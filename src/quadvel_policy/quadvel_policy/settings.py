@@ -1,4 +1,4 @@
-"""Fields of configurations that become node parameters."""
+"""Fields of configuration classes that become node parameters."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import attrs
 
 
 def setting(default: Any, description: str, at_most: float | None = None) -> Any:
-    """A field of a configuration that becomes a node parameter.
+    """Declare a field of a configuration class that becomes a node parameter.
 
     Args:
-        default: The value where none is given; it decides the type.
-        description: What the parameter means, with its unit behind the last comma.
-        at_most: The largest value of a number, which is above 0: a limit beyond this protects nothing. None where the
-            parameter is no number.
+        default: Default value; it determines the type.
+        description: Meaning of the parameter, with its unit after the last comma.
+        at_most: Largest value of a positive number; a larger limit would protect nothing. None if
+            the parameter is not a number.
 
     Returns:
-        The attrs field. A number beyond these bounds raises ValueError, which names field, value and bounds.
+        The attrs field. A value out of range raises ValueError with field, value and bounds.
     """
 
     def check(_: object, field: attrs.Attribute[Any], value: Any) -> None:

@@ -1,7 +1,8 @@
-"""Tells a robot that fell silent from a process that could not listen. It measures no time itself.
+"""Detection of stalls of this process, to distinguish them from a silent robot. Takes no time
+itself.
 
-After a stall of the machine the newest message known is old, while newer ones wait to be read, or their sender
-has just woken up, too. A process knows its own stalls by its timer, which came late.
+After a stall of the machine, the newest known message is old, while newer ones wait to be read, or
+their sender has stalled, too. A process detects its own stall by a timer that fires late.
 """
 
 from __future__ import annotations
@@ -10,39 +11,57 @@ import math
 
 
 class StallDetector:
-    """Notices when this process did not run, and excuses silence for a period after that, once.
+    """Detects that this process did not run, and excuses silence for one period after that, once.
 
-    count: how often it did not, since the start. lost: s in which it did not, since the last message.
+    Attributes:
+        count: Number of stalls since the start.
+        stalled_s: Duration of stalls since the last message, s.
     """
 
     def __init__(self, period: float, tolerance: float) -> None:
-        """`look` is called by a timer of this period (s) at least; later by more than `tolerance` (s) is a pause."""
+        """Create a detector.
+
+        Args:
+            period: Longest time between two calls of `poll` by a timer, s.
+            tolerance: A call that is later by more than this is a stall, s.
+        """
         self.count = 0
-        self.lost = 0.0
+        self.stalled_s = 0.0
         self._period = period
         self._tolerance = tolerance
-        self._looked: float | None = None
-        self._waits_until: float | None = None  # None: no pause since the last message
+        self._last_poll: float | None = None
+        self._excused_until: float | None = None  # None: no pause since the last message
 
     def poll(self, now: float) -> None:
-        """This process runs at `now` (s)."""
-        if self._looked is not None and now - self._looked > self._period + self._tolerance:
-            self.count += 1
-            self.lost += now - self._looked
-            if self._waits_until is None:
-                self._waits_until = now + self._period
-        self._looked = now
+        """Record that this process runs.
 
-    def heard(self) -> None:
-        """A message fit to use came."""
-        self._waits_until = None
-        self.lost = 0.0
+        Args:
+            now: Time, s.
+        """
+        if self._last_poll is not None and now - self._last_poll > self._period + self._tolerance:
+            self.count += 1
+            self.stalled_s += now - self._last_poll
+            if self._excused_until is None:
+                self._excused_until = now + self._period
+        self._last_poll = now
+
+    def on_message(self) -> None:
+        """Record that a valid message arrived."""
+        self._excused_until = None
+        self.stalled_s = 0.0
 
     @property
-    def since_heard(self) -> bool:
-        """Whether there was a pause since the last message."""
-        return self._waits_until is not None
+    def has_stalled(self) -> bool:
+        """Whether there was a stall since the last message."""
+        return self._excused_until is not None
 
-    def excuse(self, now: float) -> bool:
-        """Whether nothing can be said at `now` (s) about who is silent."""
-        return now <= (-math.inf if self._waits_until is None else self._waits_until)
+    def excuses_silence(self, now: float) -> bool:
+        """Return whether silence may be due to a recent stall.
+
+        Args:
+            now: Time, s.
+
+        Returns:
+            True until one period after the first stall since the last message.
+        """
+        return now <= (-math.inf if self._excused_until is None else self._excused_until)

@@ -78,7 +78,7 @@ class Board:
         modes = np.full(JOINTS, MODE_DAMPING) if self.loop.simulator.braking else self._modes
         warm = np.full(JOINTS, WARM)
         packet = wire.encode_state(
-            BoardState(self._off.reported(state), modes, 0 * warm, warm, WARM, self.remote)
+            BoardState(self._off.as_reported(state), modes, 0 * warm, warm, WARM, self.remote)
         )
         with self._lock:
             self._outward.send(packet, self._clock())
@@ -129,13 +129,13 @@ class Board:
         """Carry out a command, as of now: packets have no time."""
         assert self.loop is not None
         try:
-            command = self._off.carried_out(wire.decode_command(packet))
+            command = self._off.as_executed(wire.decode_command(packet))
             command.tick = self.loop.tick % _WRAP
             self.loop.submit(command)
             self._modes = wire.commanded_modes(packet)
             self.counts["commands"] += 1
         except ValueError as error:
-            about = error.about if isinstance(error, WireError) else wire.CONTENT
+            about = error.kind if isinstance(error, WireError) else wire.CONTENT
             self._refuse(f"wrong_{about.lower()}", str(error))
 
     def _refuse(self, name: str, why: str) -> None:

@@ -52,7 +52,7 @@ class SimNode(SimulationNode[SimParameters]):
 
     def figures(self) -> dict[str, object]:
         """The messages that were refused."""
-        return {**self._refusals.values()}
+        return {**self._refusals.diagnostic_values()}
 
     def worry(self, report: LoopReport) -> str:
         """Whether messages were refused, or none came where one was waited for."""

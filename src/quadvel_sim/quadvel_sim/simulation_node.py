@@ -26,8 +26,8 @@ from quadvel_description.frames import BASE, ODOM, Placed
 from quadvel_description.state import RobotState
 from quadvel_msgs.srv import Push, ResetSim, StepSim
 from quadvel_nodes.diagnostics import QUIET, diagnostics
-from quadvel_nodes.node import end, read_parameters
-from quadvel_nodes.robot_view import LATCHED, fill_quaternion, fill_vector, transforms
+from quadvel_nodes.node import read_parameters, request_exit
+from quadvel_nodes.robot_view import LATCHED, fill_quaternion, fill_vector, transform_messages
 from quadvel_nodes.system_time import SystemTime, as_time
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.loop import REALTIME, LoopReport
@@ -162,7 +162,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
         self._truth.publish(message)
         if transform:
             base = Placed(ODOM, BASE, truth.position, truth.quaternion)
-            self._tf.publish(TFMessage(transforms=transforms(stamp, [base])))
+            self._tf.publish(TFMessage(transforms=transform_messages(stamp, [base])))
 
     # In the executor's thread.
 
@@ -209,7 +209,7 @@ class SimulationNode(Node, ABC, Generic[Settings]):
     def _report(self) -> None:
         """Once a second: how the simulation does."""
         if self._failure:
-            end(self, f"{self.get_name()}: {self._failure}")
+            request_exit(self, f"{self.get_name()}: {self._failure}")
             return
         report = self._loop.report()
         worry = self.worry(report)

@@ -11,7 +11,7 @@ from sensor_msgs.msg import LaserScan
 from tf2_msgs.msg import TFMessage
 
 from quadvel_description.frames import BASE, LASER, ODOM, Placed
-from quadvel_nodes.robot_view import LATCHED, transforms
+from quadvel_nodes.robot_view import LATCHED, transform_messages
 from quadvel_sim.simulator import Simulator
 from quadvel_sim.world import World
 
@@ -25,7 +25,9 @@ class WorldView:
         self._persons = node.create_publisher(PoseArray, "ground_truth/persons", 10)
         self._static = node.create_publisher(TFMessage, "/tf_static", LATCHED)
         mounted = Placed(BASE, LASER, laser.position, laser.quaternion)
-        self._static.publish(TFMessage(transforms=transforms(node.get_clock().now().to_msg(), [mounted])))
+        self._static.publish(
+            TFMessage(transforms=transform_messages(node.get_clock().now().to_msg(), [mounted]))
+        )
         self._message = LaserScan(
             angle_min=scanner.angle_min,
             angle_max=float(scanner.angles[-1]),

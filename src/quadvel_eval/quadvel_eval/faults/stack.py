@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
-from quadvel_driver.link import MAX_AGE, for_the_board
+from quadvel_driver.link import MAX_COMMAND_AGE_MS, clamp_for_board
 from quadvel_estimator.features import previous_action
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import LearnedEstimator
@@ -31,7 +31,7 @@ from quadvel_nodes.messages import (
     write_low_state,
 )
 from quadvel_policy.command_mux import CommandMux, MuxInput
-from quadvel_policy.control_loop import WATCH_PERIOD, ControlConfig, ControlLoop
+from quadvel_policy.control_loop import WATCH_PERIOD_S, ControlConfig, ControlLoop
 from quadvel_policy.guard import Guard
 from quadvel_policy.guards import GUARDS
 from quadvel_policy.policy_file import PolicyFile
@@ -142,7 +142,7 @@ class Stack:
             self.processes["mux"].do(self._arbitrate)
         for link in self.links.values():
             link.deliver(self.now)
-        if self.now % round(1e3 * WATCH_PERIOD) == 7:  # a timer has a phase of its own
+        if self.now % round(1e3 * WATCH_PERIOD_S) == 7:  # a timer has a phase of its own
             self.processes["controller"].do(self._loop.watch)
         self.simulator.step()
         self.now += 1
@@ -186,7 +186,7 @@ class Stack:
 
     def _estimate(self, message: Message) -> None:
         try:
-            estimate = self._tracker.take(read_low_state(message))
+            estimate = self._tracker.process(read_low_state(message))
         except (MessageError, FloatingPointError):
             return
         if estimate is not None:
@@ -195,7 +195,7 @@ class Stack:
 
     def _command_to_estimator(self, message: Message) -> None:
         self.processes["estimator"].do(
-            lambda: self._tracker.command(previous_action(message.q, message.mode))
+            lambda: self._tracker.set_previous_action(previous_action(message.q, message.mode))
         )
 
     def _state_to_controller(self, message: Message) -> None:
@@ -236,9 +236,9 @@ class Stack:
             command = read_low_cmd(message)
         except MessageError:
             return
-        if 0 <= self.now - command.tick <= MAX_AGE:
+        if 0 <= self.now - command.tick <= MAX_COMMAND_AGE_MS:
             self.held_mode = command.mode
-            self.simulator.command(for_the_board(command))
+            self.simulator.command(clamp_for_board(command))
 
 
 def spoil(message: Message, rng: np.random.Generator) -> Message:

@@ -72,7 +72,7 @@ def limits(study: Study, policy: str) -> CommandLimits:
 
 def within(command: Command, taken: CommandLimits) -> bool:
     """Whether a policy with these limits takes the command as it is."""
-    return bool(np.allclose(taken.held(command), command, rtol=0.0, atol=1e-9))
+    return bool(np.allclose(taken.clamp(command), command, rtol=0.0, atol=1e-9))
 
 
 def reach(direction: Command, bounds: CommandLimits) -> float:
