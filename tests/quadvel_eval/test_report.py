@@ -22,7 +22,7 @@ WALKED = CellResult(
     cot=0.5,
     estimator_mse={"learned": np.full(3, 0.04)},
     estimator_drift={"learned": 0.1},
-    way=4.0,
+    path_length=4.0,
 )
 FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
 ONE = summarise([WALKED, FALLEN], [0.01])

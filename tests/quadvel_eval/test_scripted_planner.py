@@ -15,7 +15,7 @@ quadvel_dds.install()
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
-from quadvel_eval.script import RETRY  # noqa: E402
+from quadvel_eval.script import RETRY_INTERVAL_S  # noqa: E402
 from quadvel_eval.scripted_planner import ScriptedPlanner  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
@@ -61,7 +61,7 @@ def controller() -> Iterator[Controller]:
 
 
 def test_nothing_is_ordered_before_the_controller_has_heard_the_robot(controller: Controller) -> None:
-    until = time.monotonic() + 3.0 * RETRY
+    until = time.monotonic() + 3.0 * RETRY_INTERVAL_S
     controller.say_until(0.0, lambda: time.monotonic() > until)
     assert controller.asked == []
     controller.say_until(200.0, lambda: controller.asked)

@@ -13,8 +13,8 @@ from quadvel_eval.walk import (
     drive_power,
     jitter,
     make_simulator,
-    record,
-    record_to_the_fall,
+    record_until_fall,
+    record_walk,
 )
 
 G = 9.81
@@ -63,7 +63,7 @@ def test_drift_is_where_the_velocities_lead_beside_where_the_robot_got_to() -> N
 
 
 def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Callable[..., RobotLoop]) -> None:
-    walk = record(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
+    walk = record_walk(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
     assert walk is not None
     np.testing.assert_allclose(walk.time, np.arange(100) * 0.005, atol=1e-9)
     assert walk.targets.shape == (100, 12)
@@ -76,7 +76,7 @@ def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Calla
 def test_a_robot_that_falls_leaves_no_walk(make_loop: Callable[..., RobotLoop]) -> None:
     loop = make_loop()
     loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
-    assert record(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
+    assert record_walk(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
 
 
 def test_seeds_draw_the_plant_only_where_randomised_is_asked_for() -> None:
@@ -109,7 +109,7 @@ def test_what_is_given_of_the_plant_holds_whatever_was_drawn() -> None:
 def test_a_walk_is_kept_up_to_the_fall(make_loop: Callable[..., RobotLoop]) -> None:
     loop = make_loop()
     loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
-    walk, stood = record_to_the_fall(loop, [((0.0, 0.0, 0.0), 3.0)])
+    walk, stood = record_until_fall(loop, [((0.0, 0.0, 0.0), 3.0)])
     assert not stood
     assert walk is not None
     assert 0.1 < walk.time[-1] < 2.0

@@ -1,4 +1,4 @@
-"""What a tour came to: tour.json, and tour.png with the way on the map and how the distance was kept."""
+"""Writes the result of a tour: tour.json, and tour.png with map, distance and speed."""
 
 from __future__ import annotations
 
@@ -15,24 +15,43 @@ from quadvel_nodes.number_text import number_text
 from quadvel_sim.world import World
 
 from ..report import write_figure, write_json
-from ..world_map import draw
-from .stage import BAND
-from .tour import Moment, Outcome, summary
+from ..world_map import draw_world
+from .stage import DISTANCE_BAND_M
+from .tour import Outcome, TourSample, summarise_tour
 
 PAPER_XY, PAPER_WZ = 0.077, 0.059  # m/s, rad/s: mean errors of the paper's tour of 3.1 km
 
 
-def write_tour(folder: Path, world: World, outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
-    """Both files, each whole or not at all; the figures."""
-    figures = summary(outcome, moments)
+def write_tour(folder: Path, world: World, outcome: Outcome, moments: Sequence[TourSample]) -> dict[str, Any]:
+    """Write tour.json and tour.png.
+
+    Args:
+        folder: Folder of the files.
+        world: World of the tour.
+        outcome: Outcome of the tour.
+        moments: Its samples.
+
+    Returns:
+        The figures.
+    """
+    figures = summarise_tour(outcome, moments)
     write_json(folder / "tour.json", figures)
-    write_figure(folder / "tour.png", picture(world, outcome.distance, moments))
+    write_figure(folder / "tour.png", tour_figure(world, outcome.distance, moments))
     return figures
 
 
-def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
-    """The robot's way on the map of the world; below, distance to the person and speed over time."""
-    figure = draw(world)
+def tour_figure(world: World, distance: float, moments: Sequence[TourSample]) -> Figure:
+    """Draw the robot's path on the map, and distance and speed over time below.
+
+    Args:
+        world: World of the tour.
+        distance: Set distance to the person, m.
+        moments: Samples of the tour.
+
+    Returns:
+        The figure.
+    """
+    figure = draw_world(world)
     way = np.array([one.pose[:2] for one in moments])
     time = np.array([one.time - moments[0].time for one in moments]) / 60.0
     away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
@@ -45,7 +64,7 @@ def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
     low = 2.4 / (high + 3.0)
     world_map.set_position((0.07, low + 0.12, 0.9, 0.8 - low))
     below = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
-    below.axhspan(distance - BAND, distance + BAND, color="tab:green", alpha=0.15)
+    below.axhspan(distance - DISTANCE_BAND_M, distance + DISTANCE_BAND_M, color="tab:green", alpha=0.15)
     below.plot(time, away, color="tab:blue", linewidth=0.8)
     lost = np.array([one.state in (State.LOST, State.LOOKING) for one in moments])
     below.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
@@ -62,7 +81,14 @@ def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
 
 
 def tour_table(figures: Mapping[str, Any]) -> Table:
-    """The figures, for people, beside what the paper reports of its own."""
+    """Create a table of the figures, next to those of the paper.
+
+    Args:
+        figures: Result of `summarise_tour`.
+
+    Returns:
+        The table.
+    """
     table = Table("", "here", "paper", title=f"Following through {figures['world']}, seed {figures['seed']}")
     touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
     n = number_text
@@ -73,7 +99,11 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
         ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
         ("error of the yaw rate, mean", f"{n(figures['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),
         ("distance, mean", f"{n(figures['distance_mean'], '.2f')} m", ""),
-        (f"within {BAND} m of the set distance", f"{n(figures['distance_kept'], '.0%')} of the time", ""),
+        (
+            f"within {DISTANCE_BAND_M} m of the set distance",
+            f"{n(figures['distance_kept'], '.0%')} of the time",
+            "",
+        ),
         ("least clearance from things", _metres(figures["least_clearance"]), ""),
         ("least clearance from persons", _metres(figures["least_gap"]), ""),
         ("person lost", f"{figures['losses']} times, {n(figures['lost_seconds'], '.0f')} s together", ""),
@@ -86,4 +116,5 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
 
 
 def _metres(value: float | None) -> str:
+    """Distance as text; null means that nothing was near."""
     return "nothing was near" if value is None else f"{value:.2f} m"

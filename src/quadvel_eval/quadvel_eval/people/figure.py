@@ -1,4 +1,4 @@
-"""A picture of tracks over the scans that they were made of."""
+"""Draws tracks over the scans from which they were made."""
 
 from __future__ import annotations
 
@@ -10,17 +10,23 @@ from matplotlib.figure import Figure
 from quadvel_follow.leg_detector import LegDetector
 
 from ..report import write_figure
-from .measure import Recording
+from .measure import ScanRecording
 
 
-def draw_tracks(recording: Recording, detector: LegDetector, path: Path) -> None:
-    """From above, in the frame of a sensor that stands: all readings, and the way of each confirmed person."""
+def draw_tracks(recording: ScanRecording, detector: LegDetector, path: Path) -> None:
+    """Draw all ranges and the path of each confirmed person from above, for a sensor at rest.
+
+    Args:
+        recording: The scans.
+        detector: Leg detector.
+        path: File of the figure.
+    """
     figure = Figure(figsize=(8.0, 7.0), layout="constrained")
     axes = figure.subplots()
     angles = recording.angle_min + recording.angle_increment * np.arange(recording.ranges.shape[1])
     ahead = np.column_stack([np.cos(angles), np.sin(angles)])
     ways: dict[int, list[np.ndarray]] = {}
-    for _, ranges, tracks in recording.tracked(detector):
+    for _, ranges, tracks in recording.tracks(detector):
         seen = np.isfinite(ranges) & (ranges > 0.0)
         axes.plot(*(ranges[seen, None] * ahead[seen]).T, ".", color="0.75", markersize=1.0, zorder=1)
         for track in tracks:

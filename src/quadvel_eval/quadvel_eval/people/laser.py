@@ -1,6 +1,6 @@
-"""A floor plan and a laser scanner in it: rays against circles and segments, with the faults of the simulator's.
+"""Simulates a laser scanner in a floor plan: rays against circles and segments, with sensor noise.
 
-For tests, training and as the measure of other simulated lasers; not for dynamics.
+It serves tests, training and the check of other simulated lasers, not dynamics.
 """
 
 from __future__ import annotations
@@ -14,33 +14,55 @@ from quadvel_sim.laser import Scanner
 Array = NDArray[np.float64]
 
 
-def _circles(values: ArrayLike) -> Array:
+def _as_circles(values: ArrayLike) -> Array:
+    """Convert to an array (N, 3)."""
     return np.reshape(np.asarray(values, float), (-1, 3))
 
 
-def _segments(values: ArrayLike) -> Array:
+def _as_segments(values: ArrayLike) -> Array:
+    """Convert to an array (M, 4)."""
     return np.reshape(np.asarray(values, float), (-1, 4))
 
 
 @attrs.frozen
 class FloorPlan:
-    """What a ray may hit: circles (N, 3), each x, y, radius; segments (M, 4), each x, y of both ends; all m."""
+    """Obstacles of a laser in the plane.
 
-    circles: Array = attrs.field(default=(), converter=_circles)
-    segments: Array = attrs.field(default=(), converter=_segments)
+    Attributes:
+        circles: x, y and radius of each circle (N, 3), m.
+        segments: x, y of both ends of each segment (M, 4), m.
+    """
+
+    circles: Array = attrs.field(default=(), converter=_as_circles)
+    segments: Array = attrs.field(default=(), converter=_as_segments)
 
     def with_circles(self, circles: ArrayLike) -> FloorPlan:
-        """This plan with more circles in it."""
-        return FloorPlan(np.vstack([self.circles, _circles(circles)]), self.segments)
+        """Return a plan with additional circles.
+
+        Args:
+            circles: x, y and radius of each (N, 3), m.
+
+        Returns:
+            The new plan.
+        """
+        return FloorPlan(np.vstack([self.circles, _as_circles(circles)]), self.segments)
 
     def cast(self, origin: ArrayLike, angles: Array) -> Array:
-        """How far rays from `origin` (2,) at `angles` (rays,) go, (rays,) in m; inf where they hit nothing."""
+        """Return the length of rays up to the nearest obstacle.
+
+        Args:
+            origin: Common origin of the rays (2,), m.
+            angles: Directions of the rays (rays,), rad.
+
+        Returns:
+            Lengths (rays,), m; inf without an obstacle.
+        """
         ahead = np.column_stack([np.cos(angles), np.sin(angles)])
         start = np.asarray(origin, float)
         return np.minimum(self._to_circles(start, ahead), self._to_segments(start, ahead))
 
     def _to_circles(self, start: Array, ahead: Array) -> Array:
-        """|start + t ahead - centre| = radius, the lesser t."""
+        """Lengths of rays up to the nearest circle, m."""
         if not len(self.circles):
             return np.full(len(ahead), np.inf)
         to_centre = self.circles[:, :2] - start
@@ -50,7 +72,7 @@ class FloorPlan:
         return np.where((root >= 0.0) & (hit > 0.0), hit, np.inf).min(1)
 
     def _to_segments(self, start: Array, ahead: Array) -> Array:
-        """start + t ahead = a + s (b - a), with s from 0 to 1."""
+        """Lengths of rays up to the nearest segment, m."""
         if not len(self.segments):
             return np.full(len(ahead), np.inf)
         to_end, side = self.segments[:, :2] - start, self.segments[:, 2:] - self.segments[:, :2]
@@ -62,8 +84,17 @@ class FloorPlan:
 
 
 class Laser(Scanner):
-    """A scanner in a floor plan."""
+    """Laser scanner in a floor plan."""
 
     def scan(self, plan: FloorPlan, pose: Array, rng: np.random.Generator) -> Array:
-        """Ranges (rays,) in m, from a pose x, y, yaw."""
+        """Simulate one scan.
+
+        Args:
+            plan: The obstacles.
+            pose: x, y (m) and yaw (rad) of the scanner.
+            rng: Random number generator of the noise.
+
+        Returns:
+            Ranges (rays,), m.
+        """
         return self.read(plan.cast(pose[:2], self.angles + pose[2]), rng)
