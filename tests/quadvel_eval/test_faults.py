@@ -103,7 +103,7 @@ def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None
 
 
 def test_cases_that_are_not_there_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"no case holds 'wheel'.* processor; .*lie_down") as refused:
+    with pytest.raises(ValueError, match=r"no case contains 'wheel'.* processor; .*lie_down") as refused:
         run_campaign(1, "wheel")
     assert len(str(refused.value)) < 500
 

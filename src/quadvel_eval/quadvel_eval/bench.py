@@ -254,7 +254,7 @@ PARTS: dict[str, Callable[[], dict[str, Any]]] = {
     "environment": _training("environment"),
     "training": _training("training"),
 }
-TABLE_ROWS = (  # part, figure, what it is, what is wanted
+TABLE_ROWS = (  # part, figure, description, target
     ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
     ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
     ("world", "realtime_factor", "simulator on the campus, times real time", ""),

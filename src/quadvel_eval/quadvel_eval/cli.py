@@ -33,7 +33,7 @@ ClusterOption = Annotated[
 
 
 def eval_command(
-    grid: Annotated[Literal["quick", "paper"], typer.Option(help="Which commands are tried.")],
+    grid: Annotated[Literal["quick", "paper"], typer.Option(help="Grid of commands.")],
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for eval.json, eval.csv and eval.png.")
     ] = Path("out/eval"),
@@ -67,7 +67,7 @@ def eval_command(
         randomised=randomised,
         actuator=actuator,
     )
-    PolicyFile(policy)  # what is wrong with the files shows here, once, before any run
+    PolicyFile(policy)  # fail on a bad file here, once, before any run
     LearnedEstimator(estimator_file)
     if actuator is not None:
         ActuatorParameters.load(actuator)
@@ -99,13 +99,15 @@ def faults_command(
     ] = Path("out/faults"),
     seeds: Annotated[
         int,
-        typer.Option(min=1, help="Runs of each kind of fault, in turn in its modes, with seeds 0, 1, ..."),
+        typer.Option(
+            min=1, help="Runs of each kind of fault, alternating between its modes, with seeds 0, 1, ..."
+        ),
     ] = 20,
     only: Annotated[
         str | None,
         typer.Option(
             metavar="<text>",
-            help="Cases whose 'component kind mode' holds this text.",
+            help="Only cases whose 'component kind mode' contains this text.",
             show_default="all of them",
         ),
     ] = None,
@@ -131,7 +133,7 @@ def faults_command(
 
 def compare_command(
     first: Annotated[Path, typer.Argument(help="eval.json, or a folder that holds one.")],
-    second: Annotated[Path, typer.Argument(help="The one to hold against it.")],
+    second: Annotated[Path, typer.Argument(help="The evaluation to compare with it.")],
 ) -> None:
     """Compare two evaluations of `quadvel eval`."""
     Console().print(comparison_table({str(path): read_evaluation(path) for path in (first, second)}))

@@ -20,7 +20,7 @@ FIGURES_ON_BOTH_PLANTS = (
     "mean error of the yaw rate, rad/s",
     "largest error of the yaw rate, rad/s",
 )
-"""Figures that are told of both plants."""
+"""Figures compared on both plants."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from .robot_loop import CONTROL_PERIOD_S
 
 Array = NDArray[np.float64]
 
-AVERAGING_TIME_S = 0.4  # s, over which a velocity is averaged to be seen without the sway of each step
+AVERAGING_TIME_S = 0.4  # of plotted velocities, to remove the sway of each step
 AXIS_LABELS = ("vx, m/s", "vy, m/s", "wz, rad/s")
 
 

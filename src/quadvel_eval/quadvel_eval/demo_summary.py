@@ -12,11 +12,11 @@ from .segments import SETTLING_TIME_S, Segment, measure_segment, rounded, tracki
 
 Array = NDArray[np.float64]
 
-MAX_COMMAND_GAP_S = 2.0  # s, a planner that was silent for longer had stopped; less is a stall, and what the robot did in it counts
-MIN_SEGMENT_S = SETTLING_TIME_S + 0.5  # s, of a segment that can be judged
+MAX_COMMAND_GAP_S = 2.0  # a longer silence ends a segment; a shorter one is a stall and counts
+MIN_SEGMENT_S = SETTLING_TIME_S + 0.5  # shorter segments are left out
 MAX_TILT_RAD = 1.0  # rad
-MIN_TRUNK_HEIGHT_M = 0.2  # m, of the trunk; it stands at 0.43 and lies at 0.14
-UPRIGHT_MODES = ("stance", "walk", "fault")  # in which a robot that lies has fallen
+MIN_TRUNK_HEIGHT_M = 0.2  # standing: 0.43, lying: 0.14
+UPRIGHT_MODES = ("stance", "walk", "fault")  # in these modes a lying robot has fallen
 
 
 def constant_commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Array]]:
@@ -48,6 +48,7 @@ def count_falls(height: Array, quaternion: Array, upright: NDArray[np.bool_]) ->
     Returns:
         Number of falls.
     """
+    # Third diagonal element of the rotation matrix: cos(tilt) = 1 - 2 (x^2 + y^2).
     tilt_cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
     down = (tilt_cosine < np.cos(MAX_TILT_RAD)) | ((height < MIN_TRUNK_HEIGHT_M) & upright)
     return int(np.count_nonzero(down[1:] & ~down[:-1]) + (down[0] if len(down) else 0))
@@ -84,7 +85,7 @@ def summarise_demo(recording: Recording) -> dict[str, Any]:
     """
     walked = recorded_segments(recording)
     if not walked:
-        raise ValueError("no command was held for long enough to be judged")
+        raise ValueError(f"found no command of {MIN_SEGMENT_S:g} s or more, expected one to evaluate")
     return {
         "segments": [segment.to_json() for segment in walked],
         "falls": _falls(recording),

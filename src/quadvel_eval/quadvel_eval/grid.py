@@ -22,16 +22,22 @@ from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record_walk
 Array = NDArray[np.float64]
 
 SCHEMA = 1
-COMMAND_DURATION_S = 6.0  # s of each command, of which the last 4 are evaluated
-GRIDS: dict[str, tuple[Array, Array, Array]] = {  # vx, vy (m/s), wz (rad/s): every combination
+COMMAND_DURATION_S = 6.0  # of each command; the last 4 s are evaluated
+GRIDS: dict[str, tuple[Array, Array, Array]] = {  # all combinations of vx, vy (m/s) and wz (rad/s)
     "quick": (np.arange(-2, 4) / 2, np.array([-0.4, 0.0, 0.4]), np.array([-1.0, 0.0, 1.0])),
     "paper": (np.arange(-5, 6) / 2, np.arange(-5, 6) / 5, np.array([0.0])),
 }
-WALK_BEFORE_STANCE = [((0.5, 0.0, 0.0), 2.0), ((0.0, 0.0, 0.0), 2.0)]  # how the robot comes to stand
+WALK_BEFORE_STANCE = [
+    ((0.5, 0.0, 0.0), 2.0),
+    ((0.0, 0.0, 0.0), 2.0),
+]  # velocities and durations (s) before standing
 STANCE_DURATION_S = 10.0
-MIN_SPEED_FOR_DELAY, MIN_YAW_RATE_FOR_DELAY = 0.2, 0.3  # m/s, rad/s: of slower ones no delay can be told
+MIN_SPEED_FOR_DELAY, MIN_YAW_RATE_FOR_DELAY = (
+    0.2,
+    0.3,
+)  # m/s, rad/s: for slower commands the delay is undefined
 PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": SECOND}}
-"""Fields of `SimulatorConfig` of the plants that a policy is judged on: the usual one, and one that solves contacts otherwise."""
+"""Plants of the evaluation, as fields of `SimulatorConfig`; the second one solves contacts differently."""
 
 
 @attrs.frozen
@@ -163,12 +169,12 @@ def evaluate_walk(walk: Walk, cell: Cell, mass: float) -> CellResult:
 def _response_delays(walk: Walk, command: Array) -> tuple[float | None, float | None]:
     """Delays (s) of the velocity along the command and of the yaw rate; None for slow commands."""
     speed, turn = float(np.hypot(*command[:2])), abs(command[2])
-    asked, found, xy, wz = walk.commanded, walk.velocity, None, None
+    commanded, found, xy, wz = walk.commanded, walk.velocity, None, None
     if speed >= MIN_SPEED_FOR_DELAY:
         ahead = command[:2] / speed
-        xy = response_delay(asked[:, :2] @ ahead, found[:, :2] @ ahead, CONTROL_PERIOD_S)
+        xy = response_delay(commanded[:, :2] @ ahead, found[:, :2] @ ahead, CONTROL_PERIOD_S)
     if turn >= MIN_YAW_RATE_FOR_DELAY:
-        wz = response_delay(asked[:, 2], found[:, 2], CONTROL_PERIOD_S)
+        wz = response_delay(commanded[:, 2], found[:, 2], CONTROL_PERIOD_S)
     return xy, wz
 
 
@@ -251,11 +257,11 @@ def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:
     Every walk has the same number of ticks, so that the mean of the mean squares is exact.
     """
     names = stood[0].estimator_mse if stood else ()
-    way = sum(r.path_length for r in stood)
+    path_length = sum(r.path_length for r in stood)
     return {
         name: {
             "rmse": rounded(np.sqrt(np.mean([r.estimator_mse[name] for r in stood], axis=0))),
-            "drift": rounded(sum(r.estimator_drift[name] for r in stood) / way),
+            "drift": rounded(sum(r.estimator_drift[name] for r in stood) / path_length),
         }
         for name in names
     }

@@ -43,9 +43,9 @@ from .segments import rounded
 
 Array = NDArray[np.float64]
 
-MAX_STATE_PERIOD_S = 0.005  # s, from one state to the next
+MAX_STATE_PERIOD_S = 0.005
 WARM_UP_S = 0.5
-"""s from the beginning of a recording in which an estimator still lacks what it would remember of the time before"""
+"""Start of a recording in which an estimator still lacks its history."""
 
 
 @attrs.frozen(eq=False)
@@ -140,7 +140,7 @@ def velocity_errors(run: RecordedRun, times: Array, found: Array) -> Mapping[str
         RMS differences of vx and vy (2,), m/s, by reference.
     """
     errors = {}
-    whole = np.searchsorted(times, times[0] + WARM_UP_S) % len(times)  # 0: all of a short one
+    whole = np.searchsorted(times, times[0] + WARM_UP_S) % len(times)  # 0: keep all of a short recording
     times, found = times[whole:], found[whole:]
     for name, topic in (("recorded estimate", "/velocity_estimate"), ("truth", "/ground_truth/odom")):
         if topic in run.series:
@@ -150,12 +150,12 @@ def velocity_errors(run: RecordedRun, times: Array, found: Array) -> Mapping[str
     return errors
 
 
-def torque_figure(run: RecordedRun, said: TorqueComparison) -> Figure:
+def torque_figure(run: RecordedRun, comparison: TorqueComparison) -> Figure:
     """Plot measured and modelled torque of each joint.
 
     Args:
         run: The recorded run.
-        said: The comparison.
+        comparison: The comparison.
 
     Returns:
         The figure.
@@ -163,12 +163,12 @@ def torque_figure(run: RecordedRun, said: TorqueComparison) -> Figure:
     figure, panels = time_panels(run, 4, 3, (13.0, 9.0))
     for joint, panel in enumerate(panels.ravel()):
         for label, value, colour in (
-            ("measured", said.measured, "black"),
-            ("modelled", said.modelled, "tab:blue"),
+            ("measured", comparison.measured, "black"),
+            ("modelled", comparison.modelled, "tab:blue"),
         ):
-            panel.plot(said.time - run.begin, value[:, joint], color=colour, lw=0.5, label=label)
+            panel.plot(comparison.time - run.begin, value[:, joint], color=colour, lw=0.5, label=label)
         name = JOINT_NAMES[joint].removesuffix("_joint")
-        panel.set_title(f"{name}, N m: off by {said.errors[joint]:.2f}", fontsize="small", loc="left")
+        panel.set_title(f"{name}, N m: off by {comparison.errors[joint]:.2f}", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure
 
@@ -209,9 +209,7 @@ def replay_command(
     actuator: Annotated[
         Path | None, typer.Option(metavar="<file>", help="An actuator.yaml.", show_default="the shipped one")
     ] = None,
-    estimator: Annotated[
-        Literal["learned", "kalman"], typer.Option(help="Which estimator of the velocity.")
-    ] = "learned",
+    estimator: Annotated[Literal["learned", "kalman"], typer.Option(help="Velocity estimator.")] = "learned",
     estimator_file: Annotated[
         Path,
         typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
@@ -220,19 +218,19 @@ def replay_command(
         tuple[float, float] | None,
         typer.Option(
             metavar="<kp kd>",
-            help="Commanded gains, N m/rad and N m s/rad, of recordings that hold none.",
+            help="Commanded gains, N m/rad and N m s/rad, if the recording holds none.",
             show_default="none",
         ),
     ] = None,
     state_topic: StateTopicOption = None,
     command_topic: CommandTopicOption = None,
 ) -> None:
-    """Ask the actuator model and the estimator offline what they say of a recording of low_state and low_cmd.
+    """Run actuator model and velocity estimator offline on a recording of low_state and low_cmd.
 
-    Of another robot's recording (sensor_msgs/JointState, unitree_go) the actuator model alone is asked.
+    For another robot (sensor_msgs/JointState, unitree_go) only the actuator model runs.
 
     \b
-    For example, whether a corrected model says more of a walk than the shipped one:
+    For example, to compare a corrected actuator model with the shipped one:
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
@@ -244,26 +242,26 @@ def replay_command(
         joints = read_joints(recording, MAX_STATE_PERIOD_S, run.uses_receipt_times)
     else:
         joints = joints_from_log(recording, run.foreign_log, MAX_STATE_PERIOD_S, gains)
-    said = compare_torques(joints, model)
-    pictures, errors = {"torque": torque_figure(run, said)}, dict[str, Array]()
+    comparison = compare_torques(joints, model)
+    pictures, errors = {"torque": torque_figure(run, comparison)}, dict[str, Array]()
     if run.foreign_log is None:
         times, found = run_estimator(recording, asked, run.uses_receipt_times)
         errors |= velocity_errors(run, times, found)
         pictures["velocity"] = velocity_figure(run, times, found)
-    _print_results(said, errors)
-    _write(out, said, errors, pictures)
+    _print_results(comparison, errors)
+    _write(out, comparison, errors, pictures)
 
 
 def _write(
-    out: Path, said: TorqueComparison, errors: Mapping[str, Array], pictures: Mapping[str, Figure]
+    out: Path, comparison: TorqueComparison, errors: Mapping[str, Array], pictures: Mapping[str, Figure]
 ) -> None:
     """Write replay.json and the pictures."""
     result: dict[str, Any] = {
         "schema": 1,
         "torque_rms_nm": dict(
-            zip(JOINT_NAMES, map(rounded, np.sqrt((said.measured**2).mean(0)).tolist()), strict=True)
+            zip(JOINT_NAMES, map(rounded, np.sqrt((comparison.measured**2).mean(0)).tolist()), strict=True)
         ),
-        "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, said.errors.tolist()), strict=True)),
+        "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, comparison.errors.tolist()), strict=True)),
         "velocity_error": {name: [rounded(one) for one in error.tolist()] for name, error in errors.items()},
     }
     with replacing(out / "replay.json") as draft:
@@ -274,16 +272,16 @@ def _write(
     typer.echo(f"written: {out}/replay.json, {', '.join(f'{name}.png' for name in pictures)}")
 
 
-def _print_results(said: TorqueComparison, errors: Mapping[str, Array]) -> None:
+def _print_results(comparison: TorqueComparison, errors: Mapping[str, Array]) -> None:
     """Print torque and velocity errors."""
     table = Table("torque, RMS in N m", "measured", "off by", title="actuator model on the recorded motion")
     for joint, name in enumerate(JOINT_NAMES):
-        rms = np.sqrt(np.mean(said.measured[:, joint] ** 2))
+        rms = np.sqrt(np.mean(comparison.measured[:, joint] ** 2))
         table.add_row(
-            name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(said.errors[joint], ".2f")
+            name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(comparison.errors[joint], ".2f")
         )
     Console().print(table)
     for name, (x, y) in errors.items():
         typer.echo(
-            f"estimator, offline, beside the {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"
+            f"offline estimator minus {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"
         )

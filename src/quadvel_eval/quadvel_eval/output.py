@@ -24,7 +24,7 @@ def created_folder(folder: Path) -> Iterator[Path]:
         yield folder
     finally:
         for one in missing:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # it is not empty
                 one.rmdir()
 
 
@@ -87,22 +87,22 @@ def output_file(path: Path) -> Path:
     return path
 
 
-def _check_writable(folder: Path, name: Path, asked: Path, kind: str) -> None:
+def _check_writable(folder: Path, name: Path, requested: Path, kind: str) -> None:
     """Touch and delete a draft in `folder` or in its nearest existing parent.
 
-    `asked` and `kind` appear in the error message.
+    `requested` and `kind` appear in the error message.
     """
     try:
         nearest = next(one for one in (folder, *folder.absolute().parents) if one.exists())
         if not nearest.is_dir():
-            raise NotADirectoryError(f"{asked}: {nearest} is a file, expected a folder")
+            raise NotADirectoryError(f"{requested}: {nearest} is a file, expected a folder")
         draft = _draft_path(nearest / name)
         draft.touch()
         draft.unlink()
     except OSError as error:
         if error.strerror is None:
             raise
-        raise type(error)(f"{asked}: the {kind} can't be written: {error.strerror}") from None
+        raise type(error)(f"{requested}: the {kind} can't be written: {error.strerror}") from None
 
 
 def _draft_path(path: Path) -> Path:

@@ -44,10 +44,10 @@ def _process_pool() -> Iterator[Callable[..., Any]]:
         try:
             yield pool.submit
         except KeyboardInterrupt:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the clean-up
             for (
                 worker
-            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
+            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not receive it
                 worker.terminate()
             raise
         finally:
@@ -90,12 +90,12 @@ def _interrupts_blocked() -> Iterator[None]:
     Ctrl-C reaches the whole process group. A worker that receives it during its imports would
     print a traceback. Workers unblock SIGINT in `_restore_interrupt`.
     """
-    resource_tracker.ensure_running()  # it is started with the workers otherwise, and then lets signals through
+    resource_tracker.ensure_running()  # otherwise it starts with the workers and unblocks signals
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     except (BrokenPipeError, BrokenProcessPool):
-        if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
+        if signal.SIGINT not in signal.sigpending():  # pending: a worker received it first and ended
             raise
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -19,7 +19,7 @@ from quadvel_recordings.reading import read_messages
 
 Array = NDArray[np.float64]
 
-SIMULATOR_NODES = ("sim_node", "board")  # who says how well real time was kept
+SIMULATOR_NODES = ("sim_node", "board")  # nodes that report the realtime factor
 TOPICS = (
     "/cmd_vel",
     "/command",
@@ -168,8 +168,8 @@ def _loop(messages: list[Any]) -> ControllerTrace:
 
 
 def _answer_time(states: list[tuple[float, Any]], commands: list[tuple[float, Any]]) -> Series:
-    held = {message.tick: seconds(message.stamp) for _, message in states}
-    sent = [(held[m.tick], seconds(m.stamp)) for _, m in commands if m.tick in held]
+    state_times = {message.tick: seconds(message.stamp) for _, message in states}
+    sent = [(state_times[m.tick], seconds(m.stamp)) for _, m in commands if m.tick in state_times]
     return _series([(state, [command - state]) for state, command in sent])
 
 

@@ -30,7 +30,7 @@ from .recording import planar
 
 Array = NDArray[np.float64]
 
-MAX_POINTS_PER_LINE = 4000  # of a line at most: more are not seen
+MAX_POINTS_PER_LINE = 4000  # more are invisible
 LOOP_QUANTITIES = {
     "rate_hz": "rate, Hz",
     "compute_p99_us": "computing, 99 %, us",

@@ -34,12 +34,12 @@ from .walk import Setup
 
 Array = NDArray[np.float64]
 
-STRETCH_DURATION_S = 0.2  # s, of one replay
-STRETCH_INTERVAL_S = 0.35  # s, from one to the next: no multiple of a step of the gait
-SMOOTHING_HALF_WIDTH_MS = 2  # ms to either side, over which the noise of encoders is averaged out
-HISTORY_MS = 60  # ms, that the drives live through before
-GROWTH_INTERVAL_MS = 10  # ms, from one point to the next of how an error grows
-COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")  # of a command, 12 numbers each
+STRETCH_DURATION_S = 0.2  # of one open-loop replay
+STRETCH_INTERVAL_S = 0.35  # between stretches; not a multiple of the gait period
+SMOOTHING_HALF_WIDTH_MS = 2  # of the filter against encoder noise
+HISTORY_MS = 60  # before a stretch, for the delays of the drives
+GROWTH_INTERVAL_MS = 10  # between points of the error growth
+COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")  # 12 numbers each
 
 
 @attrs.frozen(eq=False)
@@ -149,9 +149,7 @@ def joints_from_log(
     state, command = log.state, expect_commands(path, log)
     for field, meaning in (("q", "angles"), ("tau", "torques")):
         if field not in state.values:
-            raise ValueError(
-                f"{path}: {state.topic}: found no {meaning} in it, expected them beside the commands"
-            )
+            raise ValueError(f"{path}: {state.topic}: found no {meaning}, expected them next to the commands")
     values = {name: _in_model_order(path, state, each) for name, each in state.values.items()}
     speed = values.get("dq", np.gradient(values["q"], state.time, axis=0))
     ticks, first = np.unique(np.round(1e3 * state.time).astype(int), return_index=True)
@@ -178,7 +176,7 @@ def _in_model_order(path: Path, series: Series, values: Array) -> Array:
     if missing:
         found = f"found {', '.join(series.joints[:3])}, ..."
         raise ValueError(
-            f"{path}: {series.topic}: {found}, expected the model's joints, {missing[0]} among them"
+            f"{path}: {series.topic}: {found}, expected all joints of the model; {missing[0]} is missing"
         )
     return np.asarray(values[:, [named.index(name.removesuffix("_joint")) for name in JOINT_NAMES]], float)
 
@@ -209,8 +207,8 @@ def _commands_at(commands: Mapping[int, Array], ticks: Array) -> Array:
     """Command in force at each tick (n,), as (n, 61); damping before the first command."""
     sent = sorted(commands)
     table = np.array([np.zeros(12 * len(COMMAND_FIELDS) + 1), *(commands[tick] for tick in sent)], float)
-    held: Array = table[np.searchsorted(sent, ticks, side="right")]
-    return held
+    in_force: Array = table[np.searchsorted(sent, ticks, side="right")]
+    return in_force
 
 
 def _ignore_warning(_: str) -> None:
@@ -307,6 +305,8 @@ def open_loop_error(
     ]
     if not errors:
         raise ValueError(f"nothing to replay between {start:.2f} and {end:.2f} s")
+    # errors: (stretches, rows, 3). Average over stretches, then over rows for each quantity; growth
+    # averages over GROWTH_INTERVAL_MS of the angles only.
     squares = np.mean(errors, axis=0)
     q, dq, tau = np.sqrt(squares.mean(axis=0)).tolist()
     growth = np.sqrt(squares[:, 0].reshape(-1, GROWTH_INTERVAL_MS).mean(axis=1))

@@ -197,7 +197,7 @@ AGGREGATES: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "jitter": lambda one: f"{one['jitter']:.5f} rad",
     "drift in 10 s of standing": _drift,
 }
-"""Rows of the table, and what stands in them of one plant's evaluation."""
+"""Rows of the table: name, and function from the evaluation of a plant to text."""
 
 
 def segment_table(segments: Sequence[Mapping[str, Any]]) -> Table:

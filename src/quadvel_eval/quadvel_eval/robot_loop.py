@@ -29,9 +29,9 @@ from quadvel_sim.simulator import DT, Simulator, Truth
 
 Array = NDArray[np.float64]
 
-CONTROL_PERIOD_S = 1.0 / RATE_HZ  # s
+CONTROL_PERIOD_S = 1.0 / RATE_HZ
 ESTIMATORS = ("learned", "kalman", "truth")
-SIMULATOR_STEPS_PER_TICK = round(CONTROL_PERIOD_S / DT)  # of the simulator, a tick
+SIMULATOR_STEPS_PER_TICK = round(CONTROL_PERIOD_S / DT)
 _PLANNER = MuxInput("planner", priority=0, timeout=1.0)
 
 
@@ -147,14 +147,14 @@ class RobotLoop:
         now, state, truth, fallen = simulator.time, simulator.state(), simulator.truth(), simulator.fallen
         estimates = {name: e.update(state, self._previous_action)[0] for name, e in self._beside.items()}
         self._mux.receive(_PLANNER.name, now, velocity)
-        asked = self._mux.update(now)
-        command = self.supervisor.tick(now, state, self._velocity, [*asked.velocity, asked.stance])
+        mux_output = self._mux.update(now)
+        command = self.supervisor.tick(now, state, self._velocity, [*mux_output.velocity, mux_output.stance])
         self._velocity, _ = self._estimator.update(state, self._previous_action)
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)
         simulator.step(SIMULATOR_STEPS_PER_TICK)
         return Sample(
-            state, truth, np.array(asked.velocity), estimates, command, self.supervisor.mode, fallen
+            state, truth, np.array(mux_output.velocity), estimates, command, self.supervisor.mode, fallen
         )
 
     @property
@@ -177,6 +177,6 @@ class RobotLoop:
         self._request("walk")
 
     def _request(self, mode: str) -> None:
-        taken, sentence = self.supervisor.request(mode)
-        if not taken:
+        accepted, sentence = self.supervisor.request(mode)
+        if not accepted:
             raise RuntimeError(f"the supervisor refused {mode}: {sentence}")

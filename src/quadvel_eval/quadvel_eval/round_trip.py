@@ -16,8 +16,8 @@ import quadvel_dds
 
 from .robot_loop import CONTROL_PERIOD_S
 
-DISCOVERY_TIMEOUT_S = 20.0  # s, until the two have found each other
-ANSWER_TIMEOUT_S = 0.1  # s, after which an answer is not waited for
+DISCOVERY_TIMEOUT_S = 20.0  # for the discovery of the other process
+ANSWER_TIMEOUT_S = 0.1  # after which a message counts as lost
 
 
 def measure_round_trips(count: int = 1000) -> dict[str, float]:

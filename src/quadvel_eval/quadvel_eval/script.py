@@ -6,9 +6,7 @@ import attrs
 
 Velocity = tuple[float, float, float]  # vx, vy (m/s), wz (rad/s)
 
-RETRY_INTERVAL_S = (
-    0.5  # s, between two orders of the same mode: the controller may not be ready for the first
-)
+RETRY_INTERVAL_S = 0.5  # between requests of the same mode: the controller may not be ready for the first
 
 
 @attrs.frozen
@@ -111,7 +109,7 @@ class ScriptRunner:
 
     def __init__(self, steps: tuple[Step, ...]) -> None:
         self._steps = list(steps)
-        self._step_start: float | None = None  # when the present step began
+        self._step_start: float | None = None  # start of the present step, s
         self._last_request: float | None = None
 
     def update(self, now: float, mode: str, reason: str = "") -> Action | None:

@@ -15,7 +15,7 @@ from quadvel_nodes.node import end, read_parameters, run
 
 from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 
-CMD_VEL_PERIOD_S = 0.02  # s, of cmd_vel
+CMD_VEL_PERIOD_S = 0.02
 
 
 @attrs.frozen

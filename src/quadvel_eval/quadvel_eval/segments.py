@@ -14,10 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-SETTLING_TIME_S = (
-    2.0  # s at the start of each stretch that belong to the change of command and are not evaluated
-)
-DECIMALS = 6  # of numbers in files
+SETTLING_TIME_S = 2.0  # at the start of each stretch, not evaluated
+DECIMALS = 6  # of numbers in JSON files
 
 
 @attrs.frozen(eq=False)
@@ -95,25 +93,27 @@ def tracking_errors(segments: Sequence[Segment]) -> dict[str, float]:
     return found | {f"mean_error_{axis}": rounded(np.mean(some)) for axis, some in errors.items()}
 
 
-def response_delay(asked: Array, velocity: Array, period: float) -> float | None:
+def response_delay(commanded: Array, velocity: Array, period: float) -> float | None:
     """Return the delay of a velocity behind its command.
 
     The delay is the area between both curves, each divided by its final value. Final values are
     means over the second half, so that a steady-state error does not count as delay.
 
     Args:
-        asked: Commanded velocity (n,).
+        commanded: Commanded velocity (n,).
         velocity: Measured velocity (n,), same unit.
         period: Sampling period, s.
 
     Returns:
         Delay, s; None if the velocity reaches less than half of the command.
     """
-    late = len(asked) // 2
-    wanted, reached = float(asked[late:].mean()), float(velocity[late:].mean())
+    # A first-order lag y' = (u - y) / T behind a step u has the area int (u - y) dt / u = T. The same
+    # integral gives the delay of a pure dead time. u and y are divided by their final values.
+    late = len(commanded) // 2
+    wanted, reached = float(commanded[late:].mean()), float(velocity[late:].mean())
     if reached / wanted < 0.5:
         return None
-    return float(period * np.sum(asked / wanted - velocity / reached))
+    return float(period * np.sum(commanded / wanted - velocity / reached))
 
 
 def rounded(value: ArrayLike) -> Any:

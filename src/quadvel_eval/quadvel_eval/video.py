@@ -24,9 +24,9 @@ from .report import write_figure
 
 Image = NDArray[np.uint8]
 
-FRAMES_PER_SECOND = 20  # frames a second
+FRAMES_PER_SECOND = 20
 VIDEO_SIZE = (640, 360)
-STRIP_FRAMES = 5  # frames
+STRIP_FRAMES = 5
 STRIP_SIZE = (400, 300)
 
 
@@ -72,7 +72,9 @@ class Film:
             mujoco.mj_forward(self._model, self._data)
             self._camera.lookat[:] = [pose[0], pose[1], 0.25]
             self._renderer.update_scene(self._data, self._camera)
-            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # thrice the time, in software
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = (
+                False  # shadows triple the time of software rendering
+            )
             yield self._renderer.render().copy()
 
 

@@ -28,9 +28,9 @@ from .robot_loop import CONTROL_PERIOD_S, RobotLoop, Sample, make_estimator
 Array = NDArray[np.float64]
 
 TERRAINS = ("flat", "rough", "slope")
-SLOPE_ANGLE_RAD = 0.15  # rad, rising ahead
-HEATING_COEFFICIENT = 0.2  # W/(N m)^2, k_r of Table 2: what a drive turns to heat
-DIAGONAL_FOOT_DISTANCE_M = 0.555  # m, l_c of Eq. 10: the distance between two diagonal feet
+SLOPE_ANGLE_RAD = 0.15  # rising ahead
+HEATING_COEFFICIENT = 0.2  # k_r of Table 2, W/(N m)^2
+DIAGONAL_FOOT_DISTANCE_M = 0.555  # characteristic length l_c of Eq. 10
 
 
 @attrs.frozen(kw_only=True)
@@ -246,8 +246,9 @@ def dead_reckoning_error(velocity: Array, position: Array) -> float:
     Returns:
         Distance between integrated and true final position, m.
     """
-    led = 0.5 * CONTROL_PERIOD_S * (velocity[1:] + velocity[:-1]).sum(axis=0)
-    return float(np.linalg.norm((led - (position[-1] - position[0]))[:2]))
+    # Trapezoidal rule: p_n - p_0 = sum_i (v_i + v_{i+1}) / 2 dt.
+    displacement = 0.5 * CONTROL_PERIOD_S * (velocity[1:] + velocity[:-1]).sum(axis=0)
+    return float(np.linalg.norm((displacement - (position[-1] - position[0]))[:2]))
 
 
 def drive_power(torque: ArrayLike, speed: ArrayLike) -> Array:
@@ -260,6 +261,7 @@ def drive_power(torque: ArrayLike, speed: ArrayLike) -> Array:
     Returns:
         Power (...,), W, without recuperation.
     """
+    # Eq. 10: P = sum_j max(k_r tau_j^2 + tau_j dq_j, 0): heat plus mechanical power, per joint.
     torque = np.asarray(torque, float)
     power: Array = np.maximum(HEATING_COEFFICIENT * torque**2 + torque * np.asarray(speed, float), 0.0).sum(
         axis=-1
@@ -279,6 +281,8 @@ def cost_of_transport(power: float, mass: float, command: Array, mean: Array) ->
     Returns:
         The dimensionless cost; None for a zero command, or if the robot does not move along it.
     """
+    # Eq. 10: CoT = P / (m g v), with v the mean velocity along the command. For a pure turn,
+    # CoTu = P / (m g l_c w_z), with the distance l_c of diagonal feet.
     speed = float(np.hypot(*command[:2]))
     if speed > 0.0:
         pace = float(command[:2] @ mean[:2]) / speed

@@ -34,7 +34,7 @@ def world_command(
         ),
     ] = None,
 ) -> None:
-    """Check a world's file, and draw the world from above.
+    """Check a world file, and draw the world from above.
 
     \b
     For example:
@@ -114,12 +114,12 @@ def _obstacles(axes: Axes, world: World) -> None:
 
 def _paths(axes: Axes, world: World) -> None:
     for person in world.persons:
-        way = np.vstack([person.path, person.path[:1]]) if person.closed else person.path
-        label = _once(axes, "who is led" if person.led else "others")
+        path = np.vstack([person.path, person.path[:1]]) if person.closed else person.path
+        label = _once(axes, "leader" if person.led else "others")
         color, width = (LEADER_COLOUR, 1.8) if person.led else (OTHER_COLOUR, 1.0)
-        axes.plot(*way.T, color=color, linewidth=width, label=label, zorder=5)
-        if np.hypot(*np.ptp(way, axis=0)) < 0.5:  # who stands
-            axes.plot(*way[-1], "o", color=color, markersize=3, zorder=5)
+        axes.plot(*path.T, color=color, linewidth=width, label=label, zorder=5)
+        if np.hypot(*np.ptp(path, axis=0)) < 0.5:  # standing people
+            axes.plot(*path[-1], "o", color=color, markersize=3, zorder=5)
 
 
 def _rectangle(

@@ -22,7 +22,7 @@ from .injection import make_injection
 from .stack import Array, Stack
 
 SCHEMA = 1
-OBSERVATION_TIME_S = 2.5  # s that a run goes on after the fault began
+OBSERVATION_TIME_S = 2.5  # after the fault
 VELOCITIES = (
     (0.5, 0.0, 0.0),
     (1.0, 0.0, 0.0),
@@ -31,7 +31,7 @@ VELOCITIES = (
     (0.5, 0.0, 0.8),
     (0.0, 0.0, 1.0),
 )
-STANDING_SPEED_LIMIT, STANDING_YAW_RATE_LIMIT = 0.1, 0.3  # m/s, rad/s, slower than which a robot stands
+STANDING_SPEED_LIMIT, STANDING_YAW_RATE_LIMIT = 0.1, 0.3  # m/s, rad/s: a slower robot stands
 
 
 @attrs.define
@@ -94,7 +94,7 @@ def run_campaign(
         words = [dict.fromkeys(case.name.split()[i] for case in CASES) for i in range(3)]
         components, kinds_of_fault, modes = (", ".join(column) for column in words)
         raise ValueError(
-            f"no case holds '{only}'; components: {components}; kinds: {kinds_of_fault}; modes: {modes}"
+            f"no case contains '{only}'; components: {components}; kinds: {kinds_of_fault}; modes: {modes}"
         )
     kinds: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
@@ -171,8 +171,8 @@ def _prepare_stack(mode: str, rng: np.random.Generator, seed: int) -> Stack:
 
 def _request(stack: Stack, mode: str) -> None:
     """Request a mode from the supervisor. Raises RuntimeError if it refuses."""
-    taken, sentence = stack.supervisor.request(mode)
-    if not taken:
+    accepted, sentence = stack.supervisor.request(mode)
+    if not accepted:
         raise RuntimeError(f"the supervisor refused {mode}: {sentence}")
 
 
@@ -197,6 +197,7 @@ def _observe(stack: Stack, case: Case, time: float, result: FaultRun, too_fast: 
     """
     data, supervisor = stack.simulator.data, stack.supervisor
     result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
+    # A drive accelerates its joint if torque and speed have the same sign.
     q, dq = data.qpos[7:], data.qvel[6:]
     driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
     result.speed = max(result.speed, float(driven.max()))

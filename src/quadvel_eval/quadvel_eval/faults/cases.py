@@ -57,9 +57,9 @@ def _cases(
 WALK_ONLY = ("walk",)
 STALE = ("state_stale",)
 UNUSABLE_STATE = ("state_not_finite", "attitude_not_unit", *STALE)
-"""What is wrong with states none of which can be used"""
+"""Findings for states that are all unusable"""
 UNCOMMANDED_SYMPTOMS = ("tilted", "joint_out_of_range", "joint_too_fast", "drive_does_not_answer")
-"""What a robot that nobody commands any more, or too late, is seen to do"""
+"""Findings for a robot without commands, or with late ones"""
 ENCODER = (
     "encoder_inconsistent",
     "encoder_frozen",
@@ -67,7 +67,7 @@ ENCODER = (
     "joint_too_fast",
     "drive_does_not_answer",
 )
-STOPPING_TIME_S = 1.3  # s in which the policy brakes and the robot stands
+STOPPING_TIME_S = 1.3  # in which the policy brakes the robot to a stand
 
 CASES: list[Case] = [
     *_cases("low_state", "off", MODES, STALE, 0.08, "damping"),
@@ -106,7 +106,9 @@ CASES: list[Case] = [
     *_cases("encoder", "wrong", MODES, ENCODER, 0.02, "damping"),
     *_cases("encoder", "slow", WALK_ONLY, ENCODER, 0.5, "damping"),
     *_cases("encoder", "delayed", WALK_ONLY, (), 0.0, "any"),
-    *_cases("encoder", "intermittent", WALK_ONLY, (), 0.0, "any"),  # a hip is at zero anyway
+    *_cases(
+        "encoder", "intermittent", WALK_ONLY, (), 0.0, "any"
+    ),  # an intermittent hip reads 0, near its true value
     *_cases("imu", "off", MODES, ("attitude_not_unit",), 0.08, "damping"),
     *_cases("imu", "stuck", WALK_ONLY, ("imu_frozen",), 0.15, "stopped", STOPPING_TIME_S),
     *_cases("imu", "garbage", MODES, (*UNUSABLE_STATE, "imu_inconsistent", "tilted"), 0.1, "damping"),

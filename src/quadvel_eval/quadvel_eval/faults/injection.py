@@ -21,10 +21,10 @@ KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent", 
 Rng = np.random.Generator
 Deliveries = list[tuple[int, Message]]
 
-DELAY_MS = 80  # ms, of what is delayed
-SLOW_LINK_DIVISOR = 16  # messages get through a slow link
-MAX_DROPOUT_MS = 15  # ms that an intermittent link is silent at most
-PAUSE_MS = 100  # ms that a process does nothing, now and then
+DELAY_MS = 80  # of delayed messages and sensors
+SLOW_LINK_DIVISOR = 16  # a slow link passes one message in so many
+MAX_DROPOUT_MS = 15  # of an intermittent link
+PAUSE_MS = 100  # of an intermittent process
 
 
 @attrs.frozen
@@ -67,7 +67,7 @@ def make_injection(component: str, kind: str) -> Injection:
     return Injection(component, kind, known[kind])
 
 
-# Links.
+# Faults of links: functions from a link to what happens to each message.
 
 
 def _link(
@@ -115,7 +115,7 @@ def _delayed(late: int) -> Callable[[Link, Rng], Callable[[int, Message], Delive
 
 def _intermittent(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
     """Lose all messages in random bursts of up to MAX_DROPOUT_MS."""
-    silent_until = [0, 0]  # and the next time from which it may be silent
+    silent_until = [0, 0]  # end of this dropout, and earliest start of the next, ms
 
     def way(now: int, message: Message) -> Deliveries:
         if now >= silent_until[1]:
@@ -155,7 +155,7 @@ def _combined(*begins: Callable[[Stack, Rng], None]) -> Callable[[Stack, Rng], N
     return begin
 
 
-# Sensors.
+# Faults of sensors: functions from a measured state to a faulty one.
 
 
 def _sensor(fields: tuple[str, ...], kind: str, one_joint: bool = False) -> Callable[[Stack, Rng], None]:
@@ -213,13 +213,14 @@ GARBAGE = {
     "linear_acceleration": 50.0,
     "foot_force": 500.0,
 }
-"""Standard deviation of nonsense, in the field's unit"""
+"""Standard deviation of garbage, in the unit of the field"""
 MOUNTING_TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
 
 
 def _wrong(field: str, true: NDArray[np.float64]) -> NDArray[np.float64]:
     """Add an offset to a field; the orientation gets a wrong mounting (Hamilton product with a tilt)."""
     if field == "quaternion":
+        # Hamilton product q * (a, b, 0, 0): rotation by 2 acos(a) about the body's x axis.
         w, x, y, z = true
         a, b = MOUNTING_TILT[0], MOUNTING_TILT[1]
         return np.array([w * a - x * b, x * a + w * b, y * a + z * b, z * a - y * b])
@@ -228,7 +229,7 @@ def _wrong(field: str, true: NDArray[np.float64]) -> NDArray[np.float64]:
     )
 
 
-# Drives, processes, clock, processor.
+# Faults of drives, processes, clock and processor.
 
 
 def _dead_drive(stack: Stack, rng: Rng) -> None:
@@ -366,22 +367,22 @@ COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
     "clock": {"wrong": _set_clock(1.0)},
     "processor": {"slow": _slow_processor},
 }
-"""What each component can suffer, and how that is brought about"""
+"""Injection of each kind of fault of each component"""
 
-_A_SENSOR = "a sensor sends no messages of its own"
-_A_PROCESS = "what a process sends is the link's matter"
+_A_SENSOR = "a sensor sends no separate messages"
+_A_PROCESS = "faults of its messages belong to the link"
 REASONS_UNSUPPORTED = {
     "low_state": "all make sense",
-    "low_cmd": "packets to the board carry a check sum, and what is spoilt is lost: see intermittent",
+    "low_cmd": "packets to the board have a checksum, so that corrupt ones are lost: see intermittent",
     "estimate": "all make sense",
     "command": "all make sense",
     **dict.fromkeys(
         ("encoder", "imu", "orientation", "gyroscope", "accelerometer", "torque", "foot"), _A_SENSOR
     ),
-    "drive": "it is driven by low_cmd and reports through the torque sensor",
-    "network": "datagrams carry a check sum, and what is spoilt is lost: see intermittent",
+    "drive": "low_cmd drives it, and the torque sensor reports it",
+    "network": "datagrams have a checksum, so that corrupt ones are lost: see intermittent",
     **dict.fromkeys(("controller", "estimator", "mux", "planner"), _A_PROCESS),
-    "clock": "a clock that stands or drifts slowly is not noticed within seconds",
-    "processor": "a processor without time for anybody is a process that is stuck",
+    "clock": "a stopped or slowly drifting clock has no effect within seconds",
+    "processor": "a fully loaded processor is equivalent to a stuck process",
 }
-"""Why a kind that is not there makes no sense"""
+"""Reason why the other kinds of fault make no sense"""

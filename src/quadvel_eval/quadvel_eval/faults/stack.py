@@ -41,9 +41,9 @@ from quadvel_sim.simulator import DT, Simulator
 Array = NDArray[np.float64]
 Message = Any
 
-STATE_PERIOD_MS = 5  # ms
-COMMAND_PERIOD_MS = 20  # ms, of planner and mux
-EPOCH_S = 1000.0  # s, what the machine's clock shows when the simulation begins
+STATE_PERIOD_MS = 5
+COMMAND_PERIOD_MS = 20  # of planner and mux
+EPOCH_S = 1000.0  # system time at the start of the simulation
 PLANNER = MuxInput("planner", priority=0, timeout=0.5)
 
 
@@ -175,7 +175,7 @@ class Stack:
             self.processes["mux"].submit(self._arbitrate)
         for link in self.links.values():
             link.deliver(self.now)
-        if self.now % round(1e3 * WATCH_PERIOD) == 7:  # a timer has a phase of its own
+        if self.now % round(1e3 * WATCH_PERIOD) == 7:  # arbitrary phase of the timer
             self.processes["controller"].submit(self._loop.watch)
         self.simulator.step()
         self.now += 1
@@ -192,7 +192,7 @@ class Stack:
         """System clock without the additional computing time, s."""
         return EPOCH_S + self.now * DT + self.clock_offset
 
-    # What each process does.
+    # Work of the processes.
 
     def _report(self) -> None:
         state = self.simulator.state()
@@ -211,9 +211,11 @@ class Stack:
         self.processes["mux"].submit(lambda: self._mux.receive(PLANNER.name, self._steady(), velocity))
 
     def _arbitrate(self) -> None:
-        asked = self._mux.update(self._steady())
+        mux_output = self._mux.update(self._steady())
         message = SimpleNamespace(
-            stamp=_time(self._stamp()), velocity=asked.velocity.astype(np.float32), stance=asked.stance
+            stamp=_time(self._stamp()),
+            velocity=mux_output.velocity.astype(np.float32),
+            stance=mux_output.stance,
         )
         self.links["command"].send(self.now, message)
 
@@ -257,7 +259,7 @@ class Stack:
         def refusing() -> None:
             try:
                 work()
-            except MessageError as error:  # as the node does, which counts them, too
+            except MessageError as error:  # as the node does, which also counts them
                 self._loop.refuse(topic, error)
 
         self.processes["controller"].submit(refusing)
@@ -293,7 +295,7 @@ def corrupt(message: Message, rng: np.random.Generator) -> Message:
     for name, value in vars(message).items():
         if isinstance(value, np.ndarray) and value.dtype == np.float32:
             bits = rng.integers(0, 2**32, value.size, dtype=np.uint32).view(np.float32)
-            bits = np.where(np.isnan(bits), np.float32(np.nan), bits)  # a quiet one
+            bits = np.where(np.isnan(bits), np.float32(np.nan), bits)  # canonical quiet NaN
             setattr(spoilt, name, np.where(rng.random(value.size) < 0.3, bits, value))
     return spoilt
 

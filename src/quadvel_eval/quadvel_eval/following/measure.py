@@ -14,11 +14,11 @@ from .scenes import SCENES, FollowScene
 from .stage import CONFIG, DISTANCE_BAND_M, SETTLING_TIME_S, FollowSample, FollowSimulation
 
 
-def following_scores(instants: Sequence[FollowSample], distance: float) -> dict[str, float]:
+def following_scores(samples: Sequence[FollowSample], distance: float) -> dict[str, float]:
     """Score one run of a scene.
 
     Args:
-        instants: Samples of the run, one per planner period.
+        samples: Samples of the run, one per planner period.
         distance: Set distance to the person, m.
 
     Returns:
@@ -28,19 +28,19 @@ def following_scores(instants: Sequence[FollowSample], distance: float) -> dict[
         `gap`: smallest distance to obstacles and to people, m; `ms` and `slowest`: mean and
         largest computing time of a step, ms.
     """
-    place = np.array([one.pose[:2] for one in instants])
-    person = np.array([one.person for one in instants])
-    time = np.array([one.time for one in instants])
-    velocity = np.array([one.velocity for one in instants])[:, :2]
+    place = np.array([one.pose[:2] for one in samples])
+    person = np.array([one.person for one in samples])
+    time = np.array([one.time for one in samples])
+    velocity = np.array([one.velocity for one in samples])[:, :2]
     inside = np.abs(np.hypot(*(person - place).T) - distance) < DISTANCE_BAND_M
-    clearance, gap = min(one.clearance for one in instants), min(one.gap for one in instants)
+    clearance, gap = min(one.clearance for one in samples), min(one.gap for one in samples)
     walks = np.flatnonzero((np.diff(person, axis=0) != 0.0).any(1))
     away = np.flatnonzero(~inside | (np.hypot(*velocity.T) > 0.1))
     jerk = np.diff(velocity, n=2, axis=0) / PERIOD**2
-    took = [one.milliseconds for one in instants]
+    took = [one.milliseconds for one in samples]
     return {
         "success": float(
-            clearance > 0.0 and gap > 0.0 and inside[-1] and instants[-1].state is State.FOLLOWING
+            clearance > 0.0 and gap > 0.0 and inside[-1] and samples[-1].state is State.FOLLOWING
         ),
         "share": float(inside[time >= SETTLING_TIME_S].mean()),
         "late": max(0.0, PERIOD * float(away[-1] - walks[-1])),

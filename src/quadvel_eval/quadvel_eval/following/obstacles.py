@@ -14,9 +14,9 @@ from quadvel_sim.world import World
 
 Array = NDArray[np.float64]
 
-OUTLINE_SPACING_M = 0.03  # m, between two points of an outline
-SEARCH_RADIUS_M = 3.0  # m, to which clearances are looked for
-PERSON_RADIUS_M = 0.2  # m, radius of a person
+OUTLINE_SPACING_M = 0.03  # between points of an outline
+SEARCH_RADIUS_M = 3.0  # for obstacles
+PERSON_RADIUS_M = 0.2
 
 
 class Clearances:
@@ -45,18 +45,18 @@ class Clearances:
             return float("inf")
         return float(outline_distance(self._points[near], pose, self._half).min())
 
-    def to_people(self, pose: Array, persons: Array) -> float:
+    def to_people(self, pose: Array, people: Array) -> float:
         """Return the distance from the outline to the nearest person.
 
         Args:
             pose: x, y (m) and yaw (rad) of the robot (3,).
-            persons: Positions of the people (n, 2 or more), m.
+            people: Positions of the people (n, 2 or more), m.
 
         Returns:
             Distance, m; inf without people.
         """
         return float(
-            (outline_distance(persons[:, :2], pose, self._half) - PERSON_RADIUS_M).min(initial=np.inf)
+            (outline_distance(people[:, :2], pose, self._half) - PERSON_RADIUS_M).min(initial=np.inf)
         )
 
 

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 INITIAL_STOP = (
     1.6,
     6.0,
-)  # s, from when to when everybody to follow stands: then the tracker knows that it is a person
+)  # s, start and end of the first stop of the person, in which the tracker confirms the track
 INITIAL_STOP_DURATION_S = INITIAL_STOP[1] - INITIAL_STOP[0]
 
 
@@ -185,7 +185,7 @@ def in_the_way(seed: int) -> FollowScene:
     half, x = rng.uniform(0.7, 0.85), 6.0
     walls = [[-4.0, -half, 20.0, -half], [-4.0, half, x - 0.6, half], [x + 0.6, half, 20.0, half]]
     person = _person(rng, [[0.0, 0.0], [10.0, 0.0]], (0.8, 1.1))
-    comes = (x + 0.5) / person.speed + INITIAL_STOP_DURATION_S  # s, when the person has just passed
+    comes = (x + 0.5) / person.speed + INITIAL_STOP_DURATION_S  # s, just after the person has passed
     speed = 1.2
     into = half + 1.0
     other = _walker(rng, [[x, into], [x, 0.0], [x, 3.0 * into]], (speed, speed))

@@ -26,19 +26,19 @@ from .scenes import FollowScene
 
 Array = NDArray[np.float64]
 
-STEP_S = 0.01  # s
-COMMAND_DELAY_S = 0.06  # s, from a command to the first motion
-VELOCITY_LAG_S = 0.15  # s, of the velocity behind it
-MAX_ACCELERATION = np.array([2.6, 2.0, 6.0])  # m/s^2, rad/s^2, that the robot reaches
+STEP_S = 0.01
+COMMAND_DELAY_S = 0.06  # from a command to the first motion
+VELOCITY_LAG_S = 0.15  # time constant of the velocity
+MAX_ACCELERATION = np.array([2.6, 2.0, 6.0])  # m/s^2, rad/s^2
 FOLLOW_INPUT = MuxInput("follow", 50, 0.15)
 MOUNTING = np.array([0.3, 0.0, 0.0])  # m, rad, of the laser on the robot
 CONFIG = FollowConfig(laser_x=float(MOUNTING[0]))
 LASER = Laser(rays=541, angle_min=-0.75 * np.pi, angle_increment=np.deg2rad(0.5), range_max=12.0)
-GROUND_HIT_PROBABILITY = 0.15  # share of the scans in which some rays hit the ground
-DISTANCE_BAND_M = 0.5  # m, round the set distance
-SETTLING_TIME_S = 6.0  # s, after which the distance counts: then the person sets out
-YIELD_DISTANCE_M = 0.3  # m, before the robot's outline, where a person waits
-WALL_POINT_SPACING_M = 0.02  # m, between the points of a wall
+GROUND_HIT_PROBABILITY = 0.15  # share of scans in which some rays hit the ground
+DISTANCE_BAND_M = 0.5  # around the set distance
+SETTLING_TIME_S = 6.0  # until the person starts to walk and the distance counts
+YIELD_DISTANCE_M = 0.3  # from the robot's outline, at which a person waits
+WALL_POINT_SPACING_M = 0.02  # between points of a wall
 
 
 @attrs.define
@@ -60,6 +60,7 @@ class PlanarRobot:
         Args:
             command: vx, vy (m/s) and wz (rad/s); it takes effect after COMMAND_DELAY_S.
         """
+        # v' = clip((u(t - delay) - v) / lag, -a_max, a_max); p' = R(yaw) v. Explicit Euler.
         self._commands.append(command)
         if len(self._commands) > COMMAND_DELAY_S / STEP_S:
             late = self._commands.popleft()
@@ -135,7 +136,7 @@ class FollowSimulation:
         self.robot = PlanarRobot(np.array([first[0] - scene.initial_distance, first[1], 0.0]))
         self._obstacles = _points(scene.plan)
         self._half = (0.5 * self.config.length, 0.5 * self.config.width)
-        self._directions = np.zeros((len(scene.people), 2))  # where each walked last
+        self._directions = np.zeros((len(scene.people), 2))  # last walking direction of each person
         self.mute = ""
 
     def run(self) -> Any:
@@ -169,9 +170,9 @@ class FollowSimulation:
         if self.mute == "scan":
             return
         scan = Scan(now, ranges, LASER.angle_min, LASER.angle_increment)
-        meant = self._follower.on_scan(now, scan, self.robot.sensor)
+        target = self._follower.on_scan(now, scan, self.robot.sensor)
         if self.mute != "person":
-            self._follower.on_person(now, meant)
+            self._follower.on_person(now, target)
 
     def _hit_ground(self, ranges: Array) -> Array:
         """Let some rays hit the ground 3 to 6 m ahead in some scans, as a pitching trunk does."""

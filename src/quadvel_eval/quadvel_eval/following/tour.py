@@ -35,10 +35,8 @@ from .stage import DISTANCE_BAND_M, SETTLING_TIME_S
 
 Array = NDArray[np.float64]
 
-AVERAGING_TIME_S = (
-    0.35  # s, over which velocities are averaged before they are compared: a stride's sway is no error
-)
-ODOMETRY_INTERVAL_TICKS = 4  # ticks from one odometry to the next
+AVERAGING_TIME_S = 0.35  # of compared velocities, to remove the sway of a stride
+ODOMETRY_INTERVAL_TICKS = 4  # between odometry messages
 
 
 @attrs.frozen(kw_only=True)
@@ -145,7 +143,7 @@ class Tour:
         """
         loop, follower, place = self._loop, self._follower, np.zeros(3)
         loop.start_walking()
-        asked, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
+        commanded, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
         share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD / TICK), 0
         last = self.simulator.truth().position[:2].copy()
         plan: Plan | None = None
@@ -160,9 +158,13 @@ class Tour:
                 return
             now = sample.truth.time
             estimated = np.zeros(3) if loop.velocity is None else loop.velocity
+            # Dead reckoning: p += dt R(q) v, with the estimated velocity v in the body frame.
             place = place + TICK * rotate(sample.state.quaternion, estimated)
             true = np.append(sample.truth.linear_velocity[:2], sample.truth.angular_velocity[2])
-            asked, velocity = asked + share * (sample.commanded - asked), velocity + share * (true - velocity)
+            commanded, velocity = (
+                commanded + share * (sample.commanded - commanded),
+                velocity + share * (true - velocity),
+            )
             if tick % ODOMETRY_INTERVAL_TICKS == 0:
                 heading = float(yaw(sample.state.quaternion))
                 motion = np.append(estimated[:2], sample.state.angular_velocity[2])
@@ -170,8 +172,8 @@ class Tour:
                 self._poses.add(now, pose)
                 follower.on_odometry(now, pose, motion)
                 if (scan := self.simulator.scan()) is not None:
-                    meant = follower.on_scan(now, scan, self._poses.sensor_at(now))
-                    follower.on_person(now, meant)
+                    target = follower.on_scan(now, scan, self._poses.sensor_at(now))
+                    follower.on_person(now, target)
             if tick % often == 0 and tick:
                 begin = process_time()
                 plan = follower.step(now)
@@ -180,10 +182,10 @@ class Tour:
                 here = sample.truth.position[:2]
                 self.walked += float(np.hypot(*(here - last)))
                 last = here.copy()
-                yield self._sample(sample, asked, velocity, plan)
+                yield self._sample(sample, commanded, velocity, plan)
             tick += 1
 
-    def _sample(self, sample: Sample, asked: Array, velocity: Array, plan: Plan) -> TourSample:
+    def _sample(self, sample: Sample, commanded: Array, velocity: Array, plan: Plan) -> TourSample:
         """Sample of the present state."""
         truth = sample.truth
         pose = np.array([*truth.position[:2], float(yaw(truth.quaternion))])
@@ -192,7 +194,7 @@ class Tour:
             truth.time,
             pose,
             persons[0],
-            asked,
+            commanded,
             velocity,
             plan.state,
             plan.words,
@@ -224,36 +226,36 @@ class Outcome:
     planning: Sequence[float] = ()
 
 
-def summarise_tour(outcome: Outcome, moments: Sequence[TourSample]) -> dict[str, Any]:
+def summarise_tour(outcome: Outcome, samples: Sequence[TourSample]) -> dict[str, Any]:
     """Compute the figures of a tour; the paper reports errors of 0.077 m/s and 0.059 rad/s.
 
     Args:
         outcome: Outcome of the tour.
-        moments: Its samples.
+        samples: Its samples.
 
     Returns:
         Content of `tour.json`.
     """
-    time = np.array([one.time for one in moments])
+    time = np.array([one.time for one in samples])
     late = time >= min(time[0] + SETTLING_TIME_S, time[-1])
-    asked, velocity = (
-        np.array([getattr(one, name) for one in moments]) for name in ("commanded", "velocity")
+    commanded, velocity = (
+        np.array([getattr(one, name) for one in samples]) for name in ("commanded", "velocity")
     )
-    off = asked - velocity
-    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
-    lost = [one.state in (State.LOST, State.LOOKING) for one in moments]
+    error = commanded - velocity
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in samples])
+    lost = [one.state in (State.LOST, State.LOOKING) for one in samples]
     begins = np.flatnonzero(np.diff(np.append(False, lost).astype(int)) == 1)
-    states = Counter(one.state.value for one in moments)
+    states = Counter(one.state.value for one in samples)
     found = {
         "schema": 1,
         **attrs.asdict(outcome, filter=lambda field, _: field.name != "planning"),
         "minutes": (time[-1] - time[0]) / 60.0,
-        "error_xy": np.hypot(off[:, 0], off[:, 1]).mean(),
-        "error_wz": np.abs(off[:, 2]).mean(),
+        "error_xy": np.hypot(error[:, 0], error[:, 1]).mean(),
+        "error_wz": np.abs(error[:, 2]).mean(),
         "distance_mean": away[late].mean(),
         "distance_kept": np.mean(np.abs(away[late] - outcome.distance) < DISTANCE_BAND_M),
-        "least_clearance": min(one.clearance for one in moments),
-        "least_gap": min(one.gap for one in moments),
+        "least_clearance": min(one.clearance for one in samples),
+        "least_gap": min(one.gap for one in samples),
         "losses": len(begins),
         "lost_seconds": PERIOD * sum(lost),
         "seconds": {name: PERIOD * count for name, count in states.items()},

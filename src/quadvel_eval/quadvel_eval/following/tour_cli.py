@@ -10,8 +10,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from .tour import Tour, TourSample, TourSetup
 from .tour_report import tour_table, write_tour
 
-BAR_UPDATE_INTERVAL = 20  # moments, a second: how often the bar moves
-MAX_PROGRESS_LINES = 20  # in all, where there is no terminal that shows a bar
+BAR_UPDATE_INTERVAL = 20  # samples, one second
+MAX_PROGRESS_LINES = 20  # in total, without a terminal
 
 
 def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
@@ -31,7 +31,7 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         KeyboardInterrupt: Ctrl-C ended the walk.
     """
     tour = Tour(setup)
-    moments: list[TourSample] = []
+    samples: list[TourSample] = []
     columns = (
         TextColumn("{task.description:32}"),
         BarColumn(),
@@ -39,21 +39,21 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("sets out", total=setup.path_length)
-        told, is_stopped = 0.0, False
+        task = bar.add_task("start", total=setup.path_length)
+        next_report, is_stopped = 0.0, False
         try:
-            for moment in tour.samples():
-                moments.append(moment)
-                if len(moments) % BAR_UPDATE_INTERVAL == 0:
-                    bar.update(task, completed=tour.walked, description=moment.words)
-                if not console.is_terminal and tour.walked >= told:
-                    console.print(f"{tour.walked:.0f} of {setup.path_length:.0f} m: {moment.words}")
-                    told += setup.path_length / MAX_PROGRESS_LINES
+            for sample in tour.samples():
+                samples.append(sample)
+                if len(samples) % BAR_UPDATE_INTERVAL == 0:
+                    bar.update(task, completed=tour.walked, description=sample.words)
+                if not console.is_terminal and tour.walked >= next_report:
+                    console.print(f"{tour.walked:.0f} of {setup.path_length:.0f} m: {sample.words}")
+                    next_report += setup.path_length / MAX_PROGRESS_LINES
         except KeyboardInterrupt:
             is_stopped = True
-    if moments:
-        console.print(tour_table(write_tour(out, tour.world, tour.outcome, moments)))
-        console.print(f"written to {out}: tour.json, tour.png; no video is drawn of a tour")
+    if samples:
+        console.print(tour_table(write_tour(out, tour.world, tour.outcome, samples)))
+        console.print(f"written to {out}: tour.json, tour.png; a tour has no video")
     if is_stopped:
         raise KeyboardInterrupt
-    return bool(moments) and not (tour.fell or tour.simulator.touched)
+    return bool(samples) and not (tour.fell or tour.simulator.touched)

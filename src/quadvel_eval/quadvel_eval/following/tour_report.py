@@ -22,61 +22,63 @@ from .tour import Outcome, TourSample, summarise_tour
 PAPER_XY, PAPER_WZ = 0.077, 0.059  # m/s, rad/s: mean errors of the paper's tour of 3.1 km
 
 
-def write_tour(folder: Path, world: World, outcome: Outcome, moments: Sequence[TourSample]) -> dict[str, Any]:
+def write_tour(folder: Path, world: World, outcome: Outcome, samples: Sequence[TourSample]) -> dict[str, Any]:
     """Write tour.json and tour.png.
 
     Args:
         folder: Folder of the files.
         world: World of the tour.
         outcome: Outcome of the tour.
-        moments: Its samples.
+        samples: Its samples.
 
     Returns:
         The figures.
     """
-    figures = summarise_tour(outcome, moments)
+    figures = summarise_tour(outcome, samples)
     write_json(folder / "tour.json", figures)
-    write_figure(folder / "tour.png", tour_figure(world, outcome.distance, moments))
+    write_figure(folder / "tour.png", tour_figure(world, outcome.distance, samples))
     return figures
 
 
-def tour_figure(world: World, distance: float, moments: Sequence[TourSample]) -> Figure:
-    """Draw the robot's path on the map, and distance and speed over time below.
+def tour_figure(world: World, distance: float, samples: Sequence[TourSample]) -> Figure:
+    """Draw the robot's path on the map, and distance and speed over time distance_axis.
 
     Args:
         world: World of the tour.
         distance: Set distance to the person, m.
-        moments: Samples of the tour.
+        samples: Samples of the tour.
 
     Returns:
         The figure.
     """
     figure = draw_world(world)
-    way = np.array([one.pose[:2] for one in moments])
-    time = np.array([one.time - moments[0].time for one in moments]) / 60.0
-    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
-    speed = np.array([np.hypot(*one.velocity[:2]) for one in moments])
+    path = np.array([one.pose[:2] for one in samples])
+    time = np.array([one.time - samples[0].time for one in samples]) / 60.0
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in samples])
+    speed = np.array([np.hypot(*one.velocity[:2]) for one in samples])
     world_map = figure.axes[0]
-    world_map.plot(*way.T, color="tab:red", linewidth=0.8, zorder=7)
+    world_map.plot(*path.T, color="tab:red", linewidth=0.8, zorder=7)
     wide, high = figure.get_size_inches()
     figure.set_size_inches(wide, high + 3.0)
     figure.set_layout_engine("none")
     low = 2.4 / (high + 3.0)
     world_map.set_position((0.07, low + 0.12, 0.9, 0.8 - low))
-    below = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
-    below.axhspan(distance - DISTANCE_BAND_M, distance + DISTANCE_BAND_M, color="tab:green", alpha=0.15)
-    below.plot(time, away, color="tab:blue", linewidth=0.8)
-    lost = np.array([one.state in (State.LOST, State.LOOKING) for one in moments])
-    below.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
-    below.set(
+    distance_axis = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
+    distance_axis.axhspan(
+        distance - DISTANCE_BAND_M, distance + DISTANCE_BAND_M, color="tab:green", alpha=0.15
+    )
+    distance_axis.plot(time, away, color="tab:blue", linewidth=0.8)
+    lost = np.array([one.state in (State.LOST, State.LOOKING) for one in samples])
+    distance_axis.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
+    distance_axis.set(
         xlabel="min",
         ylabel="distance, m",
         ylim=(0.0, max(4.0, float(away.max()))),
         xlim=(0.0, float(time[-1])),
     )
-    beside = below.twinx()
-    beside.plot(time, speed, color="0.6", linewidth=0.6)
-    beside.set(ylabel="speed, m/s", ylim=(0.0, 4.0))
+    speed_axis = distance_axis.twinx()
+    speed_axis.plot(time, speed, color="0.6", linewidth=0.6)
+    speed_axis.set(ylabel="speed, m/s", ylim=(0.0, 4.0))
     return figure
 
 

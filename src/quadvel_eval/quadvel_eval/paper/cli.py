@@ -46,12 +46,12 @@ def paper_command(
         typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
-    again: Annotated[bool, typer.Option("--again", help="Run sections that are done already, too.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Run finished sections, too.")] = False,
     cluster: ClusterOption = None,
 ) -> None:
-    """Measure what Section 4 of the paper shows: a page with its values beside ours, pictures and CSV files.
+    """Repeat Section 4 of the paper in simulation: a page with both values, pictures and CSV files.
 
-    Sections whose files were made with the same networks, seeds and settings are kept; what was stopped goes on.
+    Sections made with the same networks, seeds and settings are kept; an interrupted run continues.
 
     \b
     For example:
@@ -66,14 +66,14 @@ def paper_command(
         seeds=seeds,
     )
     for path in study.policies.values():
-        PolicyFile(path)  # what is wrong with the files shows here, once, before any run
+        PolicyFile(path)  # fail on a bad file here, once, before any run
     LearnedEstimator(estimator_file)
     sections = _sections(only or [])
     folder = output_folder(out)
     with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
 
-        def tell(progress: Progress) -> None:
+        def show_progress(progress: Progress) -> None:
             bar.update(task, completed=progress.done, total=progress.total)
             if progress.completed:
                 bar.console.print(
@@ -81,11 +81,11 @@ def paper_command(
                     highlight=False,
                 )
 
-        done = run_sections(study, sections, folder, again, cluster, tell)
+        done = run_sections(study, sections, folder, again, cluster, show_progress)
     kept = [section.name for section in sections if section.name not in done]
     console = Console()
     if kept:
-        console.print(f"kept as they were: {', '.join(kept)}")
+        console.print(f"unchanged: {', '.join(kept)}")
     console.print(f"written: {folder}/{PAGE_FILE}")
 
 
@@ -95,7 +95,7 @@ def _policies(given: list[str]) -> dict[str, Path]:
     for text in given:
         name, equals, file = text.partition("=")
         if not (name and equals and file) or name in policies:
-            raise ValueError(f"--policy: found {text!r}, expected NAME=FILE with a name of its own")
+            raise ValueError(f"--policy: found {text!r}, expected NAME=FILE with a unique name")
         policies[name] = Path(file)
     return policies
 

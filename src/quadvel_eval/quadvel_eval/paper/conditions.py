@@ -26,8 +26,8 @@ LOOSE_JOINTS: Mapping[str, Any] = {
 """Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
 HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE_JOINTS}
 PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
-"""As rows name those of HARD_PLANTS that are not the usual one."""
-PUSH_START_S, PUSH_DURATION_S = 1.0, 0.2  # s after the start of a walk, and for how long
+"""Names in table rows of the plants of HARD_PLANTS other than the usual one."""
+PUSH_START_S, PUSH_DURATION_S = 1.0, 0.2  # after the start of the walk
 
 
 @attrs.frozen

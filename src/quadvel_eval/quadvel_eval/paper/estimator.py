@@ -17,9 +17,9 @@ from ..walk import Setup, Walk, make_loop, record_until_fall
 from .cells import command_limits
 from .section import Job, JobResults, Record, Row, Section, Study, by_policy, column, distinct, mean, select
 
-BANDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)  # m/s, where a band of true speed begins; each is 0.5 wide
-MAX_COMMAND_SPEED = 2.5  # m/s: commands go no further
-COMMAND_HOLD_S = 2.5  # s of each command
+BANDS = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5)  # m/s, lower ends of the bands of true speed, each 0.5 wide
+MAX_COMMAND_SPEED = 2.5  # m/s, for vx and vy each
+COMMAND_HOLD_S = 2.5  # duration of each command
 ESTIMATORS = ("learned", "kalman")
 GROUNDS = ("flat", "rough")
 
@@ -39,6 +39,7 @@ def random_walk(setup: Setup, seed: int, bounds: CommandLimits, seconds: float) 
     rng = np.random.default_rng(seed)
     commands = []
     for _ in range(round(seconds / COMMAND_HOLD_S)):
+        # Uniform in the unit ball: a normal direction with length u^(1/3), u uniform in [0, 1).
         direction = rng.standard_normal(3)
         direction *= rng.uniform() ** (1.0 / 3.0) / np.linalg.norm(direction)
         command = direction * np.where(direction > 0, bounds.high, np.negative(bounds.low))

@@ -24,7 +24,7 @@ from .section import Record, Row, Section, Study, distinct
 
 SCHEMA = 1
 PAGE_FILE = "README.md"
-DIGEST_LENGTH = 12  # letters of a SHA-256 that tell one file from another
+DIGEST_LENGTH = 12  # hexadecimal digits of a SHA-256
 
 
 def provenance(section: Section, study: Study) -> dict[str, Any]:

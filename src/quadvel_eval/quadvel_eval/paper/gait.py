@@ -37,12 +37,12 @@ from .section import (
 
 Array = NDArray[np.float64]
 
-WINDOW_S = 1.0  # s, over which a gait is counted
-MEDIAN_FILTER_TICKS = 5  # ticks: a shorter touch or gap is a bounce
-CSV_INTERVAL_TICKS = 4  # ticks from one line of the CSV to the next
-GAIT_KIND_SPEEDS = (0.5, 1.0, 2.0, 2.75)  # m/s of the ramp, at which the kind of gait is in the table,
-GAIT_KIND_HALF_SPAN = 0.125  # m/s, from so much below to so much above
-GAIT_KIND_FIGURES = {  # what the table has of a gait's kind, with units and factors
+WINDOW_S = 1.0  # for gait figures
+MEDIAN_FILTER_TICKS = 5  # touches or gaps shorter than half of it are bounces
+CSV_INTERVAL_TICKS = 4  # between lines of the CSV
+GAIT_KIND_SPEEDS = (0.5, 1.0, 2.0, 2.75)  # m/s, in the table
+GAIT_KIND_HALF_SPAN = 0.125  # m/s around each of GAIT_KIND_SPEEDS
+GAIT_KIND_FIGURES = {  # name, unit and factor in the table
     "diagonal": ("diagonal feet alike", "%", 100.0),
     "side": ("feet of one side alike", "%", 100.0),
     "frequency": ("gait frequency", "Hz", 1.0),

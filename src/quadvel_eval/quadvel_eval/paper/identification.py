@@ -25,9 +25,9 @@ from ..walk import Setup, record_until_fall
 from .cells import command_limits
 from .section import Job, JobResults, Record, Row, Section, Study, column, select
 
-TRANSITION_TIME_S = 1.5  # s, from standing to where the motion begins
-PLOTTED_JOINT = "FR_calf_joint"  # of the picture, as in the paper's Figure 4
-PLOTTED_TIME_S = 0.5  # s of it
+TRANSITION_TIME_S = 1.5  # from standing to the first target
+PLOTTED_JOINT = "FR_calf_joint"  # as in the paper's Figure 4
+PLOTTED_TIME_S = 0.5  # at the end of the log
 TORQUES = {"measured": "measured", "pd": "ideal PD", "before": "EAM"}
 PAPER_VALUES: dict[str, dict[str, float]] = {
     "Eq. 9": {

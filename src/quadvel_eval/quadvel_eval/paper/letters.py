@@ -34,8 +34,8 @@ from .section import (
 
 Array = NDArray[np.float64]
 
-CSV_INTERVAL_TICKS = 10  # ticks from one line of the CSV to the next
-Stroke = tuple[Command, float]  # velocity in the body frame and its seconds
+CSV_INTERVAL_TICKS = 10  # between lines of the CSV
+Stroke = tuple[Command, float]  # velocity in the body frame, and duration (s)
 
 
 def _read_strokes() -> tuple[Stroke, ...]:
@@ -112,15 +112,15 @@ class Letters(Section):
 
     @override
     def to_records(self, answers: JobResults) -> list[Record]:
-        asked = reference_path(self.strokes)
+        commanded = reference_path(self.strokes)
         records: list[Record] = []
-        for labels, (way, stood) in answers:
-            for i in range(0, 0 if way is None else len(way), CSV_INTERVAL_TICKS):
+        for labels, (path, stood) in answers:
+            for i in range(0, 0 if path is None else len(path), CSV_INTERVAL_TICKS):
                 numbers = (
                     i * CONTROL_PERIOD_S,
-                    *asked[i],
-                    *way[i],
-                    float(np.hypot(*(way[i] - asked[i])[:2])),
+                    *commanded[i],
+                    *path[i],
+                    float(np.hypot(*(path[i] - commanded[i])[:2])),
                 )
                 names = ("time", "asked_x", "asked_y", "asked_heading", "x", "y", "heading", "deviation")
                 records.append({**labels, **dict(zip(names, numbers, strict=True)), "fell": int(not stood)})

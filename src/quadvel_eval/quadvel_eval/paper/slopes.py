@@ -27,12 +27,10 @@ from .section import Job, JobResults, Record, Row, Section, Study, by_policy, di
 
 SLOPES = {-15.0: "15 degrees down", -7.5: "7.5 degrees down", 7.5: "7.5 degrees up", 15.0: "15 degrees up"}
 """Slopes (degrees, rising ahead of the robot at the start) and their names."""
-STANDING_TIME_S = 2.0  # s that a robot stands on a slope before it is commanded to walk
+STANDING_TIME_S = 2.0  # on the slope before the command to walk
 STARTS = {"": STANDING_TIME_S, "started at once": 0.0}
-"""Names of the starts, and how long the robot stands before it walks, s."""
-MAX_FOLLOWING_ERROR = (
-    0.15  # m/s: a robot whose error over the judged 4 s is larger is stuck: it does not follow
-)
+"""Names of the starts, and standing time before the walk, s."""
+MAX_FOLLOWING_ERROR = 0.15  # m/s, over the evaluated 4 s; a robot with a larger error is stuck
 
 
 def survival_and_following(records: Sequence[Record]) -> float:
@@ -65,7 +63,7 @@ TITLES = {
     group_name(plant, start): "".join(f"{name}, " for name in (PLANT_NAMES.get(plant), start) if name)
     for plant, start in itertools.product(HARD_PLANTS, STARTS)
 }
-"""What the rows of a group begin with."""
+"""Start of the row names of each group."""
 
 
 def conditions(plant: str, start: str) -> list[Condition]:

@@ -37,7 +37,7 @@ from .section import (
 
 Array = NDArray[np.float64]
 
-SETTLING_TIME_S = 1.0  # s, from the command to stand still until it counts
+SETTLING_TIME_S = 1.0  # after the zero command
 ZERO_COMMAND = (0.0, 0.0, 0.0)
 
 
@@ -138,8 +138,8 @@ class Stance(Section):
         for policy in distinct(records, "policy"):
             for seed in distinct(records, "seed"):
                 mine = select(records, policy=policy, seed=seed)
-                way = np.hypot(column(mine, "x"), column(mine, "y"))
-                panel.plot(column(mine, "time"), 100.0 * way, label=f"{policy}, seed {seed}")
+                distance = np.hypot(column(mine, "x"), column(mine, "y"))
+                panel.plot(column(mine, "time"), 100.0 * distance, label=f"{policy}, seed {seed}")
         panel.set_xlabel("time, s")
         panel.set_ylabel("distance from the start, cm")
         panel.set_ylim(0.0, None)

@@ -32,10 +32,10 @@ from .section import (
     select,
 )
 
-ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
-HOLD_TIME_S = 5.0  # s at the full command, of which the last 4 count
-EVALUATED_TIME_S = 4.0  # s
-DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s, rad/s
+ACCELERATION = 0.7  # of the command, m/s^2; twice as many rad/s^2 for spins
+HOLD_TIME_S = 5.0  # at the full command
+EVALUATED_TIME_S = 4.0  # at the end of HOLD_TIME_S
+DIRECTIONS: dict[str, tuple[Command, float]] = {  # direction, and the paper's largest velocity, m/s, rad/s
     "forward": ((1.0, 0.0, 0.0), 4.2),
     "backward": ((-1.0, 0.0, 0.0), 3.2),
     "left": ((0.0, 1.0, 0.0), 2.0),
@@ -63,6 +63,7 @@ def measure_sustained(setup: Setup, seed: int, direction: Command, speed: float)
         `ended`: reason of the supervisor for the end; `joint_speed` and `torque`: largest of all
         joints, divided by the limit of the drive.
     """
+    # The command rises as min(t / rise, 1) * speed, then stays for HOLD_TIME_S.
     along = np.array(direction)
     rise = speed / (2 * ACCELERATION if along[2] else ACCELERATION)
     shares = np.minimum(

@@ -23,8 +23,8 @@ from .section import Job, JobResults, Record, Row, Section, Study, by_policy, co
 
 Array = NDArray[np.float64]
 
-WALK_DURATION_S, SETTLING_TIME_S = 7.0, 3.0  # s of a walk, and from where on it counts
-PHASES_PER_CYCLE = 80  # of a gait cycle
+WALK_DURATION_S, SETTLING_TIME_S = 7.0, 3.0  # duration, and start of the evaluated part
+PHASES_PER_CYCLE = 80
 PARTS = ("hip", "thigh", "calf")
 PAIRS = (("FL", "FR"), ("RL", "RR"))
 
@@ -53,6 +53,7 @@ def resample_cycles(down: NDArray[np.intp], values: Array) -> Array:
     Returns:
         Values (cycles, PHASES_PER_CYCLE, k).
     """
+    # Phase p of a cycle from tick t_k to t_{k+1} lies at t_k + p (t_{k+1} - t_k).
     ticks, phases = np.arange(len(values)), np.arange(PHASES_PER_CYCLE) / PHASES_PER_CYCLE
     at = [begin + (end - begin) * phases for begin, end in pairwise(down)]
     each = [np.column_stack([np.interp(places, ticks, series) for series in values.T]) for places in at]
@@ -108,6 +109,7 @@ def asymmetry(records: Sequence[Record]) -> float:
             return float("nan")
         apart.append(sides[0] - sides[1])
         together.append(0.5 * (sides[0] + sides[1]))
+    # ||left - right|| / ||(left + right) / 2||, over legs, joints and phases.
     return float(np.linalg.norm(apart) / np.linalg.norm(together))
 
 

@@ -136,22 +136,22 @@ def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
     """Rows of one grid on the usual plant; the paper gives a value for its own grid only."""
     paper = PAPER_LARGEST_ERROR if grid == "paper" else None
     every, inside = f"{grid} grid, all", f"{grid} grid, within the policy's limits"
-    taken = select(records, within=1)
+    within_limits = select(records, within=1)
     return [
         Row(f"{every}: runs", "", None, by_policy(records, len), 0),
         Row(f"{every}: falls", "", 0.0, by_policy(records, count_falls), 0, key=True),
         Row(f"{every}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
         Row(f"{every}: largest error", "m/s", paper, by_policy(records, largest_error), key=True),
-        Row(f"{inside}: runs", "", None, by_policy(taken, len), 0),
-        Row(f"{inside}: falls", "", 0.0, by_policy(taken, count_falls), 0),
-        Row(f"{inside}: mean error", "m/s", None, by_policy(taken, mean_error), key=True),
-        Row(f"{inside}: largest error", "m/s", paper, by_policy(taken, largest_error), key=True),
-        *_turn_rows(inside, taken),
+        Row(f"{inside}: runs", "", None, by_policy(within_limits, len), 0),
+        Row(f"{inside}: falls", "", 0.0, by_policy(within_limits, count_falls), 0),
+        Row(f"{inside}: mean error", "m/s", None, by_policy(within_limits, mean_error), key=True),
+        Row(f"{inside}: largest error", "m/s", paper, by_policy(within_limits, largest_error), key=True),
+        *_turn_rows(inside, within_limits),
         Row(
             f"{inside}: largest left-right difference",
             "m/s",
             None,
-            by_policy(taken, left_right_difference),
+            by_policy(within_limits, left_right_difference),
             key=True,
         ),
     ]

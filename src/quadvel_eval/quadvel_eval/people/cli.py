@@ -45,7 +45,7 @@ def people_command(
     runs: Annotated[int, typer.Option(min=0, help="Simulated scenes of each kind.")] = 100,
     model: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file that knows legs.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="ONNX file of the leg detector.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
 ) -> None:
     """Measure how well people are found and tracked in laser scans, real and simulated."""

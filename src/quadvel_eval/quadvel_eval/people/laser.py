@@ -65,6 +65,8 @@ class FloorPlan:
         """Lengths of rays up to the nearest circle, m."""
         if not len(self.circles):
             return np.full(len(ahead), np.inf)
+        # |o + t d - c| = r, with |d| = 1 and b = d . (c - o):
+        # t = b - sqrt(r^2 - |c - o|^2 + b^2), the nearer of both intersections.
         to_centre = self.circles[:, :2] - start
         along = ahead @ to_centre.T
         root = self.circles[:, 2] ** 2 - (to_centre**2).sum(1) + along**2
@@ -75,6 +77,8 @@ class FloorPlan:
         """Lengths of rays up to the nearest segment, m."""
         if not len(self.segments):
             return np.full(len(ahead), np.inf)
+        # o + t d = a + s e, with e = b - a and the cross product in the plane:
+        # t = ((a - o) x e) / (d x e), s = ((a - o) x d) / (d x e), valid for t > 0 and 0 <= s <= 1.
         to_end, side = self.segments[:, :2] - start, self.segments[:, 2:] - self.segments[:, :2]
         cross = ahead[:, :1] * side[:, 1] - ahead[:, 1:] * side[:, 0]
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -19,10 +19,10 @@ from .scenes import SCENES, Scene
 
 Array = NDArray[np.float64]
 
-LABEL_RADIUS_M = 0.25  # m, from a label to a leg that is found
-SWITCH_LIMITS = (1.0, 3.0)  # m and s, within which a track that begins goes on with one that ended: a switch
-MATCH_RADIUS_M = 0.75  # m, from a person to its track
-GHOST_DISTANCE_M = 1.5  # m, from any person to what is no person's track
+LABEL_RADIUS_M = 0.25  # between a label and a detected leg
+SWITCH_LIMITS = (1.0, 3.0)  # m and s, between the end of a track and the start of another
+MATCH_RADIUS_M = 0.75  # between a person and their track
+GHOST_DISTANCE_M = 1.5  # from all people
 
 
 @attrs.frozen
@@ -173,7 +173,7 @@ def scene_scores(
         tracker = PersonTracker(detector=detector)
         first: dict[int, int] = {}
         now: dict[int, int] = {}
-        nobodys: set[int] = set()
+        ghost_ids: set[int] = set()
         for instant in scene.scans():
             start = process_time()
             tracks = tracker.update(
@@ -193,11 +193,11 @@ def scene_scores(
                     now[person] = nearest
                     if first.setdefault(person, nearest) == nearest:
                         errors.append(distances[nearest])
-            nobodys |= {
+            ghost_ids |= {
                 t.id for t in confirmed if np.hypot(*(instant.people - t.position).T).min() > GHOST_DISTANCE_M
             }
         kept.append(len(first) == len(scene.walkers) and first == now)
-        ghosts += len(nobodys)
+        ghosts += len(ghost_ids)
     return {
         "kept": float(np.mean(kept)),
         "rms": float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan"),

@@ -14,9 +14,9 @@ from .laser import FloorPlan, Laser
 
 Array = NDArray[np.float64]
 
-WALKING_STEP_S = 0.01  # s, in which persons walk
+WALKING_STEP_S = 0.01  # simulation step of the people
 RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])
-SCAN_RATES_HZ = (10.0, 20.0, 40.0)  # Hz
+SCAN_RATES_HZ = (10.0, 20.0, 40.0)
 
 
 @attrs.frozen
@@ -90,9 +90,9 @@ def crossing(seed: int) -> Scene:
     walkers = []
     for direction, aside in ((first, 0.2), (first + angle, 0.2)):
         ahead = np.array([np.cos(direction), np.sin(direction)])
-        beside = meeting + aside * np.array([ahead[1], -ahead[0]])
+        path_centre = meeting + aside * np.array([ahead[1], -ahead[0]])
         speed = rng.uniform(0.8, 1.5)
-        way = [beside - 3.0 * speed * ahead, beside + 3.0 * speed * ahead]
+        way = [path_centre - 3.0 * speed * ahead, path_centre + 3.0 * speed * ahead]
         walkers.append(_walker(rng, way, speed))
     return Scene(_laser(rng), rng.choice(SCAN_RATES_HZ), _trees(rng, meeting), walkers, 6.0, rng)
 
@@ -109,6 +109,8 @@ def occlusion(seed: int) -> Scene:
     rng = np.random.default_rng([2, seed])
     distance, speed, hidden = rng.uniform(2.5, 5.0), rng.uniform(0.8, 1.4), 1.5
     to_tree = distance * rng.uniform(0.4, 0.6)
+    # The shadow of the tree at the walker's distance has width 2 r distance / to_tree; the walker
+    # crosses it in `hidden` seconds.
     radius = 0.5 * hidden * speed * to_tree / distance
     side = rng.choice([-1.0, 1.0])
     way = np.array([[distance, -3.0 * side * speed], [distance, 4.0 * side * speed]])
