@@ -40,12 +40,12 @@ FIRST = evaluation({0.5: 0.1, 1.0: 0.2, 2.0: None})
 SECOND = evaluation({0.5: 0.05, 1.0: 0.1, 2.0: 0.9})
 
 
-def test_only_runs_that_both_went_through_are_held_against_each_other() -> None:
+def test_only_common_runs_are_compared() -> None:
     assert errors_on_common_runs(FIRST, SECOND) == pytest.approx((0.15, 0.075))
     assert errors_on_common_runs(FIRST, evaluation({3.0: 0.1})) is None
 
 
-def test_figures_are_those_of_the_evaluation() -> None:
+def test_figures_equal_those_of_the_evaluation() -> None:
     found = comparison_figures(FIRST)
     assert found["falls"] == 1
     assert found["cost of transport, mean"] == 0.5

@@ -1,4 +1,4 @@
-"""The fault campaign: what makes no sense is refused, what is found is judged, and a missing guard shows."""
+"""Fault campaign: invalid faults raise, reactions are checked, and a missing guard is detected."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def case(name: str) -> Case:
 
 @pytest.mark.parametrize("component", COMPONENTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_makes_no_sense_is_refused_in_words(component: str, kind: str) -> None:
+def test_an_invalid_combination_raises_with_the_reason(component: str, kind: str) -> None:
     if kind in COMPONENTS[component]:
         assert make_injection(component, kind).kind == kind
         return
@@ -38,12 +38,12 @@ def test_what_makes_no_sense_is_refused_in_words(component: str, kind: str) -> N
 
 
 @pytest.mark.parametrize(("component", "kind"), [("wheel", "off"), ("imu", "purple")])
-def test_unknown_names_are_refused(component: str, kind: str) -> None:
+def test_unknown_names_raise(component: str, kind: str) -> None:
     with pytest.raises(ValueError, match="expected one of"):
         make_injection(component, kind)
 
 
-def test_the_campaign_is_large_and_each_of_its_cases_can_be_brought_about() -> None:
+def test_the_campaign_is_large_and_each_of_its_cases_can_be_injected() -> None:
     kinds = {(one.component, one.kind) for one in CASES}
     assert len(kinds) >= 40
     assert len({one.name for one in CASES}) == len(CASES)
@@ -60,7 +60,7 @@ def test_the_campaign_is_large_and_each_of_its_cases_can_be_brought_about() -> N
         "controller off stand_up",
     ],
 )
-def test_it_is_as_expected(name: str) -> None:
+def test_the_reaction_is_as_expected(name: str) -> None:
     result = run_case(case(name), seed=3)
     assert result.wrong == []
     assert result.torque <= 1.0
@@ -73,7 +73,9 @@ def test_it_is_as_expected(name: str) -> None:
         ("torque wrong stance", DriveDoesNotAnswer, "expected drive_does_not_answer"),
     ],
 )
-def test_a_missing_guard_shows(monkeypatch: pytest.MonkeyPatch, name: str, guard: Any, sentence: str) -> None:
+def test_a_missing_guard_is_detected(
+    monkeypatch: pytest.MonkeyPatch, name: str, guard: Any, sentence: str
+) -> None:
     def without(*arguments: Any) -> Stack:
         return Stack(*arguments, guards=tuple(one for one in GUARDS if one is not guard))
 
@@ -102,13 +104,13 @@ def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None
     assert (tmp_path / "faults.png").stat().st_size > 1000
 
 
-def test_cases_that_are_not_there_are_refused() -> None:
+def test_unknown_cases_raise() -> None:
     with pytest.raises(ValueError, match=r"no case contains 'wheel'.* processor; .*lie_down") as refused:
         run_campaign(1, "wheel")
     assert len(str(refused.value)) < 500
 
 
-def test_the_command_says_what_is_not_as_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_reports_unexpected_reactions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     bad = run_case(case("clock wrong stance"), seed=0)
     bad.wrong.append("it is purple")
     monkeypatch.setattr("quadvel_eval.cli.run_campaign", lambda *_: [bad])

@@ -70,17 +70,17 @@ def test_paper_grid_is_that_of_section_4() -> None:
     assert not commands[:, 2].any()
 
 
-def test_a_cell_is_judged_over_its_last_four_seconds() -> None:
-    judged = evaluate_walk(walk((0.9, 0.1, 0.0)), Cell((1.0, 0.0, 0.0), 0), mass=25.0)
-    assert judged.segment is not None
-    assert judged.segment.error_xy == pytest.approx(np.hypot(0.1, 0.1))
-    assert judged.jitter == pytest.approx(0.002)
-    assert judged.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
-    np.testing.assert_allclose(judged.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
-    assert judged.estimator_drift == {"learned": 0.3}
-    assert judged.delay_xy == pytest.approx(0.5, abs=0.02)
-    assert judged.delay_wz is None  # no turn was commanded
-    assert judged.path_length == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
+def test_a_cell_is_evaluated_over_its_last_four_seconds() -> None:
+    evaluated = evaluate_walk(walk((0.9, 0.1, 0.0)), Cell((1.0, 0.0, 0.0), 0), mass=25.0)
+    assert evaluated.segment is not None
+    assert evaluated.segment.error_xy == pytest.approx(np.hypot(0.1, 0.1))
+    assert evaluated.jitter == pytest.approx(0.002)
+    assert evaluated.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
+    np.testing.assert_allclose(evaluated.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
+    assert evaluated.estimator_drift == {"learned": 0.3}
+    assert evaluated.delay_xy == pytest.approx(0.5, abs=0.02)
+    assert evaluated.delay_wz is None  # no turn was commanded
+    assert evaluated.path_length == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
 
 
 def test_evaluation_has_the_fields_of_schema_1() -> None:

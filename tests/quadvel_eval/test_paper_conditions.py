@@ -1,4 +1,4 @@
-"""Sections on changed plants: what is changed, and how survival and error are counted."""
+"""Sections on changed plants: their conditions, survival rate and errors."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled(
     section.figure(records)
 
 
-def test_robots_walk_on_slopes_after_standing_and_at_once_on_every_plant() -> None:
+def test_robots_walk_on_slopes_after_both_starts_on_every_plant() -> None:
     jobs = Slopes().jobs(Study(seeds=1))
     assert len(jobs) == 2 * 3 * 4 * 3
     stood = {(job.labels["group"].endswith("at once"), job.call[-1]) for job in jobs}
@@ -114,7 +114,7 @@ def test_a_robot_that_falls_while_it_stands_has_fallen(monkeypatch: pytest.Monke
     assert walk_under(Study().setup("crl_eam"), cell, None, 1.0).segment is None
 
 
-def test_the_gap_is_told_plant_by_plant() -> None:
+def test_the_gap_has_rows_for_each_plant() -> None:
     section = Gap()
     command = (1.0, 0.0, 0.0)
     records = section.to_records(

@@ -1,4 +1,4 @@
-"""How sections are run and kept, with one that needs no robot."""
+"""Running and keeping sections, with a section that needs no robot."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_section_leaves_csv_picture_json_and_the_page(tmp_path: Path, page: No
     assert [progress.completed for progress in heard] == [None] * 5 + ["powers"]
 
 
-def test_what_is_done_is_kept_until_it_is_asked_for_or_something_changes(
+def test_a_finished_section_is_kept_until_a_rerun_or_a_change(
     tmp_path: Path, page: None, in_this_process: None
 ) -> None:
     study.run_sections(TWO, [Powers()], tmp_path)
@@ -85,7 +85,7 @@ def test_what_is_done_is_kept_until_it_is_asked_for_or_something_changes(
     assert study.run_sections(TWO, [Powers(count=4)], tmp_path) == ["powers"]
 
 
-def test_another_network_makes_a_section_anew(tmp_path: Path) -> None:
+def test_another_network_repeats_a_section(tmp_path: Path) -> None:
     other = tmp_path / "other.onnx"
     other.write_bytes(SHIPPED_POLICY.read_bytes() + b"\0")
     first, second = (files.provenance(Powers(), Study(policies={"a": p})) for p in (SHIPPED_POLICY, other))
@@ -111,7 +111,7 @@ def test_an_unknown_section_is_refused_by_its_name(tmp_path: Path) -> None:
         paper_command(tmp_path / "out", only=["figure13"])
 
 
-def test_a_section_that_is_stopped_leaves_the_old_one_whole(
+def test_an_interrupted_section_keeps_the_old_files(
     tmp_path: Path, page: None, in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study.run_sections(TWO, [Powers()], tmp_path)

@@ -14,7 +14,7 @@ N = round(7.0 / PERIOD)
 
 
 def trot(right: float = 1.0) -> Walk:
-    """A trot whose right legs do as the left ones, half a cycle later, with `right` times their torque."""
+    """A trot whose right legs follow the left ones by half a cycle, with `right` times the torque."""
     phase = FREQUENCY * PERIOD * np.arange(N)
     legs = phase[:, None] + np.array([0.5, 0.0, 0.0, 0.5])  # FR FL RR RL
     curves = np.sin(2 * np.pi * legs)[:, :, None] * np.array([2.0, 5.0, 9.0]) + np.array([1.0, 0.0, 3.0])

@@ -28,7 +28,7 @@ def answer(
     )
 
 
-def test_commands_beyond_the_limits_of_a_policy_are_told_from_those_within() -> None:
+def test_commands_beyond_the_limits_of_a_policy_are_marked() -> None:
     assert is_within_limits((2.0, -0.5, 1.0), LIMITS)
     assert not is_within_limits((2.0, -0.6, 0.0), LIMITS)
     assert not is_within_limits((2.0, -0.5, 1.0), attrs.evolve(LIMITS, curve=1.0))
@@ -43,7 +43,7 @@ def test_left_right_is_the_largest_difference_between_mirrored_commands() -> Non
     assert np.isnan(left_right_difference(records[2:]))
 
 
-def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() -> None:
+def test_the_table_counts_falls_and_separates_errors_within_the_limits() -> None:
     section = Tracking()
     answers = [answer(1.0, 0.0, 0.02), answer(1.0, 0.4, None), answer(2.5, 0.0, 0.5, inside=0)]
     records = section.to_records([*answers, answer(1.0, 0.0, 0.04, plant="second")])
@@ -82,7 +82,7 @@ def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     section.figure(records)
 
 
-def test_what_other_plants_ask_of_the_drives_stands_by_itself() -> None:
+def test_the_drive_load_of_other_plants_has_its_own_rows() -> None:
     section = Sustained(shares=(1.0,), directions=("forward",))
     plants = [job.labels["plant"] for job in section.jobs(Study(seeds=1))]
     assert plants == ["usual", "second", "loose joints"]

@@ -1,4 +1,4 @@
-"""The walks of the paper's sections, as short as they can be, with the shipped networks."""
+"""Short walks of the paper's sections, with the shipped networks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ONE = Study(seeds=1)
 
 
 def rows(section: Section) -> Sequence[Row]:
-    """The table of a section that is run here and now."""
+    """Run a section in this process and return its table."""
     answers: list[tuple[dict[str, Any], Any]] = []
     for job in section.jobs(ONE):
         function, *arguments = job.call
@@ -38,7 +38,7 @@ def rows(section: Section) -> Sequence[Row]:
 
 
 def ours(section: Section) -> dict[str, float | None]:
-    """What the shipped policy reached, by what."""
+    """Values of the shipped policy, by row."""
     return {row.what: row.ours[SHIPPED_POLICY.stem] for row in rows(section)}
 
 
@@ -76,7 +76,7 @@ def test_a_robot_that_stands_drifts_little(monkeypatch: pytest.MonkeyPatch) -> N
     assert found["whether one fell"] == 0.0
 
 
-def test_both_estimators_are_judged_on_the_same_walks() -> None:
+def test_both_estimators_are_evaluated_on_the_same_walks() -> None:
     found = ours(Estimator(seconds=2.5, grounds=("flat",)))
     for name in ("learned", "kalman"):
         assert 0.0 < found[f"flat ground, {name}: RMSE of the worst axis"] < 0.3

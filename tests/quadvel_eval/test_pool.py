@@ -11,7 +11,7 @@ from quadvel_eval.pool import run_in_parallel
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of two workers on this machine."""
+    """Address of a scheduler with two workers on this machine."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:

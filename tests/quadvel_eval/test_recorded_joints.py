@@ -84,7 +84,7 @@ def test_a_replay_is_the_same_of_every_kind_of_recording(tmp_path: Path) -> None
         ([("/x", "std_msgs/msg/String", T0, STORE.types["std_msgs/msg/String"]("x"))], r"the recording has /x \(std_msgs"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_replayed_is_refused_with_its_cause(
+def test_a_recording_that_cannot_be_replayed_fails_with_the_cause(
     tmp_path: Path, messages: list[Message], sentence: str
 ) -> None:
     path = rosbag2(tmp_path / "bag", messages)

@@ -1,4 +1,4 @@
-"""A recording written message by message, as the nodes would, and what is read out of it."""
+"""Reads recordings that are written message by message, as the nodes do."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def test_lying_down_is_no_fall_but_tilting_over_is_one() -> None:
     assert count_falls(np.full(4, 0.4), tilted, np.array([False] * 4)) == 1
 
 
-def test_nothing_walked_is_said(recorded: Callable[..., Path]) -> None:
+def test_a_recording_without_a_walk_fails(recorded: Callable[..., Path]) -> None:
     recording = read_recording(recorded())
     assert len(recorded_segments(recording)) == 2
     object.__setattr__(recording.planned, "time", np.zeros(0))

@@ -1,4 +1,4 @@
-"""Replaying a run with its own model errs by little, with another one by more."""
+"""A replay with the true model has a small error, with another model a larger one."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ LowState, LowCmd = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 
 @pytest.fixture(scope="module")
 def run() -> tuple[JointRecord, Callable[[float], Truth]]:
-    """A robot with the shipped drives that sways on its feet under commands at 200 Hz; what its sensors say, exactly."""
+    """A robot with the shipped drives that sways on its feet under commands at 200 Hz, without noise."""
     simulator = Simulator(SimulatorConfig(noise=SensorNoise.none(), seed=3))
     simulator.reset("stand")
     states, truths, rows = [], [], []
@@ -92,7 +92,7 @@ def write_recording(path: Path, ticks: list[int], answered: list[int]) -> None:
         writer.finish()
 
 
-def test_states_that_the_recorder_missed_are_marked_and_commands_held_over_them(tmp_path: Path) -> None:
+def test_missing_states_are_marked_and_commands_stay_in_force(tmp_path: Path) -> None:
     write_recording(tmp_path / "walk.mcap", [5, 6, 7, 10, 11, 12], answered=[6, 10])
     joints = read_joints(tmp_path / "walk.mcap")
     np.testing.assert_allclose(joints.time, np.arange(5, 13) * 1e-3)
@@ -150,7 +150,7 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
     assert np.sqrt(np.mean(np.square(ideal.growth))) == pytest.approx(ideal.q)
 
 
-def test_a_stretch_without_a_past_is_not_replayed(run: tuple[JointRecord, Callable[[float], Truth]]) -> None:
+def test_a_stretch_without_history_is_not_replayed(run: tuple[JointRecord, Callable[[float], Truth]]) -> None:
     with pytest.raises(ValueError, match=r"nothing to replay between 0\.00 and 0\.25 s"):
         open_loop_error(ActuatorParameters.default(), *run, 0.0, 0.25)
 

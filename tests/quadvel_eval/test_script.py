@@ -20,13 +20,13 @@ def test_a_script_is_walked_step_by_step() -> None:
     assert runner.update(7.1, "passive") is None
 
 
-def test_an_order_is_repeated_while_the_controller_does_not_follow_it() -> None:
+def test_a_mode_request_is_repeated_until_the_controller_follows() -> None:
     runner = ScriptRunner((STAND_UP,))
     orders = [runner.update(t, "passive").requested_mode for t in (0.0, 0.2, 0.4, 0.6, 0.8, 1.2)]
     assert orders == ["stand_up", None, None, "stand_up", None, "stand_up"]
 
 
-def test_a_robot_that_stands_already_is_not_ordered_to() -> None:
+def test_a_standing_robot_gets_no_request_to_stand_up() -> None:
     assert ScriptRunner((STAND_UP, WALK)).update(0.0, "stand_up").requested_mode is None
     runner = ScriptRunner((STAND_UP, WALK))
     runner.update(0.0, "stance")
@@ -38,7 +38,7 @@ def test_a_fault_ends_the_script_with_the_controllers_reason() -> None:
         ScriptRunner((WALK,)).update(0.0, "fault", "the trunk is tilted by 1.20 rad")
 
 
-def test_patience_ends() -> None:
+def test_a_mode_request_times_out() -> None:
     runner = ScriptRunner((STAND_UP,))
     runner.update(0.0, "passive")
     with pytest.raises(ScriptError, match=r"'stand up' took more than 20 s; the mode is passive"):

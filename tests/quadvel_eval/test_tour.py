@@ -1,4 +1,4 @@
-"""Following a person through a world in one process: clearances against closed form, figures, and some metres of it."""
+"""Tour in one process: clearances against closed-form values, figures, and a short walk."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def moment(time: float, away: float, state: State = State.FOLLOWING) -> TourSamp
     return TourSample(time, np.zeros(3), person, asked, velocity, state, "", 0.5, float("inf"))
 
 
-def test_figures_tell_errors_distance_losses_and_leave_the_start_out() -> None:
+def test_figures_have_errors_distance_and_losses_without_the_start() -> None:
     states = 140 * [State.FOLLOWING] + 20 * [State.LOST] + 20 * [State.LOOKING] + 20 * [State.FOLLOWING]
     away = np.where(np.arange(200) < 120, 9.0, np.where(np.arange(200) < 180, 1.6, 3.0))
     moments = [moment(PERIOD * k, float(d), s) for k, (d, s) in enumerate(zip(away, states, strict=True))]

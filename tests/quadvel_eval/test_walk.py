@@ -55,7 +55,7 @@ def test_jitter_of_a_parabola_is_its_second_difference_and_of_a_line_zero() -> N
     assert jitter(np.tile(3.0 * k[:, None], (1, 12))) == pytest.approx(0.0)
 
 
-def test_drift_is_where_the_velocities_lead_beside_where_the_robot_got_to() -> None:
+def test_drift_is_the_distance_of_integrated_and_true_position() -> None:
     time = np.arange(201) * 0.005
     position = np.column_stack([np.sin(time), time, 0.1 * time])  # 1 s
     velocity = np.column_stack([np.cos(time) + 0.03, np.full(201, 1.0 - 0.04), np.full(201, 9.0)])
@@ -79,7 +79,7 @@ def test_a_robot_that_falls_leaves_no_walk(make_loop: Callable[..., RobotLoop]) 
     assert record_walk(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
 
 
-def test_seeds_draw_the_plant_only_where_randomised_is_asked_for() -> None:
+def test_seeds_draw_the_plant_only_if_randomised() -> None:
     def friction(randomised: bool, seed: int) -> list[float]:
         return make_simulator(Setup(randomised=randomised), seed).config.friction.tolist()
 
@@ -100,7 +100,7 @@ def test_an_unknown_terrain_is_refused() -> None:
         Setup(terrain="sand")
 
 
-def test_what_is_given_of_the_plant_holds_whatever_was_drawn() -> None:
+def test_given_plant_fields_override_drawn_ones() -> None:
     config = make_simulator(Setup(randomised=True, plant={"payload": 4.0}), seed=1).config
     assert config.payload == 4.0
     assert config.friction.tolist() == make_simulator(Setup(randomised=True), seed=1).config.friction.tolist()

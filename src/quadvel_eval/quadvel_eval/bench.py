@@ -48,6 +48,7 @@ def machine_info() -> dict[str, Any]:
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:
+    """Median and 99th percentile of durations in seconds, in us."""
     p50, p99 = 1e6 * np.quantile(seconds, (0.5, 0.99))
     return {"p50_us": float(p50), "p99_us": float(p99)}
 
@@ -231,6 +232,8 @@ def bench_supervisor() -> dict[str, Any]:
 
 
 def _training(part: str) -> Callable[[], dict[str, Any]]:
+    """Return a benchmark of the training package, which is skipped without torch."""
+
     def measure() -> dict[str, Any]:
         if util.find_spec("torch") is None:
             return {"skipped": "torch is not installed; pip install -e '.[train]'"}
@@ -258,14 +261,14 @@ TABLE_ROWS = (  # part, figure, description, target
     ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
     ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
     ("world", "realtime_factor", "simulator on the campus, times real time", ""),
-    ("world", "scan_p50_us", "a scan of 1080 rays there, median, us", "5000 or less"),
+    ("world", "scan_p50_us", "scan of 1080 rays on the campus, median, us", "5000 or less"),
     ("loop", "realtime_factor", "evaluation loop, times real time", ""),
     ("policy", "p50_us", "inference, observation to action, median, us", "50 or less"),
     ("policy", "p99_us", "inference, observation to action, 99 %, us", ""),
     ("policy", "ahead_p50_us", "inference, part done ahead, median, us", ""),
     ("policy", "whole_p50_us", "inference, step in one piece, median, us", ""),
     ("policy", "rested_p50_us", "inference after 5 ms of rest, median, us", ""),
-    ("policy", "rested_idle_p50_us", "a network that does nothing after 5 ms of rest, us", ""),
+    ("policy", "rested_idle_p50_us", "smallest network after 5 ms of rest, us", ""),
     ("supervisor", "p50_us", "supervisor tick, median, us", ""),
     ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
     ("estimator", "p50_us", "learned estimator, median, us", ""),
@@ -273,16 +276,16 @@ TABLE_ROWS = (  # part, figure, description, target
     ("packets", "decode_state_p50_us", "packet to state, median, us", "60 or less"),
     ("packets", "encode_state_p50_us", "state to packet, median, us", "60 or less"),
     ("packets", "decode_command_p50_us", "packet to command, median, us", "60 or less"),
-    ("round_trip", "p50_us", "message there and back, median, us", ""),
-    ("round_trip", "p99_us", "message there and back, 99 %, us", ""),
+    ("round_trip", "p50_us", "message round trip, median, us", ""),
+    ("round_trip", "p99_us", "message round trip, 99 %, us", ""),
     ("environment", "steps_per_s", "training environment, steps/s", ""),
-    ("environment", "ratio", "of the bare batch's", "0.7 or more"),
+    ("environment", "ratio", "divided by that of the bare batch", "0.7 or more"),
     ("training", "samples_per_s", "training, policy samples/s", ""),
-    ("training", "ratio", "of what bare steps and passes allow", "0.6 or more"),
-    ("training", "physics_share", "of its time: physics and actuators", ""),
-    ("training", "sensing_share", "observations and rewards", ""),
-    ("training", "inference_share", "inference", ""),
-    ("training", "learning_share", "learning", ""),
+    ("training", "ratio", "divided by that of bare steps and passes", "0.6 or more"),
+    ("training", "physics_share", "share of training time: physics and actuators", ""),
+    ("training", "sensing_share", "share: observations and rewards", ""),
+    ("training", "inference_share", "share: inference", ""),
+    ("training", "learning_share", "share: learning", ""),
 )
 
 
@@ -295,7 +298,7 @@ def benchmark_table(results: dict[str, dict[str, Any]]) -> Table:
     Returns:
         The table.
     """
-    found = Table("figure", "measured", "wanted", title="Benchmark")
+    found = Table("figure", "measured", "target", title="Benchmark")
     for part, figure, about, wanted in TABLE_ROWS:
         result = results[part]
         found.add_row(about, result.get("skipped") or number_text(result[figure], ",.4g"), wanted)

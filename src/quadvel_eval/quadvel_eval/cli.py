@@ -26,7 +26,7 @@ ClusterOption = Annotated[
     str | None,
     typer.Option(
         metavar="<address>",
-        help="Address of a Dask scheduler to run the walks on.",
+        help="Address of a Dask scheduler that runs the walks.",
         show_default="the cores of this machine",
     ),
 ]
@@ -45,15 +45,18 @@ def eval_command(
     ] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
-    terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
+    terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="Terrain.")] = "flat",
     actuator: Annotated[
         Path | None,
         typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     randomised: Annotated[
-        bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")
+        bool,
+        typer.Option("--randomised", help="Randomise payload, friction, joints and actuators by the seed."),
     ] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each command, with seeds 0, 1, ...")] = 1,
     cluster: ClusterOption = None,

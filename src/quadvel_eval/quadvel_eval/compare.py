@@ -116,7 +116,7 @@ def comparison_table(evaluations: Mapping[str, Mapping[str, Any]]) -> Table:
     rows = {name: (before.get(name), after.get(name)) for name in dict.fromkeys((*before, *after))}
     common = errors_on_common_runs(first, second)
     if common:
-        rows["mean error of the runs that both went through, m/s"] = common
+        rows["mean error of the common runs, m/s"] = common
     for name, (a, b) in rows.items():
         difference = "" if a is None or b is None else f"{b - a:+.4g}"
         table.add_row(name, _number(a), _number(b), difference)
@@ -124,4 +124,5 @@ def comparison_table(evaluations: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _number(value: float | None) -> str:
+    """Number with four significant digits; a dash for None."""
     return "–" if value is None else f"{value:.4g}"

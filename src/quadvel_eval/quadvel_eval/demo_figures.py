@@ -49,6 +49,7 @@ def tracking_figure(recording: Recording, frames: Sequence[tuple[str, NDArray[np
 
 
 def _tracking_panels(panels: Any, recording: Recording) -> None:
+    """Plot the three velocities, one panel per axis."""
     start, end = _walked_interval(recording)
     planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])
     for axis, (panel, name) in enumerate(zip(panels, AXIS_LABELS, strict=True)):
@@ -96,6 +97,7 @@ def loop_figure(recording: Recording) -> Figure:
 
 
 def _distribution(panel: Any, values: Array, name: str) -> None:
+    """Draw a histogram (logarithmic counts) with median and 99th percentile."""
     panel.set_xlabel(name)
     panel.set_ylabel("ticks")
     if not len(values):

@@ -97,10 +97,12 @@ def summarise_demo(recording: Recording) -> dict[str, Any]:
 
 
 def _mean(values: Array) -> float:
+    """Mean; nan without values."""
     return float(values.mean()) if len(values) else float("nan")
 
 
 def _falls(recording: Recording) -> int:
+    """Count the falls of a recording."""
     loop = recording.loop
     upright = np.array([mode in UPRIGHT_MODES for mode in loop.mode])
     now = np.maximum(np.searchsorted(loop.time, recording.position.time, side="right") - 1, 0)

@@ -207,12 +207,17 @@ def replay_command(
         Path, typer.Option(metavar="<folder>", help="Folder for replay.json and pictures.")
     ] = Path("out/replay"),
     actuator: Annotated[
-        Path | None, typer.Option(metavar="<file>", help="An actuator.yaml.", show_default="the shipped one")
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="Actuator model, an actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
     estimator: Annotated[Literal["learned", "kalman"], typer.Option(help="Velocity estimator.")] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
     gains: Annotated[
         tuple[float, float] | None,

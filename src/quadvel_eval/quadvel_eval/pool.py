@@ -13,7 +13,7 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeAlias
 
 Call: TypeAlias = tuple[Any, ...]
-"""a function that another process can import, and its arguments"""
+"""Function that another process can import, and its arguments."""
 
 
 def run_in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterator[tuple[int, Any]]:

@@ -147,19 +147,23 @@ def _by_stamp(
     value: Callable[[Any], Any],
     stamp: Callable[[Any], Any] = lambda message: message.header.stamp,
 ) -> Series:
+    """Series of values at the stamps of the messages."""
     return _series([(seconds(stamp(message)), value(message)) for _, message in entries])
 
 
 def _by_arrival(entries: Iterable[tuple[float, Any]], value: Callable[[Any], Any]) -> Series:
+    """Series of values at the times of receipt."""
     return _series([(time, value(message)) for time, message in entries])
 
 
 def _series(pairs: list[tuple[float, Any]]) -> Series:
+    """Series of pairs of time and value, sorted by time."""
     pairs.sort(key=lambda pair: pair[0])
     return Series(np.array([time for time, _ in pairs]), np.array([value for _, value in pairs], float))
 
 
 def _loop(messages: list[Any]) -> ControllerTrace:
+    """Trace of the controller's reports."""
     return ControllerTrace(
         np.array([seconds(m.stamp) for m in messages]),
         [m.mode_name for m in messages],
@@ -168,12 +172,14 @@ def _loop(messages: list[Any]) -> ControllerTrace:
 
 
 def _answer_time(states: list[tuple[float, Any]], commands: list[tuple[float, Any]]) -> Series:
+    """Time from each state to its command, matched by tick."""
     state_times = {message.tick: seconds(message.stamp) for _, message in states}
     sent = [(state_times[m.tick], seconds(m.stamp)) for _, m in commands if m.tick in state_times]
     return _series([(state, [command - state]) for state, command in sent])
 
 
 def _xyz(vector: Any) -> list[float]:
+    """Components of a vector message."""
     return [vector.x, vector.y, vector.z]
 
 

@@ -363,11 +363,14 @@ RecordingArgument = Annotated[
     Path, typer.Argument(help="An MCAP file, a rosbag2 folder or a bag of ROS 1.", show_default=False)
 ]
 StateTopicOption = Annotated[
-    str | None, typer.Option(metavar="<topic>", help="States of the joints.", show_default="found by type")
+    str | None,
+    typer.Option(metavar="<topic>", help="Topic of the joint states.", show_default="found by type"),
 ]
 CommandTopicOption = Annotated[
     str | None,
-    typer.Option(metavar="<topic>", help="Commands of the joints.", show_default="found by type and name"),
+    typer.Option(
+        metavar="<topic>", help="Topic of the joint commands.", show_default="found by type and name"
+    ),
 ]
 
 
@@ -401,7 +404,7 @@ def plot_command(
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:
-            typer.echo(f"no {name}.png: nothing was recorded for it")
+            typer.echo(f"no {name}.png: its topics were not recorded")
             continue
         with replacing(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)

@@ -164,7 +164,7 @@ def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
         table.add_row(f"{name} estimator, RMSE x, y, z, m/s", *rmse)
         table.add_row(
             f"{name} estimator, drift",
-            *(f"{100 * one['drift']:.1f} % of the way" if one else "" for one in figures),
+            *(f"{100 * one['drift']:.1f} % of the path length" if one else "" for one in figures),
         )
     return table
 
@@ -178,16 +178,18 @@ def _worst_command(one: Mapping[str, Any], error: str) -> str:
 
 
 def _seconds(value: float | None) -> str:
+    """Time as text; empty for None."""
     return "" if value is None else f"{value:.2f} s"
 
 
 def _drift(one: Mapping[str, Any]) -> str:
+    """Drift as text."""
     drift = one["stance"]["drift_10s_m"]
     return "fell" if drift is None else f"{100 * drift:.2f} cm"
 
 
 AGGREGATES: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "runs, of these fallen": lambda one: f"{len(one['cells'])}, {one['falls']}",
+    "runs, falls": lambda one: f"{len(one['cells'])}, {one['falls']}",
     "error, mean and largest": lambda one: f"{one['mean_error_xy']:.3f}, {one['max_error_xy']:.3f} m/s",
     "largest at (vx, vy, wz)": lambda one: _worst_command(one, "error_xy"),
     "yaw rate, mean and largest": lambda one: f"{one['mean_error_wz']:.3f}, {one['max_error_wz']:.3f} rad/s",

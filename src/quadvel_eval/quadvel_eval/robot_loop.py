@@ -177,6 +177,7 @@ class RobotLoop:
         self._request("walk")
 
     def _request(self, mode: str) -> None:
+        """Request a mode. Raises RuntimeError if the supervisor refuses."""
         accepted, sentence = self.supervisor.request(mode)
         if not accepted:
             raise RuntimeError(f"the supervisor refused {mode}: {sentence}")

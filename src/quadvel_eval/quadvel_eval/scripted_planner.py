@@ -55,6 +55,7 @@ class ScriptedPlanner(Node):
             self._mode, self._reason = message.mode_name, message.reason
 
     def _update(self) -> None:
+        """Execute the next action of the script; end the node at its end or at an error."""
         try:
             action = self._runner.update(1e-9 * self.get_clock().now().nanoseconds, self._mode, self._reason)
         except ScriptError as error:
@@ -78,6 +79,7 @@ class ScriptedPlanner(Node):
 
 
 def _twist(velocity: Velocity) -> Any:
+    """Twist message of a planar velocity."""
     message = Twist()
     message.linear.x, message.linear.y, message.angular.z = velocity
     return message

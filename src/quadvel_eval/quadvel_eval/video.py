@@ -95,6 +95,7 @@ def frame_strip(recording: Recording) -> list[tuple[str, Image]]:
 
 
 def _caption(velocity: NDArray[np.float64]) -> str:
+    """Nonzero components of a command as text."""
     return ", ".join(f"{axis} {x:g}" for axis, x in zip(("vx", "vy", "wz"), velocity, strict=True) if x)
 
 

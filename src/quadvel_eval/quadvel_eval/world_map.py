@@ -74,6 +74,7 @@ def draw_world(world: World) -> Figure:
 
 
 def _ground(axes: Axes, world: World) -> None:
+    """Draw patches and hills."""
     for patch in world.patches:
         _rectangle(
             axes, patch.position, patch.size, patch.yaw, GROUND_COLOURS[patch.surface], label=patch.surface
@@ -94,6 +95,7 @@ def _ground(axes: Axes, world: World) -> None:
 
 
 def _obstacles(axes: Axes, world: World) -> None:
+    """Draw walls, boxes, tables and trees."""
     for wall in world.walls:
         for begin, end in pairwise(wall.points):
             length = float(np.hypot(*(end - begin))) + wall.thickness
@@ -113,6 +115,7 @@ def _obstacles(axes: Axes, world: World) -> None:
 
 
 def _paths(axes: Axes, world: World) -> None:
+    """Draw the paths of the people."""
     for person in world.persons:
         path = np.vstack([person.path, person.path[:1]]) if person.closed else person.path
         label = _once(axes, "leader" if person.led else "others")

@@ -257,11 +257,11 @@ def _violations(case: Case, result: FaultRun) -> Iterator[str]:
 
 
 MAX_SPEED_RATIO = 1.25
-"""Speed of a joint, as a share of what its drive can do, beyond which the drive must not move it on"""
+"""Joint speed over the drive's limit above which the drive must not accelerate the joint."""
 REACTION_TIME_S = 0.02
-"""s in which it may: until the next tick sees it and the drive has heard of it"""
+"""Time in which it may, s: until the next tick detects it and its command reaches the drive."""
 MAX_OVERTRAVEL_RAD, MAX_OVERTRAVEL_IN_FALL_RAD = 0.05, 0.2
-"""rad that a joint may press into its mechanical stop, which yields; in a fall the ground does it"""
+"""Overtravel into a compliant mechanical stop, rad; in a fall, the ground presses the joint."""
 
 
 def summarise_cases(runs: Sequence[FaultRun]) -> list[dict[str, Any]]:

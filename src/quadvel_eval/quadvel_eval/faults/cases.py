@@ -57,9 +57,9 @@ def _cases(
 WALK_ONLY = ("walk",)
 STALE = ("state_stale",)
 UNUSABLE_STATE = ("state_not_finite", "attitude_not_unit", *STALE)
-"""Findings for states that are all unusable"""
+"""Findings for a stream of unusable states."""
 UNCOMMANDED_SYMPTOMS = ("tilted", "joint_out_of_range", "joint_too_fast", "drive_does_not_answer")
-"""Findings for a robot without commands, or with late ones"""
+"""Findings for a robot without commands, or with late ones."""
 ENCODER = (
     "encoder_inconsistent",
     "encoder_frozen",

@@ -213,7 +213,7 @@ GARBAGE = {
     "linear_acceleration": 50.0,
     "foot_force": 500.0,
 }
-"""Standard deviation of garbage, in the unit of the field"""
+"""Standard deviation of garbage, in the unit of the field."""
 MOUNTING_TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
 
 
@@ -367,7 +367,7 @@ COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
     "clock": {"wrong": _set_clock(1.0)},
     "processor": {"slow": _slow_processor},
 }
-"""Injection of each kind of fault of each component"""
+"""Injection of each kind of fault of each component."""
 
 _A_SENSOR = "a sensor sends no separate messages"
 _A_PROCESS = "faults of its messages belong to the link"
@@ -385,4 +385,4 @@ REASONS_UNSUPPORTED = {
     "clock": "a stopped or slowly drifting clock has no effect within seconds",
     "processor": "a fully loaded processor is equivalent to a stuck process",
 }
-"""Reason why the other kinds of fault make no sense"""
+"""Reason why the other kinds of fault make no sense."""

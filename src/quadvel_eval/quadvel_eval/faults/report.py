@@ -84,7 +84,7 @@ def campaign_table(entries: Entries) -> Table:
     Returns:
         The table.
     """
-    table = Table("case", "as expected", "instead", title="not as expected")
+    table = Table("case", "as expected", "violations", title="Unexpected reactions")
     for entry in entries:
         if entry["as_expected"] < entry["runs"]:
             table.add_row(
@@ -103,7 +103,7 @@ def markdown(entries: Entries) -> str:
         The text of faults.md.
     """
     head = [
-        "| component, kind, mode | as expected | named | until named, s | has to | until there, s | torque | speed | falls |",
+        "| case | as expected | finding | until finding, s | expected end | until end, s | torque | speed | falls |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     rows = [
@@ -113,13 +113,14 @@ def markdown(entries: Entries) -> str:
         for entry in entries
     ]
     note = (
-        "Times: median, largest over the seeds, since the fault began. Torque and speed (of joints that their drive moves on): "
-        "largest, as a share of what the drive can do."
+        "Times: median and largest over the seeds, since the fault. Torque and speed (of joints that their drive accelerates): "
+        "largest, divided by the limit of the drive."
     )
     return "\n".join([*head, *rows, "", note, "", f"{campaign_summary(entries)}.", ""])
 
 
 def _times(times: list[float] | None) -> str:
+    """Median and largest time as text."""
     return "-" if times is None else f"{times[0]:.3f}, {times[1]:.3f}"
 
 
@@ -146,7 +147,7 @@ def reaction_time_figure(entries: Entries) -> Figure:
     axes.invert_yaxis()
     axes.set_xlim(1e-3, OBSERVATION_TIME_S)
     axes.set_xscale("log")
-    axes.set_xlabel("s since the fault began (dot: median, line: to the largest)")
+    axes.set_xlabel("time since the fault, s (dot: median, line: to the largest)")
     axes.grid(axis="x", alpha=0.3)
     axes.legend(loc="lower right")
     return picture

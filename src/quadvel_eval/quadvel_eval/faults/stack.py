@@ -195,6 +195,7 @@ class Stack:
     # Work of the processes.
 
     def _report(self) -> None:
+        """Robot: measure and send the state."""
         state = self.simulator.state()
         state.tick = self.now
         if self.sensor_fault is not None:
@@ -205,12 +206,15 @@ class Stack:
         self.links["low_state"].send(self.now, message)
 
     def _plan(self) -> None:
+        """Planner: send its velocity."""
         self.links["cmd_vel"].send(self.now, self.planned_velocity.copy())
 
     def _velocity_to_mux(self, velocity: Array) -> None:
+        """Mux: take a velocity."""
         self.processes["mux"].submit(lambda: self._mux.receive(PLANNER.name, self._steady(), velocity))
 
     def _arbitrate(self) -> None:
+        """Mux: send the command."""
         mux_output = self._mux.update(self._steady())
         message = SimpleNamespace(
             stamp=_time(self._stamp()),
@@ -220,9 +224,11 @@ class Stack:
         self.links["command"].send(self.now, message)
 
     def _state_to_estimator(self, message: Message) -> None:
+        """Estimator: take a state."""
         self.processes["estimator"].submit(lambda: self._estimate(message))
 
     def _estimate(self, message: Message) -> None:
+        """Estimator: update, and send the velocity; invalid states are ignored."""
         try:
             estimate = self._tracker.take(read_low_state(message))
         except (MessageError, FloatingPointError):
@@ -232,20 +238,24 @@ class Stack:
             self.links["estimate"].send(self.now, answer)
 
     def _command_to_estimator(self, message: Message) -> None:
+        """Estimator: take the joint command, its previous action."""
         self.processes["estimator"].submit(
             lambda: self._tracker.command(previous_action(message.q, message.mode))
         )
 
     def _state_to_controller(self, message: Message) -> None:
+        """Controller: take a state."""
         self._to_controller("low_state", lambda: self._loop.on_state(read_low_state(message)))
 
     def _velocity_to_controller(self, message: Message) -> None:
+        """Controller: take a velocity estimate."""
         self._to_controller(
             "velocity_estimate",
             lambda: self._loop.on_velocity(seconds(message.stamp), numbers(message, "velocity", 3)),
         )
 
     def _command_to_controller(self, message: Message) -> None:
+        """Controller: take a velocity command."""
         self._to_controller(
             "command",
             lambda: self._loop.on_command(
@@ -265,6 +275,7 @@ class Stack:
         self.processes["controller"].submit(refusing)
 
     def _answer(self, command: JointCommand) -> None:
+        """Controller: send a joint command, after its additional computing time."""
         message = SimpleNamespace()
         write_low_cmd(command, message)
         message.stamp = _time(self._stamp())
@@ -301,5 +312,6 @@ def corrupt(message: Message, rng: np.random.Generator) -> Message:
 
 
 def _time(seconds: float) -> Message:
+    """Time in s as a ROS 2 time message."""
     whole = int(seconds)
     return SimpleNamespace(sec=whole, nanosec=int(1e9 * (seconds - whole)))

@@ -18,10 +18,10 @@ from .measure import measure_scenes
 HEADS = {
     "success": "success",
     "share": "within 0.5 m",
-    "late": "there after, s",
+    "late": "settled after, s",
     "jerk": "jerk, m/s^3",
     "clearance": "clearance, m",
-    "gap": "to persons, m",
+    "gap": "to people, m",
     "ms": "ms a step",
     "slowest": "slowest",
 }

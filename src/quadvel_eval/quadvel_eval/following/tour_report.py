@@ -95,7 +95,11 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
     touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
     n = number_text
     rows = [
-        ("way", f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min", "3100 m in 37 min"),
+        (
+            "path length",
+            f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min",
+            "3100 m in 37 min",
+        ),
         ("fell", "yes" if figures["fell"] else "no", "no"),
         ("touched", touched, ""),
         ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
@@ -106,8 +110,8 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
             f"{n(figures['distance_kept'], '.0%')} of the time",
             "",
         ),
-        ("least clearance from things", _metres(figures["least_clearance"]), ""),
-        ("least clearance from persons", _metres(figures["least_gap"]), ""),
+        ("smallest clearance from obstacles", _metres(figures["least_clearance"]), ""),
+        ("smallest clearance from people", _metres(figures["least_gap"]), ""),
         ("person lost", f"{figures['losses']} times, {n(figures['lost_seconds'], '.0f')} s together", ""),
     ]
     if planner := figures.get("planner_ms"):
@@ -119,4 +123,4 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
 
 def _metres(value: float | None) -> str:
     """Distance as text; null means that nothing was near."""
-    return "nothing was near" if value is None else f"{value:.2f} m"
+    return "nothing near" if value is None else f"{value:.2f} m"

@@ -43,7 +43,9 @@ def paper_command(
     ] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
     again: Annotated[bool, typer.Option("--again", help="Run finished sections, too.")] = False,

@@ -17,13 +17,13 @@ from .cells import Command
 from .section import Job, Record, Study, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
-"""ahead, sideways, along an arc; m/s, rad/s"""
+"""Forward, lateral and curved walk: vx, vy (m/s), wz (rad/s)."""
 LOOSE_JOINTS: Mapping[str, Any] = {
     "physics": SECOND,
     "joint_friction": np.zeros(12),
     "joint_damping": np.zeros(12),
 }
-"""Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
+"""Fields of `SimulatorConfig`: second plant, with joints without friction and damping."""
 HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE_JOINTS}
 PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
 """Names in table rows of the plants of HARD_PLANTS other than the usual one."""

@@ -113,6 +113,7 @@ def write_records(path: Path, records: Sequence[Record]) -> None:
 
 
 def _text(value: Any) -> str:
+    """Value as text of a CSV field."""
     if value is None:
         return ""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
@@ -132,6 +133,7 @@ def read_records(path: Path) -> list[Record]:
 
 
 def _value(text: str) -> Any:
+    """Value of a CSV field: int, float, text, or None if empty."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -166,6 +168,7 @@ def write_page(folder: Path, sections: Sequence[Section]) -> None:
 
 
 def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) -> list[str]:
+    """Lines of a section on the page."""
     made = content["made_with"]
     policies = ", ".join(f"{name} ({digest})" for name, digest in made["policies"].items())
     seeds = "1 seed" if made["seeds"] == 1 else f"{made['seeds']} seeds"
@@ -184,6 +187,7 @@ def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) 
 
 
 def _table(rows: Sequence[Row]) -> list[str]:
+    """Lines of a Markdown table of rows."""
     policies = distinct([{"policy": name} for row in rows for name in row.ours], "policy")
     lines = [
         f"| | paper | {' | '.join(policies)} |",
@@ -197,10 +201,12 @@ def _table(rows: Sequence[Row]) -> list[str]:
 
 
 def _cell(row: Row, value: float | None) -> str:
+    """Our value, with its difference from the paper's in brackets."""
     if value is None or row.paper is None:
         return _number(row, value)
     return f"{_number(row, value)} ({value - row.paper:+.{row.digits}f})"
 
 
 def _number(row: Row, value: float | None) -> str:
+    """Number with the decimals of the row; a dash for None."""
     return "–" if value is None else f"{value:.{row.digits}f}"

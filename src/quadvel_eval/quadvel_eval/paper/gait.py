@@ -159,6 +159,7 @@ class Gait(Section):
         return figure
 
     def _draw(self, panels: Any, policy: str, records: Sequence[Record]) -> None:
+        """Draw velocity, contacts and gait figures of a policy in three panels."""
         speed, feet, gait = panels
         time = column(records, "time")
         speed.plot(time, column(records, "command"), "k--", linewidth=1.0, label="command")

@@ -70,4 +70,5 @@ class Jitter(Section):
 
 
 def _jitter(records: Sequence[Record]) -> float:
+    """Mean jitter, mrad."""
     return 1e3 * mean(records, "jitter")

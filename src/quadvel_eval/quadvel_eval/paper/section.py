@@ -21,7 +21,7 @@ from ..pool import Call
 from ..walk import Setup
 
 Record: TypeAlias = dict[str, Any]
-"""one line of a section's CSV: names and numbers, None where there is none"""
+"""One line of a section's CSV: column names and values, None if undefined."""
 
 
 @attrs.frozen(kw_only=True)
@@ -90,7 +90,7 @@ def walk_jobs(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[J
 
 
 JobResults: TypeAlias = Sequence[tuple[Record, Any]]
-"""labels of each job and what it returned, in the order of the jobs"""
+"""Labels and answer of each job, in the order of the jobs."""
 
 
 @attrs.frozen

@@ -90,6 +90,7 @@ def _speed_under_constant_target(loop: RobotLoop, target: Array, like: JointComm
 
 
 def _rms(values: Sequence[Array]) -> float:
+    """Root mean square over all values."""
     return float(np.sqrt(np.mean(np.square(values))))
 
 

@@ -46,7 +46,7 @@ SECTIONS: tuple[Section, ...] = (
     Stance(),
     Estimator(),
 )
-"""in the order of the page"""
+"""All sections, in the order of the page."""
 
 
 @attrs.frozen

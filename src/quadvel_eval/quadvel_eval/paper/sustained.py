@@ -178,6 +178,7 @@ class Sustained(Section):
 
 
 def _drive_rows(what: str, records: Sequence[Record]) -> list[Row]:
+    """Rows of the largest joint speed and torque."""
     return [
         Row(f"{what}: {drive}", "", None, by_policy(records, partial(largest, name=key)), 2)
         for key, drive in DRIVE_FIGURES.items()

@@ -114,6 +114,7 @@ def _second_rows(grid: str, records: Sequence[Record]) -> list[Row]:
 
 
 def _turn_rows(where: str, records: Sequence[Record]) -> list[Row]:
+    """Rows of the yaw rate errors."""
     return [
         Row(
             f"{where}: mean error of the yaw rate",

@@ -22,7 +22,7 @@ Figures = Mapping[str, Mapping[str, float]]
 HEADS = {
     "recall": "recall",
     "precision": "precision",
-    "persons": "persons",
+    "persons": "people",
     "persons_per_minute": "a minute",
     "switches_per_minute": "switches a minute",
     "kept": "right person kept",
@@ -66,6 +66,7 @@ def people_command(
 
 
 def _table(title: str, figures: Figures) -> Table:
+    """Table of scores; columns without a value are left out."""
     heads = [head for head in HEADS if any(head in row for row in figures.values())]
     table = Table(title, *(HEADS[head] for head in heads))
     for name, row in figures.items():
