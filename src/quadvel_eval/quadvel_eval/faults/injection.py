@@ -71,12 +71,12 @@ def make_injection(component: str, kind: str) -> Injection:
 
 
 def _link(
-    name: str, way: Callable[[Link, Rng], Callable[[int, Message], Deliveries]]
+    name: str, make_fault: Callable[[Link, Rng], Callable[[int, Message], Deliveries]]
 ) -> Callable[[Stack, Rng], None]:
     """Install a fault on a link."""
 
     def begin(stack: Stack, rng: Rng) -> None:
-        stack.links[name].fault = way(stack.links[name], rng)
+        stack.links[name].fault = make_fault(stack.links[name], rng)
 
     return begin
 
@@ -90,11 +90,11 @@ def _repeated(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
     """Repeat the first message forever; a repeated state gets the stamp of the one it replaces."""
     first: list[Message] = []
 
-    def way(now: int, message: Message) -> Deliveries:
+    def deliver(now: int, message: Message) -> Deliveries:
         first.append(message)
         return [(0, _replaced(first[0], stamp=message.stamp) if hasattr(message, "q") else first[0])]
 
-    return way
+    return deliver
 
 
 def _garbage(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
@@ -108,16 +108,16 @@ def _slow(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
     return lambda now, message: [(0, message)] if next(count) % SLOW_LINK_DIVISOR == 0 else []
 
 
-def _delayed(late: int) -> Callable[[Link, Rng], Callable[[int, Message], Deliveries]]:
-    """Delay every message by `late` ms."""
-    return lambda link, rng: lambda now, message: [(late, message)]
+def _delayed(delay_ms: int) -> Callable[[Link, Rng], Callable[[int, Message], Deliveries]]:
+    """Delay every message by `delay_ms` ms."""
+    return lambda link, rng: lambda now, message: [(delay_ms, message)]
 
 
 def _intermittent(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
     """Lose all messages in random bursts of up to MAX_DROPOUT_MS."""
     silent_until = [0, 0]  # end of this dropout, and earliest start of the next, ms
 
-    def way(now: int, message: Message) -> Deliveries:
+    def deliver(now: int, message: Message) -> Deliveries:
         if now >= silent_until[1]:
             silent_until[:] = (
                 now + int(rng.integers(1, MAX_DROPOUT_MS + 1)),
@@ -125,7 +125,7 @@ def _intermittent(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
             )
         return [] if now < silent_until[0] else [(0, message)]
 
-    return way
+    return deliver
 
 
 def _duplicated(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
@@ -320,7 +320,7 @@ def _of_link(
     name: str, wrong: Callable[[Message, Rng], Message] | None = None, without: tuple[str, ...] = ()
 ) -> dict[str, Any]:
     """All link faults of a link, and an optional wrong value."""
-    kinds = {kind: _link(name, way) for kind, way in _LINK_KINDS.items() if kind not in without}
+    kinds = {kind: _link(name, make_fault) for kind, make_fault in _LINK_KINDS.items() if kind not in without}
     return kinds | ({} if wrong is None else {"wrong": _link(name, _changed(wrong))})
 
 
@@ -347,8 +347,8 @@ COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
     "foot": _of_sensor(("foot_force",), "off", "stuck", "garbage"),
     "drive": {"off": _dead_drive, "stuck": _jammed},
     "network": {
-        kind: _combined(_link("low_state", way), _link("low_cmd", way))
-        for kind, way in _LINK_KINDS.items()
+        kind: _combined(_link("low_state", make_fault), _link("low_cmd", make_fault))
+        for kind, make_fault in _LINK_KINDS.items()
         if kind in ("off", "slow", "intermittent", "duplicated")
     }
     | {"delayed": _combined(_link("low_state", _delayed(5)), _link("low_cmd", _delayed(5)))},

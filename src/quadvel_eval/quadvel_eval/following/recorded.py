@@ -81,18 +81,20 @@ def _samples(messages: dict[str, list[tuple[float, Any]]], begins: float, world:
     command_times = np.array([seconds(m.stamp) for _, m in messages["/command"]])
     commanded = np.array([planar_twist(m.twist) for _, m in messages["/command"]])
     commanded = _low_passed(time, commanded[_newest(command_times, time)])
-    people = messages["/ground_truth/persons"]
-    people_times = np.array([seconds(m.header.stamp) for _, m in people])
+    people_messages = messages["/ground_truth/persons"]
+    people_times = np.array([seconds(m.header.stamp) for _, m in people_messages])
     state_times = np.array([at for at, _ in messages["/follow_planner/state"]])
     found = []
     for now in np.arange(max(begins, time[0]), time[-1], PERIOD):
         i = int(_newest(time, now))
-        persons = np.array([planar_pose(pose) for pose in people[int(_newest(people_times, now))][1].poses])
+        people = np.array(
+            [planar_pose(pose) for pose in people_messages[int(_newest(people_times, now))][1].poses]
+        )
         state, words = _state(messages["/follow_planner/state"][int(_newest(state_times, now))][1])
         here, near = poses[i], clearances.to_obstacles(poses[i])
-        gap = clearances.to_people(here, persons)
+        gap = clearances.to_people(here, people)
         found.append(
-            TourSample(float(now), here, persons[0], commanded[i], velocity[i], state, words, near, gap)
+            TourSample(float(now), here, people[0], commanded[i], velocity[i], state, words, near, gap)
         )
     return found
 

@@ -197,9 +197,9 @@ class FollowSimulation:
 
     def _sample(self, now: float, command: Array, state: State, words: str, took: float) -> FollowSample:
         """Sample of the present state."""
-        pose, persons = self.robot.pose, circles(self._scene.people)
+        pose, leg_circles = self.robot.pose, circles(self._scene.people)
         standing = outline_distance(self._obstacles[:, :2], pose, self._half) - self._obstacles[:, 2]
-        legs = outline_distance(persons[:, :2], pose, self._half) - persons[:, 2]
+        legs = outline_distance(leg_circles[:, :2], pose, self._half) - leg_circles[:, 2]
         return FollowSample(
             now,
             pose.copy(),

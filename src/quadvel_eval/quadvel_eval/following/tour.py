@@ -189,17 +189,17 @@ class Tour:
         """Sample of the present state."""
         truth = sample.truth
         pose = np.array([*truth.position[:2], float(yaw(truth.quaternion))])
-        persons = self.simulator.persons()
+        people = self.simulator.persons()
         return TourSample(
             truth.time,
             pose,
-            persons[0],
+            people[0],
             commanded,
             velocity,
             plan.state,
             plan.words,
             self._clearances.to_obstacles(pose),
-            self._clearances.to_people(pose, persons),
+            self._clearances.to_people(pose, people),
         )
 
 

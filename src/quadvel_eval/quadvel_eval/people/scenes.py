@@ -56,7 +56,7 @@ class Scene:
     walkers: list[Walker]
     duration: float
     rng: np.random.Generator
-    pose: Callable[[Array], Array] = lambda persons: np.zeros(3)
+    pose: Callable[[Array], Array] = lambda people: np.zeros(3)
 
     def scans(self) -> Iterator[SceneScan]:
         """Simulate the scene.
@@ -66,10 +66,10 @@ class Scene:
         """
         steps = round(1.0 / self.rate / WALKING_STEP_S)
         for k in range(int(self.duration * self.rate)):
-            persons = np.array([walker.position for walker in self.walkers])
-            pose = self.pose(persons)
+            people = np.array([walker.position for walker in self.walkers])
+            pose = self.pose(people)
             ranges = self.laser.scan(self.plan.with_circles(circles(self.walkers)), pose, self.rng)
-            yield SceneScan(k * steps * WALKING_STEP_S, ranges, pose, persons)
+            yield SceneScan(k * steps * WALKING_STEP_S, ranges, pose, people)
             for walker in self.walkers:
                 for _ in range(steps):
                     walker.step(WALKING_STEP_S)
@@ -160,7 +160,7 @@ def along_walls(seed: int) -> Scene:
         [walker],
         20.0 / speed + 2.0,
         rng,
-        lambda persons: np.array([persons[0, 0] - 1.5, 0.0, 0.1 * np.sin(persons[0, 0])]),
+        lambda people: np.array([people[0, 0] - 1.5, 0.0, 0.1 * np.sin(people[0, 0])]),
     )
 
 
