@@ -382,7 +382,7 @@ REASONS_UNSUPPORTED = {
     "drive": "low_cmd drives it, and the torque sensor reports it",
     "network": "datagrams have a checksum, so that corrupt ones are lost: see intermittent",
     **dict.fromkeys(("controller", "estimator", "mux", "planner"), _A_PROCESS),
-    "clock": "a stopped or slowly drifting clock has no effect within seconds",
+    "clock": "a stopped or slowly drifting clock is not detectable within seconds",
     "processor": "a fully loaded processor is equivalent to a stuck process",
 }
 """Reason why the other kinds of fault make no sense."""

@@ -189,7 +189,7 @@ class Identification(Section):
         "commanded at 200 Hz and recorded at 1 kHz; `quadvel identify` fits that log. Errors are those on logs that were not "
         "fitted: the same motion with other noise, and a walk with standing, running, turning and stops. The truth is known "
         "here: parameters should come back (input delay 7 ms, output delay 1 ms; on a log with 1 ms between rows a sum of "
-        "delays of 8 ms can't be told from anything above 7), and the error should be the torque noise of 0.066 N² m². The "
+        "delays of 8 ms is indistinguishable from anything above 7), and the error should be the torque noise of 0.066 N² m². The "
         "paper's second error holds what its model lacks; our simulated drives hold no such thing."
     )
     data: tuple[str, ...] = tuple(PAPER_VALUES)

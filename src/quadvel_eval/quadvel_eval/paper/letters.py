@@ -101,7 +101,7 @@ class Letters(Section):
     title: ClassVar[str] = "Figure 11: open-loop letters"
     method: ClassVar[str] = (
         "The robot is commanded the velocities of the letters Z, J and U (1.5 m high, 0.5 m/s, with sideways walking, turns "
-        "on the spot and arcs) and is not told where it is. The deviation is the distance between the robot and the place "
+        "on the spot and arcs) without position feedback. The deviation is the distance between the robot and the place "
         "that the commands lead to at the same instant."
     )
     strokes: tuple[Stroke, ...] = LETTERS

@@ -105,8 +105,8 @@ class Stance(Section):
     name: ClassVar[str] = "stance"
     title: ClassVar[str] = "Standing still"
     method: ClassVar[str] = (
-        "After a short walk the robot is told to stand for 30 s, of which the first second does not count. Drift: the largest "
-        "distance from where it stood then. Steps: touchdowns of feet. Joint speed: true, root mean square, beside that of "
+        "After a short walk the robot stands for 30 s; the first second does not count. Drift: the largest "
+        "distance from where it stood then. Steps: touchdowns of feet. Joint speed: true, root mean square, next to that of "
         "the same robot with its targets frozen at their mean, which the torque noise alone moves. The paper gives no figure."
     )
     seconds: float = 29.0

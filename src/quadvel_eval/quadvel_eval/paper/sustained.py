@@ -94,7 +94,7 @@ class Sustained(Section):
     title: ClassVar[str] = "Section 4.3: largest sustained velocities"
     method: ClassVar[str] = (
         "The command rises at 0.7 m/s² (spins: 1.4 rad/s²) to 60, 80, 90 and 100 % of the policy's own limit in that "
-        "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and is held for 5 s. What counts is the "
+        "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and stays there for 5 s. The result is the "
         "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table. With it stands what "
         "the command asks of the drives: the largest speed and torque of any joint, as shares of what its drive can do. The "
         "supervisor stops a robot whose joints move at 1.25 times that speed, which counts as a fall. The second plant is that of "

@@ -60,7 +60,7 @@ class Tracking(Section):
         "Each robot follows one command for 6 s from standing; the error is the length of commanded minus mean velocity "
         "over the last 4 s. The paper's grid is vx -2.5 to 2.5 by 0.5 and vy -1 to 1 by 0.2 m/s; the quick grid holds vx -1 "
         "to 1.5, vy -0.4 to 0.4 m/s and wz -1 to 1 rad/s. A command beyond the limits in a policy's file is cut to them "
-        "before the policy sees it, and judged as it was asked for. A cross in the picture: a robot fell. The second "
+        "before the policy sees it, and evaluated against the original command. A cross in the picture: a robot fell. The second "
         "plant is MuJoCo at 0.5 ms with pyramidal friction cones, contacts twice as stiff, friction against turning feet, and "
         "links 3 % heavier with 15 % more inertia."
     )
