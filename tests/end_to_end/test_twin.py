@@ -36,7 +36,7 @@ def test_a_plant_walks_and_its_recording_shows_that_the_stacks_model_lacks_somet
     walk = read_walk(recording)
     assert [segment.command.tolist() for segment in walk.segments] == [[0.5, 0.0, 0.0]]
     assert walk.segments[0].error_xy < 0.15
-    assert walk.joints.seen.mean() > 0.99
+    assert walk.joints.recorded.mean() > 0.99
     ((start, end, _),) = walk.stretches
     model = ActuatorParameters.default()
     assert torque_error(model, walk.joints, start, end) > 3 * model.torque_noise

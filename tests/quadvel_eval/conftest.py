@@ -1,4 +1,4 @@
-"""A robot loop that needs no trained network: its policy holds a posture."""
+"""Robot loop without a trained network: its policy holds a posture."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from quadvel_sim.simulator import Simulator, SimulatorConfig
 
 
 class StandingPolicy:
-    """Always asks for the standing posture."""
+    """Policy that always commands the standing posture."""
 
     def __init__(self) -> None:
         self.metadata = PolicyMetadata(
@@ -29,10 +29,10 @@ class StandingPolicy:
         )
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing: the policy has no state."""
 
     def prepare(self) -> None:
-        """Nothing to do ahead."""
+        """Do nothing: there is nothing to precompute."""
 
     def step(self, observation: np.ndarray) -> np.ndarray:
         return np.zeros(12, np.float32)

@@ -17,13 +17,13 @@ from quadvel_eval.cli import bench_command, eval_command
 QUADVEL = (sys.executable, "-c", "from quadvel_bringup.__main__ import main; main()")
 
 
-def test_a_missing_policy_is_refused_by_its_name_before_anything_is_made(tmp_path: Path) -> None:
+def test_a_missing_policy_fails_with_its_name_before_any_output(tmp_path: Path) -> None:
     with pytest.raises(NetworkFileError, match=r"nowhere\.onnx: no such file"):
         eval_command(tmp_path / "out", "quick", policy=tmp_path / "nowhere.onnx")
     assert not any(tmp_path.iterdir())
 
 
-def test_a_file_in_the_place_of_the_folder_is_refused(tmp_path: Path) -> None:
+def test_a_file_in_place_of_the_folder_fails(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("mine")
     with pytest.raises(NotADirectoryError, match="is a file"):
         eval_command("quick", tmp_path / "out")
@@ -58,7 +58,7 @@ def test_ctrl_c_twice_ends_an_evaluation_and_leaves_the_old_results(tmp_path: Pa
     assert (tmp_path / "eval.json").read_text() == "old"
 
 
-def test_bench_finds_out_that_it_cannot_write_before_it_measures(
+def test_bench_fails_before_it_measures_if_it_cannot_write(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(bench, "PARTS", {"simulator": lambda: pytest.fail("it measured")})
@@ -67,7 +67,7 @@ def test_bench_finds_out_that_it_cannot_write_before_it_measures(
             bench_command(out)
 
 
-def test_bench_writes_figures_and_says_what_it_skipped(
+def test_bench_writes_figures_and_reports_skipped_parts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parts = dict.fromkeys(bench.PARTS, lambda: {"skipped": "not now"})

@@ -9,7 +9,7 @@ import pytest
 from rich.console import Console
 
 from quadvel_eval.cli import compare_command
-from quadvel_eval.compare import common_errors, comparison_table, figures, read_evaluation
+from quadvel_eval.compare import comparison_figures, comparison_table, errors_on_common_runs, read_evaluation
 
 
 def evaluation(errors: dict[float, float | None]) -> dict[str, Any]:
@@ -40,13 +40,13 @@ FIRST = evaluation({0.5: 0.1, 1.0: 0.2, 2.0: None})
 SECOND = evaluation({0.5: 0.05, 1.0: 0.1, 2.0: 0.9})
 
 
-def test_only_runs_that_both_went_through_are_held_against_each_other() -> None:
-    assert common_errors(FIRST, SECOND) == pytest.approx((0.15, 0.075))
-    assert common_errors(FIRST, evaluation({3.0: 0.1})) is None
+def test_only_common_runs_are_compared() -> None:
+    assert errors_on_common_runs(FIRST, SECOND) == pytest.approx((0.15, 0.075))
+    assert errors_on_common_runs(FIRST, evaluation({3.0: 0.1})) is None
 
 
-def test_figures_are_those_of_the_evaluation() -> None:
-    found = figures(FIRST)
+def test_figures_equal_those_of_the_evaluation() -> None:
+    found = comparison_figures(FIRST)
     assert found["falls"] == 1
     assert found["cost of transport, mean"] == 0.5
     assert found["drift in 10 s of standing, m"] is None

@@ -1,4 +1,4 @@
-"""The fault campaign: what makes no sense is refused, what is found is judged, and a missing guard shows."""
+"""Fault campaign: invalid faults raise, reactions are checked, and a missing guard is detected."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from typer.testing import CliRunner
 
 from quadvel_bringup.cli import app
 from quadvel_eval.faults import campaign as campaigns
-from quadvel_eval.faults.campaign import campaign, run, summary
+from quadvel_eval.faults.campaign import run_campaign, run_case, summarise_cases
 from quadvel_eval.faults.cases import CASES, Case
-from quadvel_eval.faults.injection import COMPONENTS, KINDS, WHY_NOT, injection
+from quadvel_eval.faults.injection import COMPONENTS, KINDS, REASONS_UNSUPPORTED, make_injection
 from quadvel_eval.faults.report import markdown, write_campaign
 from quadvel_eval.faults.stack import Stack
 from quadvel_policy.guards import GUARDS, DriveDoesNotAnswer, StateFrozen
@@ -26,23 +26,24 @@ def case(name: str) -> Case:
 
 @pytest.mark.parametrize("component", COMPONENTS)
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_makes_no_sense_is_refused_in_words(component: str, kind: str) -> None:
+def test_an_invalid_combination_raises_with_the_reason(component: str, kind: str) -> None:
     if kind in COMPONENTS[component]:
-        assert injection(component, kind).kind == kind
+        assert make_injection(component, kind).kind == kind
         return
     with pytest.raises(
-        ValueError, match=f"^{component} can't be {kind}: expected one of .*; {WHY_NOT[component]}$"
+        ValueError,
+        match=f"^{component} can't be {kind}: expected one of .*; {REASONS_UNSUPPORTED[component]}$",
     ):
-        injection(component, kind)
+        make_injection(component, kind)
 
 
 @pytest.mark.parametrize(("component", "kind"), [("wheel", "off"), ("imu", "purple")])
-def test_unknown_names_are_refused(component: str, kind: str) -> None:
+def test_unknown_names_raise(component: str, kind: str) -> None:
     with pytest.raises(ValueError, match="expected one of"):
-        injection(component, kind)
+        make_injection(component, kind)
 
 
-def test_the_campaign_is_large_and_each_of_its_cases_can_be_brought_about() -> None:
+def test_the_campaign_is_large_and_each_of_its_cases_can_be_injected() -> None:
     kinds = {(one.component, one.kind) for one in CASES}
     assert len(kinds) >= 40
     assert len({one.name for one in CASES}) == len(CASES)
@@ -59,8 +60,8 @@ def test_the_campaign_is_large_and_each_of_its_cases_can_be_brought_about() -> N
         "controller off stand_up",
     ],
 )
-def test_it_is_as_expected(name: str) -> None:
-    result = run(case(name), seed=3)
+def test_the_reaction_is_as_expected(name: str) -> None:
+    result = run_case(case(name), seed=3)
     assert result.wrong == []
     assert result.torque <= 1.0
 
@@ -72,28 +73,30 @@ def test_it_is_as_expected(name: str) -> None:
         ("torque wrong stance", DriveDoesNotAnswer, "expected drive_does_not_answer"),
     ],
 )
-def test_a_missing_guard_shows(monkeypatch: pytest.MonkeyPatch, name: str, guard: Any, sentence: str) -> None:
+def test_a_missing_guard_is_detected(
+    monkeypatch: pytest.MonkeyPatch, name: str, guard: Any, sentence: str
+) -> None:
     def without(*arguments: Any) -> Stack:
         return Stack(*arguments, guards=tuple(one for one in GUARDS if one is not guard))
 
     monkeypatch.setattr(campaigns, "Stack", without)
-    wrong = "; ".join(run(case(name), seed=0).wrong)
+    wrong = "; ".join(run_case(case(name), seed=0).wrong)
     assert sentence in wrong
 
 
 def test_equal_seeds_give_equal_runs() -> None:
-    first, again, other = (run(case("imu stuck walk"), seed) for seed in (1, 1, 2))
+    first, again, other = (run_case(case("imu stuck walk"), seed) for seed in (1, 1, 2))
     assert attrs.asdict(first) == attrs.asdict(again)
     assert attrs.asdict(first) != attrs.asdict(other)
 
 
 def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None:
-    runs = [run(case("clock wrong stance"), seed=0), run(case("imu off stance"), seed=0)]
+    runs = [run_case(case("clock wrong stance"), seed=0), run_case(case("imu off stance"), seed=0)]
     runs[0].wrong.append("a test")
     write_campaign(tmp_path, runs)
     kept = json.loads((tmp_path / "faults.json").read_text())
     assert [one["component"] for one in kept["runs"]] == ["clock", "imu"]
-    assert [(one["case"], one["as_expected"]) for one in summary(runs)] == [
+    assert [(one["case"], one["as_expected"]) for one in summarise_cases(runs)] == [
         ("imu off stance", 1),
         ("clock wrong stance", 0),
     ]
@@ -101,16 +104,16 @@ def test_the_result_is_written_as_file_table_and_picture(tmp_path: Path) -> None
     assert (tmp_path / "faults.png").stat().st_size > 1000
 
 
-def test_cases_that_are_not_there_are_refused() -> None:
-    with pytest.raises(ValueError, match=r"no case holds 'wheel'.* processor; .*lie_down") as refused:
-        campaign(1, "wheel")
+def test_unknown_cases_raise() -> None:
+    with pytest.raises(ValueError, match=r"no case contains 'wheel'.* processor; .*lie_down") as refused:
+        run_campaign(1, "wheel")
     assert len(str(refused.value)) < 500
 
 
-def test_the_command_says_what_is_not_as_expected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    bad = run(case("clock wrong stance"), seed=0)
+def test_the_command_reports_unexpected_reactions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bad = run_case(case("clock wrong stance"), seed=0)
     bad.wrong.append("it is purple")
-    monkeypatch.setattr("quadvel_eval.cli.campaign", lambda *_: [bad])
+    monkeypatch.setattr("quadvel_eval.cli.run_campaign", lambda *_: [bad])
     answer = CliRunner().invoke(app, ["faults", "--out", str(tmp_path)])
     assert answer.exit_code == 1
     assert "0 of 1" in answer.output

@@ -1,4 +1,4 @@
-"""The simulated scanner and the persons before it, against closed form."""
+"""Simulated scanner and walkers against closed-form solutions."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_a_scan_is_made_from_the_sensor_s_pose() -> None:
     assert np.isinf(np.delete(ranges, 4)).all()
 
 
-def test_faults_of_a_scanner_come_as_often_as_asked_for() -> None:
+def test_scanner_faults_have_the_configured_frequency() -> None:
     noisy = Laser(
         rays=20000, angle_increment=1e-4, noise=0.02, noise_share=0.0, lost=0.1, mixed=0.0, nothing=0.0
     )

@@ -20,7 +20,7 @@ def contacts(phases: np.ndarray, frequency: float, ratio: float, seconds: float 
     ("phases", "diagonal", "side"), [(TROT, 1.0, 0.0), (PACE, 0.0, 1.0), (BOUND, 0.0, 0.0), (PRONK, 1.0, 1.0)]
 )
 @pytest.mark.parametrize("frequency", [1.7, 4.1])
-def test_a_gait_is_known_by_which_feet_are_alike(
+def test_contact_agreement_identifies_the_gait(
     phases: np.ndarray, diagonal: float, side: float, frequency: float
 ) -> None:
     kind = GaitKind.of(contacts(phases, frequency, 0.5), np.zeros(800), PERIOD)

@@ -5,7 +5,16 @@ import json
 import numpy as np
 import pytest
 
-from quadvel_eval.grid import GRIDS, Cell, CellResult, cells, drift, evaluate, judge, summarise
+from quadvel_eval.grid import (
+    GRIDS,
+    Cell,
+    CellResult,
+    evaluate,
+    evaluate_walk,
+    grid_cells,
+    max_displacement,
+    summarise,
+)
 from quadvel_eval.segments import Segment
 from quadvel_eval.walk import Setup, Walk
 
@@ -17,7 +26,7 @@ def walk(velocity: tuple[float, float, float], seconds: float = 6.0) -> Walk:
         time=time,
         position=np.outer(time, [*velocity[:2], 0.0]),
         velocity=np.where(time[:, None] < 2.0, 0.0, velocity),
-        asked=np.where(time[:, None] < 1.5, 0.0, velocity),
+        commanded=np.where(time[:, None] < 1.5, 0.0, velocity),
         heading=np.zeros(n),
         contact=np.ones((n, 4), dtype=bool),
         targets=np.tile((0.5 * 0.002 * np.arange(n) ** 2)[:, None], (1, 12)),
@@ -37,7 +46,7 @@ def result(command: tuple[float, float, float], mean: tuple[float, float, float]
         0.5,
         {"learned": np.full(3, 0.04)},
         {"learned": 0.1},
-        way=4.0,
+        path_length=4.0,
     )
 
 
@@ -45,7 +54,7 @@ FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
 
 
 def test_quick_grid_is_every_combination_with_every_seed() -> None:
-    found = cells("quick", seeds=2)
+    found = grid_cells("quick", seeds=2)
     assert len(found) == 2 * 6 * 3 * 3
     assert len({(cell.command, cell.seed) for cell in found}) == len(found)
     assert {cell.command[0] for cell in found} == {-1.0, -0.5, 0.0, 0.5, 1.0, 1.5}
@@ -54,24 +63,24 @@ def test_quick_grid_is_every_combination_with_every_seed() -> None:
 
 
 def test_paper_grid_is_that_of_section_4() -> None:
-    commands = np.array([cell.command for cell in cells("paper", seeds=1)])
+    commands = np.array([cell.command for cell in grid_cells("paper", seeds=1)])
     assert commands.shape == (11 * 11, 3)
     np.testing.assert_allclose(np.unique(commands[:, 0]), np.linspace(-2.5, 2.5, 11))
     np.testing.assert_allclose(np.unique(commands[:, 1]), np.linspace(-1.0, 1.0, 11))
     assert not commands[:, 2].any()
 
 
-def test_a_cell_is_judged_over_its_last_four_seconds() -> None:
-    judged = judge(walk((0.9, 0.1, 0.0)), Cell((1.0, 0.0, 0.0), 0), mass=25.0)
-    assert judged.segment is not None
-    assert judged.segment.error_xy == pytest.approx(np.hypot(0.1, 0.1))
-    assert judged.jitter == pytest.approx(0.002)
-    assert judged.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
-    np.testing.assert_allclose(judged.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
-    assert judged.estimator_drift == {"learned": 0.3}
-    assert judged.delay_xy == pytest.approx(0.5, abs=0.02)
-    assert judged.delay_wz is None  # no turn was commanded
-    assert judged.way == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
+def test_a_cell_is_evaluated_over_its_last_four_seconds() -> None:
+    evaluated = evaluate_walk(walk((0.9, 0.1, 0.0)), Cell((1.0, 0.0, 0.0), 0), mass=25.0)
+    assert evaluated.segment is not None
+    assert evaluated.segment.error_xy == pytest.approx(np.hypot(0.1, 0.1))
+    assert evaluated.jitter == pytest.approx(0.002)
+    assert evaluated.cot == pytest.approx(250.0 / (25.0 * 9.81 * 0.9))
+    np.testing.assert_allclose(evaluated.estimator_mse["learned"], [9e-4, 16e-4, 0.0])
+    assert evaluated.estimator_drift == {"learned": 0.3}
+    assert evaluated.delay_xy == pytest.approx(0.5, abs=0.02)
+    assert evaluated.delay_wz is None  # no turn was commanded
+    assert evaluated.path_length == pytest.approx(np.hypot(0.9, 0.1) * (6.0 - 0.005))
 
 
 def test_evaluation_has_the_fields_of_schema_1() -> None:
@@ -118,7 +127,9 @@ def test_aggregates_are_numbers_even_if_every_robot_fell() -> None:
 
 
 def test_drift_is_the_largest_distance_and_horizontal() -> None:
-    assert drift(np.array([[1.0, 1.0, 0.4], [1.3, 1.4, 0.4], [1.0, 1.0, 9.0]])) == pytest.approx(0.5)
+    assert max_displacement(np.array([[1.0, 1.0, 0.4], [1.3, 1.4, 0.4], [1.0, 1.0, 9.0]])) == pytest.approx(
+        0.5
+    )
 
 
 def test_a_grid_over_processes_equals_itself_in_the_order_of_its_cells(

@@ -1,24 +1,24 @@
-"""What is said of a recording offline, held against what was recorded."""
+"""Offline estimates of a recording, compared with the recorded ones."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from quadvel_eval.offline import MEMORY, velocity_errors
-from quadvel_eval.recording_plot import Run
+from quadvel_eval.offline import WARM_UP_S, velocity_errors
+from quadvel_eval.recording_plot import RecordedRun
 
 
-def test_an_estimator_may_find_its_memory_before_it_is_judged() -> None:
+def test_the_warm_up_of_an_estimator_does_not_count() -> None:
     time = np.arange(0.0, 2.0, 0.005)
     recorded = np.full((len(time), 3), 0.3)
-    found = recorded + np.where(time < MEMORY, 0.1, 0.002)[:, None]
-    run = Run(100.0, {"/velocity_estimate": (time, recorded)}, [], 2.0)
+    found = recorded + np.where(time < WARM_UP_S, 0.1, 0.002)[:, None]
+    run = RecordedRun(100.0, {"/velocity_estimate": (time, recorded)}, [], 2.0)
     assert velocity_errors(run, 100.0 + time, found)["recorded estimate"] == pytest.approx(0.002)
 
 
-def test_all_of_a_recording_counts_that_is_shorter_than_an_estimators_memory() -> None:
-    time = np.arange(0.0, 0.9 * MEMORY, 0.005)
+def test_a_recording_shorter_than_the_warm_up_counts_entirely() -> None:
+    time = np.arange(0.0, 0.9 * WARM_UP_S, 0.005)
     recorded = np.zeros((len(time), 3))
-    run = Run(0.0, {"/velocity_estimate": (time, recorded)}, [], 0.5)
+    run = RecordedRun(0.0, {"/velocity_estimate": (time, recorded)}, [], 0.5)
     assert velocity_errors(run, time, recorded + 0.1)["recorded estimate"] == pytest.approx(0.1)

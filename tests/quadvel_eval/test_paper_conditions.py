@@ -1,4 +1,4 @@
-"""Sections on changed plants: what is changed, and how survival and error are counted."""
+"""Sections on changed plants: their conditions, survival rate and errors."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from quadvel_eval.paper import conditions as paper_conditions
 from quadvel_eval.paper import slopes
 from quadvel_eval.paper.conditions import HARD_PLANTS, walk_under
 from quadvel_eval.paper.energy import Energy
-from quadvel_eval.paper.gap import Gap, plants
+from quadvel_eval.paper.gap import Gap, drive_conditions
 from quadvel_eval.paper.jitter import Jitter
 from quadvel_eval.paper.robustness import Robustness, conditions
 from quadvel_eval.paper.section import Study
-from quadvel_eval.paper.slopes import FOLLOWED, STARTS, TITLES, Slopes
+from quadvel_eval.paper.slopes import MAX_FOLLOWING_ERROR, STARTS, TITLES, Slopes
 from quadvel_eval.segments import Segment
 from quadvel_sim.physics import SECOND
 from quadvel_sim.simulator import Simulator, SimulatorConfig
@@ -40,7 +40,7 @@ def test_every_condition_is_a_plant_that_stands() -> None:
 
 
 def test_the_plants_of_the_gap_differ_from_that_of_training_in_one_thing() -> None:
-    drives = {one.level: one.plant["actuator"] for one in plants()}
+    drives = {one.level: one.plant["actuator"] for one in drive_conditions()}
     trained = drives.pop("as in training")
     assert trained == ActuatorParameters.default()
     assert {len(p.effects) + (p.best_pair != trained.best_pair) for p in drives.values()} == {1}
@@ -56,7 +56,7 @@ def test_survival_counts_the_robots_that_did_not_fall() -> None:
     section = Robustness()
     labels = {"policy": "mine", "group": "payload", "level": 5}
     command = (1.0, 0.0, 0.0)
-    records = section.judge(
+    records = section.to_records(
         [answer(labels, command, 0.1), answer(labels, command, 0.3), answer(labels, command, None)]
     )
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
@@ -67,8 +67,12 @@ def test_survival_counts_the_robots_that_did_not_fall() -> None:
 
 def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled() -> None:
     section, command = Slopes(), (1.0, 0.0, 0.0)
-    errors = {15: (FOLLOWED + 0.01, FOLLOWED - 0.01, None), 7.5: (0.01, 0.02, 0.03), -15: (None, None, 0.02)}
-    records = section.judge(
+    errors = {
+        15: (MAX_FOLLOWING_ERROR + 0.01, MAX_FOLLOWING_ERROR - 0.01, None),
+        7.5: (0.01, 0.02, 0.03),
+        -15: (None, None, 0.02),
+    }
+    records = section.to_records(
         [
             answer({"policy": "mine", "group": plant, "level": level}, command, error)
             for plant in TITLES
@@ -93,7 +97,7 @@ def test_a_robot_that_is_stuck_on_a_slope_fails_there_and_slopes_are_not_pooled(
     section.figure(records)
 
 
-def test_robots_walk_on_slopes_after_standing_and_at_once_on_every_plant() -> None:
+def test_robots_walk_on_slopes_after_both_starts_on_every_plant() -> None:
     jobs = Slopes().jobs(Study(seeds=1))
     assert len(jobs) == 2 * 3 * 4 * 3
     stood = {(job.labels["group"].endswith("at once"), job.call[-1]) for job in jobs}
@@ -105,15 +109,15 @@ def test_robots_walk_on_slopes_after_standing_and_at_once_on_every_plant() -> No
 
 
 def test_a_robot_that_falls_while_it_stands_has_fallen(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(paper_conditions, "record", lambda loop, commands: None)
+    monkeypatch.setattr(paper_conditions, "record_walk", lambda loop, commands: None)
     cell = Cell((0.3, 0.0, 0.0), 0)
     assert walk_under(Study().setup("crl_eam"), cell, None, 1.0).segment is None
 
 
-def test_the_gap_is_told_plant_by_plant() -> None:
+def test_the_gap_has_rows_for_each_plant() -> None:
     section = Gap()
     command = (1.0, 0.0, 0.0)
-    records = section.judge(
+    records = section.to_records(
         [
             answer({"policy": name, "group": "drives", "level": level}, command, error)
             for name, level, error in (
@@ -131,7 +135,7 @@ def test_the_gap_is_told_plant_by_plant() -> None:
 
 def test_before_and_after_are_compared_on_the_walks_that_neither_fell_on() -> None:
     section, ahead, aside = Gap(), (1.0, 0.0, 0.0), (0.0, 0.5, 0.0)
-    records = section.judge(
+    records = section.to_records(
         [
             answer({"policy": name, "group": "drives", "level": "friction"}, command, error)
             for name, command, error in (
@@ -149,7 +153,7 @@ def test_before_and_after_are_compared_on_the_walks_that_neither_fell_on() -> No
 def test_the_least_cost_is_that_of_the_best_speed() -> None:
     section = Energy()
     labels = {"policy": "mine"}
-    records = section.judge([answer(labels, (1.0, 0.0, 0.0), 0.1), answer(labels, (0.0, 0.0, 1.0), 0.1)])
+    records = section.to_records([answer(labels, (1.0, 0.0, 0.0), 0.1), answer(labels, (0.0, 0.0, 1.0), 0.1)])
     records[0]["cot"] = 0.5
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
     assert ours["cost of transport, the least"] == 0.5
@@ -161,6 +165,6 @@ def test_only_speeds_that_the_policy_takes_are_walked() -> None:
     study = Study(seeds=1)
     speeds = [job.call[2].command[0] for job in Jitter(speeds=(0.5, 99.0)).jobs(study)]
     assert speeds == [0.5]
-    records = Jitter().judge([answer({"policy": "mine"}, (0.5, 0.0, 0.0), 0.0)])
+    records = Jitter().to_records([answer({"policy": "mine"}, (0.5, 0.0, 0.0), 0.0)])
     assert Jitter().rows(records)[0].ours["mine"] == pytest.approx(2.0)
     Jitter().figure(records)

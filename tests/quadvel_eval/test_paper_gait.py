@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from quadvel_eval.gait_kind import gait_frequency, touchdowns
-from quadvel_eval.paper.gait import Gait, contacts
+from quadvel_eval.paper.gait import Gait, debounce_contacts
 from quadvel_eval.walk import Walk
 
 PERIOD = 0.005
@@ -22,7 +22,7 @@ def walk(contact: np.ndarray, vx: float) -> Walk:
         time=np.arange(n) * PERIOD,
         position=np.zeros((n, 3)),
         velocity=np.tile([vx, 0.0, 0.0], (n, 1)),
-        asked=np.tile([vx, 0.0, 0.0], (n, 1)),
+        commanded=np.tile([vx, 0.0, 0.0], (n, 1)),
         heading=np.zeros(n),
         contact=contact,
         targets=np.zeros((n, 12)),
@@ -46,14 +46,14 @@ def test_a_robot_that_stands_has_no_gait() -> None:
 def test_bounces_are_no_steps() -> None:
     bounced = trot(2.0, 0.5)
     bounced[10] = ~bounced[10]  # a gap and a touch of one tick
-    assert gait_frequency(contacts(bounced), PERIOD) == pytest.approx(2.0, rel=0.01)
-    assert len(touchdowns(contacts(bounced)[:, 1])) == len(touchdowns(trot(2.0, 0.5)[:, 1]))
+    assert gait_frequency(debounce_contacts(bounced), PERIOD) == pytest.approx(2.0, rel=0.01)
+    assert len(touchdowns(debounce_contacts(bounced)[:, 1])) == len(touchdowns(trot(2.0, 0.5)[:, 1]))
 
 
 def test_the_table_holds_frequency_and_contact_ratio_of_the_end_of_the_ramp() -> None:
     section = Gait()
     standing = np.ones((400, 4), dtype=bool)
-    records = section.judge(
+    records = section.to_records(
         [({"policy": "mine"}, (walk(np.vstack([standing, trot(3.0, 0.4, 8.0)]), 3.2), True))]
     )
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
@@ -73,7 +73,7 @@ def test_the_table_holds_the_kind_of_gait_at_each_speed_of_the_ramp() -> None:
     ramped.velocity[:, 1] = 0.3 + 0.1 * np.sqrt(2.0) * np.sin(2 * np.pi * 3.0 * time)
     ours = {
         row.what: row.ours.get("mine")
-        for row in section.rows(section.judge([({"policy": "mine"}, (ramped, True))]))
+        for row in section.rows(section.to_records([({"policy": "mine"}, (ramped, True))]))
     }
     assert ours["0.5 m/s: feet of one side alike"] == pytest.approx(100.0, abs=1.0)
     assert ours["0.5 m/s: diagonal feet alike"] == pytest.approx(0.0, abs=2.0)

@@ -1,4 +1,4 @@
-"""How sections are run and kept, with one that needs no robot."""
+"""Running and keeping sections, with a section that needs no robot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from quadvel_eval.paper import files, study
 from quadvel_eval.paper.cli import paper_command
-from quadvel_eval.paper.section import Answers, Job, Record, Row, Section, Study, by_policy, largest
+from quadvel_eval.paper.section import Job, JobResults, Record, Row, Section, Study, by_policy, largest
 from quadvel_eval.pool import Call
 from quadvel_policy.policy_file import SHIPPED_POLICY
 
@@ -32,7 +32,7 @@ class Powers(Section):
             Job({"policy": name, "k": k}, (pow, 2, k)) for name in study.policies for k in range(self.count)
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [{**labels, "value": float(answer), "none": None} for labels, answer in answers]
 
     def figure(self, records: Sequence[Record]) -> Figure:
@@ -54,7 +54,7 @@ def in_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
     def one_by_one(calls: Sequence[Call], cluster: str | None) -> Iterator[tuple[int, Any]]:
         return enumerate(function(*arguments) for function, *arguments in calls)
 
-    monkeypatch.setattr(study, "in_parallel", one_by_one)
+    monkeypatch.setattr(study, "run_in_parallel", one_by_one)
 
 
 TWO = Study(policies={"a": SHIPPED_POLICY, "b": SHIPPED_POLICY})
@@ -62,7 +62,7 @@ TWO = Study(policies={"a": SHIPPED_POLICY, "b": SHIPPED_POLICY})
 
 def test_a_section_leaves_csv_picture_json_and_the_page(tmp_path: Path, page: None) -> None:
     heard: list[study.Progress] = []
-    assert study.run(TWO, [Powers()], tmp_path, tell=heard.append) == ["powers"]
+    assert study.run_sections(TWO, [Powers()], tmp_path, report_progress=heard.append) == ["powers"]
     assert sorted(path.name for path in tmp_path.iterdir()) == [
         "README.md",
         "powers.csv",
@@ -75,20 +75,20 @@ def test_a_section_leaves_csv_picture_json_and_the_page(tmp_path: Path, page: No
     assert [progress.completed for progress in heard] == [None] * 5 + ["powers"]
 
 
-def test_what_is_done_is_kept_until_it_is_asked_for_or_something_changes(
+def test_a_finished_section_is_kept_until_a_rerun_or_a_change(
     tmp_path: Path, page: None, in_this_process: None
 ) -> None:
-    study.run(TWO, [Powers()], tmp_path)
-    assert study.run(TWO, [Powers()], tmp_path) == []
-    assert study.run(TWO, [Powers()], tmp_path, again=True) == ["powers"]
-    assert study.run(attrs.evolve(TWO, seeds=1), [Powers()], tmp_path) == ["powers"]
-    assert study.run(TWO, [Powers(count=4)], tmp_path) == ["powers"]
+    study.run_sections(TWO, [Powers()], tmp_path)
+    assert study.run_sections(TWO, [Powers()], tmp_path) == []
+    assert study.run_sections(TWO, [Powers()], tmp_path, rerun=True) == ["powers"]
+    assert study.run_sections(attrs.evolve(TWO, seeds=1), [Powers()], tmp_path) == ["powers"]
+    assert study.run_sections(TWO, [Powers(count=4)], tmp_path) == ["powers"]
 
 
-def test_another_network_makes_a_section_anew(tmp_path: Path) -> None:
+def test_another_network_repeats_a_section(tmp_path: Path) -> None:
     other = tmp_path / "other.onnx"
     other.write_bytes(SHIPPED_POLICY.read_bytes() + b"\0")
-    first, second = (files.made_with(Powers(), Study(policies={"a": p})) for p in (SHIPPED_POLICY, other))
+    first, second = (files.provenance(Powers(), Study(policies={"a": p})) for p in (SHIPPED_POLICY, other))
     assert first["policies"] != second["policies"]
     assert first == json.loads(json.dumps(first))
 
@@ -111,17 +111,17 @@ def test_an_unknown_section_is_refused_by_its_name(tmp_path: Path) -> None:
         paper_command(tmp_path / "out", only=["figure13"])
 
 
-def test_a_section_that_is_stopped_leaves_the_old_one_whole(
+def test_an_interrupted_section_keeps_the_old_files(
     tmp_path: Path, page: None, in_this_process: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study.run(TWO, [Powers()], tmp_path)
+    study.run_sections(TWO, [Powers()], tmp_path)
     before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
 
     def stopped(calls: Sequence[Call], cluster: str | None) -> Iterator[tuple[int, Any]]:
         yield 0, (1, 0.1)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(study, "in_parallel", stopped)
+    monkeypatch.setattr(study, "run_in_parallel", stopped)
     with pytest.raises(KeyboardInterrupt):
-        study.run(TWO, [Powers()], tmp_path, again=True)
+        study.run_sections(TWO, [Powers()], tmp_path, rerun=True)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before

@@ -6,7 +6,7 @@ import pytest
 
 from quadvel_description import robot
 from quadvel_description.symmetry import JOINTS as MIRROR
-from quadvel_eval.paper.symmetry import PHASES, Symmetry, cycles, leg_curves
+from quadvel_eval.paper.symmetry import PHASES_PER_CYCLE, Symmetry, leg_curves, resample_cycles
 from quadvel_eval.walk import Walk
 
 PERIOD, FREQUENCY = 0.005, 2.5
@@ -14,7 +14,7 @@ N = round(7.0 / PERIOD)
 
 
 def trot(right: float = 1.0) -> Walk:
-    """A trot whose right legs do as the left ones, half a cycle later, with `right` times their torque."""
+    """A trot whose right legs follow the left ones by half a cycle, with `right` times the torque."""
     phase = FREQUENCY * PERIOD * np.arange(N)
     legs = phase[:, None] + np.array([0.5, 0.0, 0.0, 0.5])  # FR FL RR RL
     curves = np.sin(2 * np.pi * legs)[:, :, None] * np.array([2.0, 5.0, 9.0]) + np.array([1.0, 0.0, 3.0])
@@ -25,7 +25,7 @@ def trot(right: float = 1.0) -> Walk:
         time=np.arange(N) * PERIOD,
         position=np.zeros((N, 3)),
         velocity=np.zeros((N, 3)),
-        asked=np.zeros((N, 3)),
+        commanded=np.zeros((N, 3)),
         heading=np.zeros(N),
         contact=legs % 1.0 < 0.5,
         targets=joints * sides,
@@ -39,7 +39,7 @@ def trot(right: float = 1.0) -> Walk:
 
 def asymmetry(walk: Walk) -> float | None:
     section = Symmetry()
-    records = section.judge([({"policy": "mine", "speed": 1.0}, walk)])
+    records = section.to_records([({"policy": "mine", "speed": 1.0}, walk)])
     section.figure(records)
     return section.rows(records)[0].ours["mine"]
 
@@ -60,7 +60,7 @@ def test_a_robot_that_does_not_step_has_no_gait_cycle() -> None:
 
 def test_a_cycle_runs_from_touchdown_to_touchdown() -> None:
     values = np.arange(100.0)[:, None]
-    found = cycles(np.array([20, 60, 90]), values)
-    assert found.shape == (2, PHASES, 1)
+    found = resample_cycles(np.array([20, 60, 90]), values)
+    assert found.shape == (2, PHASES_PER_CYCLE, 1)
     np.testing.assert_allclose(found[:, 0, 0], [20.0, 60.0])
-    np.testing.assert_allclose(found[0, PHASES // 2, 0], 40.0)
+    np.testing.assert_allclose(found[0, PHASES_PER_CYCLE // 2, 0], 40.0)

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from quadvel_eval.grid import Cell, CellResult
-from quadvel_eval.paper.cells import cell_record, reach, within
+from quadvel_eval.paper.cells import cell_record, is_within_limits, max_command_along
 from quadvel_eval.paper.section import Study
 from quadvel_eval.paper.sustained import Sustained
-from quadvel_eval.paper.tracking import Tracking, left_right
+from quadvel_eval.paper.tracking import Tracking, left_right_difference
 from quadvel_eval.segments import Segment
 from quadvel_policy.observation import CommandLimits
 from quadvel_policy.policy_file import SHIPPED_POLICY
@@ -28,25 +28,25 @@ def answer(
     )
 
 
-def test_commands_beyond_the_limits_of_a_policy_are_told_from_those_within() -> None:
-    assert within((2.0, -0.5, 1.0), LIMITS)
-    assert not within((2.0, -0.6, 0.0), LIMITS)
-    assert not within((2.0, -0.5, 1.0), attrs.evolve(LIMITS, curve=1.0))
-    assert not within((2.1, 0.0, 0.0), LIMITS)
-    assert reach((-1.0, 0.0, 0.0), LIMITS) == 1.0
-    assert reach((0.0, 0.0, 1.0), LIMITS) == 1.0
+def test_commands_beyond_the_limits_of_a_policy_are_marked() -> None:
+    assert is_within_limits((2.0, -0.5, 1.0), LIMITS)
+    assert not is_within_limits((2.0, -0.6, 0.0), LIMITS)
+    assert not is_within_limits((2.0, -0.5, 1.0), attrs.evolve(LIMITS, curve=1.0))
+    assert not is_within_limits((2.1, 0.0, 0.0), LIMITS)
+    assert max_command_along((-1.0, 0.0, 0.0), LIMITS) == 1.0
+    assert max_command_along((0.0, 0.0, 1.0), LIMITS) == 1.0
 
 
 def test_left_right_is_the_largest_difference_between_mirrored_commands() -> None:
     records = [cell_record(*answer(*one)) for one in ((1.0, 0.4, 0.05), (1.0, -0.4, 0.08), (1.0, 0.0, 0.3))]
-    assert left_right(records) == pytest.approx(0.03)
-    assert np.isnan(left_right(records[2:]))
+    assert left_right_difference(records) == pytest.approx(0.03)
+    assert np.isnan(left_right_difference(records[2:]))
 
 
-def test_the_table_counts_falls_and_tells_errors_within_the_limits_from_all() -> None:
+def test_the_table_counts_falls_and_separates_errors_within_the_limits() -> None:
     section = Tracking()
     answers = [answer(1.0, 0.0, 0.02), answer(1.0, 0.4, None), answer(2.5, 0.0, 0.5, inside=0)]
-    records = section.judge([*answers, answer(1.0, 0.0, 0.04, plant="second")])
+    records = section.to_records([*answers, answer(1.0, 0.0, 0.04, plant="second")])
     ours = {row.what: row.ours["mine"] for row in section.rows(records)}
     assert ours["paper grid, all: runs"] == 3
     assert ours["paper grid, all: falls"] == 1
@@ -73,7 +73,7 @@ def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     labels = {"policy": "mine", "plant": "usual", "direction": "forward", "limit": 4.0}
     stood = {"reached": 2.9, "fell": 0, "ended": "", "joint_speed": 0.9, "torque": 0.7}
     fell = {"reached": None, "fell": 1, "ended": "the robot fell", "joint_speed": 1.2, "torque": 1.0}
-    records = section.judge([({**labels, "command": 3.0}, stood), ({**labels, "command": 4.0}, fell)])
+    records = section.to_records([({**labels, "command": 3.0}, stood), ({**labels, "command": 4.0}, fell)])
     rows = {row.what: row for row in section.rows(records)}
     assert rows["forward: reached"].ours == {"mine": 2.9}
     assert rows["forward: reached"].paper == 4.2
@@ -82,12 +82,12 @@ def test_the_largest_velocity_is_that_of_a_robot_that_stood() -> None:
     section.figure(records)
 
 
-def test_what_other_plants_ask_of_the_drives_stands_by_itself() -> None:
+def test_the_drive_load_of_other_plants_has_its_own_rows() -> None:
     section = Sustained(shares=(1.0,), directions=("forward",))
     plants = [job.labels["plant"] for job in section.jobs(Study(seeds=1))]
     assert plants == ["usual", "second", "loose joints"]
     labels = {"policy": "mine", "direction": "forward", "limit": 3.0, "command": 3.0}
-    records = section.judge(
+    records = section.to_records(
         [
             (
                 {**labels, "plant": plant},

@@ -6,12 +6,12 @@ from collections.abc import Iterator
 
 import pytest
 
-from quadvel_eval.pool import in_parallel
+from quadvel_eval.pool import run_in_parallel
 
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[str]:
-    """The address of two workers on this machine."""
+    """Address of a scheduler with two workers on this machine."""
     from distributed import LocalCluster
 
     with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as local:
@@ -19,20 +19,20 @@ def cluster() -> Iterator[str]:
 
 
 def test_every_call_is_answered_once_by_another_process_of_this_machine() -> None:
-    answers = dict(in_parallel([(divmod, k, 3) for k in range(7)] + [(os.getpid,)]))
+    answers = dict(run_in_parallel([(divmod, k, 3) for k in range(7)] + [(os.getpid,)]))
     assert [answers[k] for k in range(7)] == [divmod(k, 3) for k in range(7)]
     assert answers[7] != os.getpid()
 
 
 def test_every_call_is_answered_once_by_a_worker_of_the_cluster(cluster: str) -> None:
-    answers = dict(in_parallel([(divmod, k, 3) for k in range(7)] + [(os.getpid,)], cluster))
+    answers = dict(run_in_parallel([(divmod, k, 3) for k in range(7)] + [(os.getpid,)], cluster))
     assert [answers[k] for k in range(7)] == [divmod(k, 3) for k in range(7)]
     assert answers[7] != os.getpid()
 
 
 def test_what_a_call_raises_on_the_cluster_is_raised_here(cluster: str) -> None:
     with pytest.raises(ZeroDivisionError):
-        list(in_parallel([(divmod, 1, 0)], cluster))
+        list(run_in_parallel([(divmod, 1, 0)], cluster))
 
 
 def test_without_the_package_a_cluster_is_refused_with_what_to_install(
@@ -40,4 +40,4 @@ def test_without_the_package_a_cluster_is_refused_with_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ValueError, match=r"quadvel\[cluster\]"):
-        list(in_parallel([(divmod, 1, 1)], "tcp://127.0.0.1:1"))
+        list(run_in_parallel([(divmod, 1, 1)], "tcp://127.0.0.1:1"))

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_eval.offline import replay_command
-from quadvel_eval.recording_plot import plot_command, read_run
+from quadvel_eval.recording_plot import plot_command, read_recorded_run
 from quadvel_recordings.definitions import STORE
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "quadvel_recordings"))
@@ -34,8 +34,8 @@ def run(command: Any, *arguments: object) -> Any:
 def test_without_stamps_a_plot_is_over_the_times_of_receipt(tmp_path: Path, zeros: range) -> None:
     path = rosbag2(tmp_path / "bag", own(zeros))
     said: list[str] = []
-    found = read_run(path, tell=said.append)
-    assert (found.ends, found.begin) == (pytest.approx(SECONDS), pytest.approx(1e-9 * T0))
+    found = read_recorded_run(path, warn=said.append)
+    assert (found.end, found.begin) == (pytest.approx(SECONDS), pytest.approx(1e-9 * T0))
     assert sum(f"{len(zeros)} of {ROWS} stamps are 0" in text for text in said) == 2
     result = run(plot_command, path, "--out", tmp_path / "out")
     assert (result.exit_code, f"warning: {path}: /low_state" in result.stderr) == (0, True)
@@ -46,11 +46,13 @@ def test_without_stamps_a_plot_is_over_the_times_of_receipt(tmp_path: Path, zero
 )
 def test_joints_of_other_robots_are_drawn(tmp_path: Path, messages: list[Message]) -> None:
     path = rosbag2(tmp_path / "bag", messages)
-    found = read_run(path)
+    found = read_recorded_run(path)
     moved = motion(len(found.joints))
-    np.testing.assert_allclose(found.lines["/low_state"][1], np.hstack([moved["q"], moved["tau"]]), atol=1e-4)
-    np.testing.assert_allclose(found.lines["/low_cmd"][1], moved["q_des"], atol=1e-4)
-    assert found.ends == pytest.approx(SECONDS, abs=1e-3)
+    np.testing.assert_allclose(
+        found.series["/low_state"][1], np.hstack([moved["q"], moved["tau"]]), atol=1e-4
+    )
+    np.testing.assert_allclose(found.series["/low_cmd"][1], moved["q_des"], atol=1e-4)
+    assert found.end == pytest.approx(SECONDS, abs=1e-3)
     result = run(plot_command, path, "--out", tmp_path / "out")
     assert result.exit_code == 0
     assert {one.name for one in (tmp_path / "out").iterdir()} == {"joints.png", "torques.png"}
@@ -77,12 +79,12 @@ def test_a_replay_is_the_same_of_every_kind_of_recording(tmp_path: Path) -> None
     ("messages", "sentence"),
     [
         (joint_states(JOINT_NAMES), "/joint_commands: kp: not in the recording, expected --gains KP KD"),
-        (joint_states(("a", "b")), "expected the model's joints, FR_hip_joint among them"),
+        (joint_states(("a", "b")), "expected all joints of the model; FR_hip_joint is missing"),
         (joint_states(JOINT_NAMES)[::2], "expected commands beside the states on /joint_states"),
         ([("/x", "std_msgs/msg/String", T0, STORE.types["std_msgs/msg/String"]("x"))], r"the recording has /x \(std_msgs"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_replayed_is_refused_with_its_cause(
+def test_a_recording_that_cannot_be_replayed_fails_with_the_cause(
     tmp_path: Path, messages: list[Message], sentence: str
 ) -> None:
     path = rosbag2(tmp_path / "bag", messages)

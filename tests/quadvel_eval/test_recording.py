@@ -1,4 +1,4 @@
-"""A recording written message by message, as the nodes would, and what is read out of it."""
+"""Reads recordings that are written message by message, as the nodes do."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 from quadvel_eval.demo_figures import loop_figure, tracking_figure
-from quadvel_eval.demo_summary import commands, count_falls, segments, summarise
+from quadvel_eval.demo_summary import constant_commands, count_falls, recorded_segments, summarise_demo
 from quadvel_eval.recording import read_recording
 from quadvel_recordings.definitions import STORE
 
@@ -149,7 +149,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 def test_summary_has_the_means_after_the_transition_and_all_fields(recorded: Callable[..., Path]) -> None:
-    summary = summarise(read_recording(recorded()))
+    summary = summarise_demo(read_recording(recorded()))
     first, second = summary["segments"]
     assert first == {"command": [0.5, 0.0, 0.2], "mean": [0.6, 0.0, 0.2], "error_xy": 0.1, "error_wz": 0.0}
     assert (second["command"], second["mean"]) == ([0.0, 0.0, 0.0], [0.1, 0.0, 0.0])
@@ -174,7 +174,7 @@ def test_time_from_state_to_command_is_found_by_the_tick(recorded: Callable[...,
 
 
 def test_a_fall_is_counted_once(recorded: Callable[..., Path]) -> None:
-    assert summarise(read_recording(recorded(fall_at=7.0)))["falls"] == 1
+    assert summarise_demo(read_recording(recorded(fall_at=7.0)))["falls"] == 1
 
 
 def test_pictures_are_drawn(recorded: Callable[..., Path], tmp_path: Path) -> None:
@@ -202,14 +202,14 @@ def test_stretches_end_where_the_command_changes_or_the_planner_falls_silent() -
         [np.arange(0.0, 4.0, 0.02), np.arange(6.0, 10.0, 0.02), np.arange(10.0, 11.0, 0.02)]
     )
     planned = np.where(time[:, None] < 10.0, [0.5, 0.0, 0.0], [0.7, 0.0, 0.0])
-    found = commands(time, planned)
+    found = constant_commands(time, planned)
     assert [(start, round(end, 2)) for start, end, _ in found] == [(0.0, 3.98), (6.0, 9.98)]
-    assert commands(np.zeros(0), np.zeros((0, 3))) == []
+    assert constant_commands(np.zeros(0), np.zeros((0, 3))) == []
 
 
 def test_a_planner_that_was_starved_for_a_moment_has_not_stopped() -> None:
     time = np.concatenate([np.arange(0.0, 2.0, 0.02), np.arange(2.75, 4.0, 0.02)])
-    assert len(commands(time, np.tile([0.5, 0.0, 0.0], (len(time), 1)))) == 1
+    assert len(constant_commands(time, np.tile([0.5, 0.0, 0.0], (len(time), 1)))) == 1
 
 
 def test_lying_down_is_no_fall_but_tilting_over_is_one() -> None:
@@ -221,10 +221,10 @@ def test_lying_down_is_no_fall_but_tilting_over_is_one() -> None:
     assert count_falls(np.full(4, 0.4), tilted, np.array([False] * 4)) == 1
 
 
-def test_nothing_walked_is_said(recorded: Callable[..., Path]) -> None:
+def test_a_recording_without_a_walk_fails(recorded: Callable[..., Path]) -> None:
     recording = read_recording(recorded())
-    assert len(segments(recording)) == 2
+    assert len(recorded_segments(recording)) == 2
     object.__setattr__(recording.planned, "time", np.zeros(0))
     object.__setattr__(recording.planned, "value", np.zeros((0, 3)))
-    with pytest.raises(ValueError, match="no command was held for long enough"):
-        summarise(recording)
+    with pytest.raises(ValueError, match=r"found no command of 2\.5 s"):
+        summarise_demo(recording)

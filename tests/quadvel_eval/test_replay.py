@@ -1,4 +1,4 @@
-"""Replaying a run with its own model errs by little, with another one by more."""
+"""A replay with the true model has a small error, with another model a larger one."""
 
 from __future__ import annotations
 
@@ -13,7 +13,14 @@ from mcap.writer import Writer
 from quadvel_actuator import ActuatorParameters
 from quadvel_description import robot
 from quadvel_description.state import MODE_SERVO, JointCommand
-from quadvel_eval.replay import COMMAND, Joints, open_loop, read_joints, torque_error, tracking_gap
+from quadvel_eval.replay import (
+    COMMAND_FIELDS,
+    JointRecord,
+    open_loop_error,
+    read_joints,
+    torque_error,
+    tracking_gap,
+)
 from quadvel_eval.segments import Segment
 from quadvel_recordings.definitions import STORE
 from quadvel_sim import SensorNoise, Simulator, SimulatorConfig, Truth
@@ -23,8 +30,8 @@ LowState, LowCmd = "quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd"
 
 
 @pytest.fixture(scope="module")
-def run() -> tuple[Joints, Callable[[float], Truth]]:
-    """A robot with the shipped drives that sways on its feet under commands at 200 Hz; what its sensors say, exactly."""
+def run() -> tuple[JointRecord, Callable[[float], Truth]]:
+    """A robot with the shipped drives that sways on its feet under commands at 200 Hz, without noise."""
     simulator = Simulator(SimulatorConfig(noise=SensorNoise.none(), seed=3))
     simulator.reset("stand")
     states, truths, rows = [], [], []
@@ -37,11 +44,11 @@ def run() -> tuple[Joints, Callable[[float], Truth]]:
         simulator.command(command)
         states.append(simulator.state())
         truths.append(simulator.truth())
-        rows.append(np.concatenate([*(getattr(command, field) for field in COMMAND), [MODE_SERVO]]))
+        rows.append(np.concatenate([*(getattr(command, field) for field in COMMAND_FIELDS), [MODE_SERVO]]))
         simulator.step()
     time = np.array([state.time for state in states])
     q, dq, tau = (np.array([getattr(state, name) for state in states]) for name in ("q", "dq", "tau"))
-    return Joints(time, q, dq, tau, np.array(rows), np.ones(len(time), bool)), lambda t: truths[
+    return JointRecord(time, q, dq, tau, np.array(rows), np.ones(len(time), bool)), lambda t: truths[
         round(1000 * t)
     ]
 
@@ -85,18 +92,18 @@ def write_recording(path: Path, ticks: list[int], answered: list[int]) -> None:
         writer.finish()
 
 
-def test_states_that_the_recorder_missed_are_marked_and_commands_held_over_them(tmp_path: Path) -> None:
+def test_missing_states_are_marked_and_commands_stay_in_force(tmp_path: Path) -> None:
     write_recording(tmp_path / "walk.mcap", [5, 6, 7, 10, 11, 12], answered=[6, 10])
     joints = read_joints(tmp_path / "walk.mcap")
     np.testing.assert_allclose(joints.time, np.arange(5, 13) * 1e-3)
     np.testing.assert_allclose(joints.q[:, 3], joints.time, atol=1e-8)
-    assert joints.seen.tolist() == [True] * 3 + [False] * 2 + [True] * 3
+    assert joints.recorded.tolist() == [True] * 3 + [False] * 2 + [True] * 3
     np.testing.assert_allclose(joints.command[:, 0], [0, 0.006, 0.006, 0.006, 0.006, 0.01, 0.01, 0.01])
     assert joints.command[:, -1].tolist() == [0] + [MODE_SERVO] * 7
-    assert joints.whole(0, 3)
-    assert not joints.whole(1, 5)
-    assert not joints.whole(-1, 2)
-    assert not joints.whole(6, 9)
+    assert joints.is_complete(0, 3)
+    assert not joints.is_complete(1, 5)
+    assert not joints.is_complete(-1, 2)
+    assert not joints.is_complete(6, 9)
 
 
 def test_a_recording_at_another_rate_is_refused(tmp_path: Path) -> None:
@@ -109,7 +116,7 @@ def test_a_recording_at_another_rate_is_refused(tmp_path: Path) -> None:
 
 
 def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
-    run: tuple[Joints, Callable[[float], Truth]],
+    run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, _ = run
     true, ideal = ActuatorParameters.default(), ActuatorParameters.ideal()
@@ -118,7 +125,7 @@ def test_on_the_recorded_motion_the_true_model_leaves_the_noise(
 
 
 def test_noise_of_encoders_on_which_the_drives_did_not_act_hardly_counts(
-    run: tuple[Joints, Callable[[float], Truth]],
+    run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, _ = run
     true, rng = ActuatorParameters.default(), np.random.default_rng(0)
@@ -129,11 +136,11 @@ def test_noise_of_encoders_on_which_the_drives_did_not_act_hardly_counts(
 
 
 def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
-    run: tuple[Joints, Callable[[float], Truth]],
+    run: tuple[JointRecord, Callable[[float], Truth]],
 ) -> None:
     joints, truth = run
-    true = open_loop(ActuatorParameters.default(), joints, truth, 0.2, SECONDS)
-    ideal = open_loop(ActuatorParameters.ideal(), joints, truth, 0.2, SECONDS)
+    true = open_loop_error(ActuatorParameters.default(), joints, truth, 0.2, SECONDS)
+    ideal = open_loop_error(ActuatorParameters.ideal(), joints, truth, 0.2, SECONDS)
     assert true.stretches == ideal.stretches == 4
     assert true.q < 0.003
     assert true.dq < 0.7 * ideal.dq  # the noise of the torque alone makes half of it
@@ -143,9 +150,9 @@ def test_in_open_loop_the_true_model_stays_closer_than_an_ideal_one(
     assert np.sqrt(np.mean(np.square(ideal.growth))) == pytest.approx(ideal.q)
 
 
-def test_a_stretch_without_a_past_is_not_replayed(run: tuple[Joints, Callable[[float], Truth]]) -> None:
+def test_a_stretch_without_history_is_not_replayed(run: tuple[JointRecord, Callable[[float], Truth]]) -> None:
     with pytest.raises(ValueError, match=r"nothing to replay between 0\.00 and 0\.25 s"):
-        open_loop(ActuatorParameters.default(), *run, 0.0, 0.25)
+        open_loop_error(ActuatorParameters.default(), *run, 0.0, 0.25)
 
 
 def test_the_gap_is_the_mean_distance_of_the_mean_velocities() -> None:

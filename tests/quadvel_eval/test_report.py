@@ -22,7 +22,7 @@ WALKED = CellResult(
     cot=0.5,
     estimator_mse={"learned": np.full(3, 0.04)},
     estimator_drift={"learned": 0.1},
-    way=4.0,
+    path_length=4.0,
 )
 FALLEN = CellResult(Cell((1.0, 0.0, 0.0), 0))
 ONE = summarise([WALKED, FALLEN], [0.01])
@@ -103,7 +103,7 @@ def test_a_device_is_not_replaced(tmp_path: Path) -> None:
         output_file(tmp_path / "pipe")
 
 
-def test_table_tells_falls_and_the_worst_cell() -> None:
+def test_table_shows_falls_and_the_worst_cell() -> None:
     console = Console(record=True, width=100)
     console.print(evaluation_table(EVALUATION))
     text = console.export_text()
@@ -112,14 +112,14 @@ def test_table_tells_falls_and_the_worst_cell() -> None:
 
 
 @pytest.mark.parametrize("folder", ["/proc", "/sys"])  # where nobody can write, root neither
-def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(folder: str) -> None:
+def test_an_unwritable_folder_fails_before_the_work(folder: str) -> None:
     with pytest.raises(OSError, match=rf"^{folder}: the folder can't be written: "):
         output_folder(Path(folder))
     with pytest.raises(OSError, match=rf"^{folder}/x: the folder can't be written: "):
         output_folder(Path(folder) / "x")
 
 
-def test_a_file_that_cannot_be_written_is_refused_before_the_work(tmp_path: Path) -> None:
+def test_an_unwritable_file_fails_before_the_work(tmp_path: Path) -> None:
     with pytest.raises(IsADirectoryError, match="is a folder, expected a file to write"):
         output_file(tmp_path)
     with pytest.raises(OSError, match="the file can't be written: File name too long"):

@@ -9,25 +9,25 @@ WALK = Drive("forward", (0.5, 0.0, 0.0), 2.0)
 
 def test_a_script_is_walked_step_by_step() -> None:
     runner = ScriptRunner((STAND_UP, WALK, LIE_DOWN))
-    assert runner.update(0.0, "").order is None  # nobody is there to be ordered
-    assert runner.update(0.1, "passive").order == "stand_up"
+    assert runner.update(0.0, "").requested_mode is None  # nobody is there to be ordered
+    assert runner.update(0.1, "passive").requested_mode == "stand_up"
     assert runner.update(0.2, "stand_up").velocity is None
     assert runner.update(3.0, "stance").velocity == WALK.velocity
     assert runner.update(4.9, "walk").velocity == WALK.velocity
-    assert runner.update(5.1, "walk").order == "lie_down"
-    assert runner.update(5.2, "lie_down").order is None
+    assert runner.update(5.1, "walk").requested_mode == "lie_down"
+    assert runner.update(5.2, "lie_down").requested_mode is None
     assert runner.update(7.0, "passive") is None
     assert runner.update(7.1, "passive") is None
 
 
-def test_an_order_is_repeated_while_the_controller_does_not_follow_it() -> None:
+def test_a_mode_request_is_repeated_until_the_controller_follows() -> None:
     runner = ScriptRunner((STAND_UP,))
-    orders = [runner.update(t, "passive").order for t in (0.0, 0.2, 0.4, 0.6, 0.8, 1.2)]
+    orders = [runner.update(t, "passive").requested_mode for t in (0.0, 0.2, 0.4, 0.6, 0.8, 1.2)]
     assert orders == ["stand_up", None, None, "stand_up", None, "stand_up"]
 
 
-def test_a_robot_that_stands_already_is_not_ordered_to() -> None:
-    assert ScriptRunner((STAND_UP, WALK)).update(0.0, "stand_up").order is None
+def test_a_standing_robot_gets_no_request_to_stand_up() -> None:
+    assert ScriptRunner((STAND_UP, WALK)).update(0.0, "stand_up").requested_mode is None
     runner = ScriptRunner((STAND_UP, WALK))
     runner.update(0.0, "stance")
     assert runner.update(0.1, "stance").velocity == WALK.velocity
@@ -38,7 +38,7 @@ def test_a_fault_ends_the_script_with_the_controllers_reason() -> None:
         ScriptRunner((WALK,)).update(0.0, "fault", "the trunk is tilted by 1.20 rad")
 
 
-def test_patience_ends() -> None:
+def test_a_mode_request_times_out() -> None:
     runner = ScriptRunner((STAND_UP,))
     runner.update(0.0, "passive")
     with pytest.raises(ScriptError, match=r"'stand up' took more than 20 s; the mode is passive"):

@@ -1,4 +1,4 @@
-"""The planner's node and a controller that it orders about, in this process."""
+"""Planner node with a fake controller in this process."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ quadvel_dds.install()
 import rclpy  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 
-from quadvel_eval.script import RETRY  # noqa: E402
+from quadvel_eval.script import RETRY_INTERVAL_S  # noqa: E402
 from quadvel_eval.scripted_planner import ScriptedPlanner  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 from quadvel_msgs.srv import SetMode  # noqa: E402
 
 
 class Controller:
-    """Passive, at a rate of its loop that is told, and asked for modes."""
+    """Fake controller in mode passive, with a given loop rate, that records mode requests."""
 
     def __init__(self) -> None:
         rclpy.init(args=["test"])
@@ -38,7 +38,7 @@ class Controller:
         self.asked.append(request.mode)
         return response
 
-    def say_until(self, rate: float, is_so: Callable[[], Any]) -> None:
+    def publish_until(self, rate: float, is_so: Callable[[], Any]) -> None:
         """Publish states (rate: Hz of the loop) until the predicate holds."""
         until = time.monotonic() + 20.0
         while not is_so():
@@ -60,9 +60,9 @@ def controller() -> Iterator[Controller]:
     controller.close()
 
 
-def test_nothing_is_ordered_before_the_controller_has_heard_the_robot(controller: Controller) -> None:
-    until = time.monotonic() + 3.0 * RETRY
-    controller.say_until(0.0, lambda: time.monotonic() > until)
+def test_no_mode_is_requested_before_the_controller_receives_states(controller: Controller) -> None:
+    until = time.monotonic() + 3.0 * RETRY_INTERVAL_S
+    controller.publish_until(0.0, lambda: time.monotonic() > until)
     assert controller.asked == []
-    controller.say_until(200.0, lambda: controller.asked)
+    controller.publish_until(200.0, lambda: controller.asked)
     assert controller.asked[0] == "stand_up"

@@ -3,14 +3,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from quadvel_eval.segments import Segment, measure, response_delay, rounded, tracking_errors
+from quadvel_eval.segments import Segment, measure_segment, response_delay, rounded, tracking_errors
 
 TIME = np.arange(0.0, 6.0, 0.005)
 
 
 def test_mean_of_a_sine_over_whole_periods_is_its_offset() -> None:
     velocity = np.column_stack([0.5 + 0.2 * np.sin(np.pi * TIME), 0.1 + 0 * TIME, -0.3 + 0 * TIME])
-    segment = measure(TIME, velocity, (0.5, 0.0, 0.0), 2.0, 6.0)
+    segment = measure_segment(TIME, velocity, (0.5, 0.0, 0.0), 2.0, 6.0)
     np.testing.assert_allclose(segment.mean, [0.5, 0.1, -0.3], atol=1e-12)
     assert segment.error_xy == pytest.approx(0.1)
     assert segment.error_wz == pytest.approx(0.3)
@@ -18,7 +18,7 @@ def test_mean_of_a_sine_over_whole_periods_is_its_offset() -> None:
 
 def test_samples_of_the_transition_do_not_count() -> None:
     velocity = np.where(TIME[:, None] < 2.0, 9.0, [1.0, 0.0, 0.0])
-    assert measure(TIME, velocity, (1.0, 0.0, 0.0), 2.0, 6.0).error_xy == pytest.approx(0.0)
+    assert measure_segment(TIME, velocity, (1.0, 0.0, 0.0), 2.0, 6.0).error_xy == pytest.approx(0.0)
 
 
 def test_error_xy_is_the_length_of_the_difference_and_leaves_the_turn_out() -> None:
@@ -29,12 +29,12 @@ def test_error_xy_is_the_length_of_the_difference_and_leaves_the_turn_out() -> N
 
 def test_error_is_that_of_the_mean_velocity_not_the_mean_of_errors() -> None:
     sway = np.column_stack([np.where(np.arange(len(TIME)) % 2, 1.5, 0.5), 0 * TIME, 0 * TIME])
-    assert measure(TIME, sway, (1.0, 0.0, 0.0), 0.0, 6.0).error_xy == pytest.approx(0.0)
+    assert measure_segment(TIME, sway, (1.0, 0.0, 0.0), 0.0, 6.0).error_xy == pytest.approx(0.0)
 
 
 def test_a_stretch_without_samples_is_refused_in_a_sentence() -> None:
     with pytest.raises(ValueError, match=r"between 7\.00 and 8\.00 s"):
-        measure(TIME, np.zeros((len(TIME), 3)), (0.0, 0.0, 0.0), 7.0, 8.0)
+        measure_segment(TIME, np.zeros((len(TIME), 3)), (0.0, 0.0, 0.0), 7.0, 8.0)
 
 
 def test_aggregates_are_the_largest_and_the_mean_error() -> None:

@@ -1,4 +1,4 @@
-"""Following a person through a world in one process: clearances against closed form, figures, and some metres of it."""
+"""Tour in one process: clearances against closed-form values, figures, and a short walk."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from quadvel_eval.following.obstacles import BODY, Clearances, outlines
-from quadvel_eval.following.tour import Moment, Outcome, TourSetup, summary
+from quadvel_eval.following.obstacles import PERSON_RADIUS_M, Clearances, outline_points
+from quadvel_eval.following.tour import Outcome, TourSample, TourSetup, summarise_tour
 from quadvel_eval.following.tour_cli import run_tour
-from quadvel_eval.following.tour_report import picture
+from quadvel_eval.following.tour_report import tour_figure
 from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
 from quadvel_sim.world import Box, Trees, Wall, World
 
@@ -29,24 +29,28 @@ STANDING = World(
 
 def test_clearance_is_from_the_outline_to_the_nearest_thing() -> None:
     clearances = Clearances(STANDING, CONFIG)
-    assert clearances.of(np.array([1.9, 0.0, 0.0])) == pytest.approx(3.0 - 0.5 - 1.9 - 0.3, abs=0.002)
-    assert clearances.of(np.array([-3.0, 1.0, 0.0])) == pytest.approx(2.0 - 0.1 - 1.0 - 0.2, abs=0.002)
-    corner = -2.0 + np.sqrt(0.5)
-    assert clearances.of(np.array([0.0, -0.5, 0.0])) == pytest.approx(-0.5 - 0.2 - corner, abs=0.02)
-    assert clearances.of(np.array([0.0, 50.0, 0.0])) == np.inf
-    assert clearances.of_persons(np.array([0.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])) == pytest.approx(
-        0.7 - BODY
+    assert clearances.to_obstacles(np.array([1.9, 0.0, 0.0])) == pytest.approx(
+        3.0 - 0.5 - 1.9 - 0.3, abs=0.002
     )
-    assert outlines(World()).shape == (0, 2)
+    assert clearances.to_obstacles(np.array([-3.0, 1.0, 0.0])) == pytest.approx(
+        2.0 - 0.1 - 1.0 - 0.2, abs=0.002
+    )
+    corner = -2.0 + np.sqrt(0.5)
+    assert clearances.to_obstacles(np.array([0.0, -0.5, 0.0])) == pytest.approx(-0.5 - 0.2 - corner, abs=0.02)
+    assert clearances.to_obstacles(np.array([0.0, 50.0, 0.0])) == np.inf
+    assert clearances.to_people(np.array([0.0, 0.0, 0.0]), np.array([[1.0, 0.0, 0.0]])) == pytest.approx(
+        0.7 - PERSON_RADIUS_M
+    )
+    assert outline_points(World()).shape == (0, 2)
 
 
-def moment(time: float, away: float, state: State = State.FOLLOWING) -> Moment:
+def moment(time: float, away: float, state: State = State.FOLLOWING) -> TourSample:
     asked, velocity = np.array([1.0, 0.0, 0.2]), np.array([0.97, 0.04, 0.15])
     person = np.array([away, 0.0, 0.0])
-    return Moment(time, np.zeros(3), person, asked, velocity, state, "", 0.5, float("inf"))
+    return TourSample(time, np.zeros(3), person, asked, velocity, state, "", 0.5, float("inf"))
 
 
-def test_figures_tell_errors_distance_losses_and_leave_the_start_out() -> None:
+def test_figures_have_errors_distance_and_losses_without_the_start() -> None:
     states = 140 * [State.FOLLOWING] + 20 * [State.LOST] + 20 * [State.LOOKING] + 20 * [State.FOLLOWING]
     away = np.where(np.arange(200) < 120, 9.0, np.where(np.arange(200) < 180, 1.6, 3.0))
     moments = [moment(PERIOD * k, float(d), s) for k, (d, s) in enumerate(zip(away, states, strict=True))]
@@ -59,19 +63,19 @@ def test_figures_tell_errors_distance_losses_and_leave_the_start_out() -> None:
         touched={"tree_0": 1},
         planning=[0.002, 0.004],
     )
-    found = summary(outcome, moments)
+    found = summarise_tour(outcome, moments)
     assert found["error_xy"] == pytest.approx(0.05)
     assert found["error_wz"] == pytest.approx(0.05)
     assert found["distance_kept"] == pytest.approx(60 / 80)
     assert (found["losses"], found["lost_seconds"]) == (1, pytest.approx(2.0))
     assert (found["least_clearance"], found["least_gap"]) == (0.5, None)
     assert found["planner_ms"]["mean"] == pytest.approx(3.0)
-    assert "planner_ms" not in summary(attrs.evolve(outcome, planning=()), moments)
+    assert "planner_ms" not in summarise_tour(attrs.evolve(outcome, planning=()), moments)
     json.dumps(found, allow_nan=False)
 
 
 def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
-    setup = TourSetup(world="corridor", metres=5.0)
+    setup = TourSetup(world="corridor", path_length=5.0)
     said = StringIO()
     assert run_tour(setup, tmp_path, Console(file=said, width=120))
     assert re.search(r"^[2-4] of \d m: ", said.getvalue(), re.MULTILINE)  # where no terminal shows a bar
@@ -87,7 +91,7 @@ def test_some_metres_down_the_corridor_behind_a_person(tmp_path: Path) -> None:
 def test_the_picture_counts_minutes_from_its_first_moment(tmp_path: Path) -> None:
     """Of a run in real time the moments are seconds since 1970."""
     moments = [moment(1.8e9 + PERIOD * k, 1.5) for k in range(1200)]
-    figure = picture(World.load("corridor"), 1.5, moments)
+    figure = tour_figure(World.load("corridor"), 1.5, moments)
     below = next(axes for axes in figure.axes if axes.get_xlabel() == "min")
     assert below.get_xlim() == pytest.approx((0.0, 1.0), abs=0.01)
     assert all(0.0 <= x <= 1.0 for line in below.lines for x in line.get_xdata())

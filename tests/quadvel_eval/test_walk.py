@@ -13,8 +13,8 @@ from quadvel_eval.walk import (
     drive_power,
     jitter,
     make_simulator,
-    record,
-    record_to_the_fall,
+    record_until_fall,
+    record_walk,
 )
 
 G = 9.81
@@ -55,7 +55,7 @@ def test_jitter_of_a_parabola_is_its_second_difference_and_of_a_line_zero() -> N
     assert jitter(np.tile(3.0 * k[:, None], (1, 12))) == pytest.approx(0.0)
 
 
-def test_drift_is_where_the_velocities_lead_beside_where_the_robot_got_to() -> None:
+def test_drift_is_the_distance_of_integrated_and_true_position() -> None:
     time = np.arange(201) * 0.005
     position = np.column_stack([np.sin(time), time, 0.1 * time])  # 1 s
     velocity = np.column_stack([np.cos(time) + 0.03, np.full(201, 1.0 - 0.04), np.full(201, 9.0)])
@@ -63,7 +63,7 @@ def test_drift_is_where_the_velocities_lead_beside_where_the_robot_got_to() -> N
 
 
 def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Callable[..., RobotLoop]) -> None:
-    walk = record(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
+    walk = record_walk(make_loop(), [((0.0, 0.0, 0.0), 0.3), ((0.1, 0.0, 0.0), 0.2)])
     assert walk is not None
     np.testing.assert_allclose(walk.time, np.arange(100) * 0.005, atol=1e-9)
     assert walk.targets.shape == (100, 12)
@@ -76,10 +76,10 @@ def test_a_standing_robot_is_recorded_from_the_first_command_on(make_loop: Calla
 def test_a_robot_that_falls_leaves_no_walk(make_loop: Callable[..., RobotLoop]) -> None:
     loop = make_loop()
     loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
-    assert record(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
+    assert record_walk(loop, [((0.5, 0.0, 0.0), 3.0)]) is None
 
 
-def test_seeds_draw_the_plant_only_where_randomised_is_asked_for() -> None:
+def test_seeds_draw_the_plant_only_if_randomised() -> None:
     def friction(randomised: bool, seed: int) -> list[float]:
         return make_simulator(Setup(randomised=randomised), seed).config.friction.tolist()
 
@@ -100,7 +100,7 @@ def test_an_unknown_terrain_is_refused() -> None:
         Setup(terrain="sand")
 
 
-def test_what_is_given_of_the_plant_holds_whatever_was_drawn() -> None:
+def test_given_plant_fields_override_drawn_ones() -> None:
     config = make_simulator(Setup(randomised=True, plant={"payload": 4.0}), seed=1).config
     assert config.payload == 4.0
     assert config.friction.tolist() == make_simulator(Setup(randomised=True), seed=1).config.friction.tolist()
@@ -109,7 +109,7 @@ def test_what_is_given_of_the_plant_holds_whatever_was_drawn() -> None:
 def test_a_walk_is_kept_up_to_the_fall(make_loop: Callable[..., RobotLoop]) -> None:
     loop = make_loop()
     loop.simulator.push("trunk", (0.0, 600.0, 0.0), duration=0.4)
-    walk, stood = record_to_the_fall(loop, [((0.0, 0.0, 0.0), 3.0)])
+    walk, stood = record_until_fall(loop, [((0.0, 0.0, 0.0), 3.0)])
     assert not stood
     assert walk is not None
     assert 0.1 < walk.time[-1] < 2.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadvel_eval.following.scenes import FollowScene
-from quadvel_eval.following.stage import LASER, Instant, Stage
+from quadvel_eval.following.stage import LASER, FollowSample, FollowSimulation
 from quadvel_eval.people.laser import FloorPlan
 from quadvel_follow.follow_planner import PERIOD, FollowConfig, FollowPlanner, Plan, State
 from quadvel_follow.leg_detector import LegDetector
@@ -18,9 +18,11 @@ WALL = FloorPlan((), [[-5.0, -3.0, 20.0, -3.0]])
 OPEN = np.full(LASER.rays, np.inf)
 
 
-def walk(mute: Callable[[float], str], seconds: float) -> list[Instant]:
+def walk(mute: Callable[[float], str], seconds: float) -> list[FollowSample]:
     """Behind a person at 0.8 m/s along a wall; `mute` says at each time what is not heard."""
-    stage = Stage(FollowScene(WALL, [Walker([[0.0, 0.0], [30.0, 0.0]], 0.8)], seconds), 0, LegDetector())
+    stage = FollowSimulation(
+        FollowScene(WALL, [Walker([[0.0, 0.0], [30.0, 0.0]], 0.8)], seconds), 0, LegDetector()
+    )
     instants = []
     for instant in stage.run():
         instants.append(instant)

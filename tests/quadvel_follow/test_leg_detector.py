@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from quadvel_eval.people.laser import FloorPlan, Laser
-from quadvel_eval.people.measure import Recording, labelled
+from quadvel_eval.people.measure import ScanRecording, detection_scores
 from quadvel_follow import LegDetector
 
 ROOM = [[-4.0, -3.0, 6.0, -3.0], [6.0, -3.0, 6.0, 3.0], [6.0, 3.0, -4.0, 3.0], [-4.0, 3.0, -4.0, -3.0]]
@@ -99,7 +99,7 @@ def test_another_file_is_refused_by_its_name(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["legs_positive_1", "legs_positive_6"])
 def test_labelled_legs_of_real_people_are_found(detector: LegDetector, scans: Path, name: str) -> None:
-    recording = Recording.load(scans / f"{name}.npz")
-    figures = labelled(recording, detector)
+    recording = ScanRecording.load(scans / f"{name}.npz")
+    figures = detection_scores(recording, detector)
     assert figures["recall"] > 0.9
     assert figures["precision"] > 0.85

@@ -122,9 +122,9 @@ def feed(bench: Bench, robot: np.ndarray | None, seconds: float = 3.0, start: fl
         np.random.default_rng(0),
         lambda _: pose,
     )
-    for instant in scene.instants():
+    for instant in scene.scans():
         bench.send(start + instant.time, instant.ranges, robot)
-    return instant.persons[0]
+    return instant.people[0]
 
 
 def test_a_person_before_a_turned_robot_is_published_in_the_frame_of_its_odometry(bench: Bench) -> None:

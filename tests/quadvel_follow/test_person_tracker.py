@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from quadvel_eval.people.laser import FloorPlan, Laser
-from quadvel_eval.people.measure import Recording, persons, simulated
-from quadvel_eval.people.scenes import Instant, Scene, along_walls, crossing, occlusion
+from quadvel_eval.people.measure import ScanRecording, identity_scores, scene_scores
+from quadvel_eval.people.scenes import Scene, SceneScan, along_walls, crossing, occlusion
 from quadvel_follow import LegDetector, PersonTracker, Track, TrackerConfig
 from quadvel_sim.walker import Walker
 
@@ -34,7 +34,7 @@ def walk(way: list[list[float]], duration: float, still: bool = True, **changes:
     return Scene(LASER, 20.0, ROOM, [Walker(way=way, **changes)], duration, np.random.default_rng(0), pose)  # type: ignore[arg-type]
 
 
-def track(tracker: PersonTracker, instants: Iterable[Instant], posed: bool = True) -> list[list[Track]]:
+def track(tracker: PersonTracker, instants: Iterable[SceneScan], posed: bool = True) -> list[list[Track]]:
     return [
         tracker.update(
             i.time, i.ranges, LASER.angle_min, LASER.angle_increment, i.pose.tolist() if posed else None
@@ -45,12 +45,12 @@ def track(tracker: PersonTracker, instants: Iterable[Instant], posed: bool = Tru
 
 def test_who_walks_is_confirmed_within_two_seconds_with_position_and_velocity(detector: LegDetector) -> None:
     scene = walk([[4.0, -2.0], [4.0, 3.0]], 4.0, speed=1.2)
-    instants = list(scene.instants())
+    instants = list(scene.scans())
     told = track(PersonTracker(detector=detector), instants)
     confirmed = [[t for t in tracks if t.confirmed] for tracks in told]
     assert {len(c) for c in confirmed[40:]} == {1}
     last = confirmed[-1][0]
-    assert np.hypot(*(last.position - instants[-1].persons[0])) < 0.15
+    assert np.hypot(*(last.position - instants[-1].people[0])) < 0.15
     np.testing.assert_allclose(last.velocity, [0.0, 1.2], atol=0.25)
     assert last.covariance.shape == (4, 4)
     assert np.linalg.eigvalsh(last.covariance).min() > 0.0
@@ -63,32 +63,32 @@ def test_what_stands_about_is_nobody_from_a_robot_that_moves(detector: LegDetect
     scene = walk(
         [[2.5, -1.0], [2.5, 0.0]], 6.0, still=False, speed=1e-6
     )  # a person who only stands is none yet
-    told = track(PersonTracker(detector=detector), scene.instants(), posed)
+    told = track(PersonTracker(detector=detector), scene.scans(), posed)
     assert any(told)
     assert not any(t.confirmed for tracks in told for t in tracks)
 
 
 def test_tracks_are_in_the_frame_of_the_pose_and_without_one_in_the_sensor_s(detector: LegDetector) -> None:
-    instants = list(walk([[3.0, -2.0], [3.0, 2.0]], 3.0, still=False, speed=1.2).instants())
+    instants = list(walk([[3.0, -2.0], [3.0, 2.0]], 3.0, still=False, speed=1.2).scans())
     world = [t for t in track(PersonTracker(detector=detector), instants)[-1] if t.confirmed]
     own = [t for t in track(PersonTracker(detector=detector), instants, posed=False)[-1] if t.confirmed]
     assert (len(world), len(own)) == (1, 1)
     x, y, yaw = instants[-1].pose
     turn = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-    np.testing.assert_allclose(world[0].position, instants[-1].persons[0], atol=0.2)
-    np.testing.assert_allclose(own[0].position, turn @ (instants[-1].persons[0] - [x, y]), atol=0.25)
+    np.testing.assert_allclose(world[0].position, instants[-1].people[0], atol=0.2)
+    np.testing.assert_allclose(own[0].position, turn @ (instants[-1].people[0] - [x, y]), atol=0.25)
 
 
 def test_who_was_confirmed_may_stand_still(detector: LegDetector) -> None:
     scene = walk([[3.0, -2.0], [3.0, 0.0]], 6.0, speed=1.2)
-    told = track(PersonTracker(detector=detector), scene.instants())
+    told = track(PersonTracker(detector=detector), scene.scans())
     assert len({t.id for tracks in told for t in tracks if t.confirmed}) == 1
     assert np.hypot(*told[-1][0].velocity) < 0.15
 
 
 def test_who_leaves_is_forgotten(detector: LegDetector) -> None:
     tracker = PersonTracker(detector=detector)
-    instants = list(walk([[3.0, -2.0], [3.0, 2.0]], 2.5, speed=1.2).instants())
+    instants = list(walk([[3.0, -2.0], [3.0, 2.0]], 2.5, speed=1.2).scans())
     assert any(t.confirmed for t in track(tracker, instants)[-1])
     empty = LASER.scan(ROOM, np.zeros(3), np.random.default_rng(0))
     end = instants[-1].time
@@ -99,7 +99,7 @@ def test_who_leaves_is_forgotten(detector: LegDetector) -> None:
 
 @pytest.mark.parametrize("make", [crossing, occlusion, along_walls])
 def test_the_right_person_is_kept_in_scenes_in_which_trackers_go_wrong(make, detector: LegDetector) -> None:  # type: ignore[no-untyped-def]
-    figures = simulated(make, range(2 if make is not along_walls else 1), detector)
+    figures = scene_scores(make, range(2 if make is not along_walls else 1), detector)
     assert figures["kept"] == 1.0
     assert figures["rms"] < 0.15
     assert figures["ghosts"] == 0.0
@@ -126,9 +126,9 @@ def test_refused_input_changes_nothing_and_is_named(detector: LegDetector) -> No
 
 
 def test_nobody_is_found_in_an_empty_building(scans: Path, detector: LegDetector) -> None:
-    assert persons(Recording.load(scans / "legs_none.npz"), detector)["persons_per_minute"] <= 1.1
+    assert identity_scores(ScanRecording.load(scans / "legs_none.npz"), detector)["persons_per_minute"] <= 1.1
 
 
 def test_three_people_who_walk_about_keep_who_they_are(scans: Path, detector: LegDetector) -> None:
-    figures = persons(Recording.load(scans / "legs_people_walking.npz"), detector)
+    figures = identity_scores(ScanRecording.load(scans / "legs_people_walking.npz"), detector)
     assert (figures["persons"], figures["switches_per_minute"]) == (3, 0.0)

@@ -190,7 +190,9 @@ def tune_policy(
     _written(stages.tune(actuator, policy, minutes, out, device))
 
 
-Plant = Annotated[str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.plants())}.")]
+Plant = Annotated[
+    str, typer.Option(help=f"One of the gap's: {', '.join(p.level for p in gap.drive_conditions())}.")
+]
 WalkingPolicy = Annotated[Path, typer.Option(help="Policy file that walks.", exists=True)]
 
 
@@ -202,7 +204,7 @@ def record_log(
 ) -> None:
     """Record a walk on a plant whose drives hold what training never saw, as a log for `quadvel identify`."""
     try:
-        gap.record_walk(policy, plant, out)
+        gap.write_walk_log(policy, plant, out)
     except ValueError as error:
         raise typer.BadParameter(str(error)) from None
     _written(out)

@@ -14,7 +14,7 @@ from typing import Any
 from quadvel_description.network_file import read_network
 from quadvel_description.recurrent_network import METADATA_KEY
 from quadvel_estimator.features import KIND
-from quadvel_eval.compare import figures, read_evaluation
+from quadvel_eval.compare import comparison_figures, read_evaluation
 
 Json = Mapping[str, Any]
 UNITS = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}
@@ -113,7 +113,7 @@ def _measured(found: Json, estimator: bool) -> list[str]:
     """The table of an evaluation; of an estimator's, what is said of estimators."""
     rows = [
         (name, _number(value))
-        for name, value in figures(found).items()
+        for name, value in comparison_figures(found).items()
         if not estimator or "estimator" in name or name in ("runs", "falls")
     ]
     return _table(f"evaluation: {_conditions(found['setup'])}", "measured", rows)

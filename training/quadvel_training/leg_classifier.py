@@ -14,7 +14,7 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from quadvel_eval.people.measure import Recording, labelled, persons
+from quadvel_eval.people.measure import ScanRecording, detection_scores, identity_scores
 from quadvel_follow.clusters import NUMBERS, WINDOW
 from quadvel_follow.leg_detector import LegDetector
 
@@ -127,8 +127,11 @@ def cross_validate(
         with TemporaryDirectory() as folder:
             export(network, Path(folder) / "legs.onnx", {})
             detector = LegDetector(Path(folder) / "legs.onnx")
-        recording = Recording.load(left_out)
-        yield left_out.stem, (persons if recording.legs is None else labelled)(recording, detector)
+        recording = ScanRecording.load(left_out)
+        yield (
+            left_out.stem,
+            (identity_scores if recording.legs is None else detection_scores)(recording, detector),
+        )
 
 
 def export(network: LegNetwork, path: Path, about: dict[str, Any]) -> None:

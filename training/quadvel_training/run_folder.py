@@ -10,8 +10,8 @@ from typing import Any
 
 import cattrs
 
-from quadvel_eval.grid import cells, run_cell, run_stance, summarise
-from quadvel_eval.pool import Call, in_parallel
+from quadvel_eval.grid import grid_cells, run_cell, run_stance, summarise
+from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.report import write_json
 from quadvel_eval.walk import Setup
 
@@ -20,7 +20,7 @@ from .constrained import ConstrainedRun
 from .onnx_file import commit
 from .randomisation import ACTUATORS, actuator
 
-COMMANDS = cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and wz: a minute of one core
+COMMANDS = grid_cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and wz: a minute of one core
 
 
 def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
@@ -78,5 +78,5 @@ class Evaluated(loop.Keeper):
 def _evaluate(setup: Setup) -> dict[str, Any]:
     """As `quadvel eval` would have it in its eval.json, with few commands."""
     calls: list[Call] = [(run_cell, setup, cell, ()) for cell in COMMANDS]
-    answers = dict(in_parallel([*calls, (run_stance, setup, 0)]))
+    answers = dict(run_in_parallel([*calls, (run_stance, setup, 0)]))
     return summarise([answers[i] for i in range(len(calls))], [answers[len(calls)]])

@@ -101,7 +101,7 @@ def demo_command(
     if what == "follow":
         folder = output_folder(out or Path("out/tour" if tour else "out/follow"))
         if tour:
-            good = run_tour(TourSetup(world=world, metres=metres, seed=seed), folder, console)
+            good = run_tour(TourSetup(world=world, path_length=metres, seed=seed), folder, console)
         else:
             good = follow(folder, world, seconds, view, console)
         raise typer.Exit(0 if good else 1)
@@ -120,7 +120,7 @@ def demo_command(
             console.print(TOO_SLOW)
     try:
         recording = read_recording(recorded)
-        summary = demo_summary.summarise(recording)
+        summary = demo_summary.summarise_demo(recording)
     except ValueError as error:
         console.print(f"no summary of the walk: {error}", markup=False, highlight=False)
         raise typer.Exit(1) from None

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from quadvel_eval.following.recorded import read_walk
+from quadvel_eval.following.recorded import read_following
 from quadvel_eval.following.tour_report import tour_table, write_tour
 from quadvel_eval.output import replacing
 from quadvel_sim.world import World
@@ -78,7 +78,7 @@ def follow(folder: Path, world: str, seconds: float, view: bool, console: Consol
         problem = FollowedWalk(draft, stack, (x, y), seconds, view, console).run()
     if problem:
         console.print(f"[bold red]{problem}")
-    outcome, moments = read_walk(recorded, loaded)
+    outcome, moments = read_following(recorded, loaded)
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
     console.print(f"no video is drawn of it; to watch it: quadvel view {recorded}", highlight=False)

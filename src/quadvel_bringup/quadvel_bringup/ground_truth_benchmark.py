@@ -23,7 +23,7 @@ from rich.table import Table
 from quadvel_actuator import ActuatorParameters
 from quadvel_eval import demo_summary, replay
 from quadvel_eval.output import output_folder, replacing
-from quadvel_eval.pool import Call, in_parallel
+from quadvel_eval.pool import Call, run_in_parallel
 from quadvel_eval.recording import Recording, read_recording
 from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
@@ -157,7 +157,7 @@ class Walked:
     """A recorded walk of the plant, and its part that is judged."""
 
     recording: Recording
-    joints: replay.Joints
+    joints: replay.JointRecord
     stretches: list[tuple[float, float, np.ndarray]]  # start, end (s), commanded vx, vy, wz
     segments: list[Segment]
 
@@ -165,8 +165,12 @@ class Walked:
 def read_walk(path: Path) -> Walked:
     """Raises ValueError where the walk cannot be judged."""
     recording = read_recording(path)
-    moving = [c for c in demo_summary.commands(recording.planned.time, recording.planned.value) if c[2].any()]
-    segments = [segment for segment in demo_summary.segments(recording) if segment.command.any()]
+    moving = [
+        c
+        for c in demo_summary.constant_commands(recording.planned.time, recording.planned.value)
+        if c[2].any()
+    ]
+    segments = [segment for segment in demo_summary.recorded_segments(recording) if segment.command.any()]
     if not moving:
         raise ValueError(
             f"{path}: cmd_vel: found no velocity that was commanded for long enough to be judged"
@@ -178,7 +182,7 @@ def judge(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]
     """What the stack's model and the corrected one make of the plants' walks: the entries of `twin.json`."""
     own = ActuatorParameters.default()
     drives = [step for step in SCRIPTS[SCRIPT] if isinstance(step, Drive) and any(step.velocity)]
-    commands = [(np.array(step.velocity), step.seconds) for step in drives]
+    commands = [(np.array(step.velocity), step.duration) for step in drives]
     calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in SEEDS]
     for folder in folders.values():
         corrected = ActuatorParameters.load(folder / "identify" / "actuator.yaml")
@@ -223,7 +227,9 @@ def _replayed(model: ActuatorParameters, recording: Path) -> tuple[float, replay
     walk = read_walk(recording)
     begin, end = walk.stretches[0][0], walk.stretches[-1][1]
     torque = replay.torque_error(model, walk.joints, begin, end)
-    return torque, replay.open_loop(model, walk.joints, replay.trunk_at(walk.recording), begin, end)
+    return torque, replay.open_loop_error(
+        model, walk.joints, replay.recorded_truth(walk.recording), begin, end
+    )
 
 
 def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
@@ -232,7 +238,7 @@ def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
     columns = (TextColumn("before and after"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
         task = bar.add_task("", total=len(calls))
-        for i, answer in in_parallel(calls):
+        for i, answer in run_in_parallel(calls):
             answers[i] = answer
             bar.advance(task)
     return answers

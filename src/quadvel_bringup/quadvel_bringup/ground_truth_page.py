@@ -10,7 +10,7 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 
-from quadvel_eval.replay import GROWTH
+from quadvel_eval.replay import GROWTH_INTERVAL_MS
 from quadvel_sysid.report.figures import AFTER, BEFORE, MEASURED, svg
 from quadvel_sysid.report.page import document, number, table, tiles
 
@@ -117,7 +117,9 @@ def draw_plant(figure: Figure, entry: Entry) -> None:
     places = np.arange(len(commands))
     for shift, colour, when in ((-0.19, BEFORE, "before"), (0.19, AFTER, "after")):
         error = entry[when]["growth"]
-        growth.plot(GROWTH * (np.arange(len(error)) + 0.5), error, color=colour, lw=1.8, label=when)
+        growth.plot(
+            GROWTH_INTERVAL_MS * (np.arange(len(error)) + 0.5), error, color=colour, lw=1.8, label=when
+        )
         off = [np.hypot(*np.subtract(s[when], s["plant"])[:2]) for s in entry["segments"]]
         velocity.bar(places + shift, off, 0.36, color=colour, label=when)
     velocity.axhline(entry["repeat"]["xy"], color=MEASURED, lw=2.0, label="noise")

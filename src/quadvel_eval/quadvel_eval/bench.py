@@ -1,7 +1,7 @@
-"""How fast this machine runs the parts: what `quadvel bench` measures. Figures for people, no test of anything.
+"""Benchmarks the speed of simulator, networks, transport and training (`quadvel bench`).
 
-Everything is measured in one run, so that ratios hold where absolute figures vary between machines. Times are
-medians: what the machine takes away now and then for others is not the part's.
+One run measures everything, so that ratios hold where absolute figures vary between machines.
+Times are medians, which ignore interruptions by other programs.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import onnxruntime
 from numpy.typing import ArrayLike
 from onnx import TensorProto, helper
 from rich.table import Table
+from typing_extensions import override
 
 from quadvel_description.robot import NOMINAL_Q
 from quadvel_description.state import JointCommand, RobotState
@@ -29,26 +30,33 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_sim import Simulator, SimulatorConfig, World
 
 from . import round_trip
-from .robot_loop import PERIOD, STEPS, RobotLoop, TrueVelocity
+from .robot_loop import CONTROL_PERIOD_S, SIMULATOR_STEPS_PER_TICK, RobotLoop, TrueVelocity
 from .walk import Setup, make_loop, make_simulator
 
-WALK = (0.5, 0.0, 0.0)
+WALK_COMMAND = (0.5, 0.0, 0.0)
 SCHEMA = 1
 
 
-def machine() -> dict[str, Any]:
-    """What the figures belong to."""
+def machine_info() -> dict[str, Any]:
+    """Return number of cores and versions of Python and packages.
+
+    Returns:
+        Values for the file.
+    """
     packages = {name: metadata.version(name) for name in ("mujoco", "numpy", "onnxruntime")}
     return {"cores": len(os.sched_getaffinity(0)), "python": platform.python_version(), **packages}
 
 
 def _percentiles(seconds: list[float]) -> dict[str, float]:
+    """Median and 99th percentile of durations in seconds, in us."""
     p50, p99 = 1e6 * np.quantile(seconds, (0.5, 0.99))
     return {"p50_us": float(p50), "p99_us": float(p99)}
 
 
-def _time(job: Callable[[], object], count: int, before: Callable[[], object] = lambda: None) -> list[float]:
-    """Seconds of each of `count` calls, after some to warm up; not counted is what is done `before` each of them."""
+def _time_calls(
+    job: Callable[[], object], count: int, before: Callable[[], object] = lambda: None
+) -> list[float]:
+    """Seconds of each of `count` calls after a warm-up; `before` runs untimed before each call."""
     times = []
     for _ in range(count + count // 10):
         before()
@@ -58,28 +66,36 @@ def _time(job: Callable[[], object], count: int, before: Callable[[], object] = 
     return times[-count:]
 
 
-def simulator() -> dict[str, Any]:
-    """One robot that stands, a command every 5 ms; alone, and with its sensors read at 200 Hz."""
+def bench_simulator() -> dict[str, Any]:
+    """Time the simulator with a standing robot, without and with sensors at 200 Hz.
+
+    Returns:
+        Realtime factors.
+    """
     robot = make_simulator(Setup(), seed=0)
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
 
     def step() -> None:
         robot.command(command)
-        robot.step(STEPS)
+        robot.step(SIMULATOR_STEPS_PER_TICK)
 
     def step_and_read() -> None:
         step()
         robot.state()
 
-    alone, read = _time(step, 2000), _time(step_and_read, 2000)
+    alone, read = _time_calls(step, 2000), _time_calls(step_and_read, 2000)
     return {
-        "realtime_factor": PERIOD / float(np.median(alone)),
-        "with_sensors_realtime_factor": PERIOD / float(np.median(read)),
+        "realtime_factor": CONTROL_PERIOD_S / float(np.median(alone)),
+        "with_sensors_realtime_factor": CONTROL_PERIOD_S / float(np.median(read)),
     }
 
 
-def world() -> dict[str, Any]:
-    """The same robot on the campus; and a scan of its laser there."""
+def bench_world() -> dict[str, Any]:
+    """Time the simulator in the campus world, and one laser scan there.
+
+    Returns:
+        Realtime factor, and time of a scan in us.
+    """
     campus = World.load("campus")
     robot = Simulator(SimulatorConfig(world=campus))
     robot.reset("stand")
@@ -87,27 +103,38 @@ def world() -> dict[str, Any]:
 
     def step() -> None:
         robot.command(command)
-        robot.step(STEPS)
+        robot.step(SIMULATOR_STEPS_PER_TICK)
 
-    stepping, scanning = _time(step, 1000), _time(robot.scan, 50, lambda: robot.step(campus.laser.period))
+    stepping, scanning = (
+        _time_calls(step, 1000),
+        _time_calls(robot.scan, 50, lambda: robot.step(campus.laser.period)),
+    )
     return {
-        "realtime_factor": PERIOD / float(np.median(stepping)),
+        "realtime_factor": CONTROL_PERIOD_S / float(np.median(stepping)),
         "scan_p50_us": _percentiles(scanning)["p50_us"],
     }
 
 
-def loop() -> dict[str, Any]:
-    """The evaluation's whole loop, both estimators included, while walking."""
+def bench_loop() -> dict[str, Any]:
+    """Time the evaluation loop while walking, with both shadow estimators.
+
+    Returns:
+        Realtime factor.
+    """
     walking = make_loop(Setup(), seed=0)
-    times = _time(lambda: walking.tick(WALK), 600)
-    return {"realtime_factor": PERIOD / float(np.median(times))}
+    times = _time_calls(lambda: walking.tick(WALK_COMMAND), 600)
+    return {"realtime_factor": CONTROL_PERIOD_S / float(np.median(times))}
 
 
-def policy() -> dict[str, Any]:
-    """Inference alone: from observation to action with the rest done ahead, as the controller runs it; and in one piece.
+def bench_policy() -> dict[str, Any]:
+    """Time the inference of the policy.
 
-    Rested: as in the controller, which sleeps until the next state. Meanwhile the caches go to others; what this costs
-    anybody here shows a network that does nothing.
+    `p50_us` and `p99_us` measure the step after `prepare`, as in the controller. `whole` measures
+    both in one piece. `rested` measures the step after 5 ms of sleep, when other programs have
+    used the caches; `rested_idle` shows that cost for a network that does nothing.
+
+    Returns:
+        Medians and a 99th percentile, us.
     """
     network = PolicyFile()
     observation = np.zeros(network.metadata.observation.size, np.float32)
@@ -118,20 +145,20 @@ def policy() -> dict[str, Any]:
 
     def rest() -> None:
         network.prepare()
-        time.sleep(PERIOD)
+        time.sleep(CONTROL_PERIOD_S)
 
     medians = {
-        "ahead_p50_us": _time(network.prepare, 5000),
-        "whole_p50_us": _time(step, 5000),
-        "rested_p50_us": _time(step, 400, rest),
-        "rested_idle_p50_us": _time(idle, 400, rest),
+        "ahead_p50_us": _time_calls(network.prepare, 5000),
+        "whole_p50_us": _time_calls(step, 5000),
+        "rested_p50_us": _time_calls(step, 400, rest),
+        "rested_idle_p50_us": _time_calls(idle, 400, rest),
     }
-    prepared = _percentiles(_time(step, 5000, network.prepare))
+    prepared = _percentiles(_time_calls(step, 5000, network.prepare))
     return prepared | {name: _percentiles(times)["p50_us"] for name, times in medians.items()}
 
 
 def _idle_network() -> Callable[[], object]:
-    """A run of the smallest network there is: one number, handed on."""
+    """Return a function that runs the smallest network: the identity of one number."""
     number = helper.make_tensor_value_info("x", TensorProto.FLOAT, [1])
     same = helper.make_tensor_value_info("y", TensorProto.FLOAT, [1])
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "idle", [number], [same])
@@ -141,15 +168,23 @@ def _idle_network() -> Callable[[], object]:
     return lambda: session.run(None, x)
 
 
-def estimator() -> dict[str, Any]:
-    """The learned estimator from state to velocity."""
+def bench_estimator() -> dict[str, Any]:
+    """Time the learned estimator from state to velocity.
+
+    Returns:
+        Median and 99th percentile, us.
+    """
     network, state = LearnedEstimator(), make_simulator(Setup(), seed=0).state()
     previous_action = np.zeros(12)
-    return _percentiles(_time(lambda: network.update(state, previous_action), 5000))
+    return _percentiles(_time_calls(lambda: network.update(state, previous_action), 5000))
 
 
-def packets() -> dict[str, Any]:
-    """The robot's packets: a command to bytes and a state from bytes, as the driver does it, and the other way round."""
+def bench_packets() -> dict[str, Any]:
+    """Time encoding and decoding of the robot's command and state packets.
+
+    Returns:
+        Medians, us.
+    """
     twelve = np.full(12, 10)
     state = wire.BoardState(make_simulator(Setup(), seed=0).state(), twelve, twelve, twelve)
     command = JointCommand(q=NOMINAL_Q.copy(), kp=np.full(12, 100.0), kd=np.full(12, 3.0))
@@ -160,20 +195,20 @@ def packets() -> dict[str, Any]:
         "encode_state": lambda: wire.encode_state(state),
         "decode_command": lambda: wire.decode_command(of_command),
     }
-    return {f"{name}_p50_us": _percentiles(_time(job, 5000))["p50_us"] for name, job in jobs.items()}
+    return {f"{name}_p50_us": _percentiles(_time_calls(job, 5000))["p50_us"] for name, job in jobs.items()}
 
 
 class _TimedSupervisor(Supervisor):
-    """Notes what each of its ticks takes."""
+    """Supervisor that records the duration of each tick."""
 
     def __init__(self, policy: PolicyFile) -> None:
         super().__init__(policy)
         self.seconds: list[float] = []
 
+    @override
     def tick(
         self, now: float, state: RobotState, velocity: ArrayLike | None, command: ArrayLike | None
     ) -> JointCommand:
-        """As the supervisor's, and between two ticks what the controller does there."""
         start = time.perf_counter()
         answer = super().tick(now, state, velocity, command)
         self.seconds.append(time.perf_counter() - start)
@@ -181,18 +216,24 @@ class _TimedSupervisor(Supervisor):
         return answer
 
 
-def supervisor() -> dict[str, Any]:
-    """A tick from state to command: all checks, observation and inference, while walking."""
+def bench_supervisor() -> dict[str, Any]:
+    """Time a supervisor tick while walking: checks, observation and inference.
+
+    Returns:
+        Median and 99th percentile, us.
+    """
     robot, timed = make_simulator(Setup(), seed=0), _TimedSupervisor(PolicyFile())
     walking = RobotLoop(robot, timed, TrueVelocity(robot))
     walking.start_walking()
     timed.seconds.clear()
     for _ in range(600):
-        walking.tick(WALK)
+        walking.tick(WALK_COMMAND)
     return _percentiles(timed.seconds)
 
 
 def _training(part: str) -> Callable[[], dict[str, Any]]:
+    """Return a benchmark of the training package, which is skipped without torch."""
+
     def measure() -> dict[str, Any]:
         if util.find_spec("torch") is None:
             return {"skipped": "torch is not installed; pip install -e '.[train]'"}
@@ -205,29 +246,29 @@ def _training(part: str) -> Callable[[], dict[str, Any]]:
 
 
 PARTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "simulator": simulator,
-    "world": world,
-    "loop": loop,
-    "policy": policy,
-    "estimator": estimator,
-    "supervisor": supervisor,
-    "packets": packets,
-    "round_trip": round_trip.measure,
+    "simulator": bench_simulator,
+    "world": bench_world,
+    "loop": bench_loop,
+    "policy": bench_policy,
+    "estimator": bench_estimator,
+    "supervisor": bench_supervisor,
+    "packets": bench_packets,
+    "round_trip": round_trip.measure_round_trips,
     "environment": _training("environment"),
     "training": _training("training"),
 }
-ROWS = (  # part, figure, what it is, what is wanted
+TABLE_ROWS = (  # part, figure, description, target
     ("simulator", "realtime_factor", "simulator alone, times real time", "15 or more"),
     ("simulator", "with_sensors_realtime_factor", "simulator with sensors at 200 Hz", ""),
     ("world", "realtime_factor", "simulator on the campus, times real time", ""),
-    ("world", "scan_p50_us", "a scan of 1080 rays there, median, us", "5000 or less"),
+    ("world", "scan_p50_us", "scan of 1080 rays on the campus, median, us", "5000 or less"),
     ("loop", "realtime_factor", "evaluation loop, times real time", ""),
     ("policy", "p50_us", "inference, observation to action, median, us", "50 or less"),
     ("policy", "p99_us", "inference, observation to action, 99 %, us", ""),
     ("policy", "ahead_p50_us", "inference, part done ahead, median, us", ""),
     ("policy", "whole_p50_us", "inference, step in one piece, median, us", ""),
     ("policy", "rested_p50_us", "inference after 5 ms of rest, median, us", ""),
-    ("policy", "rested_idle_p50_us", "a network that does nothing after 5 ms of rest, us", ""),
+    ("policy", "rested_idle_p50_us", "smallest network after 5 ms of rest, us", ""),
     ("supervisor", "p50_us", "supervisor tick, median, us", ""),
     ("supervisor", "p99_us", "supervisor tick, 99 %, us", "1000 or less"),
     ("estimator", "p50_us", "learned estimator, median, us", ""),
@@ -235,23 +276,30 @@ ROWS = (  # part, figure, what it is, what is wanted
     ("packets", "decode_state_p50_us", "packet to state, median, us", "60 or less"),
     ("packets", "encode_state_p50_us", "state to packet, median, us", "60 or less"),
     ("packets", "decode_command_p50_us", "packet to command, median, us", "60 or less"),
-    ("round_trip", "p50_us", "message there and back, median, us", ""),
-    ("round_trip", "p99_us", "message there and back, 99 %, us", ""),
+    ("round_trip", "p50_us", "message round trip, median, us", ""),
+    ("round_trip", "p99_us", "message round trip, 99 %, us", ""),
     ("environment", "steps_per_s", "training environment, steps/s", ""),
-    ("environment", "ratio", "of the bare batch's", "0.7 or more"),
+    ("environment", "ratio", "divided by that of the bare batch", "0.7 or more"),
     ("training", "samples_per_s", "training, policy samples/s", ""),
-    ("training", "ratio", "of what bare steps and passes allow", "0.6 or more"),
-    ("training", "physics_share", "of its time: physics and actuators", ""),
-    ("training", "sensing_share", "observations and rewards", ""),
-    ("training", "inference_share", "inference", ""),
-    ("training", "learning_share", "learning", ""),
+    ("training", "ratio", "divided by that of bare steps and passes", "0.6 or more"),
+    ("training", "physics_share", "share of training time: physics and actuators", ""),
+    ("training", "sensing_share", "share: observations and rewards", ""),
+    ("training", "inference_share", "share: inference", ""),
+    ("training", "learning_share", "share: learning", ""),
 )
 
 
-def table(results: dict[str, dict[str, Any]]) -> Table:
-    """The figures and what is wanted of them."""
-    found = Table("figure", "measured", "wanted", title="Benchmark")
-    for part, figure, about, wanted in ROWS:
+def benchmark_table(results: dict[str, dict[str, Any]]) -> Table:
+    """Create a table of the figures and their targets.
+
+    Args:
+        results: Results of PARTS, by part.
+
+    Returns:
+        The table.
+    """
+    found = Table("figure", "measured", "target", title="Benchmark")
+    for part, figure, about, wanted in TABLE_ROWS:
         result = results[part]
         found.add_row(about, result.get("skipped") or number_text(result[figure], ",.4g"), wanted)
     return found

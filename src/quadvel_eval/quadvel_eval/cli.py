@@ -1,4 +1,4 @@
-"""The commands `quadvel eval`, `faults`, `compare` and `bench`, as functions for a typer application."""
+"""Defines the commands `quadvel eval`, `faults`, `compare` and `bench` for Typer."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 
 from . import bench
 from .compare import comparison_table, read_evaluation
-from .faults.campaign import campaign
-from .faults.report import campaign_table, total, write_campaign
+from .faults.campaign import run_campaign
+from .faults.report import campaign_summary, campaign_table, write_campaign
 from .grid import evaluate
 from .output import output_file, output_folder
 from .report import evaluation_table, write_evaluation, write_json
 from .walk import Setup
 
-Cluster = Annotated[
+ClusterOption = Annotated[
     str | None,
     typer.Option(
         metavar="<address>",
-        help="Address of a Dask scheduler to run the walks on.",
+        help="Address of a Dask scheduler that runs the walks.",
         show_default="the cores of this machine",
     ),
 ]
 
 
 def eval_command(
-    grid: Annotated[Literal["quick", "paper"], typer.Option(help="Which commands are tried.")],
+    grid: Annotated[Literal["quick", "paper"], typer.Option(help="Grid of commands.")],
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for eval.json, eval.csv and eval.png.")
     ] = Path("out/eval"),
@@ -45,20 +45,23 @@ def eval_command(
     ] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
-    terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="The ground.")] = "flat",
+    terrain: Annotated[Literal["flat", "rough", "slope"], typer.Option(help="Terrain.")] = "flat",
     actuator: Annotated[
         Path | None,
         typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     randomised: Annotated[
-        bool, typer.Option("--randomised", help="Draw payload, friction, joints and actuators by the seed.")
+        bool,
+        typer.Option("--randomised", help="Randomise payload, friction, joints and actuators by the seed."),
     ] = False,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each command, with seeds 0, 1, ...")] = 1,
-    cluster: Cluster = None,
+    cluster: ClusterOption = None,
 ) -> None:
-    """Measure how well a policy tracks velocities: many walks in parallel, faster than real time."""
+    """Measure how well a policy tracks velocities, in many walks in parallel."""
     setup = Setup(
         policy=policy,
         estimator=estimator,
@@ -67,12 +70,12 @@ def eval_command(
         randomised=randomised,
         actuator=actuator,
     )
-    PolicyFile(policy)  # what is wrong with the files shows here, once, before any run
+    PolicyFile(policy)  # fail on a bad file here, once, before any run
     LearnedEstimator(estimator_file)
     if actuator is not None:
         ActuatorParameters.load(actuator)
     folder = output_folder(out)
-    with walks_bar() as bar:
+    with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
         result = evaluate(
             setup, grid, seeds, lambda done, of: bar.update(task, completed=done, total=of), cluster
@@ -83,8 +86,12 @@ def eval_command(
     console.print(f"written: {folder}/eval.json, eval.csv, eval.png")
 
 
-def walks_bar() -> Progress:
-    """A bar for walks, on stderr."""
+def walk_progress_bar() -> Progress:
+    """Create a progress bar for walks, on stderr.
+
+    Returns:
+        The bar.
+    """
     columns = (TextColumn("walks"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     return Progress(*columns, console=Console(stderr=True))
 
@@ -95,31 +102,33 @@ def faults_command(
     ] = Path("out/faults"),
     seeds: Annotated[
         int,
-        typer.Option(min=1, help="Runs of each kind of fault, in turn in its modes, with seeds 0, 1, ..."),
+        typer.Option(
+            min=1, help="Runs of each kind of fault, alternating between its modes, with seeds 0, 1, ..."
+        ),
     ] = 20,
     only: Annotated[
         str | None,
         typer.Option(
             metavar="<text>",
-            help="Cases whose 'component kind mode' holds this text.",
+            help="Only cases whose 'component kind mode' contains this text.",
             show_default="all of them",
         ),
     ] = None,
 ) -> None:
-    """Let things go wrong in a simulated robot, and measure what it does and how soon.
+    """Inject faults into a simulated robot, and measure its reaction and reaction time.
 
-    The exit code is 1 where that is not as expected.
+    The exit code is 1 if a reaction is not as expected.
     """
     folder = output_folder(out)
-    with walks_bar() as bar:
+    with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
-        runs = campaign(seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
+        runs = run_campaign(seeds, only, lambda done, of: bar.update(task, completed=done, total=of))
     cases = write_campaign(folder, runs)["cases"]
     console = Console()
     bad = any(case["as_expected"] < case["runs"] for case in cases)
     if bad:
         console.print(campaign_table(cases))
-    console.print(total(cases), highlight=False)
+    console.print(campaign_summary(cases), highlight=False)
     console.print(f"written: {folder}/faults.json, faults.md, faults.png")
     if bad:
         raise typer.Exit(1)
@@ -127,9 +136,9 @@ def faults_command(
 
 def compare_command(
     first: Annotated[Path, typer.Argument(help="eval.json, or a folder that holds one.")],
-    second: Annotated[Path, typer.Argument(help="The one to hold against it.")],
+    second: Annotated[Path, typer.Argument(help="The evaluation to compare with it.")],
 ) -> None:
-    """Show two evaluations of `quadvel eval` side by side."""
+    """Compare two evaluations of `quadvel eval`."""
     Console().print(comparison_table({str(path): read_evaluation(path) for path in (first, second)}))
 
 
@@ -138,7 +147,10 @@ def bench_command(
         "out/bench.json"
     ),
 ) -> None:
-    """Measure how fast this machine simulates, infers, talks and trains; on an idle machine, some minutes."""
+    """Measure how fast this machine simulates, infers, communicates and trains.
+
+    It takes some minutes. Run it on an idle machine.
+    """
     output_file(out)
     results = {}
     messages = Console(stderr=True)
@@ -146,7 +158,7 @@ def bench_command(
         for name in bench.PARTS:
             status.update(f"measuring: {name}")
             results[name] = bench.PARTS[name]()
-    write_json(out, {"schema": bench.SCHEMA, "machine": bench.machine(), **results})
+    write_json(out, {"schema": bench.SCHEMA, "machine": bench.machine_info(), **results})
     console = Console()
-    console.print(bench.table(results))
+    console.print(bench.benchmark_table(results))
     console.print(f"written: {out}")

@@ -1,4 +1,4 @@
-"""Two evaluations of `quadvel eval` side by side: what both measured, and the difference."""
+"""Compares two evaluations of `quadvel eval`: common figures and their difference."""
 
 from __future__ import annotations
 
@@ -12,20 +12,31 @@ from rich.table import Table
 from .grid import SCHEMA
 from .report import read_json
 
-EVALUATION = "eval.json"
-ON_BOTH = (
+EVALUATION_FILE = "eval.json"
+FIGURES_ON_BOTH_PLANTS = (
     "falls",
     "mean error, m/s",
     "largest error, m/s",
     "mean error of the yaw rate, rad/s",
     "largest error of the yaw rate, rad/s",
 )
-"""Figures that are told of both plants."""
+"""Figures compared on both plants."""
 
 
 def read_evaluation(path: Path) -> dict[str, Any]:
-    """The evaluation in a file, or in the folder that holds it. ValueError or OSError, one sentence."""
-    file = path / EVALUATION if path.is_dir() else path
+    """Read an evaluation.
+
+    Args:
+        path: `eval.json`, or the folder that holds it.
+
+    Returns:
+        Content of the file.
+
+    Raises:
+        ValueError: The file is not an evaluation of this schema.
+        OSError: The file is missing or unreadable.
+    """
+    file = path / EVALUATION_FILE if path.is_dir() else path
     if not file.exists():
         raise FileNotFoundError(f"{file}: no such file, expected what `quadvel eval` wrote")
     content = read_json(file)
@@ -34,8 +45,15 @@ def read_evaluation(path: Path) -> dict[str, Any]:
     return content
 
 
-def figures(evaluation: Mapping[str, Any]) -> dict[str, float | None]:
-    """What is compared, by name and unit."""
+def comparison_figures(evaluation: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return the figures to compare.
+
+    Args:
+        evaluation: Content of `eval.json`.
+
+    Returns:
+        Values by name and unit; None if undefined.
+    """
     drift = evaluation["stance"]["drift_10s_m"]
     costs = [cost for cost in evaluation["cot"] if cost is not None]
     found = {
@@ -55,13 +73,23 @@ def figures(evaluation: Mapping[str, Any]) -> dict[str, float | None]:
         found |= {f"{name} estimator, largest RMSE, m/s": max(errors["rmse"])}
     if second := evaluation.get("second_plant"):
         found |= {
-            f"second plant: {name}": value for name, value in figures(second).items() if name in ON_BOTH
+            f"second plant: {name}": value
+            for name, value in comparison_figures(second).items()
+            if name in FIGURES_ON_BOTH_PLANTS
         }
     return found
 
 
-def common_errors(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Mean error (m/s) of each over the commands and seeds that both went through; None where there are none."""
+def errors_on_common_runs(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[float, float] | None:
+    """Return the mean errors over the commands and seeds that fell in neither evaluation.
+
+    Args:
+        first: Content of one `eval.json`.
+        second: Content of the other.
+
+    Returns:
+        Mean error of each, m/s; None without common runs.
+    """
     found = [
         {(*cell["command"], cell["seed"]): cell["error_xy"] for cell in one["cells"] if not cell["fell"]}
         for one in (first, second)
@@ -74,14 +102,21 @@ def common_errors(first: Mapping[str, Any], second: Mapping[str, Any]) -> tuple[
 
 
 def comparison_table(evaluations: Mapping[str, Mapping[str, Any]]) -> Table:
-    """Two evaluations by name, a row a figure, and the second minus the first."""
+    """Create a table of two evaluations, one row per figure, with second minus first.
+
+    Args:
+        evaluations: Exactly two contents of `eval.json`, by name.
+
+    Returns:
+        The table.
+    """
     (first_name, first), (second_name, second) = evaluations.items()
     table = Table("", first_name, second_name, "difference", title="Two evaluations")
-    before, after = figures(first), figures(second)
+    before, after = comparison_figures(first), comparison_figures(second)
     rows = {name: (before.get(name), after.get(name)) for name in dict.fromkeys((*before, *after))}
-    common = common_errors(first, second)
+    common = errors_on_common_runs(first, second)
     if common:
-        rows["mean error of the runs that both went through, m/s"] = common
+        rows["mean error of the common runs, m/s"] = common
     for name, (a, b) in rows.items():
         difference = "" if a is None or b is None else f"{b - a:+.4g}"
         table.add_row(name, _number(a), _number(b), difference)
@@ -89,4 +124,5 @@ def comparison_table(evaluations: Mapping[str, Mapping[str, Any]]) -> Table:
 
 
 def _number(value: float | None) -> str:
+    """Number with four significant digits; a dash for None."""
     return "–" if value is None else f"{value:.4g}"

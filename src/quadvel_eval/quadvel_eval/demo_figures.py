@@ -1,4 +1,4 @@
-"""Pictures of a demo: how velocity followed the command, how the loop kept time. Arrays in, figures out."""
+"""Draws the figures of a demo: velocity tracking, and timing of the control loop."""
 
 from __future__ import annotations
 
@@ -12,18 +12,26 @@ from scipy.ndimage import uniform_filter1d
 
 from quadvel_nodes.number_text import DASH
 
-from .demo_summary import commands
+from .demo_summary import constant_commands
 from .recording import Recording, Series
-from .robot_loop import PERIOD
+from .robot_loop import CONTROL_PERIOD_S
 
 Array = NDArray[np.float64]
 
-STRIDE = 0.4  # s, over which a velocity is averaged to be seen without the sway of each step
-AXES = ("vx, m/s", "vy, m/s", "wz, rad/s")
+AVERAGING_TIME_S = 0.4  # of plotted velocities, to remove the sway of each step
+AXIS_LABELS = ("vx, m/s", "vy, m/s", "wz, rad/s")
 
 
 def tracking_figure(recording: Recording, frames: Sequence[tuple[str, NDArray[np.uint8]]] = ()) -> Figure:
-    """Commanded, true and estimated velocity over time; above them `frames`, captions and (h, w, 3) images."""
+    """Plot commanded, true and estimated velocity over time.
+
+    Args:
+        recording: The recording.
+        frames: Caption and image (h, w, 3) of each picture above the panels.
+
+    Returns:
+        The figure.
+    """
     strip = 1.7 if frames else 0.0
     figure = Figure(figsize=(11, 6 + strip), layout="constrained")
     if frames:
@@ -41,33 +49,45 @@ def tracking_figure(recording: Recording, frames: Sequence[tuple[str, NDArray[np
 
 
 def _tracking_panels(panels: Any, recording: Recording) -> None:
-    start, end = _span(recording)
+    """Plot the three velocities, one panel per axis."""
+    start, end = _walked_interval(recording)
     planar = Series(recording.velocity.time, recording.velocity.value[:, [0, 1, 5]])
-    for axis, (panel, name) in enumerate(zip(panels, AXES, strict=True)):
-        lines = [("commanded", recording.commanded, "black"), ("true", _smooth(planar), "tab:blue")]
+    for axis, (panel, name) in enumerate(zip(panels, AXIS_LABELS, strict=True)):
+        lines = [("commanded", recording.commanded, "black"), ("true", _moving_average(planar), "tab:blue")]
         if axis < 2:  # the yaw rate is measured, not estimated
-            lines.append(("estimated", _smooth(recording.estimate), "tab:orange"))
+            lines.append(("estimated", _moving_average(recording.estimate), "tab:orange"))
         for label, series, colour in lines:
             within = (start - 1.0 <= series.time) & (series.time <= end + 1.0)
             panel.plot(series.time[within] - start, series.value[within, axis], colour, label=label, lw=1.2)
         panel.set_ylabel(name)
         panel.grid(alpha=0.3)
     panels[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=3, frameon=False)
-    panels[-1].set_xlabel(f"time, s (true and estimated: means over {STRIDE} s)")
+    panels[-1].set_xlabel(f"time, s (true and estimated: means over {AVERAGING_TIME_S} s)")
 
 
-def _span(recording: Recording) -> tuple[float, float]:
-    stretches = commands(recording.planned.time, recording.planned.value)
+def _walked_interval(recording: Recording) -> tuple[float, float]:
+    """Start of the first and end of the last segment, s."""
+    stretches = constant_commands(recording.planned.time, recording.planned.value)
     return stretches[0][0], stretches[-1][1]
 
 
-def _smooth(series: Series) -> Series:
-    """Mean over a stride, of evenly spaced samples."""
-    return Series(series.time, uniform_filter1d(series.value, round(STRIDE / PERIOD), axis=0, mode="nearest"))
+def _moving_average(series: Series) -> Series:
+    """Average evenly spaced samples over AVERAGING_TIME_S."""
+    return Series(
+        series.time,
+        uniform_filter1d(series.value, round(AVERAGING_TIME_S / CONTROL_PERIOD_S), axis=0, mode="nearest"),
+    )
 
 
 def loop_figure(recording: Recording) -> Figure:
-    """Time from a state to its answer, and the period between answers, as distributions."""
+    """Plot the distributions of response time and of command period.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        The figure.
+    """
     sent = recording.answer_time.time + recording.answer_time.value[:, 0]
     figure = Figure(figsize=(11, 4), layout="constrained")
     left, right = figure.subplots(1, 2)
@@ -77,6 +97,7 @@ def loop_figure(recording: Recording) -> Figure:
 
 
 def _distribution(panel: Any, values: Array, name: str) -> None:
+    """Draw a histogram (logarithmic counts) with median and 99th percentile."""
     panel.set_xlabel(name)
     panel.set_ylabel("ticks")
     if not len(values):

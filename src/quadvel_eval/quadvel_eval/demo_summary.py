@@ -1,4 +1,4 @@
-"""`summary.json` from the recording of a demo: tracking by segments, falls, timing, estimator errors."""
+"""Computes `summary.json` of a demo: tracking by segments, falls, timing and estimator errors."""
 
 from __future__ import annotations
 
@@ -8,55 +8,84 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .recording import Recording
-from .segments import SETTLE, Segment, measure, rounded, tracking_errors
+from .segments import SETTLING_TIME_S, Segment, measure_segment, rounded, tracking_errors
 
 Array = NDArray[np.float64]
 
-GAP = 2.0  # s, a planner that was silent for longer had stopped; less is a stall, and what the robot did in it counts
-SHORTEST = SETTLE + 0.5  # s, of a segment that can be judged
-MAX_TILT = 1.0  # rad
-MIN_HEIGHT = 0.2  # m, of the trunk; it stands at 0.43 and lies at 0.14
-UPRIGHT_MODES = ("stance", "walk", "fault")  # in which a robot that lies has fallen
+MAX_COMMAND_GAP_S = 2.0  # a longer silence ends a segment; a shorter one is a stall and counts
+MIN_SEGMENT_S = SETTLING_TIME_S + 0.5  # shorter segments are left out
+MAX_TILT_RAD = 1.0  # rad
+MIN_TRUNK_HEIGHT_M = 0.2  # standing: 0.43, lying: 0.14
+UPRIGHT_MODES = ("stance", "walk", "fault")  # in these modes a lying robot has fallen
 
 
-def commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Array]]:
-    """Start, end (s) and velocity of each stretch over which the planner sent the same.
+def constant_commands(planned_time: Array, planned: Array) -> list[tuple[float, float, Array]]:
+    """Split a plan into intervals of constant command, without those shorter than MIN_SEGMENT_S.
 
-    planned (n, 3): what it sent at the times (n,). Stretches too short to be judged are left out.
+    Args:
+        planned_time: Times of the commands (n,), s.
+        planned: Commands (n, 3): vx, vy (m/s), wz (rad/s).
+
+    Returns:
+        Start (s), end (s) and command of each interval.
     """
     if not len(planned_time):
         return []
-    changed = np.any(np.diff(planned, axis=0) != 0.0, axis=1) | (np.diff(planned_time) > GAP)
+    changed = np.any(np.diff(planned, axis=0) != 0.0, axis=1) | (np.diff(planned_time) > MAX_COMMAND_GAP_S)
     runs = np.split(np.arange(len(planned_time)), np.flatnonzero(changed) + 1)
     found = [(float(planned_time[r[0]]), float(planned_time[r[-1]]), planned[r[0]]) for r in runs]
-    return [(start, end, velocity) for start, end, velocity in found if end - start >= SHORTEST]
+    return [(start, end, velocity) for start, end, velocity in found if end - start >= MIN_SEGMENT_S]
 
 
 def count_falls(height: Array, quaternion: Array, upright: NDArray[np.bool_]) -> int:
-    """How often the robot went from standing to lying: trunk height (n,) m, quaternion (n, 4).
+    """Count how often the robot changed from standing to lying.
 
-    upright (n,): whether the robot should be on its feet; only the tilt tells a fall where it should not.
+    Args:
+        height: Height of the trunk (n,), m.
+        quaternion: Orientation of the trunk (n, 4), w, x, y, z.
+        upright: Whether the robot should stand (n,); otherwise only its tilt indicates a fall.
+
+    Returns:
+        Number of falls.
     """
+    # Third diagonal element of the rotation matrix: cos(tilt) = 1 - 2 (x^2 + y^2).
     tilt_cosine = 1.0 - 2.0 * (quaternion[:, 1] ** 2 + quaternion[:, 2] ** 2)
-    down = (tilt_cosine < np.cos(MAX_TILT)) | ((height < MIN_HEIGHT) & upright)
+    down = (tilt_cosine < np.cos(MAX_TILT_RAD)) | ((height < MIN_TRUNK_HEIGHT_M) & upright)
     return int(np.count_nonzero(down[1:] & ~down[:-1]) + (down[0] if len(down) else 0))
 
 
-def segments(recording: Recording) -> list[Segment]:
-    """Every stretch of constant command, its first two seconds left out of the means."""
+def recorded_segments(recording: Recording) -> list[Segment]:
+    """Measure each interval of constant command, after its settling time.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        The segments.
+    """
     truth = recording.velocity
     planar = truth.value[:, [0, 1, 5]]
     return [
-        measure(truth.time, planar, velocity, start + SETTLE, end)
-        for start, end, velocity in commands(recording.planned.time, recording.planned.value)
+        measure_segment(truth.time, planar, velocity, start + SETTLING_TIME_S, end)
+        for start, end, velocity in constant_commands(recording.planned.time, recording.planned.value)
     ]
 
 
-def summarise(recording: Recording) -> dict[str, Any]:
-    """The content of `summary.json`. Raises ValueError where no segment was walked."""
-    walked = segments(recording)
+def summarise_demo(recording: Recording) -> dict[str, Any]:
+    """Compute the content of `summary.json`.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        The content.
+
+    Raises:
+        ValueError: No command lasted long enough.
+    """
+    walked = recorded_segments(recording)
     if not walked:
-        raise ValueError("no command was held for long enough to be judged")
+        raise ValueError(f"found no command of {MIN_SEGMENT_S:g} s or more, expected one to evaluate")
     return {
         "segments": [segment.to_json() for segment in walked],
         "falls": _falls(recording),
@@ -68,10 +97,12 @@ def summarise(recording: Recording) -> dict[str, Any]:
 
 
 def _mean(values: Array) -> float:
+    """Mean; nan without values."""
     return float(values.mean()) if len(values) else float("nan")
 
 
 def _falls(recording: Recording) -> int:
+    """Count the falls of a recording."""
     loop = recording.loop
     upright = np.array([mode in UPRIGHT_MODES for mode in loop.mode])
     now = np.maximum(np.searchsorted(loop.time, recording.position.time, side="right") - 1, 0)
@@ -79,7 +110,7 @@ def _falls(recording: Recording) -> int:
 
 
 def _loop_figures(recording: Recording) -> dict[str, float]:
-    """The controller's own figures at the end, since its start; the rate as the median over the walk."""
+    """Figures of the controller at the end, since its start; `rate_hz` is the median while walking."""
     loop = recording.loop
     rates = [f["rate_hz"] for f, mode in zip(loop.figures, loop.mode, strict=True) if mode == "walk"]
     last = loop.figures[-1]
@@ -88,12 +119,13 @@ def _loop_figures(recording: Recording) -> dict[str, float]:
 
 
 def _estimator_rmse(recording: Recording) -> Array:
-    """Root mean square of estimate minus truth, (3,) m/s, at the instants of the estimates within the segments.
+    """RMSE of the estimate (3,), m/s, within the segments.
 
-    Truth is taken between its own instants: behind a network, states have theirs to within a fraction of a millisecond.
+    The truth is interpolated, because behind a network the stamps of states differ from it by a
+    fraction of a millisecond.
     """
     estimate, truth = recording.estimate, recording.velocity
-    stretches = commands(recording.planned.time, recording.planned.value)
+    stretches = constant_commands(recording.planned.time, recording.planned.value)
     begin, end = max(stretches[0][0], truth.time[0]), min(stretches[-1][1], truth.time[-1])
     walking = (begin <= estimate.time) & (estimate.time < end)
     instants = estimate.time[walking]

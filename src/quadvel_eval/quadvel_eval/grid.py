@@ -1,6 +1,6 @@
-"""Velocity tracking over a grid of commands, in parallel processes: what `quadvel eval` computes.
+"""Evaluates velocity tracking over a grid of commands in parallel processes (`quadvel eval`).
 
-Files and pictures are `report`'s matter.
+This module computes the figures. Module `report` writes files and pictures.
 """
 
 from __future__ import annotations
@@ -14,29 +14,40 @@ from numpy.typing import NDArray
 
 from quadvel_sim.physics import SECOND
 
-from .pool import Call, in_parallel
-from .robot_loop import PERIOD, RobotLoop
-from .segments import SETTLE, Segment, measure, response_delay, rounded, tracking_errors
-from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record
+from .pool import Call, run_in_parallel
+from .robot_loop import CONTROL_PERIOD_S, RobotLoop
+from .segments import SETTLING_TIME_S, Segment, measure_segment, response_delay, rounded, tracking_errors
+from .walk import Setup, Walk, cost_of_transport, jitter, make_loop, record_walk
 
 Array = NDArray[np.float64]
 
 SCHEMA = 1
-DURATION = 6.0  # s of each command, of which the last 4 are evaluated
-GRIDS: dict[str, tuple[Array, Array, Array]] = {  # vx, vy (m/s), wz (rad/s): every combination
+COMMAND_DURATION_S = 6.0  # of each command; the last 4 s are evaluated
+GRIDS: dict[str, tuple[Array, Array, Array]] = {  # all combinations of vx, vy (m/s) and wz (rad/s)
     "quick": (np.arange(-2, 4) / 2, np.array([-0.4, 0.0, 0.4]), np.array([-1.0, 0.0, 1.0])),
     "paper": (np.arange(-5, 6) / 2, np.arange(-5, 6) / 5, np.array([0.0])),
 }
-STANCE_WALK = [((0.5, 0.0, 0.0), 2.0), ((0.0, 0.0, 0.0), 2.0)]  # how the robot comes to stand
-STANCE_SECONDS = 10.0
-LEAST_SPEED, LEAST_TURN = 0.2, 0.3  # m/s, rad/s: of slower ones no delay can be told
+WALK_BEFORE_STANCE = [
+    ((0.5, 0.0, 0.0), 2.0),
+    ((0.0, 0.0, 0.0), 2.0),
+]  # velocities and durations (s) before standing
+STANCE_DURATION_S = 10.0
+MIN_SPEED_FOR_DELAY, MIN_YAW_RATE_FOR_DELAY = (
+    0.2,
+    0.3,
+)  # m/s, rad/s: for slower commands the delay is undefined
 PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": SECOND}}
-"""Fields of `SimulatorConfig` of the plants that a policy is judged on: the usual one, and one that solves contacts otherwise."""
+"""Plants of the evaluation, as fields of `SimulatorConfig`; the second one solves contacts differently."""
 
 
 @attrs.frozen
 class Cell:
-    """One run of the grid."""
+    """One run of the grid.
+
+    Attributes:
+        command: Commanded vx, vy (m/s) and wz (rad/s), body frame.
+        seed: Seed of sensor noise, terrain and drawn plants.
+    """
 
     command: tuple[float, float, float]
     seed: int
@@ -44,22 +55,36 @@ class Cell:
 
 @attrs.frozen
 class CellResult:
-    """What came of it; a robot that fell has nothing but that."""
+    """Figures of one run; a robot that fell has only its cell.
+
+    Attributes:
+        cell: The run.
+        segment: Command and mean velocity after the settling time; None if the robot fell.
+        jitter: Mean absolute second difference of the joint targets, rad.
+        cot: Cost of transport or of turning (Eq. 10); None if the robot does not follow.
+        estimator_mse: Mean square error of each estimator over the whole walk, (3,), (m/s)^2.
+        estimator_drift: Final dead reckoning error of each estimator, m.
+        path_length: Horizontal path length of the trunk, m.
+        delay_xy: Delay of the velocity along the command, s; None for slow commands.
+        delay_wz: Delay of the yaw rate, s; None for slow commands.
+    """
 
     cell: Cell
     segment: Segment | None = None
     jitter: float | None = None
     cot: float | None = None
-    estimator_mse: dict[str, Array] = attrs.Factory(dict)  # (3,) (m/s)^2, over the whole walk
-    estimator_drift: dict[str, float] = attrs.Factory(dict)  # m, at its end
-    way: float = 0.0  # m, that the trunk went
-    delay_xy: float | None = (
-        None  # s, from the velocity asked for to the robot's, along the command; None: too slow to tell
-    )
-    delay_wz: float | None = None  # s, the same of the yaw rate
+    estimator_mse: dict[str, Array] = attrs.Factory(dict)
+    estimator_drift: dict[str, float] = attrs.Factory(dict)
+    path_length: float = 0.0
+    delay_xy: float | None = None
+    delay_wz: float | None = None
 
     def to_json(self) -> dict[str, Any]:
-        """The entry of `eval.json`."""
+        """Convert the result to its entry in `eval.json`.
+
+        Returns:
+            Command, seed, mean velocity, errors and whether the robot fell.
+        """
         s = self.segment
         return {
             "command": rounded(self.cell.command),
@@ -71,29 +96,64 @@ class CellResult:
         }
 
 
-def cells(grid: str, seeds: int) -> list[Cell]:
-    """Every command of the grid with every seed 0, 1, ..."""
+def grid_cells(grid: str, seeds: int) -> list[Cell]:
+    """List every command of a grid with every seed.
+
+    Args:
+        grid: Key of GRIDS.
+        seeds: Number of seeds; they are 0, 1, ...
+
+    Returns:
+        Cells, seed by seed.
+    """
     vx, vy, wz = GRIDS[grid]
     commands = [(float(x), float(y), float(z)) for x in vx for y in vy for z in wz]
     return [Cell(command, seed) for seed in range(seeds) for command in commands]
 
 
-def run_cell(setup: Setup, cell: Cell, beside: Sequence[str] = ("learned", "kalman")) -> CellResult:
-    """One robot from standing through `DURATION` of one command, with the estimators `beside`."""
-    loop = make_loop(setup, cell.seed, beside)
-    walk = record(loop, [(cell.command, DURATION)])
-    return judge(walk, cell, mass(loop)) if walk else CellResult(cell)
+def run_cell(
+    setup: Setup, cell: Cell, shadow_estimators: Sequence[str] = ("learned", "kalman")
+) -> CellResult:
+    """Simulate one robot that follows one command from standing for COMMAND_DURATION_S.
+
+    Args:
+        setup: Robot, policy, estimator and ground.
+        cell: Command and seed.
+        shadow_estimators: Further estimators to measure; they do not influence the robot.
+
+    Returns:
+        The figures of the run.
+    """
+    loop = make_loop(setup, cell.seed, shadow_estimators)
+    walk = record_walk(loop, [(cell.command, COMMAND_DURATION_S)])
+    return evaluate_walk(walk, cell, robot_mass(loop)) if walk else CellResult(cell)
 
 
-def mass(loop: RobotLoop) -> float:
-    """Of the robot and its payload, kg."""
+def robot_mass(loop: RobotLoop) -> float:
+    """Return the mass of the robot with its payload.
+
+    Args:
+        loop: Loop whose simulator holds the robot.
+
+    Returns:
+        Mass, kg.
+    """
     return float(loop.simulator.model.body_subtreemass[1])
 
 
-def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
-    """The figures of a walk under `cell.command`; mass: of the robot, kg."""
-    segment = measure(walk.time, walk.velocity, cell.command, SETTLE, DURATION)
-    late = walk.time >= SETTLE
+def evaluate_walk(walk: Walk, cell: Cell, mass: float) -> CellResult:
+    """Compute the figures of a walk under one command.
+
+    Args:
+        walk: The recorded walk.
+        cell: Command and seed of the walk.
+        mass: Mass of robot and payload, kg.
+
+    Returns:
+        The figures; tracking, jitter and cost count from SETTLING_TIME_S on.
+    """
+    segment = measure_segment(walk.time, walk.velocity, cell.command, SETTLING_TIME_S, COMMAND_DURATION_S)
+    late = walk.time >= SETTLING_TIME_S
     return CellResult(
         cell,
         segment,
@@ -102,44 +162,65 @@ def judge(walk: Walk, cell: Cell, mass: float) -> CellResult:
         {name: np.square(error).mean(axis=0) for name, error in walk.estimate_errors.items()},
         walk.estimate_drifts,
         float(np.linalg.norm(np.diff(walk.position[:, :2], axis=0), axis=1).sum()),
-        *_delays(walk, np.asarray(cell.command)),
+        *_response_delays(walk, np.asarray(cell.command)),
     )
 
 
-def _delays(walk: Walk, command: Array) -> tuple[float | None, float | None]:
-    """Of the velocity along the command and of the yaw rate, s."""
+def _response_delays(walk: Walk, command: Array) -> tuple[float | None, float | None]:
+    """Delays (s) of the velocity along the command and of the yaw rate; None for slow commands."""
     speed, turn = float(np.hypot(*command[:2])), abs(command[2])
-    asked, found, xy, wz = walk.asked, walk.velocity, None, None
-    if speed >= LEAST_SPEED:
+    commanded, found, xy, wz = walk.commanded, walk.velocity, None, None
+    if speed >= MIN_SPEED_FOR_DELAY:
         ahead = command[:2] / speed
-        xy = response_delay(asked[:, :2] @ ahead, found[:, :2] @ ahead, PERIOD)
-    if turn >= LEAST_TURN:
-        wz = response_delay(asked[:, 2], found[:, 2], PERIOD)
+        xy = response_delay(commanded[:, :2] @ ahead, found[:, :2] @ ahead, CONTROL_PERIOD_S)
+    if turn >= MIN_YAW_RATE_FOR_DELAY:
+        wz = response_delay(commanded[:, 2], found[:, 2], CONTROL_PERIOD_S)
     return xy, wz
 
 
 def run_stance(setup: Setup, seed: int) -> float | None:
-    """Largest distance (m) from where the robot came to stand, in 10 s of standing; None where it fell.
+    """Measure the drift of a robot that stands for STANCE_DURATION_S after a short walk.
 
-    The policy stands all the while, after a short walk.
+    The policy controls the robot throughout.
+
+    Args:
+        setup: Robot, policy, estimator and ground.
+        seed: Seed of the run.
+
+    Returns:
+        Largest horizontal distance from the first position, m; None if the robot fell.
     """
     loop = make_loop(setup, seed)
-    if record(loop, STANCE_WALK) is None:
+    if record_walk(loop, WALK_BEFORE_STANCE) is None:
         return None
-    walk = record(loop, [((0.0, 0.0, 0.0), STANCE_SECONDS)])
-    return None if walk is None else drift(walk.position)
+    walk = record_walk(loop, [((0.0, 0.0, 0.0), STANCE_DURATION_S)])
+    return None if walk is None else max_displacement(walk.position)
 
 
-def drift(position: Array) -> float:
-    """Largest horizontal distance from the first of the positions (n, 3), m."""
+def max_displacement(position: Array) -> float:
+    """Return the largest horizontal distance from the first position.
+
+    Args:
+        position: Positions (n, 3), m.
+
+    Returns:
+        Distance, m.
+    """
     return float(np.linalg.norm(position[:, :2] - position[0, :2], axis=1).max())
 
 
 def summarise(results: Sequence[CellResult], drifts: Sequence[float | None]) -> dict[str, Any]:
-    """`eval.json` without the description of the run: cells in the order given, aggregates that are numbers.
+    """Summarise runs and stances as the content of `eval.json`, without the setup.
 
-    Aggregates are taken over the cells that did not fall. Where all did, the errors are those of a robot that
-    does not move, and jitter is zero. `cot` has one entry a cell, null where that has no number.
+    Aggregates cover the runs without a fall. If every robot fell, the errors are those of a
+    robot that does not move, and the jitter is zero.
+
+    Args:
+        results: Results of the runs, in the order of the file.
+        drifts: Drift of each stance, m; None for a fall.
+
+    Returns:
+        Cells and aggregates. `cot` has one entry per run, null if undefined.
     """
     stood = [r for r in results if r.segment is not None]
     segments = [r.segment for r in stood if r.segment is not None]
@@ -148,36 +229,39 @@ def summarise(results: Sequence[CellResult], drifts: Sequence[float | None]) -> 
         "schema": SCHEMA,
         "cells": [r.to_json() for r in results],
         **tracking_errors(segments or still),
-        "delay_xy": _mean([r.delay_xy for r in stood]),
-        "delay_wz": _mean([r.delay_wz for r in stood]),
+        "delay_xy": _mean_of_known([r.delay_xy for r in stood]),
+        "delay_wz": _mean_of_known([r.delay_wz for r in stood]),
         "falls": len(results) - len(stood),
         "jitter": rounded(np.mean([r.jitter for r in stood])) if stood else 0.0,
         "cot": [None if r.cot is None else rounded(r.cot) for r in results],
-        "stance": {"drift_10s_m": _largest(drifts)},
+        "stance": {"drift_10s_m": _largest_drift(drifts)},
         "estimator": _estimator_errors(stood),
     }
 
 
-def _mean(values: Sequence[float | None]) -> Any:
-    """Of those that are known, or None."""
+def _mean_of_known(values: Sequence[float | None]) -> Any:
+    """Mean of the known values, rounded; None without any."""
     known = [value for value in values if value is not None]
     return rounded(np.mean(known)) if known else None
 
 
-def _largest(drifts: Sequence[float | None]) -> Any:
-    """The largest, or None where a robot fell."""
+def _largest_drift(drifts: Sequence[float | None]) -> Any:
+    """Largest drift (m), rounded; None if a robot fell."""
     known = [drift for drift in drifts if drift is not None]
     return rounded(max(known)) if len(known) == len(drifts) else None
 
 
 def _estimator_errors(stood: Sequence[CellResult]) -> dict[str, Any]:
-    """Root mean square over all walks, m/s an axis (every walk has the same number of ticks); drift over way."""
+    """RMSE of each estimator over all walks (m/s per axis), and drift divided by path length.
+
+    Every walk has the same number of ticks, so that the mean of the mean squares is exact.
+    """
     names = stood[0].estimator_mse if stood else ()
-    way = sum(r.way for r in stood)
+    path_length = sum(r.path_length for r in stood)
     return {
         name: {
             "rmse": rounded(np.sqrt(np.mean([r.estimator_mse[name] for r in stood], axis=0))),
-            "drift": rounded(sum(r.estimator_drift[name] for r in stood) / way),
+            "drift": rounded(sum(r.estimator_drift[name] for r in stood) / path_length),
         }
         for name in names
     }
@@ -190,18 +274,26 @@ def evaluate(
     progress: Callable[[int, int], None] = lambda done, total: None,
     cluster: str | None = None,
 ) -> dict[str, Any]:
-    """Run the whole grid on all PLANTS as `pool.in_parallel` does; `progress` hears how many runs of how many are done.
+    """Run the whole grid on all PLANTS in parallel.
 
-    What comes of the usual plant, and under `second_plant` the same of the other one.
+    Args:
+        setup: Robot, policy, estimator and ground; its own plant fields override those of PLANTS.
+        grid: Key of GRIDS.
+        seeds: Number of seeds.
+        progress: Called with the number of finished runs and the number of all runs.
+        cluster: Address of a Dask scheduler; None for the cores of this machine.
+
+    Returns:
+        Summary of the usual plant, and under `second_plant` that of the second plant.
     """
-    todo = cells(grid, seeds)
+    todo = grid_cells(grid, seeds)
     calls: list[Call] = []
     for plant in PLANTS.values():
         there = attrs.evolve(setup, plant={**plant, **setup.plant})
         calls += [(run_cell, there, cell) for cell in todo]
         calls += [(run_stance, there, seed) for seed in range(seeds)]
     results: list[Any] = [None] * len(calls)
-    for done, (i, result) in enumerate(in_parallel(calls, cluster), start=1):
+    for done, (i, result) in enumerate(run_in_parallel(calls, cluster), start=1):
         results[i] = result
         progress(done, len(calls))
     usual, second = results[: len(calls) // 2], results[len(calls) // 2 :]

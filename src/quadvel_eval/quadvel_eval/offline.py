@@ -1,4 +1,4 @@
-"""`quadvel replay`: a recording through the actuator model and the velocity estimator, offline. What would they have said?"""
+"""Runs actuator model and velocity estimator offline on a recording (`quadvel replay`)."""
 
 from __future__ import annotations
 
@@ -26,31 +26,37 @@ from quadvel_nodes.number_text import number_text
 from quadvel_nodes.stall_free_clock import StallFreeClock
 from quadvel_recordings.reading import RecordingError, read_messages
 
-from .demo_figures import AXES
+from .demo_figures import AXIS_LABELS
 from .output import output_folder, replacing
 from .recording_plot import (
-    CommandTopic,
-    Recorded,
-    Run,
-    StateTopic,
+    CommandTopicOption,
+    RecordedRun,
+    RecordingArgument,
+    StateTopicOption,
     add_legend,
-    panels_over,
-    read_run,
-    warn_of,
+    read_recorded_run,
+    time_panels,
+    warning_printer,
 )
-from .replay import PAST, Joints, joints_of, modelled_torque, read_joints
+from .replay import HISTORY_MS, JointRecord, joints_from_log, modelled_torque, read_joints
 from .segments import rounded
 
 Array = NDArray[np.float64]
 
-SLOWEST = 0.005  # s, from one state to the next
-MEMORY = 0.5
-"""s from the beginning of a recording in which an estimator still lacks what it would remember of the time before"""
+MAX_STATE_PERIOD_S = 0.005
+WARM_UP_S = 0.5
+"""Start of a recording in which an estimator still lacks its history."""
 
 
 @attrs.frozen(eq=False)
-class Torques:
-    """What the drives measured and what the model says, (n, 12) N m, at `time` (n,) s, where states and their past are whole."""
+class TorqueComparison:
+    """Measured and modelled torques where states and their history are complete.
+
+    Attributes:
+        time: Times (n,), s.
+        measured: Measured torques (n, 12), N m.
+        modelled: Torques of the actuator model (n, 12), N m.
+    """
 
     time: Array
     measured: Array
@@ -58,25 +64,45 @@ class Torques:
 
     @property
     def errors(self) -> Array:
-        """RMS of measured minus modelled, (12,) N m."""
+        """RMS of measured minus modelled torque (12,), N m."""
         found: Array = np.sqrt(np.mean((self.measured - self.modelled) ** 2, axis=0))
         return found
 
 
-def torques(joints: Joints, actuator: ActuatorParameters) -> Torques:
-    """Raises ValueError where no row of the recording has its past."""
+def compare_torques(joints: JointRecord, actuator: ActuatorParameters) -> TorqueComparison:
+    """Compare measured torques with those of an actuator model.
+
+    Args:
+        joints: The recorded joints.
+        actuator: Parameters of the model.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        ValueError: The recording is shorter than the history of the model.
+    """
     modelled = modelled_torque(actuator, joints, 0, len(joints.time))
-    rows = joints.seen.copy()
-    rows[:PAST] = False
+    rows = joints.recorded.copy()
+    rows[:HISTORY_MS] = False
     if not rows.any():
-        raise ValueError(f"joints: found {len(rows)} ms of states, expected more than {PAST}")
-    return Torques(joints.time[rows], joints.tau[rows], modelled[rows])
+        raise ValueError(f"joints: found {len(rows)} ms of states, expected more than {HISTORY_MS}")
+    return TorqueComparison(joints.time[rows], joints.tau[rows], modelled[rows])
 
 
-def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple[Array, Array]:
-    """What `estimator` says of the recorded states and commands: times (n,), s, and velocities (n, 3), m/s, body frame.
+def run_estimator(path: Path, estimator: Estimator, use_receipt_times: bool = False) -> tuple[Array, Array]:
+    """Run a velocity estimator on recorded states and commands; unusable states are skipped.
 
-    States that it can't use are left out; with `received` the times of receipt count. Raises RecordingError where none can be used.
+    Args:
+        path: The recording.
+        estimator: The estimator.
+        use_receipt_times: Whether to use times of receipt instead of stamps.
+
+    Returns:
+        Times (n,), s, and velocities (n, 3), m/s, body frame.
+
+    Raises:
+        RecordingError: No state is usable.
     """
     tracker, clock = VelocityTracker(estimator), StallFreeClock()
     times, found = [], []
@@ -87,7 +113,7 @@ def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple
             continue
         try:
             state = read_low_state(message)
-            state.time = 1e-9 * receipt if received else state.time
+            state.time = 1e-9 * receipt if use_receipt_times else state.time
             stamp, state.time = state.time, clock.update(state.time, state.tick)
             estimate = tracker.process(state)
         except (MessageError, FloatingPointError):
@@ -100,116 +126,147 @@ def estimated(path: Path, estimator: Estimator, received: bool = False) -> tuple
     return np.array(times), np.array(found)
 
 
-def velocity_errors(run: Run, times: Array, found: Array) -> Mapping[str, Array]:
-    """RMS (2,) of vx and vy, m/s: of the velocities found minus what the robot's own estimator said, and minus the true ones, where
-    these were recorded. The first MEMORY of a longer recording is left out.
+def velocity_errors(run: RecordedRun, times: Array, found: Array) -> Mapping[str, Array]:
+    """Compare offline velocities with the recorded estimate and the truth, as far as recorded.
+
+    The first WARM_UP_S of a longer recording is left out.
+
+    Args:
+        run: The recorded run.
+        times: Times of the offline velocities (n,), s.
+        found: Offline velocities (n, 3), m/s.
+
+    Returns:
+        RMS differences of vx and vy (2,), m/s, by reference.
     """
     errors = {}
-    whole = np.searchsorted(times, times[0] + MEMORY) % len(times)  # 0: all of a short one
+    whole = np.searchsorted(times, times[0] + WARM_UP_S) % len(times)  # 0: keep all of a short recording
     times, found = times[whole:], found[whole:]
     for name, topic in (("recorded estimate", "/velocity_estimate"), ("truth", "/ground_truth/odom")):
-        if topic in run.lines:
-            time, value = run.lines[topic]
+        if topic in run.series:
+            time, value = run.series[topic]
             then = np.column_stack([np.interp(times - run.begin, time, axis) for axis in value.T])
             errors[name] = np.sqrt(np.mean((found[:, :2] - then[:, :2]) ** 2, axis=0))
     return errors
 
 
-def torque_figure(run: Run, said: Torques) -> Figure:
-    """Measured and modelled torque of each joint."""
-    figure, panels = panels_over(run, 4, 3, (13.0, 9.0))
+def torque_figure(run: RecordedRun, comparison: TorqueComparison) -> Figure:
+    """Plot measured and modelled torque of each joint.
+
+    Args:
+        run: The recorded run.
+        comparison: The comparison.
+
+    Returns:
+        The figure.
+    """
+    figure, panels = time_panels(run, 4, 3, (13.0, 9.0))
     for joint, panel in enumerate(panels.ravel()):
         for label, value, colour in (
-            ("measured", said.measured, "black"),
-            ("modelled", said.modelled, "tab:blue"),
+            ("measured", comparison.measured, "black"),
+            ("modelled", comparison.modelled, "tab:blue"),
         ):
-            panel.plot(said.time - run.begin, value[:, joint], color=colour, lw=0.5, label=label)
+            panel.plot(comparison.time - run.begin, value[:, joint], color=colour, lw=0.5, label=label)
         name = JOINT_NAMES[joint].removesuffix("_joint")
-        panel.set_title(f"{name}, N m: off by {said.errors[joint]:.2f}", fontsize="small", loc="left")
+        panel.set_title(f"{name}, N m: off by {comparison.errors[joint]:.2f}", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
-def velocity_figure(run: Run, times: Array, found: Array) -> Figure:
-    """Velocities found offline over those that were recorded."""
-    figure, panels = panels_over(run, 2, 1, (11.0, 5.0))
+def velocity_figure(run: RecordedRun, times: Array, found: Array) -> Figure:
+    """Plot offline and recorded velocities.
+
+    Args:
+        run: The recorded run.
+        times: Times of the offline velocities (n,), s.
+        found: Offline velocities (n, 3), m/s.
+
+    Returns:
+        The figure.
+    """
+    figure, panels = time_panels(run, 2, 1, (11.0, 5.0))
     recorded = {
         "/ground_truth/odom": ("true", "tab:blue"),
         "/velocity_estimate": ("recorded estimate", "tab:orange"),
     }
     for axis, panel in enumerate(panels[:, 0]):
         for topic, (label, colour) in recorded.items():
-            if topic in run.lines:
+            if topic in run.series:
                 panel.plot(
-                    run.lines[topic][0], run.lines[topic][1][:, axis], color=colour, lw=0.8, label=label
+                    run.series[topic][0], run.series[topic][1][:, axis], color=colour, lw=0.8, label=label
                 )
         panel.plot(times - run.begin, found[:, axis], color="black", lw=0.8, label="offline")
-        panel.set_ylabel(AXES[axis])
+        panel.set_ylabel(AXIS_LABELS[axis])
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
 def replay_command(
-    recording: Recorded,
+    recording: RecordingArgument,
     out: Annotated[
         Path, typer.Option(metavar="<folder>", help="Folder for replay.json and pictures.")
     ] = Path("out/replay"),
     actuator: Annotated[
-        Path | None, typer.Option(metavar="<file>", help="An actuator.yaml.", show_default="the shipped one")
+        Path | None,
+        typer.Option(
+            metavar="<file>", help="Actuator model, an actuator.yaml.", show_default="the shipped one"
+        ),
     ] = None,
-    estimator: Annotated[
-        Literal["learned", "kalman"], typer.Option(help="Which estimator of the velocity.")
-    ] = "learned",
+    estimator: Annotated[Literal["learned", "kalman"], typer.Option(help="Velocity estimator.")] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
     gains: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="<kp kd>",
-            help="Commanded gains, N m/rad and N m s/rad, of recordings that hold none.",
+            help="Commanded gains, N m/rad and N m s/rad, if the recording holds none.",
             show_default="none",
         ),
     ] = None,
-    state_topic: StateTopic = None,
-    command_topic: CommandTopic = None,
+    state_topic: StateTopicOption = None,
+    command_topic: CommandTopicOption = None,
 ) -> None:
-    """Ask the actuator model and the estimator offline what they say of a recording of low_state and low_cmd.
+    """Run actuator model and velocity estimator offline on a recording of low_state and low_cmd.
 
-    Of another robot's recording (sensor_msgs/JointState, unitree_go) the actuator model alone is asked.
+    For another robot (sensor_msgs/JointState, unitree_go) only the actuator model runs.
 
     \b
-    For example, whether a corrected model says more of a walk than the shipped one:
+    For example, to compare a corrected actuator model with the shipped one:
       quadvel replay walk.mcap --actuator out/identify/actuator.yaml
     To see a recording in 3-D: quadvel view walk.mcap
     """
     model = ActuatorParameters.default() if actuator is None else ActuatorParameters.load(actuator)
     asked = LearnedEstimator(estimator_file) if estimator == "learned" else KalmanEstimator()
     output_folder(out)
-    run = read_run(recording, state_topic, command_topic, warn_of(recording))
-    if run.foreign is None:
-        joints = read_joints(recording, SLOWEST, run.received)
+    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
+    if run.foreign_log is None:
+        joints = read_joints(recording, MAX_STATE_PERIOD_S, run.uses_receipt_times)
     else:
-        joints = joints_of(recording, run.foreign, SLOWEST, gains)
-    said = torques(joints, model)
-    pictures, errors = {"torque": torque_figure(run, said)}, dict[str, Array]()
-    if run.foreign is None:
-        times, found = estimated(recording, asked, run.received)
+        joints = joints_from_log(recording, run.foreign_log, MAX_STATE_PERIOD_S, gains)
+    comparison = compare_torques(joints, model)
+    pictures, errors = {"torque": torque_figure(run, comparison)}, dict[str, Array]()
+    if run.foreign_log is None:
+        times, found = run_estimator(recording, asked, run.uses_receipt_times)
         errors |= velocity_errors(run, times, found)
         pictures["velocity"] = velocity_figure(run, times, found)
-    _show(said, errors)
-    _write(out, said, errors, pictures)
+    _print_results(comparison, errors)
+    _write(out, comparison, errors, pictures)
 
 
-def _write(out: Path, said: Torques, errors: Mapping[str, Array], pictures: Mapping[str, Figure]) -> None:
-    """replay.json and the pictures."""
+def _write(
+    out: Path, comparison: TorqueComparison, errors: Mapping[str, Array], pictures: Mapping[str, Figure]
+) -> None:
+    """Write replay.json and the pictures."""
     result: dict[str, Any] = {
         "schema": 1,
         "torque_rms_nm": dict(
-            zip(JOINT_NAMES, map(rounded, np.sqrt((said.measured**2).mean(0)).tolist()), strict=True)
+            zip(JOINT_NAMES, map(rounded, np.sqrt((comparison.measured**2).mean(0)).tolist()), strict=True)
         ),
-        "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, said.errors.tolist()), strict=True)),
+        "torque_error_nm": dict(zip(JOINT_NAMES, map(rounded, comparison.errors.tolist()), strict=True)),
         "velocity_error": {name: [rounded(one) for one in error.tolist()] for name, error in errors.items()},
     }
     with replacing(out / "replay.json") as draft:
@@ -220,15 +277,16 @@ def _write(out: Path, said: Torques, errors: Mapping[str, Array], pictures: Mapp
     typer.echo(f"written: {out}/replay.json, {', '.join(f'{name}.png' for name in pictures)}")
 
 
-def _show(said: Torques, errors: Mapping[str, Array]) -> None:
+def _print_results(comparison: TorqueComparison, errors: Mapping[str, Array]) -> None:
+    """Print torque and velocity errors."""
     table = Table("torque, RMS in N m", "measured", "off by", title="actuator model on the recorded motion")
     for joint, name in enumerate(JOINT_NAMES):
-        rms = np.sqrt(np.mean(said.measured[:, joint] ** 2))
+        rms = np.sqrt(np.mean(comparison.measured[:, joint] ** 2))
         table.add_row(
-            name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(said.errors[joint], ".2f")
+            name.removesuffix("_joint"), number_text(rms, ".2f"), number_text(comparison.errors[joint], ".2f")
         )
     Console().print(table)
     for name, (x, y) in errors.items():
         typer.echo(
-            f"estimator, offline, beside the {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"
+            f"offline estimator minus {name}: RMS {number_text(x, '.3f')} m/s in vx, {number_text(y, '.3f')} in vy"
         )

@@ -1,4 +1,4 @@
-"""Where results go: places that are known to be writable before the work begins, and files that are replaced whole after it."""
+"""Writes output files atomically, and checks before the work that output paths are writable."""
 
 from __future__ import annotations
 
@@ -9,26 +9,39 @@ from pathlib import Path
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[Path]:
-    """`folder`, made with its parents where they are missing. Of those made here, the empty ones are removed after the block."""
+def created_folder(folder: Path) -> Iterator[Path]:
+    """Create a folder with its parents, and remove the new empty ones after the block.
+
+    Args:
+        folder: The folder.
+
+    Yields:
+        The same path.
+    """
     missing = [one for one in (folder, *folder.parents) if not one.exists()]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         yield folder
     finally:
         for one in missing:
-            with suppress(OSError):  # it holds something
+            with suppress(OSError):  # it is not empty
                 one.rmdir()
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """A file to write in `path`'s place, with its suffix; it takes the place only if the block succeeds.
+    """Write a file atomically: the draft replaces `path` only if the block succeeds.
 
-    The folder is made if it is missing, and removed again if the block fails.
+    A missing folder is created, and removed again if the block fails.
+
+    Args:
+        path: File to write.
+
+    Yields:
+        Path of the draft in the same folder, with the same suffix.
     """
-    draft = _draft(path)
-    with made(path.parent):
+    draft = _draft_path(path)
+    with created_folder(path.parent):
         try:
             yield draft
             draft.replace(path)
@@ -37,22 +50,36 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def output_folder(path: Path) -> Path:
-    """Check that files can be written to the folder `path`, which `replacing` makes if it is missing. Nothing is left of the check.
+    """Check that files can be written to a folder, without leaving a trace.
+
+    `replacing` creates a missing folder later.
+
+    Args:
+        path: The folder.
+
+    Returns:
+        The same path.
 
     Raises:
-        OSError: nothing can be written there; one sentence.
+        OSError: The folder is not writable; the message is one sentence.
     """
-    _check(path, Path("x"), path, "folder")
+    _check_writable(path, Path("x"), path, "folder")
     return path
 
 
 def output_file(path: Path) -> Path:
-    """Check that the file `path` can be written by `replacing`. Nothing is left of the check.
+    """Check that a file can be written by `replacing`, without leaving a trace.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The same path.
 
     Raises:
-        OSError: it cannot; one sentence.
+        OSError: The file is not writable; the message is one sentence.
     """
-    _check(path.parent, Path(path.name), path, "file")
+    _check_writable(path.parent, Path(path.name), path, "file")
     if path.is_dir():
         raise IsADirectoryError(f"{path}: is a folder, expected a file to write")
     if path.exists() and not path.is_file():
@@ -60,20 +87,24 @@ def output_file(path: Path) -> Path:
     return path
 
 
-def _check(folder: Path, name: Path, asked: Path, kind: str) -> None:
-    """Write a draft named after `name` in `folder`, or in its nearest parent that exists. asked, kind: what the error is about."""
+def _check_writable(folder: Path, name: Path, requested: Path, kind: str) -> None:
+    """Touch and delete a draft in `folder` or in its nearest existing parent.
+
+    `requested` and `kind` appear in the error message.
+    """
     try:
         nearest = next(one for one in (folder, *folder.absolute().parents) if one.exists())
         if not nearest.is_dir():
-            raise NotADirectoryError(f"{asked}: {nearest} is a file, expected a folder")
-        draft = _draft(nearest / name)
+            raise NotADirectoryError(f"{requested}: {nearest} is a file, expected a folder")
+        draft = _draft_path(nearest / name)
         draft.touch()
         draft.unlink()
     except OSError as error:
         if error.strerror is None:
             raise
-        raise type(error)(f"{asked}: the {kind} can't be written: {error.strerror}") from None
+        raise type(error)(f"{requested}: the {kind} can't be written: {error.strerror}") from None
 
 
-def _draft(path: Path) -> Path:
+def _draft_path(path: Path) -> Path:
+    """Hidden file next to `path`, with the same suffix."""
     return path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")

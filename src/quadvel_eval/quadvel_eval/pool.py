@@ -1,7 +1,4 @@
-"""Independent calls in parallel: over the cores of this machine, or over the workers of a Dask cluster.
-
-What is called and what is made of the answers is the caller's matter.
-"""
+"""Runs independent calls in parallel, on the cores of this machine or on a Dask cluster."""
 
 from __future__ import annotations
 
@@ -16,34 +13,41 @@ from multiprocessing import resource_tracker
 from typing import Any, TypeAlias
 
 Call: TypeAlias = tuple[Any, ...]
-"""a function that another process can import, and its arguments"""
+"""Function that another process can import, and its arguments."""
 
 
-def in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterator[tuple[int, Any]]:
-    """Number and answer of each call, as they are done.
+def run_in_parallel(calls: Sequence[Call], cluster: str | None = None) -> Iterator[tuple[int, Any]]:
+    """Run calls in parallel and yield each answer when it is ready.
 
-    cluster: the address of a Dask scheduler, whose workers see the same files as this machine; None for the
-    cores of this one. A KeyboardInterrupt ends it, and the calls under way on this machine.
+    A KeyboardInterrupt ends the iteration and the calls in progress on this machine.
+
+    Args:
+        calls: Each a function that another process can import, and its arguments.
+        cluster: Address of a Dask scheduler whose workers see the same files; None for the cores
+            of this machine.
+
+    Yields:
+        Index of a call and its answer.
     """
-    with _cores() if cluster is None else _dask(cluster) as submit:
-        with _without_windows(), _interrupts_held_back():
+    with _process_pool() if cluster is None else _dask_cluster(cluster) as submit:
+        with _without_display(), _interrupts_blocked():
             futures = {submit(*call): i for i, call in enumerate(calls)}
         for future in as_completed(futures):
             yield futures[future], future.result()
 
 
 @contextmanager
-def _cores() -> Iterator[Callable[..., Any]]:
-    """How to submit a call to a process on one of the cores that this one may use."""
+def _process_pool() -> Iterator[Callable[..., Any]]:
+    """Provide a function that submits a call to a process on one of the available cores."""
     context = multiprocessing.get_context("spawn")  # forking a process with threads is not safe
-    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_end_on_interrupt) as pool:
+    with ProcessPoolExecutor(len(os.sched_getaffinity(0)), context, initializer=_restore_interrupt) as pool:
         try:
             yield pool.submit
         except KeyboardInterrupt:
-            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second one must not cut the clean-up short
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # a second Ctrl-C must not interrupt the clean-up
             for (
                 worker
-            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not hear of it
+            ) in multiprocessing.active_children():  # those that started after Ctrl-C did not receive it
                 worker.terminate()
             raise
         finally:
@@ -51,8 +55,8 @@ def _cores() -> Iterator[Callable[..., Any]]:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[Callable[..., Any]]:
-    """How to submit a call to the cluster; calls that are left at the end are cancelled."""
+def _dask_cluster(address: str) -> Iterator[Callable[..., Any]]:
+    """Provide a function that submits a call to the cluster; cancel pending calls at the end."""
     try:
         from distributed import Client
     except ImportError:
@@ -63,11 +67,11 @@ def _dask(address: str) -> Iterator[Callable[..., Any]]:
 
 
 @contextmanager
-def _without_windows() -> Iterator[None]:
-    """Processes that are started in the block import MuJoCo without its windows.
+def _without_display() -> Iterator[None]:
+    """Set MUJOCO_GL to "disable" for processes that start in the block.
 
-    It looks for GLFW in a process of its own otherwise, which takes longer than the rest of the import, and writes
-    a traceback where Ctrl-C ends the worker meanwhile.
+    Otherwise MuJoCo probes GLFW in a child process. The probe takes longer than the rest of the
+    import, and prints a traceback if Ctrl-C ends the worker meanwhile.
     """
     before = os.environ.get("MUJOCO_GL")
     os.environ["MUJOCO_GL"] = "disable"
@@ -80,23 +84,24 @@ def _without_windows() -> Iterator[None]:
 
 
 @contextmanager
-def _interrupts_held_back() -> Iterator[None]:
-    """SIGINT waits until the end of the block, and in processes that are started in it until they allow it.
+def _interrupts_blocked() -> Iterator[None]:
+    """Block SIGINT until the end of the block, also in processes that start in it.
 
-    Ctrl-C reaches the whole group, and a worker that is hit while it still imports would write a traceback.
+    Ctrl-C reaches the whole process group. A worker that receives it during its imports would
+    print a traceback. Workers unblock SIGINT in `_restore_interrupt`.
     """
-    resource_tracker.ensure_running()  # it is started with the workers otherwise, and then lets signals through
+    resource_tracker.ensure_running()  # otherwise it starts with the workers and unblocks signals
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     except (BrokenPipeError, BrokenProcessPool):
-        if signal.SIGINT not in signal.sigpending():  # otherwise a worker heard of it first, and is gone
+        if signal.SIGINT not in signal.sigpending():  # pending: a worker received it first and ended
             raise
     finally:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-def _end_on_interrupt() -> None:
-    """In a worker: SIGINT ends it at once and without a word."""
+def _restore_interrupt() -> None:
+    """Let SIGINT end this worker immediately and silently."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})

@@ -1,6 +1,6 @@
-"""A recorded walk of the nodes, as arrays: what `summary.json`, plots and video are made from.
+"""Reads a recorded run of the nodes into arrays, for `summary.json`, figures and video.
 
-Reads the MCAP file that `quadvel record` and the demo write. Times are s on the system clock.
+The input is an MCAP file of `quadvel record` or of the demo. Times are s on the system clock.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from quadvel_recordings.reading import read_messages
 
 Array = NDArray[np.float64]
 
-SIMULATIONS = ("sim_node", "board")  # who says how well real time was kept
+SIMULATOR_NODES = ("sim_node", "board")  # nodes that report the realtime factor
 TOPICS = (
     "/cmd_vel",
     "/command",
@@ -35,39 +35,65 @@ TOPICS = (
 
 @attrs.frozen(eq=False)
 class Series:
-    """Values (n, k) at the times (n,), s."""
+    """Values (n, k) at times (n,), s."""
 
     time: Array
     value: Array
 
-    def at(self, time: Array) -> Array:
-        """The newest value at each of the times (m,), or the first one: (m, k)."""
+    def latest_at(self, time: Array) -> Array:
+        """Return the newest value at each time (zero-order hold).
+
+        Args:
+            time: Times (m,), s.
+
+        Returns:
+            Values (m, k); the first value before its time.
+        """
         return self.value[np.maximum(np.searchsorted(self.time, time, side="right") - 1, 0)]
 
 
 @attrs.frozen(eq=False)
-class Loop:
-    """What the controller said about itself, at the times (n,)."""
+class ControllerTrace:
+    """Reports of the controller.
+
+    Attributes:
+        time: Times (n,), s.
+        mode: Names of the modes.
+        figures: LOOP_FIGURES of quadvel_msgs/ControllerState.
+    """
 
     time: Array
     mode: list[str]
-    figures: list[dict[str, float]]  # as in quadvel_msgs/ControllerState
+    figures: list[dict[str, float]]
 
 
 @attrs.frozen(eq=False)
 class Recording:
-    """One run of the nodes."""
+    """One run of the nodes.
 
-    planned: Series  # vx, vy, wz that the planner sent, when it came
-    commanded: Series  # vx, vy, wz that the mux passed on
-    position: Series  # m, trunk, world
-    quaternion: Series  # w, x, y, z
-    velocity: Series  # vx, vy, vz, wx, wy, wz, true, body frame
-    estimate: Series  # vx, vy, vz
-    joints: Series  # q (12,) rad
-    loop: Loop
-    answer_time: Series  # from the instant of a state to the command that answers it, s
-    realtime_factor: Series  # of the simulator, once a second
+    Attributes:
+        planned: vx, vy (m/s), wz (rad/s) of the planner, by time of receipt.
+        commanded: vx, vy (m/s), wz (rad/s) after the mux.
+        position: Position of the trunk (n, 3), m, world frame.
+        quaternion: Orientation of the trunk (n, 4), w, x, y, z.
+        velocity: True vx, vy, vz (m/s), wx, wy, wz (rad/s), body frame, (n, 6).
+        estimate: Estimated vx, vy, vz (n, 3), m/s.
+        joints: Joint angles (n, 12), rad.
+        loop: Reports of the controller.
+        answer_time: Time from a state to the command that answers it (n, 1), s.
+        realtime_factor: Realtime factor of the simulator (n, 1), once a second.
+    """
+
+    planned: Series
+    commanded: Series
+    position: Series
+    quaternion: Series
+    velocity: Series
+    estimate: Series
+    joints: Series
+    loop: ControllerTrace
+    answer_time: Series
+    realtime_factor: Series
 
 
 LOOP_FIGURES = (
@@ -81,7 +107,17 @@ LOOP_FIGURES = (
 
 
 def read_recording(path: Path) -> Recording:
-    """Raises ValueError, one sentence, where a topic that is needed was not recorded."""
+    """Read a recording.
+
+    Args:
+        path: MCAP file.
+
+    Returns:
+        The arrays.
+
+    Raises:
+        ValueError: A required topic is missing.
+    """
     messages: dict[str, list[tuple[float, Any]]] = defaultdict(list)
     for topic, arrival, message in read_messages(path, lambda topic, _: topic in TOPICS):
         messages[topic].append((1e-9 * arrival, message))
@@ -100,7 +136,7 @@ def read_recording(path: Path) -> Recording:
         loop=_loop([message for _, message in messages["/controller/state"]]),
         answer_time=_answer_time(messages["/low_state"], messages["/low_cmd"]),
         realtime_factor=_by_arrival(
-            [entry for entry in messages["/diagnostics"] if entry[1].status[0].name in SIMULATIONS],
+            [entry for entry in messages["/diagnostics"] if entry[1].status[0].name in SIMULATOR_NODES],
             lambda m: [float(next(v.value for v in m.status[0].values if v.key == "realtime_factor"))],
         ),
     )
@@ -111,20 +147,24 @@ def _by_stamp(
     value: Callable[[Any], Any],
     stamp: Callable[[Any], Any] = lambda message: message.header.stamp,
 ) -> Series:
+    """Series of values at the stamps of the messages."""
     return _series([(seconds(stamp(message)), value(message)) for _, message in entries])
 
 
 def _by_arrival(entries: Iterable[tuple[float, Any]], value: Callable[[Any], Any]) -> Series:
+    """Series of values at the times of receipt."""
     return _series([(time, value(message)) for time, message in entries])
 
 
 def _series(pairs: list[tuple[float, Any]]) -> Series:
+    """Series of pairs of time and value, sorted by time."""
     pairs.sort(key=lambda pair: pair[0])
     return Series(np.array([time for time, _ in pairs]), np.array([value for _, value in pairs], float))
 
 
-def _loop(messages: list[Any]) -> Loop:
-    return Loop(
+def _loop(messages: list[Any]) -> ControllerTrace:
+    """Trace of the controller's reports."""
+    return ControllerTrace(
         np.array([seconds(m.stamp) for m in messages]),
         [m.mode_name for m in messages],
         [{name: float(getattr(m, name)) for name in LOOP_FIGURES} for m in messages],
@@ -132,15 +172,24 @@ def _loop(messages: list[Any]) -> Loop:
 
 
 def _answer_time(states: list[tuple[float, Any]], commands: list[tuple[float, Any]]) -> Series:
-    held = {message.tick: seconds(message.stamp) for _, message in states}
-    sent = [(held[m.tick], seconds(m.stamp)) for _, m in commands if m.tick in held]
+    """Time from each state to its command, matched by tick."""
+    state_times = {message.tick: seconds(message.stamp) for _, message in states}
+    sent = [(state_times[m.tick], seconds(m.stamp)) for _, m in commands if m.tick in state_times]
     return _series([(state, [command - state]) for state, command in sent])
 
 
 def _xyz(vector: Any) -> list[float]:
+    """Components of a vector message."""
     return [vector.x, vector.y, vector.z]
 
 
 def planar(twist: Any) -> list[float]:
-    """vx, vy (m/s), wz (rad/s) of a geometry_msgs/Twist."""
+    """Return the planar velocity of a twist.
+
+    Args:
+        twist: A geometry_msgs/Twist.
+
+    Returns:
+        vx, vy (m/s), wz (rad/s).
+    """
     return [twist.linear.x, twist.linear.y, twist.angular.z]

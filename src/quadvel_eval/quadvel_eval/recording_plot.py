@@ -1,6 +1,7 @@
-"""`quadvel plot`: what was recorded of a run, as pictures of velocity, joints, torques and the controller's loop.
+"""Plots velocity, joints, torques and controller loop of a recording (`quadvel plot`).
 
-Of each topic what there is: a recording of a real robot knows no true velocity, one of the joints alone no velocity at all.
+Each plot appears only if its topics were recorded. A recording of a real robot has no true
+velocity; a recording of joints alone has no velocity at all.
 """
 
 from __future__ import annotations
@@ -23,15 +24,19 @@ from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.reading import RecordingError, read_messages
 from quadvel_recordings.stamps import stamp_of, unstamped
 
-from .demo_figures import AXES
+from .demo_figures import AXIS_LABELS
 from .output import output_folder, replacing
 from .recording import planar
 
 Array = NDArray[np.float64]
 
-POINTS = 4000  # of a line at most: more are not seen
-LOOP = {"rate_hz": "rate, Hz", "compute_p99_us": "computing, 99 %, us", "overruns": "deadlines missed"}
-SHADES = {
+MAX_POINTS_PER_LINE = 4000  # more are invisible
+LOOP_QUANTITIES = {
+    "rate_hz": "rate, Hz",
+    "compute_p99_us": "computing, 99 %, us",
+    "overruns": "deadlines missed",
+}
+MODE_COLOURS = {
     "fault": "tab:red",
     "walk": "tab:green",
     "stance": "tab:blue",
@@ -41,126 +46,144 @@ SHADES = {
 
 
 def _joints(message: Any) -> list[float]:
+    """Angles, then torques of a LowState."""
     return [*message.q, *message.tau]
 
 
 @attrs.frozen
-class _Kind:
-    """How a topic is read: the type of its messages, and their numbers."""
+class _TopicReader:
+    """How to read a topic: message type, and function from a message to numbers."""
 
     typename: str
     numbers: Callable[[Any], Any]
 
 
-KINDS: Mapping[str, _Kind] = {
-    "/command": _Kind("quadvel_msgs/msg/VelocityCommand", lambda m: planar(m.twist)),
-    "/velocity_estimate": _Kind(
+TOPIC_READERS: Mapping[str, _TopicReader] = {
+    "/command": _TopicReader("quadvel_msgs/msg/VelocityCommand", lambda m: planar(m.twist)),
+    "/velocity_estimate": _TopicReader(
         "geometry_msgs/msg/TwistWithCovarianceStamped", lambda m: planar(m.twist.twist)
     ),
-    "/ground_truth/odom": _Kind("nav_msgs/msg/Odometry", lambda m: planar(m.twist.twist)),
-    "/low_state": _Kind("quadvel_msgs/msg/LowState", _joints),
-    "/low_cmd": _Kind("quadvel_msgs/msg/LowCmd", lambda m: list(m.q)),
-    "/controller/state": _Kind(
-        "quadvel_msgs/msg/ControllerState", lambda m: [getattr(m, name) for name in LOOP]
+    "/ground_truth/odom": _TopicReader("nav_msgs/msg/Odometry", lambda m: planar(m.twist.twist)),
+    "/low_state": _TopicReader("quadvel_msgs/msg/LowState", _joints),
+    "/low_cmd": _TopicReader("quadvel_msgs/msg/LowCmd", lambda m: list(m.q)),
+    "/controller/state": _TopicReader(
+        "quadvel_msgs/msg/ControllerState", lambda m: [getattr(m, name) for name in LOOP_QUANTITIES]
     ),
 }
 
 
 @attrs.frozen(eq=False)
-class Run:
-    """begin: s, on the clock of the stamps, of the first of all; lines: of each topic that was recorded, times (n,), s since then,
-    and numbers (n, k); modes: the controller's in their order, each with its beginning, s; ends: s. joints: whose angles and then
-    torques are the numbers of low_state. received: times of receipt count, as stamps are missing. foreign: what the lines of the
-    joints are made of where they are no low_state of this stack.
+class RecordedRun:
+    """Series of a recorded run.
+
+    Attributes:
+        begin: First stamp of all topics, s.
+        series: Times since `begin` (n,), s, and values (n, k) of each recorded topic.
+        modes: Start (s) and name of each mode of the controller, in order.
+        end: Last time of all topics, s since `begin`.
+        joints: Joints whose angles, then torques, are the values of low_state.
+        uses_receipt_times: Whether times of receipt replace missing stamps.
+        foreign_log: Joint log of another robot, if the joints come from one.
     """
 
     begin: float
-    lines: Mapping[str, tuple[Array, Array]]
+    series: Mapping[str, tuple[Array, Array]]
     modes: list[tuple[float, str]]
-    ends: float
+    end: float
     joints: Sequence[str] = JOINT_NAMES
-    received: bool = False
-    foreign: JointLog | None = None
+    uses_receipt_times: bool = False
+    foreign_log: JointLog | None = None
 
 
 @attrs.define
 class _Topic:
-    """Stamps and times of receipt, ns, and numbers of one topic."""
+    """Stamps and times of receipt (ns), and values of one topic."""
 
     stamps: list[int] = attrs.field(factory=list)
     receipts: list[int] = attrs.field(factory=list)
     numbers: list[list[float]] = attrs.field(factory=list)
     modes: list[str] = attrs.field(factory=list)
 
-    def times(self, received: bool) -> Array:
-        """s, on the clock that counts."""
+    def clock(self, received: bool) -> Array:
+        """Return the times of the messages.
+
+        Args:
+            received: Whether to use times of receipt instead of stamps.
+
+        Returns:
+            Times (n,), s.
+        """
         return np.asarray(1e-9 * np.array(self.receipts if received else self.stamps, np.int64), np.float64)
 
 
-def read_run(
+def read_recorded_run(
     path: Path,
     state_topic: str | None = None,
     command_topic: str | None = None,
-    tell: Callable[[str], None] | None = None,
-) -> Run:
-    """What a recording holds, of this stack or of joints of any robot.
+    warn: Callable[[str], None] | None = None,
+) -> RecordedRun:
+    """Read a recording of this stack, or of the joints of any robot.
 
     Args:
-        path: the recording.
-        state_topic: topic of the joints' states, where it is not low_state.
-        command_topic: topic of their commands, likewise.
-        tell: called with a sentence for what had to be assumed.
+        path: The recording.
+        state_topic: Topic of the joint states, if it is not low_state.
+        command_topic: Topic of the joint commands, if it is not low_cmd.
+        warn: Called with one sentence for each assumption.
+
+    Returns:
+        The series of the run.
 
     Raises:
-        RecordingError: nothing that can be drawn was recorded; the sentence names the topics that are there.
+        RecordingError: The recording holds nothing to plot; the message names its topics.
     """
-    rows = _read_topics(path, tell)
+    rows = _read_topics(path, warn)
     missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
-    if tell:
+    if warn:
         for sentence in missing:
-            tell(sentence)
+            warn(sentence)
     received = bool(missing)
-    lines = {topic: (found.times(received), np.array(found.numbers, float)) for topic, found in rows.items()}
+    lines = {topic: (found.clock(received), np.array(found.numbers, float)) for topic, found in rows.items()}
     foreign = None
     if "/low_state" not in rows or state_topic or command_topic:
-        foreign = _foreign(path, state_topic, command_topic, tell, rows != {})
-        lines |= _lines_of(foreign) if foreign else {}
+        foreign = _read_foreign_log(path, state_topic, command_topic, warn, rows != {})
+        lines |= _series_of_log(foreign) if foreign else {}
     begin = min(float(times[0]) for times, _ in lines.values())
-    lines = {topic: _thinned(times - begin, numbers) for topic, (times, numbers) in lines.items()}
+    lines = {topic: _decimate(times - begin, numbers) for topic, (times, numbers) in lines.items()}
     loop = rows.get("/controller/state", _Topic())
     changes = [k for k, mode in enumerate(loop.modes) if not k or loop.modes[k - 1] != mode]
-    modes = [(float(loop.times(received)[k]) - begin, loop.modes[k]) for k in changes]
+    modes = [(float(loop.clock(received)[k]) - begin, loop.modes[k]) for k in changes]
     ends = max(float(times[-1]) for times, _ in lines.values())
     joints = foreign.state.joints if foreign else JOINT_NAMES
-    return Run(begin, lines, modes, ends, joints, received, foreign)
+    return RecordedRun(begin, lines, modes, ends, joints, received, foreign)
 
 
-def _read_topics(path: Path, tell: Callable[[str], None] | None) -> dict[str, _Topic]:
+def _read_topics(path: Path, warn: Callable[[str], None] | None) -> dict[str, _Topic]:
+    """Read stamps and values of all topics of TOPIC_READERS."""
     rows: dict[str, _Topic] = defaultdict(_Topic)
-    known = {topic: kind.typename for topic, kind in KINDS.items()}
-    for topic, receipt, message in read_messages(path, lambda topic, kind: known.get(topic) == kind, tell):
+    known = {topic: kind.typename for topic, kind in TOPIC_READERS.items()}
+    for topic, receipt, message in read_messages(path, lambda topic, kind: known.get(topic) == kind, warn):
         rows[topic].stamps.append(stamp_of(message) or 0)
         rows[topic].receipts.append(receipt)
-        rows[topic].numbers.append(KINDS[topic].numbers(message))
+        rows[topic].numbers.append(TOPIC_READERS[topic].numbers(message))
         if topic == "/controller/state":
             rows[topic].modes.append(message.mode_name)
     return dict(rows)
 
 
-def _foreign(
-    path: Path, state: str | None, command: str | None, tell: Callable[[str], None] | None, others: bool
+def _read_foreign_log(
+    path: Path, state: str | None, command: str | None, warn: Callable[[str], None] | None, others: bool
 ) -> JointLog | None:
-    """The joints of another robot, or None where other things can be drawn. Raises RecordingError."""
+    """Joint log of another robot; None if there are other series to plot. Raises RecordingError."""
     try:
-        return read_joint_log(path, state, command, tell)
+        return read_joint_log(path, state, command, warn)
     except RecordingError:
         if others and not (state or command):
             return None
         raise
 
 
-def _lines_of(log: JointLog) -> dict[str, tuple[Array, Array]]:
-    """Its lines as if they were low_state and low_cmd, of the joints that are measured; NaN for what is not there."""
+def _series_of_log(log: JointLog) -> dict[str, tuple[Array, Array]]:
+    """Series of a joint log under the names low_state and low_cmd, with NaN for missing values."""
     begin, joints = 1e-9 * log.begin, log.state.joints
     none = np.full((len(log.state.time), len(joints)), np.nan)
     numbers = np.hstack([log.state.values.get("q", none), log.state.values.get("tau", none)])
@@ -174,55 +197,76 @@ def _lines_of(log: JointLog) -> dict[str, tuple[Array, Array]]:
     return lines
 
 
-def _thinned(times: Array, numbers: Array) -> tuple[Array, Array]:
-    """At most about POINTS of a line."""
-    every = max(1, len(times) // POINTS)
+def _decimate(times: Array, numbers: Array) -> tuple[Array, Array]:
+    """Keep at most about MAX_POINTS_PER_LINE points of a series."""
+    every = max(1, len(times) // MAX_POINTS_PER_LINE)
     return times[::every], numbers[::every]
 
 
-def velocity_figure(run: Run) -> Figure | None:
-    """Commanded, estimated and, where it is known, true velocity; None without any of them."""
+def velocity_figure(run: RecordedRun) -> Figure | None:
+    """Plot commanded, estimated and true velocity, as far as recorded.
+
+    Args:
+        run: The run.
+
+    Returns:
+        Figure; None if no velocity was recorded.
+    """
     names = {"/command": ("commanded", "black"), "/velocity_estimate": ("estimated", "tab:orange")}
     names["/ground_truth/odom"] = ("true", "tab:blue")
-    there = [topic for topic in names if topic in run.lines]
+    there = [topic for topic in names if topic in run.series]
     if not there:
         return None
-    figure, panels = panels_over(run, 3, 1, (11.0, 7.0))
+    figure, panels = time_panels(run, 3, 1, (11.0, 7.0))
     for axis, panel in enumerate(panels[:, 0]):
         for topic in reversed(there):
             label, colour = names[topic]
-            time, value = run.lines[topic]
+            time, value = run.series[topic]
             panel.plot(time, value[:, axis], color=colour, lw=0.8, label=label)
-        panel.set_ylabel(AXES[axis])
+        panel.set_ylabel(AXIS_LABELS[axis])
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
-def joints_figure(run: Run) -> Figure | None:
-    """Angle of each joint and where it was sent; None without low_state."""
-    if "/low_state" not in run.lines:
+def joints_figure(run: RecordedRun) -> Figure | None:
+    """Plot measured angle and target of each joint.
+
+    Args:
+        run: The run.
+
+    Returns:
+        Figure; None without low_state.
+    """
+    if "/low_state" not in run.series:
         return None
-    figure, panels = panels_of_joints(run)
+    figure, panels = joint_panels(run)
     for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
-        if "/low_cmd" in run.lines:
-            time, targets = run.lines["/low_cmd"]
+        if "/low_cmd" in run.series:
+            time, targets = run.series["/low_cmd"]
             panel.plot(time, targets[:, joint], color="black", lw=0.6, label="target")
-        time, numbers = run.lines["/low_state"]
+        time, numbers = run.series["/low_state"]
         panel.plot(time, numbers[:, joint], color="tab:blue", lw=0.6, label="measured")
         panel.set_title(f"{name.removesuffix('_joint')}, rad", fontsize="small", loc="left")
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
-def torques_figure(run: Run) -> Figure | None:
-    """Torque of each joint, of this stack's robot between its limits; None where none was measured."""
-    time, numbers = run.lines.get("/low_state", (None, np.empty(0)))
+def torques_figure(run: RecordedRun) -> Figure | None:
+    """Plot the torque of each joint, with limits for this stack's robot.
+
+    Args:
+        run: The run.
+
+    Returns:
+        Figure; None if no torque was measured.
+    """
+    time, numbers = run.series.get("/low_state", (None, np.empty(0)))
     if np.isnan(numbers[..., len(run.joints) :]).all():
         return None
-    figure, panels = panels_of_joints(run)
+    figure, panels = joint_panels(run)
     for joint, (name, panel) in enumerate(zip(run.joints, panels.ravel(), strict=False)):
         panel.plot(time, numbers[:, len(run.joints) + joint], color="tab:blue", lw=0.6, label="measured")
-        if run.foreign is None:
+        if run.foreign_log is None:
             panel.axhline(TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--", label="limit")
             panel.axhline(-TORQUE_LIMIT[joint], color="tab:red", lw=0.8, ls="--")
         panel.set_title(f"{name.removesuffix('_joint')}, N m", fontsize="small", loc="left")
@@ -230,20 +274,27 @@ def torques_figure(run: Run) -> Figure | None:
     return figure
 
 
-def loop_figure(run: Run) -> Figure | None:
-    """What the controller said of its loop; None where it said nothing."""
-    if "/controller/state" not in run.lines:
+def loop_figure(run: RecordedRun) -> Figure | None:
+    """Plot rate, computing time and missed deadlines of the controller.
+
+    Args:
+        run: The run.
+
+    Returns:
+        Figure; None if the controller's state was not recorded.
+    """
+    if "/controller/state" not in run.series:
         return None
-    figure, panels = panels_over(run, len(LOOP), 1, (11.0, 6.0))
-    time, numbers = run.lines["/controller/state"]
-    for column, (panel, name) in enumerate(zip(panels[:, 0], LOOP.values(), strict=True)):
+    figure, panels = time_panels(run, len(LOOP_QUANTITIES), 1, (11.0, 6.0))
+    time, numbers = run.series["/controller/state"]
+    for column, (panel, name) in enumerate(zip(panels[:, 0], LOOP_QUANTITIES.values(), strict=True)):
         panel.plot(time, numbers[:, column], color="tab:blue", lw=1.0)
         panel.set_ylabel(name)
     add_legend(figure, run, panels[0, 0])
     return figure
 
 
-FIGURES: Mapping[str, Callable[[Run], Figure | None]] = {
+FIGURES: Mapping[str, Callable[[RecordedRun], Figure | None]] = {
     "velocity": velocity_figure,
     "joints": joints_figure,
     "torques": torques_figure,
@@ -251,74 +302,109 @@ FIGURES: Mapping[str, Callable[[Run], Figure | None]] = {
 }
 
 
-def panels_over(run: Run, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
-    """A figure with panels over the run's time, shaded by the controller's mode."""
+def time_panels(run: RecordedRun, rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, Any]:
+    """Create a figure with panels over the time of a run, shaded by the controller's mode.
+
+    Args:
+        run: The run.
+        rows: Rows of panels.
+        columns: Columns of panels.
+        size: Width and height, inches.
+
+    Returns:
+        Figure and panels (rows, columns).
+    """
     figure = Figure(figsize=size, layout="constrained")
     panels = figure.subplots(rows, columns, sharex=True, squeeze=False)
     for panel in panels.ravel():
         panel.grid(alpha=0.3)
-        panel.set_xlim(0.0, max(run.ends, 1e-3))
-        for (begin, mode), (end, _) in pairwise([*run.modes, (run.ends, "")]):
-            panel.axvspan(begin, end, color=_shade(mode), alpha=0.08, lw=0.0)
+        panel.set_xlim(0.0, max(run.end, 1e-3))
+        for (begin, mode), (end, _) in pairwise([*run.modes, (run.end, "")]):
+            panel.axvspan(begin, end, color=_mode_colour(mode), alpha=0.08, lw=0.0)
     for panel in panels[-1]:
         panel.set_xlabel("time, s")
     return figure, panels
 
 
-def panels_of_joints(run: Run) -> tuple[Figure, Any]:
-    """The same with a panel for each joint, three in a row as a leg has."""
-    return panels_over(run, max(1, -(-len(run.joints) // 3)), 3, (13.0, max(3.0, 0.75 * len(run.joints))))
+def joint_panels(run: RecordedRun) -> tuple[Figure, Any]:
+    """Create a figure with one panel per joint, three per row, one row per leg.
+
+    Args:
+        run: The run.
+
+    Returns:
+        Figure and panels (rows, 3).
+    """
+    return time_panels(run, max(1, -(-len(run.joints) // 3)), 3, (13.0, max(3.0, 0.75 * len(run.joints))))
 
 
-def add_legend(figure: Figure, run: Run, panel: Any) -> None:
-    """Above the panels: what the lines of `panel` are, and which colour is which mode."""
+def add_legend(figure: Figure, run: RecordedRun, panel: Any) -> None:
+    """Add a legend of lines and mode colours above the panels.
+
+    Args:
+        figure: The figure.
+        run: The run, for its modes.
+        panel: Panel whose lines the legend explains.
+    """
     lines = panel.get_legend_handles_labels()[0]
     modes = dict.fromkeys(mode for _, mode in run.modes)
-    shades = [Patch(color=_shade(mode), alpha=0.3, label=mode.replace("_", " ")) for mode in modes]
+    shades = [Patch(color=_mode_colour(mode), alpha=0.3, label=mode.replace("_", " ")) for mode in modes]
     figure.legend(
         handles=[*lines, *shades], loc="outside upper left", ncols=len(lines) + len(shades), frameon=False
     )
 
 
-def _shade(mode: str) -> str:
-    return SHADES.get(mode, "grey")
+def _mode_colour(mode: str) -> str:
+    """Colour of a mode."""
+    return MODE_COLOURS.get(mode, "grey")
 
 
-Recorded = Annotated[
+RecordingArgument = Annotated[
     Path, typer.Argument(help="An MCAP file, a rosbag2 folder or a bag of ROS 1.", show_default=False)
 ]
-StateTopic = Annotated[
-    str | None, typer.Option(metavar="<topic>", help="States of the joints.", show_default="found by type")
-]
-CommandTopic = Annotated[
+StateTopicOption = Annotated[
     str | None,
-    typer.Option(metavar="<topic>", help="Commands of the joints.", show_default="found by type and name"),
+    typer.Option(metavar="<topic>", help="Topic of the joint states.", show_default="found by type"),
+]
+CommandTopicOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="<topic>", help="Topic of the joint commands.", show_default="found by type and name"
+    ),
 ]
 
 
-def warn_of(recording: Path) -> Callable[[str], None]:
-    """Print a sentence about a recording as a warning that names its file."""
+def warning_printer(recording: Path) -> Callable[[str], None]:
+    """Return a function that prints a warning with the name of a recording.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        Function of one sentence.
+    """
     return lambda text: typer.echo(f"quadvel: warning: {recording}: {text}", err=True)
 
 
 def plot_command(
-    recording: Recorded,
+    recording: RecordingArgument,
     out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the pictures.")] = Path(
         "out/plot"
     ),
-    state_topic: StateTopic = None,
-    command_topic: CommandTopic = None,
+    state_topic: StateTopicOption = None,
+    command_topic: CommandTopicOption = None,
 ) -> None:
-    """Draw what was recorded of a run: velocity, joints, torques, the controller's loop.
+    """Draw a recorded run: velocity, joints, torques and controller loop.
 
-    Of another robot its joints: sensor_msgs/JointState, or unitree_go LowState and LowCmd. Colours show the controller's mode.
+    For another robot it draws the joints: sensor_msgs/JointState, or unitree_go LowState and
+    LowCmd. Colours show the controller's mode.
     """
     output_folder(out)
-    run = read_run(recording, state_topic, command_topic, warn_of(recording))
+    run = read_recorded_run(recording, state_topic, command_topic, warning_printer(recording))
     for name, draw in FIGURES.items():
         figure = draw(run)
         if figure is None:
-            typer.echo(f"no {name}.png: nothing was recorded for it")
+            typer.echo(f"no {name}.png: its topics were not recorded")
             continue
         with replacing(out / f"{name}.png") as draft:
             figure.savefig(draft, dpi=110)

@@ -1,7 +1,7 @@
-"""How well a model of the robot repeats a recorded run: open loop over short stretches, and in its velocity tracking.
+"""Measures how well a model of the robot repeats a recorded run, in open loop and in tracking.
 
-Arrays of a recording in, errors out. Over longer stretches open loop says little: a walking robot is unstable, and
-any two drift apart.
+Open loop covers short stretches only. A walking robot is unstable, so that any two runs diverge
+over longer stretches.
 """
 
 from __future__ import annotations
@@ -28,220 +28,300 @@ from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
 
 from .recording import Recording
-from .robot_loop import PERIOD, RobotLoop, make_estimator
-from .segments import SETTLE, Segment, measure
+from .robot_loop import CONTROL_PERIOD_S, RobotLoop, make_estimator
+from .segments import SETTLING_TIME_S, Segment, measure_segment
 from .walk import Setup
 
 Array = NDArray[np.float64]
 
-STRETCH = 0.2  # s, of one replay
-STRIDE = 0.35  # s, from one to the next: no multiple of a step of the gait
-STEADY = 2  # ms to either side, over which the noise of encoders is averaged out
-PAST = 60  # ms, that the drives live through before
-GROWTH = 10  # ms, from one point to the next of how an error grows
-COMMAND = ("q", "dq", "tau", "kp", "kd")  # of a command, 12 numbers each
+STRETCH_DURATION_S = 0.2  # of one open-loop replay
+STRETCH_INTERVAL_S = 0.35  # between stretches; not a multiple of the gait period
+SMOOTHING_HALF_WIDTH_MS = 2  # of the filter against encoder noise
+HISTORY_MS = 60  # before a stretch, for the delays of the drives
+GROWTH_INTERVAL_MS = 10  # between points of the error growth
+COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")  # 12 numbers each
 
 
 @attrs.frozen(eq=False)
-class Joints:
-    """Joint states and commands of a run, one row each ms, at `time` (n,) s; the command held at that instant."""
+class JointRecord:
+    """Joint states and commands of a run, one row per ms.
+
+    Attributes:
+        time: Times (n,), s.
+        q: Angles (n, 12), rad.
+        dq: Velocities (n, 12), rad/s.
+        tau: Torques (n, 12), N m.
+        command: Command in force (n, 61): COMMAND_FIELDS with 12 numbers each, then the mode.
+        recorded: Whether the state was recorded (n,); False: interpolated.
+    """
 
     time: Array
-    q: Array  # (n, 12) rad
-    dq: Array  # (n, 12) rad/s
-    tau: Array  # (n, 12) N m
-    command: Array  # (n, 61): the fields of COMMAND, mode
-    seen: NDArray[np.bool_]  # (n,), false: interpolated
+    q: Array
+    dq: Array
+    tau: Array
+    command: Array
+    recorded: NDArray[np.bool_]
 
-    def whole(self, begin: int, end: int) -> bool:
-        """Whether every state of the rows from `begin` to before `end` is there and was seen."""
-        return begin >= 0 and end <= len(self.seen) and bool(self.seen[begin:end].all())
+    def is_complete(self, begin: int, end: int) -> bool:
+        """Return whether a range of rows exists and every state in it was recorded.
+
+        Args:
+            begin: First row.
+            end: Row after the last.
+
+        Returns:
+            True if no state is missing.
+        """
+        return begin >= 0 and end <= len(self.recorded) and bool(self.recorded[begin:end].all())
 
 
 @attrs.frozen
 class ReplayError:
-    """Root mean square of replayed minus recorded, over all joints and stretches.
+    """Root mean square of replayed minus recorded values, over all joints and stretches.
 
-    growth: the same of q (rad), over each GROWTH ms after the stretch's begin.
+    Attributes:
+        q: Error of the angles, rad.
+        dq: Error of the velocities, rad/s.
+        tau: Error of the torques, N m.
+        stretches: Number of stretches.
+        growth: Error of the angles over each GROWTH_INTERVAL_MS from the start of a stretch, rad.
     """
 
-    q: float  # rad
-    dq: float  # rad/s
-    tau: float  # N m
+    q: float
+    dq: float
+    tau: float
     stretches: int
     growth: tuple[float, ...]
 
 
-def read_joints(path: Path, longest: float = DT, received: bool = False) -> Joints:
-    """The joints' part of a recording at 1 kHz; states that the recorder missed are marked, and interpolated.
+def read_joints(path: Path, max_period: float = DT, use_receipt_times: bool = False) -> JointRecord:
+    """Read the joints of a recording at 1 kHz, with missing states marked and interpolated.
 
-    A command counts from the instant of the state that it answers, whatever its own stamp says.
+    A command counts from the time of the state that it answers; its own stamp is ignored.
 
     Args:
-        path: the recording.
-        longest: s, from one state to the next, usually.
-        received: take the times of receipt in place of the stamps.
+        path: The recording.
+        max_period: Largest accepted median period of the states, s.
+        use_receipt_times: Whether to use the times of receipt instead of the stamps.
+
+    Returns:
+        The joint record.
 
     Raises:
-        ValueError: the recording holds nothing of that rate.
+        ValueError: The recording has no states of that rate, or no commands.
     """
     states: dict[int, tuple[float, Any]] = {}
     commands: dict[int, Any] = {}
     for topic, receipt, message in read_messages(
-        path, lambda topic, _: topic in ("/low_state", "/low_cmd"), _quiet
+        path, lambda topic, _: topic in ("/low_state", "/low_cmd"), _ignore_warning
     ):
         if topic == "/low_state":
-            states[message.tick] = 1e-9 * receipt if received else seconds(message.stamp), message
+            states[message.tick] = 1e-9 * receipt if use_receipt_times else seconds(message.stamp), message
         else:
             commands[message.tick] = np.concatenate(
-                [*(getattr(message, field) for field in COMMAND), [message.mode]]
+                [*(getattr(message, field) for field in COMMAND_FIELDS), [message.mode]]
             )
     ticks = sorted(states)
     time = np.array([states[tick][0] for tick in ticks])
     values = [
         np.array([getattr(states[tick][1], field) for tick in ticks], float) for field in ("q", "dq", "tau")
     ]
-    return _every_millisecond(path, np.array(ticks), time, values, commands, longest)
+    return _resample_to_milliseconds(path, np.array(ticks), time, values, commands, max_period)
 
 
-def joints_of(path: Path, log: JointLog, longest: float, gains: tuple[float, float] | None) -> Joints:
-    """The same of another robot's recording, whose times are rounded to ms.
+def joints_from_log(
+    path: Path, log: JointLog, max_period: float, gains: tuple[float, float] | None
+) -> JointRecord:
+    """Convert another robot's joint log, with times rounded to ms.
 
     Args:
-        path: the recording, for messages.
-        log: what was read of it; all joints of the model have to be in it.
-        longest: s, from one state to the next, usually.
-        gains: kp and kd (N m/rad, N m s/rad) where the commands hold none.
+        path: The recording, for error messages.
+        log: Its joint log; it must hold all joints of the model.
+        max_period: Largest accepted median period of the states, s.
+        gains: kp (N m/rad) and kd (N m s/rad) if the commands hold none.
+
+    Returns:
+        The joint record.
 
     Raises:
-        ValueError: a joint, the torque, the angles or the gains are missing.
+        ValueError: A joint, the torque, the angles or the gains are missing.
     """
     state, command = log.state, expect_commands(path, log)
     for field, meaning in (("q", "angles"), ("tau", "torques")):
         if field not in state.values:
-            raise ValueError(
-                f"{path}: {state.topic}: found no {meaning} in it, expected them beside the commands"
-            )
-    values = {name: _of_model(path, state, each) for name, each in state.values.items()}
+            raise ValueError(f"{path}: {state.topic}: found no {meaning}, expected them next to the commands")
+    values = {name: _in_model_order(path, state, each) for name, each in state.values.items()}
     speed = values.get("dq", np.gradient(values["q"], state.time, axis=0))
     ticks, first = np.unique(np.round(1e3 * state.time).astype(int), return_index=True)
-    sent = {name: _of_model(path, command, each) for name, each in command.values.items()}
+    sent = {name: _in_model_order(path, command, each) for name, each in command.values.items()}
     for name, gain in zip(("kp", "kd"), gains or (None, None), strict=True):
         if name not in sent and gain is None:
             raise ValueError(f"{path}: {command.topic}: {name}: not in the recording, expected --gains KP KD")
         sent.setdefault(name, np.broadcast_to(np.float64(gain or 0.0), sent["q"].shape))
     none = np.zeros(sent["q"].shape)
-    rows = np.hstack([*(sent.get(name, none) for name in COMMAND), np.full((len(none), 1), MODE_SERVO)])
+    rows = np.hstack(
+        [*(sent.get(name, none) for name in COMMAND_FIELDS), np.full((len(none), 1), MODE_SERVO)]
+    )
     commands = dict(zip(np.round(1e3 * command.time).astype(int).tolist(), rows, strict=True))
     measured = [each[first] for each in (values["q"], speed, values["tau"])]
-    return _every_millisecond(
-        path, ticks, (state.time + 1e-9 * log.begin)[first], measured, commands, longest
+    return _resample_to_milliseconds(
+        path, ticks, (state.time + 1e-9 * log.begin)[first], measured, commands, max_period
     )
 
 
-def _of_model(path: Path, series: Series, values: Array) -> Array:
-    """Of the values (n, J) those of the model's joints, (n, 12), in its order. Raises ValueError."""
+def _in_model_order(path: Path, series: Series, values: Array) -> Array:
+    """Select the model's joints from values (n, J), in its order: (n, 12). Raises ValueError."""
     named = [name.removesuffix("_joint") for name in series.joints]
     missing = [name for name in JOINT_NAMES if name.removesuffix("_joint") not in named]
     if missing:
         found = f"found {', '.join(series.joints[:3])}, ..."
         raise ValueError(
-            f"{path}: {series.topic}: {found}, expected the model's joints, {missing[0]} among them"
+            f"{path}: {series.topic}: {found}, expected all joints of the model; {missing[0]} is missing"
         )
     return np.asarray(values[:, [named.index(name.removesuffix("_joint")) for name in JOINT_NAMES]], float)
 
 
-def _every_millisecond(
+def _resample_to_milliseconds(
     path: Path,
     ticks: Array,
     time: Array,
     values: Sequence[Array],
     commands: Mapping[int, Array],
-    longest: float,
-) -> Joints:
-    """States (n, 12) of q, dq and torque at `ticks` (n,), ms, and commands by the tick that they answer, a row each ms."""
+    max_period: float,
+) -> JointRecord:
+    """Interpolate states (n, 12) at `ticks` (n,) ms to one row per ms, and attach the commands."""
     period = np.median(np.diff(ticks)) * 1e-3 if len(ticks) > 1 else np.nan
-    if not period <= longest or not commands:
+    if not period <= max_period or not commands:
         raise ValueError(
-            f"{path}: low_state: found a period of {period:g} s and {len(commands)} commands, expected {longest:g} s"
+            f"{path}: low_state: found a period of {period:g} s and {len(commands)} commands, expected {max_period:g} s"
             " at most, and commands"
         )
     every = np.arange(ticks[0], ticks[-1] + 1)
     q, dq, tau = (interp1d(ticks, each, axis=0)(every) for each in values)
-    return Joints(np.interp(every, ticks, time), q, dq, tau, _held(commands, every), np.isin(every, ticks))
+    return JointRecord(
+        np.interp(every, ticks, time), q, dq, tau, _commands_at(commands, every), np.isin(every, ticks)
+    )
 
 
-def _held(commands: Mapping[int, Array], ticks: Array) -> Array:
-    """The command held at each of the ticks (n,), (n, 61); before the first one the robot brakes."""
+def _commands_at(commands: Mapping[int, Array], ticks: Array) -> Array:
+    """Command in force at each tick (n,), as (n, 61); damping before the first command."""
     sent = sorted(commands)
-    table = np.array([np.zeros(12 * len(COMMAND) + 1), *(commands[tick] for tick in sent)], float)
-    held: Array = table[np.searchsorted(sent, ticks, side="right")]
-    return held
+    table = np.array([np.zeros(12 * len(COMMAND_FIELDS) + 1), *(commands[tick] for tick in sent)], float)
+    in_force: Array = table[np.searchsorted(sent, ticks, side="right")]
+    return in_force
 
 
-def _quiet(_: str) -> None:
-    """What a reader assumes was said when the recording was read first."""
+def _ignore_warning(_: str) -> None:
+    """Ignore a warning that the first reading of the recording has printed already."""
 
 
-def modelled_torque(actuator: ActuatorParameters, joints: Joints, first: int, stop: int) -> Array:
-    """What `actuator` says of the recorded commands and motion, (rows, 12) N m, for the rows from `first` to before `stop`.
+def modelled_torque(actuator: ActuatorParameters, joints: JointRecord, first: int, stop: int) -> Array:
+    """Predict the torques of the recorded commands and motion with an actuator model.
 
-    Noise of encoders is averaged out. What lies before `first` is not known to the drives' delays.
+    Encoder noise is smoothed. The delays of the drives know nothing before `first`.
+
+    Args:
+        actuator: Parameters of the model.
+        joints: The recorded joints.
+        first: First row.
+        stop: Row after the last.
+
+    Returns:
+        Torques (stop - first, 12), N m.
     """
-    q, dq = (savgol_filter(values, 2 * STEADY + 1, 1, axis=0) for values in (joints.q, joints.dq))
+    q, dq = (
+        savgol_filter(values, 2 * SMOOTHING_HALF_WIDTH_MS + 1, 1, axis=0) for values in (joints.q, joints.dq)
+    )
     model = ActuatorModel(attrs.evolve(actuator, torque_noise=0.0), dt=DT)
     found = np.empty((stop - first, 12))
     for row in range(first, stop):
-        c = _command(joints, row)
+        c = _command_at(joints, row)
         found[row - first] = model.step(q[row], dq[row], c.q, c.kp, c.kd, c.dq, c.tau)
     return found
 
 
-def torque_error(actuator: ActuatorParameters, joints: Joints, start: float, end: float) -> float:
-    """Mean square of measured minus modelled torque, N^2 m^2, on the recorded motion between `start` and `end`.
+def torque_error(actuator: ActuatorParameters, joints: JointRecord, start: float, end: float) -> float:
+    """Return the mean square error of the modelled torque on the recorded motion.
 
-    The drives acted on the motion itself, so that what encoders add to it is averaged out.
+    The drives act on the true motion; therefore encoder noise is smoothed.
+
+    Args:
+        actuator: Parameters of the model.
+        joints: The recorded joints.
+        start: Start of the interval, s.
+        end: End of the interval, s.
+
+    Returns:
+        Mean square of measured minus modelled torque, N^2 m^2.
+
+    Raises:
+        ValueError: The interval holds no row with a complete history.
     """
     begin, stop = np.searchsorted(joints.time, [start, end]).tolist()
-    first = max(begin - PAST, 0)
+    first = max(begin - HISTORY_MS, 0)
     off = joints.tau[first:stop] - modelled_torque(actuator, joints, first, stop)
     squares = [
-        np.mean(off[row - first] ** 2) for row in range(begin, stop) if joints.whole(row - PAST, row + 1)
+        np.mean(off[row - first] ** 2)
+        for row in range(begin, stop)
+        if joints.is_complete(row - HISTORY_MS, row + 1)
     ]
     if not squares:
         raise ValueError(f"nothing was recorded without gaps between {start:.2f} and {end:.2f} s")
     return float(np.mean(squares))
 
 
-def open_loop(
-    actuator: ActuatorParameters, joints: Joints, truth: Callable[[float], Truth], start: float, end: float
+def open_loop_error(
+    actuator: ActuatorParameters,
+    joints: JointRecord,
+    truth: Callable[[float], Truth],
+    start: float,
+    end: float,
 ) -> ReplayError:
-    """Replay stretches of the commands between `start` and `end` (s) on a robot with `actuator`, without noise.
+    """Replay short stretches of recorded commands on a simulated robot without noise.
 
-    Each stretch begins in the recorded state; truth(t) tells the trunk's.
+    Each stretch starts from the recorded state.
+
+    Args:
+        actuator: Parameters of the robot's drives.
+        joints: The recorded joints.
+        truth: Function from a time (s) to the recorded state of the trunk.
+        start: Start of the interval, s.
+        end: End of the interval, s.
+
+    Returns:
+        Errors over all stretches.
+
+    Raises:
+        ValueError: The interval holds no complete stretch.
     """
     quiet = attrs.evolve(actuator, torque_noise=0.0)
     simulator = Simulator(SimulatorConfig(actuator=quiet, noise=SensorNoise.none()))
     errors = [
-        _stretch(simulator, joints, truth, row)
-        for row in np.searchsorted(joints.time, np.arange(start, end - STRETCH, STRIDE)).tolist()
-        if joints.whole(row - PAST, row + round(STRETCH / DT))
+        _stretch_errors(simulator, joints, truth, row)
+        for row in np.searchsorted(
+            joints.time, np.arange(start, end - STRETCH_DURATION_S, STRETCH_INTERVAL_S)
+        ).tolist()
+        if joints.is_complete(row - HISTORY_MS, row + round(STRETCH_DURATION_S / DT))
     ]
     if not errors:
         raise ValueError(f"nothing to replay between {start:.2f} and {end:.2f} s")
+    # errors: (stretches, rows, 3). Average over stretches, then over rows for each quantity; growth
+    # averages over GROWTH_INTERVAL_MS of the angles only.
     squares = np.mean(errors, axis=0)
     q, dq, tau = np.sqrt(squares.mean(axis=0)).tolist()
-    growth = np.sqrt(squares[:, 0].reshape(-1, GROWTH).mean(axis=1))
+    growth = np.sqrt(squares[:, 0].reshape(-1, GROWTH_INTERVAL_MS).mean(axis=1))
     return ReplayError(q, dq, tau, len(errors), tuple(growth.tolist()))
 
 
-def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Truth], row: int) -> Array:
-    """Mean squares over the joints of the errors of q, dq and torque, (n, 3), a row each ms from `row` on."""
-    past = [(joints.q[i], joints.dq[i], _command(joints, i)) for i in range(row - PAST, row)]
+def _stretch_errors(
+    simulator: Simulator, joints: JointRecord, truth: Callable[[float], Truth], row: int
+) -> Array:
+    """Mean square errors of q, dq and torque over the joints, (n, 3), one row per ms from `row` on."""
+    past = [(joints.q[i], joints.dq[i], _command_at(joints, i)) for i in range(row - HISTORY_MS, row)]
     simulator.place(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
-    squares = np.empty((round(STRETCH / DT), 3))
+    squares = np.empty((round(STRETCH_DURATION_S / DT), 3))
     for i, square in enumerate(squares, start=row):
-        simulator.command(_command(joints, i))
+        simulator.command(_command_at(joints, i))
         state = simulator.state()
         found = (joints.q[i] - state.q, joints.dq[i] - state.dq, joints.tau[i] - state.tau)
         square[:] = [np.mean(error**2) for error in found]
@@ -249,13 +329,21 @@ def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Trut
     return squares
 
 
-def _command(joints: Joints, row: int) -> JointCommand:
-    q, dq, tau, kp, kd, mode = np.split(joints.command[row], range(12, 12 * len(COMMAND) + 1, 12))
+def _command_at(joints: JointRecord, row: int) -> JointCommand:
+    """Joint command of a row."""
+    q, dq, tau, kp, kd, mode = np.split(joints.command[row], range(12, 12 * len(COMMAND_FIELDS) + 1, 12))
     return JointCommand(q, dq, tau, kp, kd, MODE_SERVO if mode else MODE_DAMPING)
 
 
-def trunk_at(recording: Recording) -> Callable[[float], Truth]:
-    """The recorded truth at the sample next to a time."""
+def recorded_truth(recording: Recording) -> Callable[[float], Truth]:
+    """Return a function that looks up the recorded state of the trunk.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        Function from a time (s) to the nearest true sample, without contacts.
+    """
 
     def truth(time: float) -> Truth:
         row = int(np.abs(recording.position.time - time).argmin())
@@ -277,7 +365,16 @@ def trunk_at(recording: Recording) -> Callable[[float], Truth]:
 def predicted_tracking(
     actuator: ActuatorParameters, commands: Sequence[tuple[Array, float]], seed: int
 ) -> list[Segment]:
-    """The velocities that a model with `actuator` shows under the shipped policy: each command for its seconds."""
+    """Simulate the shipped policy on a robot with an actuator model.
+
+    Args:
+        actuator: Parameters of the robot's drives.
+        commands: Velocity (3,) and duration (s) of each command.
+        seed: Seed of the simulator.
+
+    Returns:
+        Command and mean velocity of each command.
+    """
     setup = Setup()
     simulator = Simulator(SimulatorConfig(actuator=actuator, seed=seed))
     simulator.reset("stand")
@@ -287,15 +384,25 @@ def predicted_tracking(
     segments = []
     for command, duration in commands:
         begin, times, velocities = simulator.time, [], []
-        for _ in range(round(duration / PERIOD)):
+        for _ in range(round(duration / CONTROL_PERIOD_S)):
             truth = loop.tick(command).truth
             times.append(truth.time)
             velocities.append([*truth.linear_velocity[:2], truth.angular_velocity[2]])
-        segments.append(measure(times, velocities, command, begin + SETTLE, begin + duration))
+        segments.append(
+            measure_segment(times, velocities, command, begin + SETTLING_TIME_S, begin + duration)
+        )
     return segments
 
 
 def tracking_gap(plant: Sequence[Segment], model: Sequence[Segment]) -> tuple[float, float]:
-    """Mean distance between the mean velocities of plant and model: in the plane (m/s), and of turning (rad/s)."""
+    """Return the mean distance between the mean velocities of plant and model.
+
+    Args:
+        plant: Segments of the plant.
+        model: Segments of the model, same commands.
+
+    Returns:
+        Mean distance in the plane (m/s), and of the yaw rates (rad/s).
+    """
     apart = np.array([a.mean - b.mean for a, b in zip(plant, model, strict=True)])
     return float(np.hypot(apart[:, 0], apart[:, 1]).mean()), float(np.abs(apart[:, 2]).mean())

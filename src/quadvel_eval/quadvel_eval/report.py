@@ -1,6 +1,6 @@
-"""Results as files and tables: JSON, CSV, pictures. Nothing is computed here.
+"""Writes results as JSON, CSV, pictures and tables; computes nothing.
 
-A file is replaced as a whole once its content is complete; other files of a folder are never touched.
+Each file is replaced atomically. Other files of the folder are kept.
 """
 
 from __future__ import annotations
@@ -28,11 +28,17 @@ CSV_COLUMNS = (
 
 
 def read_json(path: Path) -> Any:
-    """What a JSON file holds.
+    """Read a JSON file.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Its content.
 
     Raises:
-        ValueError: the file holds no JSON; the text names it.
-        OSError: it cannot be read.
+        ValueError: The file is not JSON; the message names it.
+        OSError: The file is unreadable.
     """
     try:
         return json.loads(path.read_text(encoding="utf-8"))
@@ -41,19 +47,34 @@ def read_json(path: Path) -> Any:
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
-    """`content` as JSON text; NaN and infinity are refused with a ValueError."""
+    """Write a JSON file.
+
+    Args:
+        path: The file.
+        content: Its content. NaN and infinity raise a ValueError.
+    """
     with replacing(path) as draft:
         draft.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n")
 
 
 def write_figure(path: Path, figure: Figure) -> None:
-    """`figure` in the format of the suffix."""
+    """Write a figure in the format of the suffix.
+
+    Args:
+        path: The file.
+        figure: The figure.
+    """
     with replacing(path) as draft:
         figure.savefig(draft, dpi=120)
 
 
 def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
-    """eval.json, eval.csv and eval.png."""
+    """Write eval.json, eval.csv and eval.png.
+
+    Args:
+        folder: Folder of the files.
+        evaluation: Result of `grid.evaluate`, with its setup.
+    """
     write_json(folder / "eval.json", evaluation)
     with replacing(folder / "eval.csv") as draft, draft.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -63,17 +84,33 @@ def write_evaluation(folder: Path, evaluation: Mapping[str, Any]) -> None:
                 mean = cell["mean"] or [None] * 3
                 errors = cell["error_xy"], cell["error_wz"]
                 writer.writerow([plant, *cell["command"], cell["seed"], *mean, *errors, int(cell["fell"])])
-    write_figure(folder / "eval.png", heatmap(evaluation["cells"]))
+    write_figure(folder / "eval.png", error_heatmap(evaluation["cells"]))
 
 
-def heatmap(cells: Sequence[Mapping[str, Any]]) -> Figure:
-    """Tracking error over vx and vy, a panel a yaw rate, mean over the seeds; a cross where a robot fell."""
+def error_heatmap(cells: Sequence[Mapping[str, Any]]) -> Figure:
+    """Draw the tracking error over vx and vy, one panel per yaw rate, as mean over the seeds.
+
+    Args:
+        cells: Cells of `eval.json`.
+
+    Returns:
+        Figure; a cross marks a fall.
+    """
     rates = sorted({cell["command"][2] for cell in cells})
-    return heatmaps({f"wz = {rate:g} rad/s": [c for c in cells if c["command"][2] == rate] for rate in rates})
+    return error_heatmaps(
+        {f"wz = {rate:g} rad/s": [c for c in cells if c["command"][2] == rate] for rate in rates}
+    )
 
 
-def heatmaps(panels: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
-    """A panel a title with the cells (command, error_xy, fell) of one grid over vx and vy; one colour scale."""
+def error_heatmaps(panels: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
+    """Draw the tracking error over vx and vy, one panel per title, with one colour scale.
+
+    Args:
+        panels: Cells (command, error_xy, fell) of one grid, by title.
+
+    Returns:
+        Figure; a cross marks a fall.
+    """
     cells = [cell for some in panels.values() for cell in some]
     vx, vy = (sorted({cell["command"][axis] for cell in cells}) for axis in range(2))
     largest = max((cell["error_xy"] for cell in cells if not cell["fell"]), default=1.0)
@@ -95,7 +132,7 @@ def heatmaps(panels: Mapping[str, Sequence[Mapping[str, Any]]]) -> Figure:
 def _mean_errors(
     panel: Axes, cells: Sequence[Mapping[str, Any]], vx: Sequence[float], vy: Sequence[float]
 ) -> NDArray[np.float64]:
-    """Mean over the seeds, nan where all fell (vx, vy); draws a cross where any did."""
+    """Mean errors over the seeds (vx, vy), nan if all fell; draws a cross at each fall."""
     image = np.full((len(vx), len(vy)), np.nan)
     for i, x in enumerate(vx):
         for j, y in enumerate(vy):
@@ -109,7 +146,14 @@ def _mean_errors(
 
 
 def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
-    """The aggregates on both plants, for people."""
+    """Create a table of the aggregates on both plants.
+
+    Args:
+        evaluation: Result of `grid.evaluate`.
+
+    Returns:
+        The table.
+    """
     plants = [evaluation, evaluation["second_plant"]]
     table = Table("", "usual plant", "second plant", title="Velocity tracking")
     for name, show in AGGREGATES.items():
@@ -120,12 +164,13 @@ def evaluation_table(evaluation: Mapping[str, Any]) -> Table:
         table.add_row(f"{name} estimator, RMSE x, y, z, m/s", *rmse)
         table.add_row(
             f"{name} estimator, drift",
-            *(f"{100 * one['drift']:.1f} % of the way" if one else "" for one in figures),
+            *(f"{100 * one['drift']:.1f} % of the path length" if one else "" for one in figures),
         )
     return table
 
 
-def _furthest_off(one: Mapping[str, Any], error: str) -> str:
+def _worst_command(one: Mapping[str, Any], error: str) -> str:
+    """Command with the largest error, as text."""
     worst = max(
         (cell for cell in one["cells"] if not cell["fell"]), key=lambda cell: cell[error], default=None
     )
@@ -133,30 +178,39 @@ def _furthest_off(one: Mapping[str, Any], error: str) -> str:
 
 
 def _seconds(value: float | None) -> str:
+    """Time as text; empty for None."""
     return "" if value is None else f"{value:.2f} s"
 
 
 def _drift(one: Mapping[str, Any]) -> str:
+    """Drift as text."""
     drift = one["stance"]["drift_10s_m"]
     return "fell" if drift is None else f"{100 * drift:.2f} cm"
 
 
 AGGREGATES: dict[str, Callable[[Mapping[str, Any]], str]] = {
-    "runs, of these fallen": lambda one: f"{len(one['cells'])}, {one['falls']}",
+    "runs, falls": lambda one: f"{len(one['cells'])}, {one['falls']}",
     "error, mean and largest": lambda one: f"{one['mean_error_xy']:.3f}, {one['max_error_xy']:.3f} m/s",
-    "largest at (vx, vy, wz)": lambda one: _furthest_off(one, "error_xy"),
+    "largest at (vx, vy, wz)": lambda one: _worst_command(one, "error_xy"),
     "yaw rate, mean and largest": lambda one: f"{one['mean_error_wz']:.3f}, {one['max_error_wz']:.3f} rad/s",
-    "largest at (vx, vy, wz) ": lambda one: _furthest_off(one, "error_wz"),
+    "largest at (vx, vy, wz) ": lambda one: _worst_command(one, "error_wz"),
     "delay of the velocity": lambda one: _seconds(one["delay_xy"]),
     "delay of the yaw rate": lambda one: _seconds(one["delay_wz"]),
     "jitter": lambda one: f"{one['jitter']:.5f} rad",
     "drift in 10 s of standing": _drift,
 }
-"""Rows of the table, and what stands in them of one plant's evaluation."""
+"""Rows of the table: name, and function from the evaluation of a plant to text."""
 
 
 def segment_table(segments: Sequence[Mapping[str, Any]]) -> Table:
-    """Commanded and measured velocity of each segment of a demo."""
+    """Create a table of the commanded and measured velocity of each segment of a demo.
+
+    Args:
+        segments: Segments of `summary.json`.
+
+    Returns:
+        The table.
+    """
     columns = ("command vx, vy, wz", "measured vx, vy, wz", "error xy, m/s", "error wz, rad/s")
     table = Table(*columns, title="Segments")
     for segment in segments:

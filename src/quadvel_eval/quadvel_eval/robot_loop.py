@@ -1,10 +1,10 @@
-"""The nodes' classes in one process, a control tick at a time: what every evaluation runs.
+"""Runs the nodes' classes in one process, one control tick at a time; the base of every evaluation.
 
-Simulator, estimator, command mux and supervisor follow each other as the messages between the nodes make
-them: estimator and supervisor take up a state at the same time, so that the supervisor works with the
-velocity of the state before. Transport itself takes no time, the actuator model's input delay stands for it.
-As fast as the machine allows, the same to the bit for equal seeds. What is made of the samples is the
-caller's matter.
+Simulator, estimator, command mux and supervisor run in the order of their messages. Estimator
+and supervisor receive a state at the same time. Therefore the supervisor uses the velocity
+estimated from the previous state. Transport takes no time here; the input delay of the actuator
+model represents it. The loop runs as fast as the machine allows. Equal seeds give bitwise equal
+results.
 """
 
 from __future__ import annotations
@@ -29,28 +29,48 @@ from quadvel_sim.simulator import DT, Simulator, Truth
 
 Array = NDArray[np.float64]
 
-PERIOD = 1.0 / RATE_HZ  # s
+CONTROL_PERIOD_S = 1.0 / RATE_HZ
 ESTIMATORS = ("learned", "kalman", "truth")
-STEPS = round(PERIOD / DT)  # of the simulator, a tick
+SIMULATOR_STEPS_PER_TICK = round(CONTROL_PERIOD_S / DT)
 _PLANNER = MuxInput("planner", priority=0, timeout=1.0)
 
 
 class TrueVelocity:
-    """Stands in for an estimator and knows the answer: the simulator's."""
+    """Velocity estimator that returns the true velocity of the simulator."""
 
     def __init__(self, simulator: Simulator) -> None:
         self._simulator = simulator
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing: the estimator has no state."""
 
     def update(self, state: RobotState, previous_action: ArrayLike) -> tuple[Array, Array]:
-        """The true velocity (3,), m/s, body frame, and a covariance of zeros."""
+        """Return the true velocity.
+
+        Args:
+            state: Ignored.
+            previous_action: Ignored.
+
+        Returns:
+            Velocity (3,), m/s, body frame, and a covariance of zeros (3, 3).
+        """
         return self._simulator.truth().linear_velocity, np.zeros((3, 3))
 
 
 def make_estimator(kind: str, simulator: Simulator, file: Path) -> Estimator:
-    """One of ESTIMATORS; `file` is the learned one's network."""
+    """Create a velocity estimator.
+
+    Args:
+        kind: One of ESTIMATORS.
+        simulator: Source of the true velocity.
+        file: ONNX file of the learned estimator.
+
+    Returns:
+        The estimator.
+
+    Raises:
+        ValueError: The kind is unknown.
+    """
     if kind == "learned":
         return LearnedEstimator(file)
     if kind == "kalman":
@@ -62,24 +82,38 @@ def make_estimator(kind: str, simulator: Simulator, file: Path) -> Estimator:
 
 @attrs.frozen
 class Sample:
-    """One tick: all quantities held at `truth.time`, `command` is the answer to them."""
+    """State, truth and answer of one control tick, all at `truth.time`.
+
+    Attributes:
+        state: Measured state.
+        truth: True state of the simulator.
+        commanded: Velocity from the mux to the supervisor (3,): vx, vy (m/s), wz (rad/s).
+        estimates: Velocity (3,), m/s, body frame, of each shadow estimator.
+        command: Joint command that answers the state.
+        mode: Mode of the supervisor.
+        fallen: Whether the robot has fallen.
+    """
 
     state: RobotState
     truth: Truth
-    asked: Array
-    """velocity (3,), vx, vy (m/s), wz (rad/s), that the mux asked the supervisor for"""
+    commanded: Array
     estimates: dict[str, Array]
-    """velocity (3,), m/s, body frame, of the estimators beside"""
     command: JointCommand
     mode: str
     fallen: bool
 
 
 class RobotLoop:
-    """Drives `simulator` by `supervisor` with the velocity that `estimator` tells.
+    """Control loop of a simulated robot: estimator, command mux, supervisor and simulator.
 
-    `beside`: further estimators that see the same and drive nothing. The loop starts with the simulator as it
-    is; call `stand_up` or reset the simulator to "stand" first.
+    The loop starts from the present state of the simulator. Reset it to "stand" before
+    `start_walking`.
+
+    Args:
+        simulator: The robot.
+        supervisor: Checks and policy.
+        estimator: Estimator whose velocity the supervisor uses.
+        shadow_estimators: Estimators that receive the same input and influence nothing.
     """
 
     def __init__(
@@ -87,52 +121,63 @@ class RobotLoop:
         simulator: Simulator,
         supervisor: Supervisor,
         estimator: Estimator,
-        beside: Mapping[str, Estimator] = MappingProxyType({}),
+        shadow_estimators: Mapping[str, Estimator] = MappingProxyType({}),
     ) -> None:
         self.simulator = simulator
         self.supervisor = supervisor
         self._estimator = estimator
-        self._beside = dict(beside)
+        self._beside = dict(shadow_estimators)
         self._mux = CommandMux([_PLANNER])
         self._velocity: Array | None = None
         self._previous_action = np.zeros(12)
 
     def tick(self, velocity: ArrayLike = (0.0, 0.0, 0.0)) -> Sample:
-        """One control tick under the planner's `velocity`: vx, vy (m/s), wz (rad/s); zero means stand still.
+        """Run one control tick under a planner's velocity.
 
-        FloatingPointError where the physics or an estimate diverged.
+        Args:
+            velocity: Commanded vx, vy (m/s) and wz (rad/s); zero means stand still.
+
+        Returns:
+            The sample of this tick.
+
+        Raises:
+            FloatingPointError: Physics or an estimate diverged.
         """
         simulator = self.simulator
         now, state, truth, fallen = simulator.time, simulator.state(), simulator.truth(), simulator.fallen
         estimates = {name: e.update(state, self._previous_action)[0] for name, e in self._beside.items()}
         self._mux.receive(_PLANNER.name, now, velocity)
-        asked = self._mux.update(now)
-        command = self.supervisor.tick(now, state, self._velocity, [*asked.velocity, asked.stance])
+        mux_output = self._mux.update(now)
+        command = self.supervisor.tick(now, state, self._velocity, [*mux_output.velocity, mux_output.stance])
         self._velocity, _ = self._estimator.update(state, self._previous_action)
         self._previous_action = previous_action(command.q, command.mode)
         simulator.command(command)
-        simulator.step(STEPS)
+        simulator.step(SIMULATOR_STEPS_PER_TICK)
         return Sample(
-            state, truth, np.array(asked.velocity), estimates, command, self.supervisor.mode, fallen
+            state, truth, np.array(mux_output.velocity), estimates, command, self.supervisor.mode, fallen
         )
 
     @property
     def velocity(self) -> Array | None:
-        """The newest estimate (3,), m/s, body frame; None before the first."""
+        """Newest estimate (3,), m/s, body frame; None before the first."""
         return self._velocity
 
     def start_walking(self) -> None:
-        """From a simulator reset to "stand": half a second in the standing posture, then the policy stands.
+        """Stand for half a second, then start the policy.
 
-        RuntimeError where the supervisor refuses.
+        The simulator must have been reset to "stand".
+
+        Raises:
+            RuntimeError: The supervisor refuses a mode.
         """
         self.tick()
         self._request("stance")
-        for _ in range(round(0.5 / PERIOD)):
+        for _ in range(round(0.5 / CONTROL_PERIOD_S)):
             self.tick()
         self._request("walk")
 
     def _request(self, mode: str) -> None:
-        taken, sentence = self.supervisor.request(mode)
-        if not taken:
+        """Request a mode. Raises RuntimeError if the supervisor refuses."""
+        accepted, sentence = self.supervisor.request(mode)
+        if not accepted:
             raise RuntimeError(f"the supervisor refused {mode}: {sentence}")

@@ -1,6 +1,6 @@
-"""How long a message takes to another process and back, over whatever middleware is there.
+"""Measures the round-trip time of a message to another process over the installed middleware.
 
-`measure` starts the other side as `python -m quadvel_eval.round_trip`.
+`measure_round_trips` starts the other process as `python -m quadvel_eval.round_trip`.
 """
 
 from __future__ import annotations
@@ -14,16 +14,23 @@ import numpy as np
 
 import quadvel_dds
 
-from .robot_loop import PERIOD
+from .robot_loop import CONTROL_PERIOD_S
 
-PATIENCE = 20.0  # s, until the two have found each other
-LOST = 0.1  # s, after which an answer is not waited for
+DISCOVERY_TIMEOUT_S = 20.0  # for the discovery of the other process
+ANSWER_TIMEOUT_S = 0.1  # after which a message counts as lost
 
 
-def measure(count: int = 1000) -> dict[str, float]:
-    """Median and 99th percentile (us) of `count` round trips of a LowState at 200 Hz, and how many got lost.
+def measure_round_trips(count: int = 1000) -> dict[str, float]:
+    """Measure round trips of a LowState at 200 Hz.
 
-    RuntimeError where the other process does not answer.
+    Args:
+        count: Number of round trips.
+
+    Returns:
+        Median and 99th percentile, us, and number of lost messages.
+
+    Raises:
+        RuntimeError: The other process does not answer.
     """
     quadvel_dds.install()
     import rclpy
@@ -45,19 +52,19 @@ def measure(count: int = 1000) -> dict[str, float]:
         answers.clear()
         start = time.perf_counter()
         publisher.publish(LowState(tick=tick))
-        while (elapsed := time.perf_counter() - start) < LOST:
-            rclpy.spin_once(node, timeout_sec=LOST - elapsed)
+        while (elapsed := time.perf_counter() - start) < ANSWER_TIMEOUT_S:
+            rclpy.spin_once(node, timeout_sec=ANSWER_TIMEOUT_S - elapsed)
             if tick in answers:
                 return time.perf_counter() - start
         return float("nan")
 
     echo = subprocess.Popen([sys.executable, "-m", "quadvel_eval.round_trip"])
     try:
-        until = time.monotonic() + PATIENCE
+        until = time.monotonic() + DISCOVERY_TIMEOUT_S
         while np.isnan(trip(0)):
             if time.monotonic() > until:
-                raise RuntimeError(f"no answer from the other process within {PATIENCE:g} s")
-        times = np.array([_at_rate(trip, tick) for tick in range(1, count + 1)])
+                raise RuntimeError(f"no answer from the other process within {DISCOVERY_TIMEOUT_S:g} s")
+        times = np.array([_paced_trip(trip, tick) for tick in range(1, count + 1)])
     finally:
         echo.terminate()
         echo.wait()
@@ -67,15 +74,15 @@ def measure(count: int = 1000) -> dict[str, float]:
     return {"p50_us": float(p50), "p99_us": float(p99), "lost": int(np.isnan(times).sum())}
 
 
-def _at_rate(trip: Any, tick: int) -> float:
-    """One round trip, and a rest so that they come at the controller's rate."""
+def _paced_trip(trip: Any, tick: int) -> float:
+    """Time one round trip, then sleep until the next control period."""
     elapsed: float = trip(tick)
-    time.sleep(max(PERIOD - elapsed, 0.0) if elapsed == elapsed else 0.0)
+    time.sleep(max(CONTROL_PERIOD_S - elapsed, 0.0) if elapsed == elapsed else 0.0)
     return elapsed
 
 
 def _echo() -> None:
-    """The other side: sends back what comes, until it is told to end."""
+    """Send every message back until a signal ends the process."""
     quadvel_dds.install()
     import rclpy
     from rclpy.executors import ExternalShutdownException

@@ -1,4 +1,4 @@
-"""A walk written down: which modes to order, which velocities to command, and for how long. No ROS."""
+"""Defines scripted walks: modes to request, and velocities to command, with durations. No ROS."""
 
 from __future__ import annotations
 
@@ -6,32 +6,45 @@ import attrs
 
 Velocity = tuple[float, float, float]  # vx, vy (m/s), wz (rad/s)
 
-RETRY = 0.5  # s, between two orders of the same mode: the controller may not be ready for the first
+RETRY_INTERVAL_S = 0.5  # between requests of the same mode: the controller may not be ready for the first
 
 
 @attrs.frozen
-class Order:
-    """Order `mode` of the controller and wait for the mode `until`, for `patience` s at most."""
+class ModeRequest:
+    """Request a mode of the controller and wait for a mode.
+
+    Attributes:
+        name: Name of the step.
+        mode: Requested mode.
+        awaited_mode: Mode that ends the step.
+        timeout: Time after which the script fails, s.
+    """
 
     name: str
     mode: str
-    until: str
-    patience: float
+    awaited_mode: str
+    timeout: float
 
 
 @attrs.frozen
 class Drive:
-    """Command `velocity` for `seconds`."""
+    """Command a constant velocity.
+
+    Attributes:
+        name: Name of the step.
+        velocity: vx, vy (m/s), wz (rad/s).
+        duration: Duration, s.
+    """
 
     name: str
     velocity: Velocity
-    seconds: float
+    duration: float
 
 
-Step = Order | Drive
+Step = ModeRequest | Drive
 
-STAND_UP = Order("stand up", "stand_up", until="stance", patience=20.0)
-LIE_DOWN = Order("lie down", "lie_down", until="passive", patience=10.0)
+STAND_UP = ModeRequest("stand up", "stand_up", awaited_mode="stance", timeout=20.0)
+LIE_DOWN = ModeRequest("lie down", "lie_down", awaited_mode="passive", timeout=10.0)
 SCRIPTS: dict[str, tuple[Step, ...]] = {
     "full": (
         STAND_UP,
@@ -69,58 +82,84 @@ SCRIPTS: dict[str, tuple[Step, ...]] = {
 
 
 class ScriptError(RuntimeError):
-    """The robot does not do what the script says; one sentence."""
+    """The robot does not follow the script; the message is one sentence."""
 
 
 @attrs.frozen
 class Action:
-    """What to do now: order a mode, or command a velocity, or neither."""
+    """Action of the script at one instant.
+
+    Attributes:
+        step: Name of the step.
+        requested_mode: Mode to request, or None.
+        velocity: Velocity to command, or None.
+    """
 
     step: str
-    order: str | None = None
+    requested_mode: str | None = None
     velocity: Velocity | None = None
 
 
 class ScriptRunner:
-    """Goes through `steps` as time and the controller's modes allow."""
+    """Executes the steps of a script according to time and controller mode.
+
+    Args:
+        steps: The steps.
+    """
 
     def __init__(self, steps: tuple[Step, ...]) -> None:
         self._steps = list(steps)
-        self._since: float | None = None  # when the present step began
-        self._ordered: float | None = None
+        self._step_start: float | None = None  # start of the present step, s
+        self._last_request: float | None = None
 
     def update(self, now: float, mode: str, reason: str = "") -> Action | None:
-        """What to do at `now` (s) while the controller is in `mode` for `reason`; None at the end.
+        """Return the next action.
 
-        mode: "" as long as the controller has not been heard. Raises ScriptError on a fault, and where the
-        patience of an order is over.
+        Args:
+            now: Time, s.
+            mode: Mode of the controller; "" before its first report.
+            reason: Reason of the mode, for error messages.
+
+        Returns:
+            The action; None at the end of the script.
+
+        Raises:
+            ScriptError: The controller is in fault or lies down, or a request timed out.
         """
         if mode == "fault":
             raise ScriptError(f"the controller is in fault: {reason}")
-        if self._steps and self._since is not None and self._over(self._steps[0], now - self._since, mode):
+        if (
+            self._steps
+            and self._step_start is not None
+            and self._is_over(self._steps[0], now - self._step_start, mode)
+        ):
             self._steps.pop(0)
-            self._since = self._ordered = None
+            self._step_start = self._last_request = None
         if not self._steps:
             return None
-        if self._since is None:
-            self._since = now
+        if self._step_start is None:
+            self._step_start = now
         step = self._steps[0]
         if isinstance(step, Drive):
             if mode in ("passive", "lie_down"):
                 raise ScriptError(f"the controller is in mode {mode} during '{step.name}': {reason}")
             return Action(step.name, velocity=step.velocity)
-        return Action(step.name, order=step.mode if self._is_due(step, now, mode) else None)
+        return Action(step.name, requested_mode=step.mode if self._is_due(step, now, mode) else None)
 
-    def _over(self, step: Step, elapsed: float, mode: str) -> bool:
+    def _is_over(self, step: Step, elapsed: float, mode: str) -> bool:
+        """Return whether a step has ended. Raises ScriptError after the timeout of a request."""
         if isinstance(step, Drive):
-            return elapsed >= step.seconds
-        if mode != step.until and elapsed > step.patience:
+            return elapsed >= step.duration
+        if mode != step.awaited_mode and elapsed > step.timeout:
             found = mode or "unknown"
-            raise ScriptError(f"'{step.name}' took more than {step.patience:g} s; the mode is {found}")
-        return mode == step.until
+            raise ScriptError(f"'{step.name}' took more than {step.timeout:g} s; the mode is {found}")
+        return mode == step.awaited_mode
 
-    def _is_due(self, order: Order, now: float, mode: str) -> bool:
-        if mode in ("", order.mode) or (self._ordered is not None and now - self._ordered < RETRY):
+    def _is_due(self, order: ModeRequest, now: float, mode: str) -> bool:
+        """Return whether to send a request now, at most one every RETRY_INTERVAL_S."""
+        if mode in ("", order.mode) or (
+            self._last_request is not None and now - self._last_request < RETRY_INTERVAL_S
+        ):
             return False
-        self._ordered = now
+        self._last_request = now
         return True

@@ -1,4 +1,4 @@
-"""The node `planner`: walks the robot through a script with velocities on cmd_vel. `script` holds scripts."""
+"""Node `planner`: walks the robot through a script with velocities on cmd_vel."""
 
 from __future__ import annotations
 
@@ -15,12 +15,16 @@ from quadvel_nodes.node import read_parameters, request_exit, run
 
 from .script import SCRIPTS, ScriptError, ScriptRunner, Velocity
 
-PERIOD = 0.02  # s, of cmd_vel
+CMD_VEL_PERIOD_S = 0.02
 
 
 @attrs.frozen
 class PlannerParameters:
-    """The node's parameters."""
+    """Parameters of the node.
+
+    Attributes:
+        script: Name of the script, a key of SCRIPTS.
+    """
 
     script: str = attrs.field(
         default="full", metadata={"description": f"which script is walked: {' or '.join(SCRIPTS)}"}
@@ -32,7 +36,7 @@ class PlannerParameters:
 
 
 class ScriptedPlanner(Node):
-    """Orders modes from the controller and publishes velocities; ends with 0 when the script is through."""
+    """Node that requests modes and publishes velocities; it exits with 0 at the end of the script."""
 
     def __init__(self) -> None:
         super().__init__("planner")
@@ -43,14 +47,15 @@ class ScriptedPlanner(Node):
         self._announcement = self.create_publisher(String, "planner/step", 10)
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self.create_subscription(ControllerState, "controller/state", self._on_state, 10)
-        self.create_timer(PERIOD, self._update)
+        self.create_timer(CMD_VEL_PERIOD_S, self._update)
 
     def _on_state(self, message: Any) -> None:
-        """What the controller is in; nothing before it has heard the robot, as it refuses all orders until then."""
+        """Store the mode. The first report with a rate counts: before it the controller refuses requests."""
         if self._mode or message.rate_hz:
             self._mode, self._reason = message.mode_name, message.reason
 
     def _update(self) -> None:
+        """Execute the next action of the script; end the node at its end or at an error."""
         try:
             action = self._runner.update(1e-9 * self.get_clock().now().nanoseconds, self._mode, self._reason)
         except ScriptError as error:
@@ -62,23 +67,28 @@ class ScriptedPlanner(Node):
         if action.step != self._step:
             self._step = action.step
             self._announcement.publish(String(data=action.step))
-        if action.order:
-            self._order(action.order)
+        if action.requested_mode:
+            self._request_mode(action.requested_mode)
         if action.velocity:
             self._velocity.publish(_twist(action.velocity))
 
-    def _order(self, mode: str) -> None:
-        """Ask the controller; its state tells whether it did, and the script asks again where it did not."""
+    def _request_mode(self, mode: str) -> None:
+        """Request a mode. The controller's state shows the answer; the script repeats failed requests."""
         if self._set_mode.service_is_ready():
             self._set_mode.call_async(SetMode.Request(mode=mode))
 
 
 def _twist(velocity: Velocity) -> Any:
+    """Twist message of a planar velocity."""
     message = Twist()
     message.linear.x, message.linear.y, message.angular.z = velocity
     return message
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node."""
+    """Run the node.
+
+    Args:
+        args: Command line arguments; None for those of the process.
+    """
     run(ScriptedPlanner, args)

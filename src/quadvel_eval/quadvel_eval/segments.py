@@ -1,6 +1,6 @@
-"""How well a stretch of walking followed its command: means and errors, for the grid and for the demo alike.
+"""Measures how well a stretch of walking followed its command.
 
-Plain arrays; where they come from is the caller's matter.
+The functions take plain arrays, so that grid and demo share them.
 """
 
 from __future__ import annotations
@@ -14,13 +14,18 @@ from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
 
-SETTLE = 2.0  # s at the start of each stretch that belong to the change of command and are not evaluated
-DIGITS = 6  # of numbers in files
+SETTLING_TIME_S = 2.0  # at the start of each stretch, not evaluated
+DECIMALS = 6  # of numbers in JSON files
 
 
 @attrs.frozen(eq=False)
 class Segment:
-    """A constant command and the mean true velocity under it: vx, vy (m/s), wz (rad/s), body frame, (3,)."""
+    """A constant command and the mean true velocity under it.
+
+    Attributes:
+        command: Commanded vx, vy (m/s) and wz (rad/s), body frame, (3,).
+        mean: Mean true velocity in the same order (3,).
+    """
 
     command: Array
     mean: Array
@@ -32,11 +37,15 @@ class Segment:
 
     @property
     def error_wz(self) -> float:
-        """Absolute commanded minus mean yaw rate, rad/s."""
+        """Absolute difference of commanded and mean yaw rate, rad/s."""
         return float(abs(self.command[2] - self.mean[2]))
 
     def to_json(self) -> dict[str, Any]:
-        """The entry of `summary.json`."""
+        """Convert the segment to its entry in `summary.json`.
+
+        Returns:
+            Command, mean velocity and errors.
+        """
         return {
             "command": rounded(self.command),
             "mean": rounded(self.mean),
@@ -45,11 +54,23 @@ class Segment:
         }
 
 
-def measure(time: ArrayLike, velocity: ArrayLike, command: ArrayLike, start: float, end: float) -> Segment:
-    """The segment with the samples of `start` <= time < `end`.
+def measure_segment(
+    time: ArrayLike, velocity: ArrayLike, command: ArrayLike, start: float, end: float
+) -> Segment:
+    """Average the velocity over start <= time < end.
 
-    time (n,): s, evenly spaced. velocity (n, 3): vx, vy, wz, true, body frame. ValueError where none falls
-    into the stretch.
+    Args:
+        time: Times (n,), s, evenly spaced.
+        velocity: True vx, vy (m/s) and wz (rad/s), body frame, (n, 3).
+        command: Command of the segment (3,).
+        start: Start of the interval, s.
+        end: End of the interval, s.
+
+    Returns:
+        The segment.
+
+    Raises:
+        ValueError: The interval holds no sample.
     """
     time, velocity = np.asarray(time, float), np.asarray(velocity, float)
     within = (start <= time) & (time < end)
@@ -59,26 +80,50 @@ def measure(time: ArrayLike, velocity: ArrayLike, command: ArrayLike, start: flo
 
 
 def tracking_errors(segments: Sequence[Segment]) -> dict[str, float]:
-    """Largest and mean errors of at least one segment: xy in m/s, wz in rad/s."""
+    """Return the largest and mean tracking errors of at least one segment.
+
+    Args:
+        segments: The segments.
+
+    Returns:
+        max_error_xy, mean_error_xy (m/s), max_error_wz, mean_error_wz (rad/s).
+    """
     errors = {"xy": [s.error_xy for s in segments], "wz": [s.error_wz for s in segments]}
     found = {f"max_error_{axis}": rounded(max(some)) for axis, some in errors.items()}
     return found | {f"mean_error_{axis}": rounded(np.mean(some)) for axis, some in errors.items()}
 
 
-def response_delay(asked: Array, velocity: Array, period: float) -> float | None:
-    """By how much a velocity (n,) comes after what was asked for (n,), s: the area between both, each as a share of its end.
+def response_delay(commanded: Array, velocity: Array, period: float) -> float | None:
+    """Return the delay of a velocity behind its command.
 
-    Ends are means over the second half of the stretch, so that a steady error is no delay. Samples are `period` (s) apart.
-    None where the velocity does not get half as far as it should: that is no delay either.
+    The delay is the area between both curves, each divided by its final value. Final values are
+    means over the second half, so that a steady-state error does not count as delay.
+
+    Args:
+        commanded: Commanded velocity (n,).
+        velocity: Measured velocity (n,), same unit.
+        period: Sampling period, s.
+
+    Returns:
+        Delay, s; None if the velocity reaches less than half of the command.
     """
-    late = len(asked) // 2
-    wanted, reached = float(asked[late:].mean()), float(velocity[late:].mean())
+    # A first-order lag y' = (u - y) / T behind a step u has the area int (u - y) dt / u = T. The same
+    # integral gives the delay of a pure dead time. u and y are divided by their final values.
+    late = len(commanded) // 2
+    wanted, reached = float(commanded[late:].mean()), float(velocity[late:].mean())
     if reached / wanted < 0.5:
         return None
-    return float(period * np.sum(asked / wanted - velocity / reached))
+    return float(period * np.sum(commanded / wanted - velocity / reached))
 
 
 def rounded(value: ArrayLike) -> Any:
-    """`value` as JSON keeps it: a number or nested lists of numbers, with as many digits as make sense; None for NaN."""
-    digits = np.round(np.asarray(value, float), DIGITS)
+    """Round values for a JSON file.
+
+    Args:
+        value: A number or an array.
+
+    Returns:
+        A number or nested lists, rounded to DECIMALS; None for values that are not finite.
+    """
+    digits = np.round(np.asarray(value, float), DECIMALS)
     return np.where(np.isfinite(digits), digits.astype(object), np.array(None, object)).tolist()

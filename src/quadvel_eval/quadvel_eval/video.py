@@ -1,7 +1,7 @@
-"""Pictures of the robot of a recording, drawn by MuJoCo: a video, and frames for a strip.
+"""Renders the robot of a recording with MuJoCo: a video, and frames for a figure.
 
-A program of its own, `python -m quadvel_eval.video RECORDING FOLDER`, because MuJoCo reads MUJOCO_GL when it
-is imported, and a broken GL library must not take the caller down.
+It is a separate program, `python -m quadvel_eval.video RECORDING FOLDER`. MuJoCo reads MUJOCO_GL
+at import, and a broken GL library must not end the caller.
 """
 
 from __future__ import annotations
@@ -17,21 +17,27 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_description.mjcf import load_model
 
 from .demo_figures import tracking_figure
-from .demo_summary import commands
+from .demo_summary import constant_commands
 from .output import replacing
 from .recording import Recording, read_recording
 from .report import write_figure
 
 Image = NDArray[np.uint8]
 
-RATE = 20  # frames a second
-SIZE = (640, 360)
-STRIP = 5  # frames
+FRAMES_PER_SECOND = 20
+VIDEO_SIZE = (640, 360)
+STRIP_FRAMES = 5
 STRIP_SIZE = (400, 300)
 
 
 class Film:
-    """Draws the robot of `recording` at given times, with a camera that goes along."""
+    """Renders the robot of a recording, with a camera that follows it.
+
+    Args:
+        recording: The recording.
+        width: Width of a frame, pixels.
+        height: Height of a frame, pixels.
+    """
 
     def __init__(self, recording: Recording, width: int, height: int) -> None:
         self._recording = recording
@@ -48,49 +54,77 @@ class Film:
         self._renderer.close()
 
     def frames(self, times: ArrayLike) -> Iterator[Image]:
-        """One image (height, width, 3) for each of the times (n,), s on the recording's clock."""
+        """Render frames.
+
+        Args:
+            times: Times (n,), s, on the clock of the recording.
+
+        Yields:
+            One image (height, width, 3) per time.
+        """
         times = np.asarray(times, float)
         r = self._recording
-        poses = np.hstack([r.position.at(times), r.quaternion.at(times), r.joints.at(times)])
+        poses = np.hstack(
+            [r.position.latest_at(times), r.quaternion.latest_at(times), r.joints.latest_at(times)]
+        )
         for pose in poses:
             self._data.qpos[:] = pose
             mujoco.mj_forward(self._model, self._data)
             self._camera.lookat[:] = [pose[0], pose[1], 0.25]
             self._renderer.update_scene(self._data, self._camera)
-            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = False  # thrice the time, in software
+            self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = (
+                False  # shadows triple the time of software rendering
+            )
             yield self._renderer.render().copy()
 
 
-def strip(recording: Recording) -> list[tuple[str, Image]]:
-    """Frames from the middle of some segments in which the robot moves, with the command as caption."""
-    moving = [c for c in commands(recording.planned.time, recording.planned.value) if c[2].any()]
-    picked = [moving[i] for i in np.unique(np.linspace(0, len(moving) - 1, STRIP).round().astype(int))]
+def frame_strip(recording: Recording) -> list[tuple[str, Image]]:
+    """Render frames from the middle of some segments with motion.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        Caption (the command) and image of each frame.
+    """
+    moving = [c for c in constant_commands(recording.planned.time, recording.planned.value) if c[2].any()]
+    picked = [moving[i] for i in np.unique(np.linspace(0, len(moving) - 1, STRIP_FRAMES).round().astype(int))]
     with Film(recording, *STRIP_SIZE) as film:
         images = list(film.frames([0.5 * (start + end) for start, end, _ in picked]))
     return [(_caption(velocity), image) for (_, _, velocity), image in zip(picked, images, strict=True)]
 
 
 def _caption(velocity: NDArray[np.float64]) -> str:
+    """Nonzero components of a command as text."""
     return ", ".join(f"{axis} {x:g}" for axis, x in zip(("vx", "vy", "wz"), velocity, strict=True) if x)
 
 
 def write_video(path: Path, recording: Recording) -> None:
-    """The whole recording as an MP4 in real time."""
+    """Write the whole recording as an MP4 in real time.
+
+    Args:
+        path: The file.
+        recording: The recording.
+    """
     from imageio_ffmpeg import write_frames
 
     start, end = recording.position.time[[0, -1]]
-    with replacing(path) as draft, Film(recording, *SIZE) as film:
-        video = write_frames(str(draft), SIZE, fps=RATE, quality=7, macro_block_size=8)
+    with replacing(path) as draft, Film(recording, *VIDEO_SIZE) as film:
+        video = write_frames(str(draft), VIDEO_SIZE, fps=FRAMES_PER_SECOND, quality=7, macro_block_size=8)
         video.send(None)  # starts the encoder
-        for frame in film.frames(np.arange(start, end, 1.0 / RATE)):
+        for frame in film.frames(np.arange(start, end, 1.0 / FRAMES_PER_SECOND)):
             video.send(np.ascontiguousarray(frame))
         video.close()
 
 
 def main(arguments: Sequence[str]) -> None:
-    """`demo.png` with a strip of frames, then `demo.mp4`."""
+    """Write demo.png with a strip of frames, then demo.mp4.
+
+    Args:
+        arguments: Recording and folder.
+    """
     recording, folder = read_recording(Path(arguments[0])), Path(arguments[1])
-    write_figure(folder / "demo.png", tracking_figure(recording, strip(recording)))
+    write_figure(folder / "demo.png", tracking_figure(recording, frame_strip(recording)))
     write_video(folder / "demo.mp4", recording)
 
 

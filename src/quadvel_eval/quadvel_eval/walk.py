@@ -1,6 +1,6 @@
-"""One walk in the loop, from standing: which robot on which ground, what it did, and what that cost.
+"""Records one simulated walk: sets up robot, ground and policy, and computes power and jitter.
 
-A walk is a list of velocities with durations; `grid` makes many of them and judges them.
+A walk is a list of velocity commands with durations. Module `grid` runs and evaluates many.
 """
 
 from __future__ import annotations
@@ -23,22 +23,28 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.terrain import Terrain
 
-from .robot_loop import PERIOD, RobotLoop, Sample, make_estimator
+from .robot_loop import CONTROL_PERIOD_S, RobotLoop, Sample, make_estimator
 
 Array = NDArray[np.float64]
 
 TERRAINS = ("flat", "rough", "slope")
-SLOPE = 0.15  # rad, rising ahead
-HEAT = 0.2  # W/(N m)^2, k_r of Table 2: what a drive turns to heat
-DIAGONAL = 0.555  # m, l_c of Eq. 10: the distance between two diagonal feet
+SLOPE_ANGLE_RAD = 0.15  # rising ahead
+HEATING_COEFFICIENT = 0.2  # k_r of Table 2, W/(N m)^2
+DIAGONAL_FOOT_DISTANCE_M = 0.555  # characteristic length l_c of Eq. 10
 
 
 @attrs.frozen(kw_only=True)
 class Setup:
-    """What a walk is made with. estimator: the one in the loop. randomised: draw the plant by the seed.
-    actuator: file of the robot's actuator model, None for the shipped one.
+    """Robot, policy and ground of a walk.
 
-    plant: fields of `SimulatorConfig` that are as given here, whatever is said or drawn for them elsewhere.
+    Attributes:
+        policy: ONNX file of the policy.
+        estimator: Velocity estimator in the loop, one of `robot_loop.ESTIMATORS`.
+        estimator_file: ONNX file of the learned estimator.
+        terrain: One of TERRAINS.
+        randomised: Whether the seed draws plant and actuators.
+        actuator: File of the robot's actuator model; None for the shipped model.
+        plant: Fields of `SimulatorConfig` that override all other settings and draws.
     """
 
     policy: Path = SHIPPED_POLICY
@@ -50,14 +56,28 @@ class Setup:
     plant: Mapping[str, Any] = attrs.field(factory=dict)
 
     def to_json(self) -> dict[str, Any]:
-        """As `eval.json` keeps it; `plant` is for studies that say what they changed themselves."""
+        """Convert the setup for `eval.json`, without `plant`.
+
+        Returns:
+            Field names and values, paths as strings.
+        """
         fields = attrs.asdict(self, filter=lambda field, _: field.name != "plant")
         return {name: str(value) if isinstance(value, Path) else value for name, value in fields.items()}
 
 
 def make_simulator(setup: Setup, seed: int) -> Simulator:
-    """The robot standing; nominal, or with a plant and actuators drawn by `seed` (Sections 3.1 and 3.4)."""
-    terrain = Terrain(kind=setup.terrain, slope=SLOPE if setup.terrain == "slope" else 0.0, seed=seed)
+    """Create a simulator with a standing robot.
+
+    Args:
+        setup: Robot and ground.
+        seed: Seed of terrain, noise and randomisation (Sections 3.1 and 3.4 of the paper).
+
+    Returns:
+        A simulator of the nominal robot, or of a randomised one if the setup says so.
+    """
+    terrain = Terrain(
+        kind=setup.terrain, slope=SLOPE_ANGLE_RAD if setup.terrain == "slope" else 0.0, seed=seed
+    )
     rng = np.random.default_rng(seed)
     drawn = _draw_plant(rng) if setup.randomised else {}
     if setup.actuator is not None:
@@ -71,6 +91,7 @@ def make_simulator(setup: Setup, seed: int) -> Simulator:
 
 
 def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
+    """Draw friction, payload and joint properties as fields of `SimulatorConfig`."""
     return {
         "friction": rng.uniform(0.3, 1.0, 4),
         "payload": rng.uniform(0.0, 3.0),
@@ -81,14 +102,25 @@ def _draw_plant(rng: np.random.Generator) -> dict[str, Any]:
     }
 
 
-def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalman")) -> RobotLoop:
-    """The standing robot under the policy, with the estimators `beside` the one that is followed."""
+def make_loop(setup: Setup, seed: int, shadow_estimators: Sequence[str] = ("learned", "kalman")) -> RobotLoop:
+    """Create the control loop of a standing robot and start the policy.
+
+    Args:
+        setup: Robot, policy, estimator and ground.
+        seed: Seed of the run.
+        shadow_estimators: Kinds of further estimators to measure, see `RobotLoop`.
+
+    Returns:
+        A loop whose supervisor is in mode walk.
+    """
     simulator = make_simulator(setup, seed)
     loop = RobotLoop(
         simulator,
         Supervisor(PolicyFile(setup.policy), backup=KalmanEstimator()),
         make_estimator(setup.estimator, simulator, setup.estimator_file),
-        beside={name: make_estimator(name, simulator, setup.estimator_file) for name in beside},
+        shadow_estimators={
+            name: make_estimator(name, simulator, setup.estimator_file) for name in shadow_estimators
+        },
     )
     loop.start_walking()
     return loop
@@ -96,44 +128,76 @@ def make_loop(setup: Setup, seed: int, beside: Sequence[str] = ("learned", "kalm
 
 @attrs.frozen(eq=False)
 class Walk:
-    """A recorded walk, n ticks; time 0 is the first command. Body frame where not said otherwise."""
+    """A recorded walk of n ticks. Vectors are in the body frame unless stated otherwise.
 
-    time: Array  # (n,) s
-    position: Array  # (n, 3) m, trunk, world
-    velocity: Array  # (n, 3) vx, vy (m/s), wz (rad/s), true
-    asked: Array  # (n, 3) the same, that the policy was asked for
-    heading: Array  # (n,) rad, of the trunk, without jumps
-    contact: NDArray[np.bool_]  # (n, 4) whether a foot touches the ground
-    targets: Array  # (n, 12) rad, what the joints were asked for
-    joint_velocity: Array  # (n, 12) rad/s, measured
-    torque: Array  # (n, 12) N m
-    power: Array  # (n,) W, of the 12 drives, heat included
-    estimate_errors: dict[str, Array]  # (n, 3) m/s, estimate minus truth
-    estimate_drifts: dict[str, float]  # m, level, between the end of the walk and where the estimates lead
-
-
-def record(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> Walk | None:
-    """Command each velocity (vx, vy, wz) for its seconds; None where the robot fell.
-
-    A robot that the supervisor put to damping, or whose simulation diverged, counts as fallen.
+    Attributes:
+        time: Time since the first command (n,), s.
+        position: Position of the trunk (n, 3), m, world frame.
+        velocity: True vx, vy (m/s) and wz (rad/s), (n, 3).
+        commanded: Commanded vx, vy (m/s) and wz (rad/s) after the mux, (n, 3).
+        heading: Unwrapped yaw of the trunk (n,), rad.
+        contact: Whether each foot touches the ground (n, 4).
+        targets: Joint targets (n, 12), rad.
+        joint_velocity: Measured joint velocity (n, 12), rad/s.
+        torque: Measured joint torque (n, 12), N m.
+        power: Power of the 12 drives with heat (n,), W.
+        estimate_errors: Estimate minus true velocity (n, 3), m/s, by estimator.
+        estimate_drifts: Final horizontal dead reckoning error, m, by estimator.
     """
-    samples, stood = _attempt(loop, commands)
-    return _walk(samples) if stood else None
+
+    time: Array
+    position: Array
+    velocity: Array
+    commanded: Array
+    heading: Array
+    contact: NDArray[np.bool_]
+    targets: Array
+    joint_velocity: Array
+    torque: Array
+    power: Array
+    estimate_errors: dict[str, Array]
+    estimate_drifts: dict[str, float]
 
 
-def record_to_the_fall(
+def record_walk(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> Walk | None:
+    """Record a walk through a list of velocity commands.
+
+    A robot counts as fallen if the supervisor leaves mode walk or the simulation diverges.
+
+    Args:
+        loop: Loop with a robot in mode walk.
+        commands: Velocity vx, vy (m/s), wz (rad/s) and duration (s) of each command.
+
+    Returns:
+        The walk; None if the robot fell.
+    """
+    samples, stood = _sample_until_fall(loop, commands)
+    return _to_walk(samples) if stood else None
+
+
+def record_until_fall(
     loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]
 ) -> tuple[Walk | None, bool]:
-    """As `record`, with what there was of the walk where the robot fell, and whether it kept standing."""
-    samples, stood = _attempt(loop, commands)
-    return (_walk(samples) if samples else None), stood
+    """Record a walk up to its end or up to the fall of the robot.
+
+    Args:
+        loop: Loop with a robot in mode walk.
+        commands: Velocity vx, vy (m/s), wz (rad/s) and duration (s) of each command.
+
+    Returns:
+        The walk (None if it has no sample), and whether the robot stayed on its feet.
+    """
+    samples, stood = _sample_until_fall(loop, commands)
+    return (_to_walk(samples) if samples else None), stood
 
 
-def _attempt(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> tuple[list[Sample], bool]:
-    """The samples until the end or the fall, and whether it was the end."""
+def _sample_until_fall(
+    loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]
+) -> tuple[list[Sample], bool]:
+    """Collect samples until the end or the fall, and whether the end was reached."""
     samples: list[Sample] = []
     for velocity, seconds in commands:
-        for _ in range(round(seconds / PERIOD)):
+        for _ in range(round(seconds / CONTROL_PERIOD_S)):
             try:
                 sample = loop.tick(velocity)
             except FloatingPointError:
@@ -144,7 +208,8 @@ def _attempt(loop: RobotLoop, commands: Sequence[tuple[ArrayLike, float]]) -> tu
     return samples, True
 
 
-def _walk(samples: Sequence[Sample]) -> Walk:
+def _to_walk(samples: Sequence[Sample]) -> Walk:
+    """Convert samples to arrays."""
     time = np.array([s.truth.time for s in samples])
     true = np.array([s.truth.linear_velocity for s in samples])
     turning = np.array([s.truth.angular_velocity for s in samples])
@@ -156,7 +221,7 @@ def _walk(samples: Sequence[Sample]) -> Walk:
         time=time - time[0],
         position=position,
         velocity=np.column_stack([true[:, :2], turning[:, 2]]),
-        asked=np.array([s.asked for s in samples]),
+        commanded=np.array([s.commanded for s in samples]),
         heading=np.unwrap(yaw(np.array([s.truth.quaternion for s in samples]))),
         contact=np.array([s.truth.contact for s in samples]),
         targets=np.array([s.command.target for s in samples]),
@@ -172,31 +237,67 @@ def _walk(samples: Sequence[Sample]) -> Walk:
 
 
 def dead_reckoning_error(velocity: Array, position: Array) -> float:
-    """Level distance (m) from the last of the positions to where the velocities lead from the first, (n, 3) each, world."""
-    led = 0.5 * PERIOD * (velocity[1:] + velocity[:-1]).sum(axis=0)
-    return float(np.linalg.norm((led - (position[-1] - position[0]))[:2]))
+    """Return the horizontal error of a position that is integrated from velocities.
+
+    Args:
+        velocity: Velocities (n, 3), m/s, world frame, one per tick.
+        position: True positions (n, 3), m, world frame.
+
+    Returns:
+        Distance between integrated and true final position, m.
+    """
+    # Trapezoidal rule: p_n - p_0 = sum_i (v_i + v_{i+1}) / 2 dt.
+    displacement = 0.5 * CONTROL_PERIOD_S * (velocity[1:] + velocity[:-1]).sum(axis=0)
+    return float(np.linalg.norm((displacement - (position[-1] - position[0]))[:2]))
 
 
 def drive_power(torque: ArrayLike, speed: ArrayLike) -> Array:
-    """P of Eq. 10, (...,) W: sum over the joints of max(k_r tau^2 + tau dq, 0); (..., 12) N m, rad/s."""
+    """Return the electrical power of the 12 drives, P in Eq. 10 of the paper.
+
+    Args:
+        torque: Joint torques (..., 12), N m.
+        speed: Joint velocities (..., 12), rad/s.
+
+    Returns:
+        Power (...,), W, without recuperation.
+    """
+    # Eq. 10: P = sum_j max(k_r tau_j^2 + tau_j dq_j, 0): heat plus mechanical power, per joint.
     torque = np.asarray(torque, float)
-    power: Array = np.maximum(HEAT * torque**2 + torque * np.asarray(speed, float), 0.0).sum(axis=-1)
+    power: Array = np.maximum(HEATING_COEFFICIENT * torque**2 + torque * np.asarray(speed, float), 0.0).sum(
+        axis=-1
+    )
     return power
 
 
 def cost_of_transport(power: float, mass: float, command: Array, mean: Array) -> float | None:
-    """Eq. 10 with the mean power (W): CoT along the commanded direction, CoTu where only a turn is commanded.
+    """Return the cost of transport, or the cost of turning for a pure turn (Eq. 10).
 
-    command, mean (3,): vx, vy, wz. None where nothing is commanded, or the robot does not go that way.
+    Args:
+        power: Mean power of the drives, W.
+        mass: Mass of robot and payload, kg.
+        command: Commanded vx, vy (m/s) and wz (rad/s), (3,).
+        mean: Mean true velocity in the same order (3,).
+
+    Returns:
+        The dimensionless cost; None for a zero command, or if the robot does not move along it.
     """
+    # Eq. 10: CoT = P / (m g v), with v the mean velocity along the command. For a pure turn,
+    # CoTu = P / (m g l_c w_z), with the distance l_c of diagonal feet.
     speed = float(np.hypot(*command[:2]))
     if speed > 0.0:
         pace = float(command[:2] @ mean[:2]) / speed
     else:
-        pace = DIAGONAL * float(np.sign(command[2]) * mean[2])
+        pace = DIAGONAL_FOOT_DISTANCE_M * float(np.sign(command[2]) * mean[2])
     return power / (mass * robot.GRAVITY * pace) if pace > 0.0 else None
 
 
 def jitter(targets: ArrayLike) -> float:
-    """Mean absolute second difference of joint targets (n, 12), rad, over ticks of 5 ms (Figure 9)."""
+    """Return the action jitter: mean absolute second difference of the joint targets (Figure 9).
+
+    Args:
+        targets: Joint targets (n, 12), rad, one per tick of 5 ms.
+
+    Returns:
+        Jitter, rad.
+    """
     return float(np.abs(np.diff(np.asarray(targets, float), n=2, axis=0)).mean())

@@ -1,4 +1,4 @@
-"""`quadvel world`: a world from above, as a picture."""
+"""Draws a world from above (`quadvel world`)."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from quadvel_sim.world import SHIPPED, World
 from .output import output_file
 from .report import write_figure
 
-WIDTH = 10.0  # inches
+FIGURE_WIDTH_IN = 10.0  # inches
 FORMATS = (".png", ".svg", ".pdf")
-GROUND = {"grass": "#a9c48f", "gravel": "#cfc7b8", "paved": "#d9dadc"}
-LED, OTHER = "#1a9641", "#4575b4"
+GROUND_COLOURS = {"grass": "#a9c48f", "gravel": "#cfc7b8", "paved": "#d9dadc"}
+LEADER_COLOUR, OTHER_COLOUR = "#1a9641", "#4575b4"
 
 
 def world_command(
@@ -34,7 +34,7 @@ def world_command(
         ),
     ] = None,
 ) -> None:
-    """Check a world's file, and draw the world from above.
+    """Check a world file, and draw the world from above.
 
     \b
     For example:
@@ -44,31 +44,45 @@ def world_command(
     path = output_file(Path(f"out/{loaded.name}.png") if out is None else out)
     if path.suffix not in FORMATS:
         raise ValueError(f"{path}: found the suffix {path.suffix!r}, expected {', '.join(FORMATS)}")
-    write_figure(path, draw(loaded))
+    write_figure(path, draw_world(loaded))
     Console(soft_wrap=True).print(f"written: {path}")
 
 
-def draw(world: World) -> Figure:
-    """Ground, what stands on it, and the ways of the persons, who are led in green."""
+def draw_world(world: World) -> Figure:
+    """Draw ground, obstacles and paths of the people; the paths of leaders are green.
+
+    Args:
+        world: The world.
+
+    Returns:
+        The figure.
+    """
     figure = Figure(layout="constrained")
     axes = figure.subplots()
     _ground(axes, world)
-    _things(axes, world)
-    _ways(axes, world)
+    _obstacles(axes, world)
+    _paths(axes, world)
     axes.plot(0.0, 0.0, ">", color="black", markersize=7, label="the robot's start", zorder=6)
     axes.set(xlabel="x, m", ylabel="y, m", title=world.name, aspect="equal")
     axes.autoscale_view()
     across, up = np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())
-    figure.set_size_inches(WIDTH, float(np.clip(WIDTH * up / across, 2.5, WIDTH)) + 1.0)
+    figure.set_size_inches(
+        FIGURE_WIDTH_IN, float(np.clip(FIGURE_WIDTH_IN * up / across, 2.5, FIGURE_WIDTH_IN)) + 1.0
+    )
     figure.legend(loc="outside lower center", ncols=5, fontsize="small", frameon=False)
     return figure
 
 
 def _ground(axes: Axes, world: World) -> None:
+    """Draw patches and hills."""
     for patch in world.patches:
-        _rectangle(axes, patch.position, patch.size, patch.yaw, GROUND[patch.surface], label=patch.surface)
+        _rectangle(
+            axes, patch.position, patch.size, patch.yaw, GROUND_COLOURS[patch.surface], label=patch.surface
+        )
     for hill in world.hills:
-        _rectangle(axes, hill.position, hill.size, hill.yaw, GROUND[hill.surface], edge="0.5", label="hill")
+        _rectangle(
+            axes, hill.position, hill.size, hill.yaw, GROUND_COLOURS[hill.surface], edge="0.5", label="hill"
+        )
         _rectangle(axes, hill.position, hill.top, hill.yaw, "none", edge="0.5")
         axes.annotate(
             f"{hill.slope:g}°",
@@ -80,7 +94,8 @@ def _ground(axes: Axes, world: World) -> None:
         )
 
 
-def _things(axes: Axes, world: World) -> None:
+def _obstacles(axes: Axes, world: World) -> None:
+    """Draw walls, boxes, tables and trees."""
     for wall in world.walls:
         for begin, end in pairwise(wall.points):
             length = float(np.hypot(*(end - begin))) + wall.thickness
@@ -99,14 +114,15 @@ def _things(axes: Axes, world: World) -> None:
             )
 
 
-def _ways(axes: Axes, world: World) -> None:
+def _paths(axes: Axes, world: World) -> None:
+    """Draw the paths of the people."""
     for person in world.persons:
-        way = np.vstack([person.path, person.path[:1]]) if person.closed else person.path
-        label = _once(axes, "who is led" if person.led else "others")
-        color, width = (LED, 1.8) if person.led else (OTHER, 1.0)
-        axes.plot(*way.T, color=color, linewidth=width, label=label, zorder=5)
-        if np.hypot(*np.ptp(way, axis=0)) < 0.5:  # who stands
-            axes.plot(*way[-1], "o", color=color, markersize=3, zorder=5)
+        path = np.vstack([person.path, person.path[:1]]) if person.closed else person.path
+        label = _once(axes, "leader" if person.led else "others")
+        color, width = (LEADER_COLOUR, 1.8) if person.led else (OTHER_COLOUR, 1.0)
+        axes.plot(*path.T, color=color, linewidth=width, label=label, zorder=5)
+        if np.hypot(*np.ptp(path, axis=0)) < 0.5:  # standing people
+            axes.plot(*path[-1], "o", color=color, markersize=3, zorder=5)
 
 
 def _rectangle(
@@ -118,7 +134,7 @@ def _rectangle(
     edge: str = "none",
     label: str | None = None,
 ) -> None:
-    """`size` (2,) in m around `centre`, turned by `yaw` deg."""
+    """Add a rectangle of `size` (2,) m around `centre`, rotated by `yaw` degrees."""
     corner, (along, across) = np.asarray(centre) - 0.5 * np.asarray(size), np.asarray(size)
     axes.add_patch(
         Rectangle(
@@ -129,5 +145,5 @@ def _rectangle(
 
 
 def _once(axes: Axes, label: str) -> str | None:
-    """`label`, unless the legend has it already."""
+    """Return `label`, unless the legend holds it already."""
     return None if label in axes.get_legend_handles_labels()[1] else label

@@ -1,1 +1,1 @@
-"""The fault campaign: what goes wrong at random instants, what the robot does then, and how soon."""
+"""Fault campaign: injects faults at random instants and measures the robot's reaction."""

@@ -1,4 +1,4 @@
-"""The campaign: each fault in each mode where it matters, from random seeds, against what has to follow and how soon."""
+"""Runs the fault campaign: every fault in every relevant mode, with random seeds, against its oracle."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from quadvel_policy.policy_file import PolicyFile
 from quadvel_sim.config import SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator
 
-from ..pool import Call, in_parallel
+from ..pool import Call, run_in_parallel
 from .cases import CASES, Case
-from .injection import injection
+from .injection import make_injection
 from .stack import Array, Stack
 
 SCHEMA = 1
-AFTERWARDS = 2.5  # s that a run goes on after the fault began
+OBSERVATION_TIME_S = 2.5  # after the fault
 VELOCITIES = (
     (0.5, 0.0, 0.0),
     (1.0, 0.0, 0.0),
@@ -31,61 +31,79 @@ VELOCITIES = (
     (0.5, 0.0, 0.8),
     (0.0, 0.0, 1.0),
 )
-STANDS, TURNS_NOT = 0.1, 0.3  # m/s, rad/s, slower than which a robot stands
+STANDING_SPEED_LIMIT, STANDING_YAW_RATE_LIMIT = 0.1, 0.3  # m/s, rad/s: a slower robot stands
 
 
 @attrs.define
-class Run:
-    """What came of one fault from one seed. Times in s since the fault began, None where it did not come."""
+class FaultRun:
+    """Outcome of one fault from one seed. Times are in s since the fault; None: never.
+
+    Attributes:
+        component: Faulty component.
+        kind: Kind of fault.
+        mode: Mode of the controller at the fault.
+        seed: Seed of the run.
+        fault: Name of the finding that stopped the robot.
+        findings: Names of all findings, in order.
+        named_after: Time until the first expected finding.
+        safe_after: Time until the expected end: damped, or standing.
+        ended: Final mode of the supervisor.
+        fell: Whether the robot fell.
+        torque: Largest torque, divided by the limit of the drive.
+        speed: Largest speed of a joint that its drive accelerates, divided by the drive's limit.
+        too_fast: Longest time in which a drive accelerated a joint above MAX_SPEED_RATIO, s.
+        beyond: Largest overtravel of a joint beyond its mechanical range, rad.
+        wrong: Violations of the oracle, one sentence each.
+    """
 
     component: str
     kind: str
     mode: str
     seed: int
     fault: str = ""
-    """the name of what made the robot stop"""
     findings: list[str] = attrs.Factory(list)
-    """every name that was found, in order"""
     named_after: float | None = None
-    """until one of the right names was found"""
     safe_after: float | None = None
-    """until the robot was as it has to end: damped, or standing"""
     ended: str = ""
     fell: bool = False
     torque: float = 0.0
-    """largest torque, as a share of the drive's limit"""
     speed: float = 0.0
-    """largest speed of a joint that its drive moves on, as a share of what it can do"""
     too_fast: float = 0.0
-    """longest time in which a drive moved a joint on that was beyond MAX_SPEED, s"""
     beyond: float = 0.0
-    """how far a joint was beyond its mechanical range, rad"""
     wrong: list[str] = attrs.Factory(list)
-    """what is against the oracle, as sentences"""
 
 
-def campaign(
+def run_campaign(
     seeds: int, only: str | None = None, progress: Callable[[int, int], None] = lambda done, of: None
-) -> list[Run]:
-    """Every component and kind from seeds 0, 1, ..., which take turns in its modes.
+) -> list[FaultRun]:
+    """Run every component and kind of fault from seeds 0, 1, ..., which alternate between its modes.
 
-    only: those cases whose "component kind mode" holds this text. ValueError where none does.
+    Args:
+        seeds: Number of seeds of each component and kind.
+        only: Run only cases whose "component kind mode" contains this text.
+        progress: Called with the number of finished runs and the number of all runs.
+
+    Returns:
+        The runs, case by case.
+
+    Raises:
+        ValueError: No case contains `only`.
     """
     cases = [case for case in CASES if only is None or only in case.name]
     if not cases:
         words = [dict.fromkeys(case.name.split()[i] for case in CASES) for i in range(3)]
         components, kinds_of_fault, modes = (", ".join(column) for column in words)
         raise ValueError(
-            f"no case holds '{only}'; components: {components}; kinds: {kinds_of_fault}; modes: {modes}"
+            f"no case contains '{only}'; components: {components}; kinds: {kinds_of_fault}; modes: {modes}"
         )
     kinds: dict[tuple[str, str], list[Case]] = {}
     for case in cases:
         kinds.setdefault((case.component, case.kind), []).append(case)
     calls: list[Call] = [
-        (run, modes[seed % len(modes)], seed) for modes in kinds.values() for seed in range(seeds)
+        (run_case, modes[seed % len(modes)], seed) for modes in kinds.values() for seed in range(seeds)
     ]
-    runs: list[Run | None] = [None] * len(calls)
-    for done, (i, answer) in enumerate(in_parallel(calls), 1):
+    runs: list[FaultRun | None] = [None] * len(calls)
+    for done, (i, answer) in enumerate(run_in_parallel(calls), 1):
         runs[i] = answer
         progress(done, len(calls))
     return [one for one in runs if one is not None]
@@ -93,20 +111,29 @@ def campaign(
 
 @cache
 def _networks() -> tuple[PolicyFile, LearnedEstimator]:
+    """Load the shipped networks once per process."""
     return PolicyFile(), LearnedEstimator()
 
 
-def run(case: Case, seed: int) -> Run:
-    """One fault from one seed."""
+def run_case(case: Case, seed: int) -> FaultRun:
+    """Simulate one fault.
+
+    Args:
+        case: Fault and oracle.
+        seed: Seed of simulator, instant and fault.
+
+    Returns:
+        The outcome.
+    """
     rng = np.random.default_rng([seed, *map(ord, case.name)])
-    stack = _prepared(case.mode, rng, seed)
-    result = Run(case.component, case.kind, case.mode, seed)
+    stack = _prepare_stack(case.mode, rng, seed)
+    result = FaultRun(case.component, case.kind, case.mode, seed)
     healthy = [*stack.supervisor.findings]
     if healthy or stack.supervisor.fault:
         result.wrong.append(f"before the fault: {stack.supervisor.fault or healthy[0].name}")
-    injection(case.component, case.kind).begin(stack, rng)
+    make_injection(case.component, case.kind).begin(stack, rng)
     began, too_fast = stack.now, np.zeros(12)  # ms; s by joint
-    for _ in range(round(AFTERWARDS / DT)):
+    for _ in range(round(OBSERVATION_TIME_S / DT)):
         try:
             stack.step()
         except FloatingPointError as error:
@@ -114,116 +141,138 @@ def run(case: Case, seed: int) -> Run:
             break
         too_fast = _observe(stack, case, (stack.now - began) * DT, result, too_fast)
     result.ended, result.fell = stack.supervisor.mode, stack.simulator.fallen
-    result.wrong += _judge(case, result)
+    result.wrong += _violations(case, result)
     return result
 
 
-def _prepared(mode: str, rng: np.random.Generator, seed: int) -> Stack:
-    """A robot in the midst of `mode`, at a random instant of it."""
+def _prepare_stack(mode: str, rng: np.random.Generator, seed: int) -> Stack:
+    """Bring a robot to a random instant of a mode."""
     simulator = Simulator(SimulatorConfig(seed=seed))
     simulator.reset("lie" if mode == "stand_up" else "stand")
     policy, estimator = _networks()
     policy.reset()
     estimator.reset()
     stack = Stack(simulator, policy, estimator)
-    _let(stack, 0.05)
+    _advance(stack, 0.05)
     _request(stack, "stand_up" if mode == "stand_up" else "stance")
-    _let(stack, 0.6)
+    _advance(stack, 0.6)
     if mode == "stand_up":
-        _let(stack, rng.uniform(0.0, 1.0))
+        _advance(stack, rng.uniform(0.0, 1.0))
     elif mode == "stance":
-        _let(stack, rng.uniform(0.0, 0.5))
+        _advance(stack, rng.uniform(0.0, 0.5))
     elif mode == "lie_down":
         _request(stack, "lie_down")
-        _let(stack, rng.uniform(0.2, 0.7))
+        _advance(stack, rng.uniform(0.2, 0.7))
     else:
-        stack.velocity = np.array(VELOCITIES[int(rng.integers(len(VELOCITIES)))])
-        _let(stack, rng.uniform(1.2, 2.0))
+        stack.planned_velocity = np.array(VELOCITIES[int(rng.integers(len(VELOCITIES)))])
+        _advance(stack, rng.uniform(1.2, 2.0))
     return stack
 
 
 def _request(stack: Stack, mode: str) -> None:
-    taken, sentence = stack.supervisor.request(mode)
-    if not taken:
+    """Request a mode from the supervisor. Raises RuntimeError if it refuses."""
+    accepted, sentence = stack.supervisor.request(mode)
+    if not accepted:
         raise RuntimeError(f"the supervisor refused {mode}: {sentence}")
 
 
-def _let(stack: Stack, seconds: float) -> None:
+def _advance(stack: Stack, seconds: float) -> None:
+    """Simulate for some seconds."""
     for _ in range(round(seconds / DT)):
         stack.step()
 
 
-def _observe(stack: Stack, case: Case, time: float, result: Run, too_fast: Array) -> Array:
-    """Take down what is seen at one millisecond.
+def _observe(stack: Stack, case: Case, time: float, result: FaultRun, too_fast: Array) -> Array:
+    """Record what happens in one millisecond.
 
-    too_fast: for how long each joint (12,) has been driven beyond MAX_SPEED by the millisecond before, s; returned for this one.
+    Args:
+        stack: The stack after the step.
+        case: Fault and oracle.
+        time: Time since the fault, s.
+        result: Outcome to update.
+        too_fast: Time for which each joint (12,) has been too fast before this step, s.
+
+    Returns:
+        The same times after this step (12,), s.
     """
     data, supervisor = stack.simulator.data, stack.supervisor
     result.torque = max(result.torque, float((np.abs(data.ctrl) / TORQUE_LIMIT).max()))
+    # A drive accelerates its joint if torque and speed have the same sign.
     q, dq = data.qpos[7:], data.qvel[6:]
     driven = np.where(data.ctrl * dq > 0.0, np.abs(dq) / VELOCITY_LIMIT, 0.0)
     result.speed = max(result.speed, float(driven.max()))
-    too_fast = np.where(driven > MAX_SPEED, too_fast + DT, 0.0)
+    too_fast = np.where(driven > MAX_SPEED_RATIO, too_fast + DT, 0.0)
     result.too_fast = max(result.too_fast, float(too_fast.max()))
     result.beyond = max(result.beyond, float(np.maximum(LOWER - q, q - UPPER).max()))
     for name in [supervisor.fault, *(finding.name for finding in supervisor.findings)]:
         if name and name not in result.findings:
             result.findings.append(name)
     result.fault = result.fault or supervisor.fault
-    if result.named_after is None and set(result.findings) & set(case.named):
+    if result.named_after is None and set(result.findings) & set(case.expected_findings):
         result.named_after = time
-    if result.safe_after is None and case.ends != "goes on" and _is_safe(stack, case.ends):
+    if result.safe_after is None and case.expected_end != "goes on" and _is_safe(stack, case.expected_end):
         result.safe_after = time
     return too_fast
 
 
 def _is_safe(stack: Stack, ends: str) -> bool:
+    """Return whether the robot has reached the expected end."""
     if ends == "damping":
-        return stack.simulator.braking or stack.held_mode == MODE_DAMPING
+        return stack.simulator.braking or stack.robot_command_mode == MODE_DAMPING
     if ends == "stance":
         return stack.supervisor.mode == "stance"
     if ends == "stopped":
         return stack.supervisor.mode in ("stance", "fault")
     velocity = stack.simulator.data.qvel
-    return float(np.linalg.norm(velocity[:2])) < STANDS and abs(velocity[5]) < TURNS_NOT
+    return (
+        float(np.linalg.norm(velocity[:2])) < STANDING_SPEED_LIMIT
+        and abs(velocity[5]) < STANDING_YAW_RATE_LIMIT
+    )
 
 
-def _judge(case: Case, result: Run) -> Iterator[str]:
-    """What is against the oracle."""
-    if case.named and result.named_after is None:
+def _violations(case: Case, result: FaultRun) -> Iterator[str]:
+    """Yield one sentence for each violation of the oracle."""
+    if case.expected_findings and result.named_after is None:
         found = ", ".join(result.findings) or "nothing"
-        yield f"found {found}, expected {' or '.join(case.named)}"
-    elif result.named_after is not None and result.named_after > case.named_within:
-        yield f"named after {result.named_after:.3f} s, expected {case.named_within:.3f} s"
-    if case.ends != "goes on" and case.ends != "any":
+        yield f"found {found}, expected {' or '.join(case.expected_findings)}"
+    elif result.named_after is not None and result.named_after > case.finding_deadline:
+        yield f"named after {result.named_after:.3f} s, expected {case.finding_deadline:.3f} s"
+    if case.expected_end != "goes on" and case.expected_end != "any":
         if result.safe_after is None:
-            yield f"ended in {result.ended}, expected {case.ends}"
-        elif result.safe_after > case.safe_within:
-            yield f"{case.ends} after {result.safe_after:.3f} s, expected {case.safe_within:.3f} s"
-    if case.ends in ("goes on", "stands") and (result.fault or result.fell):
+            yield f"ended in {result.ended}, expected {case.expected_end}"
+        elif result.safe_after > case.safe_deadline:
+            yield f"{case.expected_end} after {result.safe_after:.3f} s, expected {case.safe_deadline:.3f} s"
+    if case.expected_end in ("goes on", "stands") and (result.fault or result.fell):
         yield f"stopped by {result.fault or 'a fall'}, expected to go on"
-    if case.ends == "stance" and result.fell:
+    if case.expected_end == "stance" and result.fell:
         yield "fell on the way to a stand"
-    if case.ends == "any" and result.fell and not result.fault:
+    if case.expected_end == "any" and result.fell and not result.fault:
         yield "fell, and no fault was named"
     if result.torque > 1.0 + 1e-6:
         yield f"a torque of {result.torque:.2f} times the drive's limit"
-    if result.too_fast > REACTION:
-        yield f"a joint driven on beyond {MAX_SPEED} times its drive's speed for {result.too_fast:.3f} s"
-    if result.beyond > (MAX_BEYOND_IN_A_FALL if result.fell else MAX_BEYOND):
+    if result.too_fast > REACTION_TIME_S:
+        yield f"a joint driven on beyond {MAX_SPEED_RATIO} times its drive's speed for {result.too_fast:.3f} s"
+    if result.beyond > (MAX_OVERTRAVEL_IN_FALL_RAD if result.fell else MAX_OVERTRAVEL_RAD):
         yield f"a joint {result.beyond:.2f} rad beyond its mechanical range"
 
 
-MAX_SPEED = 1.25
-"""Speed of a joint, as a share of what its drive can do, beyond which the drive must not move it on"""
-REACTION = 0.02
-"""s in which it may: until the next tick sees it and the drive has heard of it"""
-MAX_BEYOND, MAX_BEYOND_IN_A_FALL = 0.05, 0.2
-"""rad that a joint may press into its mechanical stop, which yields; in a fall the ground does it"""
+MAX_SPEED_RATIO = 1.25
+"""Joint speed over the drive's limit above which the drive must not accelerate the joint."""
+REACTION_TIME_S = 0.02
+"""Time in which it may, s: until the next tick detects it and its command reaches the drive."""
+MAX_OVERTRAVEL_RAD, MAX_OVERTRAVEL_IN_FALL_RAD = 0.05, 0.2
+"""Overtravel into a compliant mechanical stop, rad; in a fall, the ground presses the joint."""
 
 
-def summary(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """One entry a case."""
+def summarise_cases(runs: Sequence[FaultRun]) -> list[dict[str, Any]]:
+    """Summarise the runs of each case.
+
+    Args:
+        runs: All runs.
+
+    Returns:
+        One entry per case, for JSON.
+    """
     entries = []
     for case in CASES:
         own = [
@@ -232,17 +281,18 @@ def summary(runs: Sequence[Run]) -> list[dict[str, Any]]:
             if (one.component, one.kind, one.mode) == (case.component, case.kind, case.mode)
         ]
         if own:
-            entries.append(_entry(case, own))
+            entries.append(_case_summary(case, own))
     return entries
 
 
-def _entry(case: Case, runs: list[Run]) -> dict[str, Any]:
+def _case_summary(case: Case, runs: list[FaultRun]) -> dict[str, Any]:
+    """Summarise the runs of one case."""
     named = [one.named_after for one in runs if one.named_after is not None]
     safe = [one.safe_after for one in runs if one.safe_after is not None]
     return {
         "case": case.name,
-        "ends": case.ends,
-        "named": sorted({name for one in runs for name in one.findings if name in case.named}),
+        "ends": case.expected_end,
+        "named": sorted({name for one in runs for name in one.findings if name in case.expected_findings}),
         "runs": len(runs),
         "as_expected": sum(not one.wrong for one in runs),
         "named_after": [float(np.median(named)), max(named)] if named else None,

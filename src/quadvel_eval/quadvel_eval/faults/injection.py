@@ -1,4 +1,4 @@
-"""What can be done to a `Stack`: each component with each kind of fault that makes sense for it."""
+"""Injects faults into a `Stack`: each component with each kind of fault that makes sense for it."""
 
 from __future__ import annotations
 
@@ -15,29 +15,46 @@ from quadvel_description.robot import JOINT_NAMES
 from quadvel_description.state import RobotState
 from quadvel_sim.simulator import DT
 
-from .stack import Link, Message, Stack, spoil
+from .stack import Link, Message, Stack, corrupt
 
 KINDS = ("off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent", "duplicated")
 Rng = np.random.Generator
-Way = list[tuple[int, Message]]
+Deliveries = list[tuple[int, Message]]
 
-LATE = 80  # ms, of what is delayed
-ONE_OF = 16  # messages get through a slow link
-BURST = 15  # ms that an intermittent link is silent at most
-PAUSE = 100  # ms that a process does nothing, now and then
+DELAY_MS = 80  # of delayed messages and sensors
+SLOW_LINK_DIVISOR = 16  # a slow link passes one message in so many
+MAX_DROPOUT_MS = 15  # of an intermittent link
+PAUSE_MS = 100  # of an intermittent process
 
 
 @attrs.frozen
 class Injection:
-    """One fault: `begin(stack, rng)` brings it about."""
+    """One fault; `begin(stack, rng)` injects it.
+
+    Attributes:
+        component: Key of COMPONENTS.
+        kind: One of KINDS.
+        begin: Function that injects the fault into a stack.
+    """
 
     component: str
     kind: str
     begin: Callable[[Stack, Rng], None]
 
 
-def injection(component: str, kind: str) -> Injection:
-    """The fault. Raises ValueError, one sentence, where there is no such component or kind, or they make no sense together."""
+def make_injection(component: str, kind: str) -> Injection:
+    """Return the injection of a fault.
+
+    Args:
+        component: Key of COMPONENTS.
+        kind: One of KINDS.
+
+    Returns:
+        The injection.
+
+    Raises:
+        ValueError: Component or kind is unknown, or the combination makes no sense.
+    """
     if component not in COMPONENTS:
         raise ValueError(f"component is '{component}', expected one of {', '.join(COMPONENTS)}")
     if kind not in KINDS:
@@ -45,80 +62,92 @@ def injection(component: str, kind: str) -> Injection:
     known = COMPONENTS[component]
     if kind not in known:
         raise ValueError(
-            f"{component} can't be {kind}: expected one of {', '.join(known)}; {WHY_NOT[component]}"
+            f"{component} can't be {kind}: expected one of {', '.join(known)}; {REASONS_UNSUPPORTED[component]}"
         )
     return Injection(component, kind, known[kind])
 
 
-# Links.
+# Faults of links: functions from a link to what happens to each message.
 
 
 def _link(
-    name: str, way: Callable[[Link, Rng], Callable[[int, Message], Way]]
+    name: str, make_fault: Callable[[Link, Rng], Callable[[int, Message], Deliveries]]
 ) -> Callable[[Stack, Rng], None]:
+    """Install a fault on a link."""
+
     def begin(stack: Stack, rng: Rng) -> None:
-        stack.links[name].way = way(stack.links[name], rng)
+        stack.links[name].fault = make_fault(stack.links[name], rng)
 
     return begin
 
 
-def _off(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
+def _off(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Lose every message."""
     return lambda now, message: []
 
 
-def _repeated(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
-    """The first message again and again; a state under the stamp of each that it takes the place of."""
+def _repeated(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Repeat the first message forever; a repeated state gets the stamp of the one it replaces."""
     first: list[Message] = []
 
-    def way(now: int, message: Message) -> Way:
+    def deliver(now: int, message: Message) -> Deliveries:
         first.append(message)
-        return [(0, _with(first[0], stamp=message.stamp) if hasattr(message, "q") else first[0])]
+        return [(0, _replaced(first[0], stamp=message.stamp) if hasattr(message, "q") else first[0])]
 
-    return way
-
-
-def _garbage(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
-    return lambda now, message: [(0, spoil(message, rng))]
+    return deliver
 
 
-def _slow(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
+def _garbage(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Corrupt every message."""
+    return lambda now, message: [(0, corrupt(message, rng))]
+
+
+def _slow(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Pass one message in SLOW_LINK_DIVISOR."""
     count = iter(range(1, 10**9))
-    return lambda now, message: [(0, message)] if next(count) % ONE_OF == 0 else []
+    return lambda now, message: [(0, message)] if next(count) % SLOW_LINK_DIVISOR == 0 else []
 
 
-def _delayed(late: int) -> Callable[[Link, Rng], Callable[[int, Message], Way]]:
-    return lambda link, rng: lambda now, message: [(late, message)]
+def _delayed(delay_ms: int) -> Callable[[Link, Rng], Callable[[int, Message], Deliveries]]:
+    """Delay every message by `delay_ms` ms."""
+    return lambda link, rng: lambda now, message: [(delay_ms, message)]
 
 
-def _intermittent(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
-    silent_until = [0, 0]  # and the next time from which it may be silent
+def _intermittent(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Lose all messages in random bursts of up to MAX_DROPOUT_MS."""
+    silent_until = [0, 0]  # end of this dropout, and earliest start of the next, ms
 
-    def way(now: int, message: Message) -> Way:
+    def deliver(now: int, message: Message) -> Deliveries:
         if now >= silent_until[1]:
             silent_until[:] = (
-                now + int(rng.integers(1, BURST + 1)),
-                now + int(rng.integers(2 * BURST, 8 * BURST)),
+                now + int(rng.integers(1, MAX_DROPOUT_MS + 1)),
+                now + int(rng.integers(2 * MAX_DROPOUT_MS, 8 * MAX_DROPOUT_MS)),
             )
         return [] if now < silent_until[0] else [(0, message)]
 
-    return way
+    return deliver
 
 
-def _duplicated(link: Link, rng: Rng) -> Callable[[int, Message], Way]:
+def _duplicated(link: Link, rng: Rng) -> Callable[[int, Message], Deliveries]:
+    """Deliver every message twice, 1 ms apart."""
     return lambda now, message: [(0, message), (1, message)]
 
 
 def _changed(
     change: Callable[[Message, Rng], Message],
-) -> Callable[[Link, Rng], Callable[[int, Message], Way]]:
+) -> Callable[[Link, Rng], Callable[[int, Message], Deliveries]]:
+    """Change every message by a function."""
     return lambda link, rng: lambda now, message: [(0, change(message, rng))]
 
 
-def _with(message: Message, **fields: Any) -> Message:
+def _replaced(message: Message, **fields: Any) -> Message:
+    """Copy a message with other fields."""
     return SimpleNamespace(**{**vars(message), **fields})
 
 
-def _both(*begins: Callable[[Stack, Rng], None]) -> Callable[[Stack, Rng], None]:
+def _combined(*begins: Callable[[Stack, Rng], None]) -> Callable[[Stack, Rng], None]:
+    """Inject several faults together."""
+
     def begin(stack: Stack, rng: Rng) -> None:
         for one in begins:
             one(stack, rng)
@@ -126,10 +155,12 @@ def _both(*begins: Callable[[Stack, Rng], None]) -> Callable[[Stack, Rng], None]
     return begin
 
 
-# Sensors.
+# Faults of sensors: functions from a measured state to a faulty one.
 
 
 def _sensor(fields: tuple[str, ...], kind: str, one_joint: bool = False) -> Callable[[Stack, Rng], None]:
+    """Install a sensor fault on fields of the state, at one random joint or at all values."""
+
     def begin(stack: Stack, rng: Rng) -> None:
         joint = int(rng.integers(12))
         sizes = {"quaternion": 4, "foot_force": 4, "angular_velocity": 3, "linear_acceleration": 3}
@@ -137,13 +168,13 @@ def _sensor(fields: tuple[str, ...], kind: str, one_joint: bool = False) -> Call
             field: np.arange(12) == joint if one_joint else np.ones(sizes.get(field, 12), bool)
             for field in fields
         }
-        stack.sensors = _Sensor(kind, places, rng)
+        stack.sensor_fault = _Sensor(kind, places, rng)
 
     return begin
 
 
 class _Sensor:
-    """Spoils some numbers of the states."""
+    """Sensor fault: replaces some values of each state."""
 
     def __init__(self, kind: str, places: dict[str, NDArray[np.bool_]], rng: Rng) -> None:
         self._kind, self._places, self._rng = kind, places, rng
@@ -158,6 +189,7 @@ class _Sensor:
         return attrs.evolve(state, **values)
 
     def _value(self, field: str, now: int, true: NDArray[np.float64]) -> Any:
+        """Faulty value of a field."""
         kind, begun = self._kind, self._past[0]
         if kind == "off" or (kind == "intermittent" and self._rng.random() < 0.3):
             return 0.0
@@ -166,7 +198,7 @@ class _Sensor:
         if kind == "slow":  # a new value every 200 ms
             return getattr(self._past[(now - begun[0]) // 200 * 200 // 5][1], field)
         if kind == "delayed":
-            return getattr(self._past[max(len(self._past) - 1 - LATE // 5, 0)][1], field)
+            return getattr(self._past[max(len(self._past) - 1 - DELAY_MS // 5, 0)][1], field)
         if kind == "garbage":
             return self._rng.normal(0.0, GARBAGE[field], np.shape(true))
         return _wrong(field, true) if kind == "wrong" else true
@@ -181,26 +213,27 @@ GARBAGE = {
     "linear_acceleration": 50.0,
     "foot_force": 500.0,
 }
-"""Standard deviation of nonsense, in the field's unit"""
-TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
+"""Standard deviation of garbage, in the unit of the field."""
+MOUNTING_TILT = np.array([np.cos(0.25), np.sin(0.25), 0.0, 0.0])
 
 
 def _wrong(field: str, true: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A zero that is off, or for the orientation a mounting."""
+    """Add an offset to a field; the orientation gets a wrong mounting (Hamilton product with a tilt)."""
     if field == "quaternion":
+        # Hamilton product q * (a, b, 0, 0): rotation by 2 acos(a) about the body's x axis.
         w, x, y, z = true
-        a, b = TILT[0], TILT[1]
+        a, b = MOUNTING_TILT[0], MOUNTING_TILT[1]
         return np.array([w * a - x * b, x * a + w * b, y * a + z * b, z * a - y * b])
     return (
         true + {"q": 0.5, "dq": 0.0, "tau": 25.0, "angular_velocity": 1.5, "linear_acceleration": 15.0}[field]
     )
 
 
-# Drives, processes, clock, processor.
+# Faults of drives, processes, clock and processor.
 
 
 def _dead_drive(stack: Stack, rng: Rng) -> None:
-    """One that gives no torque and says so."""
+    """Set the torque of one random drive to zero, also in its feedback."""
     joint = int(rng.integers(12))
     step = stack.simulator.actuator.step
 
@@ -213,7 +246,7 @@ def _dead_drive(stack: Stack, rng: Rng) -> None:
 
 
 def _jammed(stack: Stack, rng: Rng) -> None:
-    """Something holds one joint where it is."""
+    """Block one random thigh or calf joint by friction."""
     joint = mujoco.mj_name2id(
         stack.simulator.model,
         mujoco.mjtObj.mjOBJ_JOINT,
@@ -223,6 +256,8 @@ def _jammed(stack: Stack, rng: Rng) -> None:
 
 
 def _killed(name: str) -> Callable[[Stack, Rng], None]:
+    """Kill a process."""
+
     def begin(stack: Stack, rng: Rng) -> None:
         stack.processes[name].killed = True
 
@@ -230,6 +265,8 @@ def _killed(name: str) -> Callable[[Stack, Rng], None]:
 
 
 def _stopped(name: str) -> Callable[[Stack, Rng], None]:
+    """Stop a process without an end."""
+
     def begin(stack: Stack, rng: Rng) -> None:
         stack.processes[name].stopped = True
 
@@ -237,22 +274,26 @@ def _stopped(name: str) -> Callable[[Stack, Rng], None]:
 
 
 def _pausing(name: str) -> Callable[[Stack, Rng], None]:
+    """Stop a process for PAUSE_MS in every three."""
+
     def begin(stack: Stack, rng: Rng) -> None:
-        process, report = stack.processes[name], stack.sensors
+        process, report = stack.processes[name], stack.sensor_fault
 
         def pause(now: int, state: RobotState) -> RobotState:
-            if now // PAUSE % 3 == 0:
+            if now // PAUSE_MS % 3 == 0:
                 process.stopped = True
             elif process.stopped:
                 process.resume()
             return state if report is None else report(now, state)
 
-        stack.sensors = pause
+        stack.sensor_fault = pause
 
     return begin
 
 
 def _set_clock(by: float) -> Callable[[Stack, Rng], None]:
+    """Set the machine's clock forward or back by some seconds."""
+
     def begin(stack: Stack, rng: Rng) -> None:
         stack.clock_offset += by * float(rng.choice((-1.0, 1.0)))
 
@@ -260,8 +301,8 @@ def _set_clock(by: float) -> Callable[[Stack, Rng], None]:
 
 
 def _slow_processor(stack: Stack, rng: Rng) -> None:
-    """Each tick of the controller takes 8 ms more."""
-    stack.late = 8 * DT
+    """Lengthen each tick of the controller by 8 ms."""
+    stack.extra_tick_time = 8 * DT
 
 
 _LINK_KINDS = {
@@ -269,7 +310,7 @@ _LINK_KINDS = {
     "stuck": _repeated,
     "garbage": _garbage,
     "slow": _slow,
-    "delayed": _delayed(LATE),
+    "delayed": _delayed(DELAY_MS),
     "intermittent": _intermittent,
     "duplicated": _duplicated,
 }
@@ -278,19 +319,21 @@ _LINK_KINDS = {
 def _of_link(
     name: str, wrong: Callable[[Message, Rng], Message] | None = None, without: tuple[str, ...] = ()
 ) -> dict[str, Any]:
-    kinds = {kind: _link(name, way) for kind, way in _LINK_KINDS.items() if kind not in without}
+    """All link faults of a link, and an optional wrong value."""
+    kinds = {kind: _link(name, make_fault) for kind, make_fault in _LINK_KINDS.items() if kind not in without}
     return kinds | ({} if wrong is None else {"wrong": _link(name, _changed(wrong))})
 
 
 def _of_sensor(fields: tuple[str, ...], *kinds: str, one_joint: bool = False) -> dict[str, Any]:
+    """Sensor faults of some kinds."""
     return {kind: _sensor(fields, kind, one_joint) for kind in kinds}
 
 
 COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
-    "low_state": _of_link("low_state", lambda m, rng: _with(m, q=m.q + np.float32(0.5))),
+    "low_state": _of_link("low_state", lambda m, rng: _replaced(m, q=m.q + np.float32(0.5))),
     "low_cmd": _of_link("low_cmd", without=("garbage",)) | {"delayed": _link("low_cmd", _delayed(30))},
-    "estimate": _of_link("estimate", lambda m, rng: _with(m, velocity=m.velocity + np.float32(1.5))),
-    "command": _of_link("command", lambda m, rng: _with(m, velocity=m.velocity * np.float32(100.0))),
+    "estimate": _of_link("estimate", lambda m, rng: _replaced(m, velocity=m.velocity + np.float32(1.5))),
+    "command": _of_link("command", lambda m, rng: _replaced(m, velocity=m.velocity * np.float32(100.0))),
     "encoder": _of_sensor(
         ("q", "dq"), "off", "stuck", "garbage", "wrong", "slow", "delayed", "intermittent", one_joint=True
     ),
@@ -304,11 +347,11 @@ COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
     "foot": _of_sensor(("foot_force",), "off", "stuck", "garbage"),
     "drive": {"off": _dead_drive, "stuck": _jammed},
     "network": {
-        kind: _both(_link("low_state", way), _link("low_cmd", way))
-        for kind, way in _LINK_KINDS.items()
+        kind: _combined(_link("low_state", make_fault), _link("low_cmd", make_fault))
+        for kind, make_fault in _LINK_KINDS.items()
         if kind in ("off", "slow", "intermittent", "duplicated")
     }
-    | {"delayed": _both(_link("low_state", _delayed(5)), _link("low_cmd", _delayed(5)))},
+    | {"delayed": _combined(_link("low_state", _delayed(5)), _link("low_cmd", _delayed(5)))},
     "controller": {
         "off": _killed("controller"),
         "stuck": _stopped("controller"),
@@ -324,22 +367,22 @@ COMPONENTS: dict[str, dict[str, Callable[[Stack, Rng], None]]] = {
     "clock": {"wrong": _set_clock(1.0)},
     "processor": {"slow": _slow_processor},
 }
-"""What each component can suffer, and how that is brought about"""
+"""Injection of each kind of fault of each component."""
 
-_A_SENSOR = "a sensor sends no messages of its own"
-_A_PROCESS = "what a process sends is the link's matter"
-WHY_NOT = {
+_A_SENSOR = "a sensor sends no separate messages"
+_A_PROCESS = "faults of its messages belong to the link"
+REASONS_UNSUPPORTED = {
     "low_state": "all make sense",
-    "low_cmd": "packets to the board carry a check sum, and what is spoilt is lost: see intermittent",
+    "low_cmd": "packets to the board have a checksum, so that corrupt ones are lost: see intermittent",
     "estimate": "all make sense",
     "command": "all make sense",
     **dict.fromkeys(
         ("encoder", "imu", "orientation", "gyroscope", "accelerometer", "torque", "foot"), _A_SENSOR
     ),
-    "drive": "it is driven by low_cmd and reports through the torque sensor",
-    "network": "datagrams carry a check sum, and what is spoilt is lost: see intermittent",
+    "drive": "low_cmd drives it, and the torque sensor reports it",
+    "network": "datagrams have a checksum, so that corrupt ones are lost: see intermittent",
     **dict.fromkeys(("controller", "estimator", "mux", "planner"), _A_PROCESS),
-    "clock": "a clock that stands or drifts slowly is not noticed within seconds",
-    "processor": "a processor without time for anybody is a process that is stuck",
+    "clock": "a stopped or slowly drifting clock is not detectable within seconds",
+    "processor": "a fully loaded processor is equivalent to a stuck process",
 }
-"""Why a kind that is not there makes no sense"""
+"""Reason why the other kinds of fault make no sense."""

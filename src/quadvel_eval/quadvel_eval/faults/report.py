@@ -1,4 +1,4 @@
-"""The campaign's result as a file, a table and a picture."""
+"""Writes the result of the fault campaign as JSON, table and picture."""
 
 from __future__ import annotations
 
@@ -13,21 +13,37 @@ from rich.table import Table
 
 from ..output import replacing
 from ..report import write_json
-from .campaign import AFTERWARDS, MAX_BEYOND, MAX_BEYOND_IN_A_FALL, MAX_SPEED, SCHEMA, Run, summary
+from .campaign import (
+    MAX_OVERTRAVEL_IN_FALL_RAD,
+    MAX_OVERTRAVEL_RAD,
+    MAX_SPEED_RATIO,
+    OBSERVATION_TIME_S,
+    SCHEMA,
+    FaultRun,
+    summarise_cases,
+)
 
 Entries = Sequence[dict[str, Any]]
 
 
-def write_campaign(folder: Path, runs: Sequence[Run]) -> dict[str, Any]:
-    """faults.json (every run and every case), faults.md (a table) and faults.png (reaction times); returns what the JSON holds."""
-    entries = summary(runs)
+def write_campaign(folder: Path, runs: Sequence[FaultRun]) -> dict[str, Any]:
+    """Write faults.json (runs and cases), faults.md (table) and faults.png (reaction times).
+
+    Args:
+        folder: Folder of the files.
+        runs: All runs.
+
+    Returns:
+        Content of faults.json.
+    """
+    entries = summarise_cases(runs)
     result = {
         "schema": SCHEMA,
         "limits": {
             "torque": 1.0,
-            "speed": MAX_SPEED,
-            "beyond": MAX_BEYOND,
-            "beyond_in_a_fall": MAX_BEYOND_IN_A_FALL,
+            "speed": MAX_SPEED_RATIO,
+            "beyond": MAX_OVERTRAVEL_RAD,
+            "beyond_in_a_fall": MAX_OVERTRAVEL_IN_FALL_RAD,
         },
         "cases": entries,
         "runs": [attrs.asdict(run) for run in runs],
@@ -36,12 +52,19 @@ def write_campaign(folder: Path, runs: Sequence[Run]) -> dict[str, Any]:
     with replacing(folder / "faults.md") as draft:
         draft.write_text(markdown(entries))
     with replacing(folder / "faults.png") as draft:
-        figure(entries).savefig(draft, dpi=150)
+        reaction_time_figure(entries).savefig(draft, dpi=150)
     return result
 
 
-def total(entries: Entries) -> str:
-    """One sentence on all of them."""
+def campaign_summary(entries: Entries) -> str:
+    """Summarise the campaign in one sentence.
+
+    Args:
+        entries: Summaries of the cases.
+
+    Returns:
+        The sentence, without a full stop.
+    """
     runs, good = (sum(entry[name] for entry in entries) for name in ("runs", "as_expected"))
     worst = {name: max(entry[name] for entry in entries) for name in ("torque", "speed", "beyond")}
     kinds = {entry["case"].rsplit(" ", 1)[0] for entry in entries}
@@ -53,8 +76,15 @@ def total(entries: Entries) -> str:
 
 
 def campaign_table(entries: Entries) -> Table:
-    """For the terminal: the cases that are not as expected, and what they did instead."""
-    table = Table("case", "as expected", "instead", title="not as expected")
+    """Create a table of the cases with an unexpected reaction.
+
+    Args:
+        entries: Summaries of the cases.
+
+    Returns:
+        The table.
+    """
+    table = Table("case", "as expected", "violations", title="Unexpected reactions")
     for entry in entries:
         if entry["as_expected"] < entry["runs"]:
             table.add_row(
@@ -64,9 +94,16 @@ def campaign_table(entries: Entries) -> Table:
 
 
 def markdown(entries: Entries) -> str:
-    """Every case with its reaction times."""
+    """Create a Markdown table of all cases with their reaction times.
+
+    Args:
+        entries: Summaries of the cases.
+
+    Returns:
+        The text of faults.md.
+    """
     head = [
-        "| component, kind, mode | as expected | named | until named, s | has to | until there, s | torque | speed | falls |",
+        "| case | as expected | finding | until finding, s | expected end | until end, s | torque | speed | falls |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     rows = [
@@ -76,18 +113,26 @@ def markdown(entries: Entries) -> str:
         for entry in entries
     ]
     note = (
-        "Times: median, largest over the seeds, since the fault began. Torque and speed (of joints that their drive moves on): "
-        "largest, as a share of what the drive can do."
+        "Times: median and largest over the seeds, since the fault. Torque and speed (of joints that their drive accelerates): "
+        "largest, divided by the limit of the drive."
     )
-    return "\n".join([*head, *rows, "", note, "", f"{total(entries)}.", ""])
+    return "\n".join([*head, *rows, "", note, "", f"{campaign_summary(entries)}.", ""])
 
 
 def _times(times: list[float] | None) -> str:
+    """Median and largest time as text."""
     return "-" if times is None else f"{times[0]:.3f}, {times[1]:.3f}"
 
 
-def figure(entries: Entries) -> Figure:
-    """How soon each case is named and how soon the robot is safe, medians and largest."""
+def reaction_time_figure(entries: Entries) -> Figure:
+    """Plot median and largest reaction time of each case.
+
+    Args:
+        entries: Summaries of the cases.
+
+    Returns:
+        The figure.
+    """
     timed = [
         entry for entry in entries if entry["named_after"] or (entry["safe_after"] and entry["ends"] != "any")
     ]
@@ -100,9 +145,9 @@ def figure(entries: Entries) -> Figure:
         axes.plot(times[:, 0], y, "o", color=colour, markersize=3.5, label=label)
     axes.set_yticks(y, [entry["case"] for entry in timed], fontsize=6)
     axes.invert_yaxis()
-    axes.set_xlim(1e-3, AFTERWARDS)
+    axes.set_xlim(1e-3, OBSERVATION_TIME_S)
     axes.set_xscale("log")
-    axes.set_xlabel("s since the fault began (dot: median, line: to the largest)")
+    axes.set_xlabel("time since the fault, s (dot: median, line: to the largest)")
     axes.grid(axis="x", alpha=0.3)
     axes.legend(loc="lower right")
     return picture

@@ -1,1 +1,1 @@
-"""How well a person is followed, in simulated scenes in the plane: the real tracker and planner, a robot without dynamics."""
+"""Measures person following: real tracker and planner, with a planar robot or a simulated one."""

@@ -1,4 +1,4 @@
-"""The command `quadvel following`, as a function for a typer application."""
+"""Defines the command `quadvel following` for Typer."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from rich.table import Table
 from quadvel_nodes.number_text import number_text
 
 from ..output import output_folder, replacing
-from .measure import measure
+from .measure import measure_scenes
 
 HEADS = {
     "success": "success",
     "share": "within 0.5 m",
-    "late": "there after, s",
+    "late": "settled after, s",
     "jerk": "jerk, m/s^3",
     "clearance": "clearance, m",
-    "gap": "to persons, m",
+    "gap": "to people, m",
     "ms": "ms a step",
     "slowest": "slowest",
 }
@@ -33,9 +33,9 @@ def following_command(
     ),
     runs: Annotated[int, typer.Option(min=1, help="Scenes of each kind.")] = 10,
 ) -> None:
-    """Measure how well a person is followed, in simulated scenes in the plane."""
+    """Measure how well the robot follows a person, in simulated scenes in the plane."""
     output_folder(out)
-    found = measure(runs)
+    found = measure_scenes(runs)
     table = Table(f"simulated, {runs} each", *HEADS.values())
     for name, row in found.items():
         table.add_row(name, *(number_text(row[head], ".2f") for head in HEADS))

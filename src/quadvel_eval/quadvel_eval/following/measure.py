@@ -1,4 +1,4 @@
-"""How well a person is followed: the figures of a scene, and those of many."""
+"""Scores person following in simulated scenes."""
 
 from __future__ import annotations
 
@@ -11,29 +11,38 @@ from quadvel_follow.follow_planner import PERIOD, State
 from quadvel_follow.leg_detector import LegDetector
 
 from .scenes import SCENES, FollowScene
-from .stage import BAND, CONFIG, SETTLED, Instant, Stage
+from .stage import CONFIG, DISTANCE_BAND_M, SETTLING_TIME_S, FollowSample, FollowSimulation
 
 
-def figures(instants: Sequence[Instant], distance: float) -> dict[str, float]:
-    """success: whether nothing was touched and the robot is in the end where it should be; share: of the time within BAND of
-    the set distance; late: s, from the instant at which the person stands for good until the robot is there and stands;
-    jerk: m/s^3, RMS of the robot's; clearance, gap: m, least, from what stands and from persons; ms: mean; slowest: ms.
+def following_scores(samples: Sequence[FollowSample], distance: float) -> dict[str, float]:
+    """Score one run of a scene.
+
+    Args:
+        samples: Samples of the run, one per planner period.
+        distance: Set distance to the person, m.
+
+    Returns:
+        `success`: 1 if nothing was touched and the robot ends within DISTANCE_BAND_M of the set
+        distance; `share`: share of time within that band; `late`: time from the last step of the
+        person until the robot stands in the band, s; `jerk`: RMS jerk, m/s^3; `clearance` and
+        `gap`: smallest distance to obstacles and to people, m; `ms` and `slowest`: mean and
+        largest computing time of a step, ms.
     """
-    place = np.array([one.pose[:2] for one in instants])
-    person = np.array([one.person for one in instants])
-    time = np.array([one.time for one in instants])
-    velocity = np.array([one.velocity for one in instants])[:, :2]
-    inside = np.abs(np.hypot(*(person - place).T) - distance) < BAND
-    clearance, gap = min(one.clearance for one in instants), min(one.gap for one in instants)
+    place = np.array([one.pose[:2] for one in samples])
+    person = np.array([one.person for one in samples])
+    time = np.array([one.time for one in samples])
+    velocity = np.array([one.velocity for one in samples])[:, :2]
+    inside = np.abs(np.hypot(*(person - place).T) - distance) < DISTANCE_BAND_M
+    clearance, gap = min(one.clearance for one in samples), min(one.gap for one in samples)
     walks = np.flatnonzero((np.diff(person, axis=0) != 0.0).any(1))
     away = np.flatnonzero(~inside | (np.hypot(*velocity.T) > 0.1))
     jerk = np.diff(velocity, n=2, axis=0) / PERIOD**2
-    took = [one.milliseconds for one in instants]
+    took = [one.milliseconds for one in samples]
     return {
         "success": float(
-            clearance > 0.0 and gap > 0.0 and inside[-1] and instants[-1].state is State.FOLLOWING
+            clearance > 0.0 and gap > 0.0 and inside[-1] and samples[-1].state is State.FOLLOWING
         ),
-        "share": float(inside[time >= SETTLED].mean()),
+        "share": float(inside[time >= SETTLING_TIME_S].mean()),
         "late": max(0.0, PERIOD * float(away[-1] - walks[-1])),
         "jerk": float(np.sqrt((jerk**2).sum(1).mean())),
         "clearance": clearance,
@@ -43,17 +52,35 @@ def figures(instants: Sequence[Instant], distance: float) -> dict[str, float]:
     }
 
 
-def run(scene: FollowScene, seed: int, detector: LegDetector) -> list[Instant]:
-    """All instants of a scene."""
-    return list(Stage(scene, seed, detector).run())
+def run_scene(scene: FollowScene, seed: int, detector: LegDetector) -> list[FollowSample]:
+    """Simulate a scene.
+
+    Args:
+        scene: The scene.
+        seed: Seed of the noise.
+        detector: Leg detector.
+
+    Returns:
+        All samples.
+    """
+    return list(FollowSimulation(scene, seed, detector).run())
 
 
-def measure(runs: int) -> Mapping[str, dict[str, float]]:
-    """Of each kind of scene, `runs` of them: means; of clearances and gaps the least, of times the largest."""
+def measure_scenes(runs: int) -> Mapping[str, dict[str, float]]:
+    """Score each kind of scene.
+
+    Args:
+        runs: Number of scenes of each kind.
+
+    Returns:
+        Scores by kind: means; smallest clearances and gaps, largest times.
+    """
     detector = LegDetector()
     found = {}
     for name, scene in SCENES.items():
-        rows = [figures(run(scene(seed), seed, detector), CONFIG.distance) for seed in range(runs)]
+        rows = [
+            following_scores(run_scene(scene(seed), seed, detector), CONFIG.distance) for seed in range(runs)
+        ]
         how: dict[str, Any] = {"clearance": min, "gap": min, "slowest": max}
         found[name] = {key: float(how.get(key, np.mean)([row[key] for row in rows])) for key in rows[0]}
     return found

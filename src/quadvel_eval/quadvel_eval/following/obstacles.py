@@ -1,4 +1,4 @@
-"""How far the robot stays from what stands in a world and from the persons there, in the plane, as they really are."""
+"""Computes the true clearance of the robot from obstacles and people in the plane."""
 
 from __future__ import annotations
 
@@ -14,32 +14,61 @@ from quadvel_sim.world import World
 
 Array = NDArray[np.float64]
 
-APART = 0.03  # m, between two points of an outline
-SIGHT = 3.0  # m, to which clearances are looked for
-BODY = 0.2  # m, radius of a person
+OUTLINE_SPACING_M = 0.03  # between points of an outline
+SEARCH_RADIUS_M = 3.0  # for obstacles
+PERSON_RADIUS_M = 0.2
 
 
 class Clearances:
-    """Of a robot with the outline of `config`."""
+    """Clearances of a robot in a world.
+
+    Args:
+        world: Walls, boxes, trees and tables.
+        config: Parameters with the outline of the robot.
+    """
 
     def __init__(self, world: World, config: FollowConfig) -> None:
         self._half = 0.5 * config.length, 0.5 * config.width
-        self._points = outlines(world)
+        self._points = outline_points(world)
         self._tree = cKDTree(self._points) if len(self._points) else None
 
-    def of(self, pose: Array) -> float:
-        """From the outline at a pose (3,) to what stands, m; inf where nothing does within SIGHT."""
-        if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SIGHT)):
+    def to_obstacles(self, pose: Array) -> float:
+        """Return the distance from the outline to the nearest obstacle.
+
+        Args:
+            pose: x, y (m) and yaw (rad) of the robot (3,).
+
+        Returns:
+            Distance, m; inf if none is within SEARCH_RADIUS_M.
+        """
+        if self._tree is None or not (near := self._tree.query_ball_point(pose[:2], SEARCH_RADIUS_M)):
             return float("inf")
         return float(outline_distance(self._points[near], pose, self._half).min())
 
-    def of_persons(self, pose: Array, persons: Array) -> float:
-        """From the outline to the nearest of persons (n, 2 or more), m; inf where there are none."""
-        return float((outline_distance(persons[:, :2], pose, self._half) - BODY).min(initial=np.inf))
+    def to_people(self, pose: Array, people: Array) -> float:
+        """Return the distance from the outline to the nearest person.
+
+        Args:
+            pose: x, y (m) and yaw (rad) of the robot (3,).
+            people: Positions of the people (n, 2 or more), m.
+
+        Returns:
+            Distance, m; inf without people.
+        """
+        return float(
+            (outline_distance(people[:, :2], pose, self._half) - PERSON_RADIUS_M).min(initial=np.inf)
+        )
 
 
-def outlines(world: World) -> Array:
-    """Points (n, 2), m, APART from each other, around walls, boxes, trees and the legs of tables."""
+def outline_points(world: World) -> Array:
+    """Sample the outlines of walls, boxes, trees and table legs.
+
+    Args:
+        world: The world.
+
+    Returns:
+        Points (n, 2), m, OUTLINE_SPACING_M apart.
+    """
     found = [
         _rectangle(
             0.5 * (a + b), (np.hypot(*(b - a)) + wall.thickness, wall.thickness), np.arctan2(*(b - a)[::-1])
@@ -54,16 +83,17 @@ def outlines(world: World) -> Array:
 
 
 def _circle(middle: Array, radius: float) -> Array:
-    angle = np.linspace(0.0, 2.0 * np.pi, 4 + int(2.0 * np.pi * radius / APART), endpoint=False)
+    """Points on a circle."""
+    angle = np.linspace(0.0, 2.0 * np.pi, 4 + int(2.0 * np.pi * radius / OUTLINE_SPACING_M), endpoint=False)
     return middle + radius * np.column_stack([np.cos(angle), np.sin(angle)])
 
 
 def _rectangle(middle: ArrayLike, size: ArrayLike, yaw: float) -> Array:
-    """Points on the edge of a rectangle of `size` (2,) m, turned by `yaw` rad."""
+    """Points on the edge of a rectangle of `size` (2,) m, rotated by `yaw` rad."""
     half = 0.5 * np.asarray(size, float)
     corners = half * [[1, 1], [-1, 1], [-1, -1], [1, -1], [1, 1]]
     edges = [
-        a + np.linspace(0.0, 1.0, 2 + int(np.hypot(*(b - a)) / APART))[:, None] * (b - a)
+        a + np.linspace(0.0, 1.0, 2 + int(np.hypot(*(b - a)) / OUTLINE_SPACING_M))[:, None] * (b - a)
         for a, b in pairwise(corners)
     ]
     c, s = np.cos(yaw), np.sin(yaw)

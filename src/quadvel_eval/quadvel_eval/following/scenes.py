@@ -1,4 +1,4 @@
-"""Scenes in which a planner that follows a person may fail, each from a seed."""
+"""Simulates scenes that are hard for a planner that follows a person, each from a seed."""
 
 from __future__ import annotations
 
@@ -15,33 +15,57 @@ from ..people.scenes import along_walls
 
 Array = NDArray[np.float64]
 
-SHOWN = (
+INITIAL_STOP = (
     1.6,
     6.0,
-)  # s, from when to when everybody to follow stands: then the tracker knows that it is a person
-HELD = SHOWN[1] - SHOWN[0]
+)  # s, start and end of the first stop of the person, in which the tracker confirms the track
+INITIAL_STOP_DURATION_S = INITIAL_STOP[1] - INITIAL_STOP[0]
 
 
 @attrs.frozen
 class FollowScene:
-    """persons: the one to follow first; start: m, from it to the robot behind it; seconds: that it lasts."""
+    """Scene with a person to follow.
+
+    Attributes:
+        plan: Static obstacles.
+        people: Walkers; the first is the person to follow.
+        duration: Duration, s.
+        initial_distance: Distance from the person to the robot behind, m.
+    """
 
     plan: FloorPlan
-    persons: list[Walker]
-    seconds: float
-    start: float = 1.5
+    people: list[Walker]
+    duration: float
+    initial_distance: float = 1.5
 
 
 def corridor(seed: int) -> FollowScene:
-    """20 m along walls with doors and tables, with a stop on the way."""
+    """Create a corridor of 20 m with doors and tables, and a stop.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     scene = along_walls(seed)
     person = scene.walkers[0]
-    person.stops = [SHOWN, *((begin + HELD, end + HELD) for begin, end in person.stops)]
-    return FollowScene(scene.plan, [person], 20.0 / person.speed + 2.0 + HELD + 5.0)
+    person.stops = [
+        INITIAL_STOP,
+        *((begin + INITIAL_STOP_DURATION_S, end + INITIAL_STOP_DURATION_S) for begin, end in person.stops),
+    ]
+    return FollowScene(scene.plan, [person], 20.0 / person.speed + 2.0 + INITIAL_STOP_DURATION_S + 5.0)
 
 
 def trees(seed: int) -> FollowScene:
-    """A slalom, and a stop."""
+    """Create a slalom around trees, with a stop.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([11, seed])
     places = [(2.5 * i, rng.uniform(-0.2, 0.2), rng.uniform(0.1, 0.25)) for i in range(1, 7)]
     sides = rng.choice([-1.0, 1.0]) * np.resize([1.0, -1.0], 6)
@@ -50,7 +74,14 @@ def trees(seed: int) -> FollowScene:
 
 
 def turning_round(seed: int) -> FollowScene:
-    """A person who comes back and passes the robot closely."""
+    """Create a person who turns round and passes close to the robot.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([12, seed])
     aside = rng.choice([-1.0, 1.0]) * rng.uniform(0.0, 0.5)
     away = rng.uniform(5.0, 7.0)
@@ -60,21 +91,37 @@ def turning_round(seed: int) -> FollowScene:
 
 
 def crossing(seed: int) -> FollowScene:
-    """Bystanders who cross between the person and the robot."""
+    """Create bystanders who cross between the person and the robot.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([13, seed])
     person = _person(rng, [[0.0, 0.0], [16.0, 0.0]], (0.9, 1.5))
     others = []
     for at in rng.uniform(3.0, 14.0, 3):
         side, speed = rng.choice([-1.0, 1.0]), rng.uniform(0.8, 1.3)
-        begin = side * speed * ((at + rng.uniform(0.4, 1.4)) / person.speed + HELD)
+        begin = side * speed * ((at + rng.uniform(0.4, 1.4)) / person.speed + INITIAL_STOP_DURATION_S)
         way = [[at, begin], [at + rng.uniform(-0.5, 0.5), begin - side * 30.0]]
         others.append(_walker(rng, way, (speed, speed)))
     posts = [[x, y, 0.15] for x in (2.0, 8.0, 14.0) for y in (-3.0, 3.0)]
-    return FollowScene(FloorPlan(posts), [person, *others], 16.0 / person.speed + HELD + 5.0)
+    return FollowScene(
+        FloorPlan(posts), [person, *others], 16.0 / person.speed + INITIAL_STOP_DURATION_S + 5.0
+    )
 
 
 def narrow(seed: int) -> FollowScene:
-    """Through a passage of 1.0 m, 0.4 m deep, that lies aside."""
+    """Create a passage 1.0 m wide and 0.4 m deep, off the straight path.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([14, seed])
     gap, x = rng.uniform(-1.5, 1.5), 5.0
     walls = []
@@ -90,7 +137,14 @@ def narrow(seed: int) -> FollowScene:
 
 
 def corner(seed: int) -> FollowScene:
-    """Round the corner of a corridor, out of sight for a while."""
+    """Create a corridor with a corner that hides the person for some time.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([15, seed])
     half, side = rng.uniform(0.8, 1.1), rng.choice([-1.0, 1.0])
     x = 6.0
@@ -102,7 +156,14 @@ def corner(seed: int) -> FollowScene:
 
 
 def dead_end(seed: int) -> FollowScene:
-    """Into a blind alley, and out again past the robot."""
+    """Create a dead end, from which the person returns past the robot.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([16, seed])
     half = rng.uniform(1.1, 1.4)
     walls = [[1.0, -half, 8.0, -half], [1.0, half, 8.0, half], [8.0, -half, 8.0, half]]
@@ -112,12 +173,19 @@ def dead_end(seed: int) -> FollowScene:
 
 
 def in_the_way(seed: int) -> FollowScene:
-    """A bystander who comes out of a door behind the person, stands in the corridor for a while, and goes back."""
+    """Create a bystander who steps out of a door behind the person and blocks the corridor for 6 s.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([17, seed])
     half, x = rng.uniform(0.7, 0.85), 6.0
     walls = [[-4.0, -half, 20.0, -half], [-4.0, half, x - 0.6, half], [x + 0.6, half, 20.0, half]]
     person = _person(rng, [[0.0, 0.0], [10.0, 0.0]], (0.8, 1.1))
-    comes = (x + 0.5) / person.speed + HELD  # s, when the person has just passed
+    comes = (x + 0.5) / person.speed + INITIAL_STOP_DURATION_S  # s, just after the person has passed
     speed = 1.2
     into = half + 1.0
     other = _walker(rng, [[x, into], [x, 0.0], [x, 3.0 * into]], (speed, speed))
@@ -143,8 +211,8 @@ def _person(
     speeds: tuple[float, float],
     stops: list[tuple[float, float]] | None = None,
 ) -> Walker:
-    """Somebody to follow."""
-    return _walker(rng, way, speeds, [SHOWN, *(stops or ())])
+    """Create the person to follow, with an initial stop."""
+    return _walker(rng, way, speeds, [INITIAL_STOP, *(stops or ())])
 
 
 def _walker(
@@ -153,6 +221,7 @@ def _walker(
     speeds: tuple[float, float],
     stops: list[tuple[float, float]] | None = None,
 ) -> Walker:
+    """Create a walker with a random speed and gait."""
     return Walker(
         way=way,
         speed=rng.uniform(*speeds),

@@ -1,7 +1,7 @@
-"""A walk after a person through a simulated world, in one process: laser, tracker, planner, mux, policy and robot.
+"""Simulates a walk behind a person through a world: laser, tracker, planner, mux, policy and robot.
 
-As the nodes make it, and as fast as the machine allows. Odometry is dead reckoning with the estimated velocity, as the estimator's
-node does it: where the robot really is, only the measurement knows.
+The classes of the nodes run in one process, as fast as the machine allows. Odometry integrates
+the estimated velocity, as the estimator node does. Only the evaluation uses the true pose.
 """
 
 from __future__ import annotations
@@ -26,25 +26,36 @@ from quadvel_policy.supervisor import Supervisor
 from quadvel_sim.simulator import Simulator, SimulatorConfig
 from quadvel_sim.world import World
 
-from ..robot_loop import PERIOD as TICK
+from ..robot_loop import CONTROL_PERIOD_S as TICK
 from ..robot_loop import RobotLoop, Sample, make_estimator
 from ..segments import rounded
 from .follower import Follower
 from .obstacles import Clearances
-from .stage import BAND, SETTLED
+from .stage import DISTANCE_BAND_M, SETTLING_TIME_S
 
 Array = NDArray[np.float64]
 
-STRIDE = 0.35  # s, over which velocities are averaged before they are compared: a stride's sway is no error
-ODOMETRY = 4  # ticks from one odometry to the next
+AVERAGING_TIME_S = 0.35  # of compared velocities, to remove the sway of a stride
+ODOMETRY_INTERVAL_TICKS = 4  # between odometry messages
 
 
 @attrs.frozen(kw_only=True)
 class TourSetup:
-    """Who walks where. world: a shipped one or a file; metres: how far the robot is to walk."""
+    """Setup of a tour.
+
+    Attributes:
+        world: Name of a shipped world, or a YAML file.
+        path_length: Path length after which the tour ends, m.
+        seed: Seed of the simulator.
+        policy: ONNX file of the policy.
+        estimator: Velocity estimator in the loop.
+        estimator_file: ONNX file of the learned estimator.
+        distance: Set distance to the person, m.
+        plant: Fields of `SimulatorConfig` that differ from the nominal robot.
+    """
 
     world: str = "campus"
-    metres: float = 3100.0
+    path_length: float = 3100.0
     seed: int = 0
     policy: Path = SHIPPED_POLICY
     estimator: str = "learned"
@@ -54,16 +65,25 @@ class TourSetup:
 
 
 @attrs.frozen
-class Moment:
-    """What is kept every PERIOD. pose, person: true, x, y (m), yaw (rad); asked, velocity (3,): means over a stride.
+class TourSample:
+    """State of the tour at one planner period.
 
-    clearance, gap: m, from the robot's outline to what stands near and to the nearest person, inf where there is none.
+    Attributes:
+        time: Time, s.
+        pose: True x, y (m) and yaw (rad) of the robot.
+        person: True x, y (m) and yaw (rad) of the person.
+        commanded: Commanded vx, vy (m/s) and wz (rad/s), averaged over a stride.
+        velocity: True velocity in the same order, averaged over a stride.
+        state: State of the planner.
+        words: Explanation of the state.
+        clearance: Distance from the outline to the nearest obstacle, m; inf if none is near.
+        gap: Distance from the outline to the nearest person, m; inf without people.
     """
 
     time: float
     pose: Array
     person: Array
-    asked: Array
+    commanded: Array
     velocity: Array
     state: State
     words: str
@@ -72,9 +92,18 @@ class Moment:
 
 
 class Tour:
-    """One walk: `moments` goes through it; what it came to is in the attributes afterwards.
+    """Walk behind a person through a world; iterate over `samples` once.
 
-    walked: m, way of the trunk. fell: whether the robot did. planning: s of one core for each step of the planner.
+    Args:
+        setup: World, robot and length of the tour.
+
+    Attributes:
+        setup: World, robot and length of the tour.
+        world: The loaded world.
+        simulator: The robot.
+        walked: Path length of the trunk so far, m.
+        fell: Whether the robot fell.
+        planning: CPU time of each planner step, s.
     """
 
     def __init__(self, setup: TourSetup) -> None:
@@ -95,7 +124,7 @@ class Tour:
 
     @property
     def outcome(self) -> Outcome:
-        """What it has come to so far."""
+        """Outcome of the tour so far."""
         return Outcome(
             world=self.world.name,
             seed=self.setup.seed,
@@ -106,15 +135,19 @@ class Tour:
             planning=self.planning,
         )
 
-    def moments(self) -> Iterator[Moment]:
-        """PERIOD apart, until the way is walked, the robot fell, or the person has long been lost."""
+    def samples(self) -> Iterator[TourSample]:
+        """Simulate until the path length is reached or the robot falls.
+
+        Yields:
+            Samples, one per planner period.
+        """
         loop, follower, place = self._loop, self._follower, np.zeros(3)
         loop.start_walking()
-        asked, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
-        share, often, tick = TICK / STRIDE, round(PERIOD / TICK), 0
+        commanded, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
+        share, often, tick = TICK / AVERAGING_TIME_S, round(PERIOD / TICK), 0
         last = self.simulator.truth().position[:2].copy()
         plan: Plan | None = None
-        while self.walked < self.setup.metres:
+        while self.walked < self.setup.path_length:
             try:
                 sample = loop.tick(command)
             except FloatingPointError:
@@ -125,18 +158,22 @@ class Tour:
                 return
             now = sample.truth.time
             estimated = np.zeros(3) if loop.velocity is None else loop.velocity
+            # Dead reckoning: p += dt R(q) v, with the estimated velocity v in the body frame.
             place = place + TICK * rotate(sample.state.quaternion, estimated)
             true = np.append(sample.truth.linear_velocity[:2], sample.truth.angular_velocity[2])
-            asked, velocity = asked + share * (sample.asked - asked), velocity + share * (true - velocity)
-            if tick % ODOMETRY == 0:
+            commanded, velocity = (
+                commanded + share * (sample.commanded - commanded),
+                velocity + share * (true - velocity),
+            )
+            if tick % ODOMETRY_INTERVAL_TICKS == 0:
                 heading = float(yaw(sample.state.quaternion))
                 motion = np.append(estimated[:2], sample.state.angular_velocity[2])
                 pose = [*place[:2].tolist(), heading]
                 self._poses.add(now, pose)
                 follower.on_odometry(now, pose, motion)
                 if (scan := self.simulator.scan()) is not None:
-                    meant = follower.on_scan(now, scan, self._poses.sensor_at(now))
-                    follower.on_person(now, meant)
+                    target = follower.on_scan(now, scan, self._poses.sensor_at(now))
+                    follower.on_person(now, target)
             if tick % often == 0 and tick:
                 begin = process_time()
                 plan = follower.step(now)
@@ -145,30 +182,39 @@ class Tour:
                 here = sample.truth.position[:2]
                 self.walked += float(np.hypot(*(here - last)))
                 last = here.copy()
-                yield self._moment(sample, asked, velocity, plan)
+                yield self._sample(sample, commanded, velocity, plan)
             tick += 1
 
-    def _moment(self, sample: Sample, asked: Array, velocity: Array, plan: Plan) -> Moment:
+    def _sample(self, sample: Sample, commanded: Array, velocity: Array, plan: Plan) -> TourSample:
+        """Sample of the present state."""
         truth = sample.truth
         pose = np.array([*truth.position[:2], float(yaw(truth.quaternion))])
-        persons = self.simulator.persons()
-        return Moment(
+        people = self.simulator.persons()
+        return TourSample(
             truth.time,
             pose,
-            persons[0],
-            asked,
+            people[0],
+            commanded,
             velocity,
             plan.state,
             plan.words,
-            self._clearances.of(pose),
-            self._clearances.of_persons(pose, persons),
+            self._clearances.to_obstacles(pose),
+            self._clearances.to_people(pose, people),
         )
 
 
 @attrs.frozen(kw_only=True)
 class Outcome:
-    """What a walk after a person came to, moments apart. distance: m, that was to be kept; walked: m; touched: how often what was
-    run into; planning: s of one core for each step of the planner, where that is known.
+    """Outcome of a walk behind a person, without its samples.
+
+    Attributes:
+        world: Name of the world.
+        seed: Seed of the run.
+        distance: Set distance to the person, m.
+        walked: Path length of the trunk, m.
+        fell: Whether the robot fell.
+        touched: Number of contacts with each obstacle.
+        planning: CPU time of each planner step, s; empty if unknown.
     """
 
     world: str
@@ -180,26 +226,36 @@ class Outcome:
     planning: Sequence[float] = ()
 
 
-def summary(outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
-    """The figures of a walk; errors beside the paper's 0.077 m/s and 0.059 rad/s."""
-    time = np.array([one.time for one in moments])
-    late = time >= min(time[0] + SETTLED, time[-1])
-    asked, velocity = (np.array([getattr(one, name) for one in moments]) for name in ("asked", "velocity"))
-    off = asked - velocity
-    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
-    lost = [one.state in (State.LOST, State.LOOKING) for one in moments]
+def summarise_tour(outcome: Outcome, samples: Sequence[TourSample]) -> dict[str, Any]:
+    """Compute the figures of a tour; the paper reports errors of 0.077 m/s and 0.059 rad/s.
+
+    Args:
+        outcome: Outcome of the tour.
+        samples: Its samples.
+
+    Returns:
+        Content of `tour.json`.
+    """
+    time = np.array([one.time for one in samples])
+    late = time >= min(time[0] + SETTLING_TIME_S, time[-1])
+    commanded, velocity = (
+        np.array([getattr(one, name) for one in samples]) for name in ("commanded", "velocity")
+    )
+    error = commanded - velocity
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in samples])
+    lost = [one.state in (State.LOST, State.LOOKING) for one in samples]
     begins = np.flatnonzero(np.diff(np.append(False, lost).astype(int)) == 1)
-    states = Counter(one.state.value for one in moments)
+    states = Counter(one.state.value for one in samples)
     found = {
         "schema": 1,
         **attrs.asdict(outcome, filter=lambda field, _: field.name != "planning"),
         "minutes": (time[-1] - time[0]) / 60.0,
-        "error_xy": np.hypot(off[:, 0], off[:, 1]).mean(),
-        "error_wz": np.abs(off[:, 2]).mean(),
+        "error_xy": np.hypot(error[:, 0], error[:, 1]).mean(),
+        "error_wz": np.abs(error[:, 2]).mean(),
         "distance_mean": away[late].mean(),
-        "distance_kept": np.mean(np.abs(away[late] - outcome.distance) < BAND),
-        "least_clearance": min(one.clearance for one in moments),
-        "least_gap": min(one.gap for one in moments),
+        "distance_kept": np.mean(np.abs(away[late] - outcome.distance) < DISTANCE_BAND_M),
+        "least_clearance": min(one.clearance for one in samples),
+        "least_gap": min(one.gap for one in samples),
         "losses": len(begins),
         "lost_seconds": PERIOD * sum(lost),
         "seconds": {name: PERIOD * count for name, count in states.items()},
@@ -209,13 +265,13 @@ def summary(outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
             "mean": 1e3 * np.mean(outcome.planning),
             "p99": 1e3 * np.quantile(outcome.planning, 0.99),
         }
-    return {name: _plain(value) for name, value in found.items()}
+    return {name: _to_json(value) for name, value in found.items()}
 
 
-def _plain(value: Any) -> Any:
-    """As JSON keeps it; what is nowhere near is null."""
+def _to_json(value: Any) -> Any:
+    """Convert a value for JSON; values that are not finite become null."""
     if isinstance(value, Mapping):
-        return {key: _plain(one) for key, one in value.items()}
+        return {key: _to_json(one) for key, one in value.items()}
     if isinstance(value, float | np.floating):
         return rounded(value) if np.isfinite(value) else None
     return value

@@ -1,4 +1,4 @@
-"""`quadvel demo follow --tour`: a tour with a bar, its table and files."""
+"""Runs `quadvel demo follow --tour`: a tour with progress bar, table and files."""
 
 from __future__ import annotations
 
@@ -7,20 +7,31 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from .tour import Moment, Tour, TourSetup
+from .tour import Tour, TourSample, TourSetup
 from .tour_report import tour_table, write_tour
 
-EVERY = 20  # moments, a second: how often the bar moves
-LINES = 20  # in all, where there is no terminal that shows a bar
+BAR_UPDATE_INTERVAL = 20  # samples, one second
+MAX_PROGRESS_LINES = 20  # in total, without a terminal
 
 
 def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
-    """Follow through a world as `setup` has it; whether the robot neither fell nor touched anything.
+    """Simulate a tour, print its figures and write its files.
 
-    Ctrl-C ends the walk early: what there is of it is judged and written. Raises KeyboardInterrupt then.
+    Ctrl-C ends the walk early; its figures are written nevertheless.
+
+    Args:
+        setup: World, robot and length of the tour.
+        out: Folder of the files.
+        console: Console of bar and table.
+
+    Returns:
+        Whether the robot neither fell nor touched anything.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C ended the walk.
     """
     tour = Tour(setup)
-    moments: list[Moment] = []
+    samples: list[TourSample] = []
     columns = (
         TextColumn("{task.description:32}"),
         BarColumn(),
@@ -28,21 +39,21 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=console) as bar:
-        task = bar.add_task("sets out", total=setup.metres)
-        told, is_stopped = 0.0, False
+        task = bar.add_task("start", total=setup.path_length)
+        next_report, is_stopped = 0.0, False
         try:
-            for moment in tour.moments():
-                moments.append(moment)
-                if len(moments) % EVERY == 0:
-                    bar.update(task, completed=tour.walked, description=moment.words)
-                if not console.is_terminal and tour.walked >= told:
-                    console.print(f"{tour.walked:.0f} of {setup.metres:.0f} m: {moment.words}")
-                    told += setup.metres / LINES
+            for sample in tour.samples():
+                samples.append(sample)
+                if len(samples) % BAR_UPDATE_INTERVAL == 0:
+                    bar.update(task, completed=tour.walked, description=sample.words)
+                if not console.is_terminal and tour.walked >= next_report:
+                    console.print(f"{tour.walked:.0f} of {setup.path_length:.0f} m: {sample.words}")
+                    next_report += setup.path_length / MAX_PROGRESS_LINES
         except KeyboardInterrupt:
             is_stopped = True
-    if moments:
-        console.print(tour_table(write_tour(out, tour.world, tour.outcome, moments)))
-        console.print(f"written to {out}: tour.json, tour.png; no video is drawn of a tour")
+    if samples:
+        console.print(tour_table(write_tour(out, tour.world, tour.outcome, samples)))
+        console.print(f"written to {out}: tour.json, tour.png; a tour has no video")
     if is_stopped:
         raise KeyboardInterrupt
-    return bool(moments) and not (tour.fell or tour.simulator.touched)
+    return bool(samples) and not (tour.fell or tour.simulator.touched)

@@ -1,4 +1,4 @@
-"""What a tour came to: tour.json, and tour.png with the way on the map and how the distance was kept."""
+"""Writes the result of a tour: tour.json, and tour.png with map, distance and speed."""
 
 from __future__ import annotations
 
@@ -15,67 +15,103 @@ from quadvel_nodes.number_text import number_text
 from quadvel_sim.world import World
 
 from ..report import write_figure, write_json
-from ..world_map import draw
-from .stage import BAND
-from .tour import Moment, Outcome, summary
+from ..world_map import draw_world
+from .stage import DISTANCE_BAND_M
+from .tour import Outcome, TourSample, summarise_tour
 
 PAPER_XY, PAPER_WZ = 0.077, 0.059  # m/s, rad/s: mean errors of the paper's tour of 3.1 km
 
 
-def write_tour(folder: Path, world: World, outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
-    """Both files, each whole or not at all; the figures."""
-    figures = summary(outcome, moments)
+def write_tour(folder: Path, world: World, outcome: Outcome, samples: Sequence[TourSample]) -> dict[str, Any]:
+    """Write tour.json and tour.png.
+
+    Args:
+        folder: Folder of the files.
+        world: World of the tour.
+        outcome: Outcome of the tour.
+        samples: Its samples.
+
+    Returns:
+        The figures.
+    """
+    figures = summarise_tour(outcome, samples)
     write_json(folder / "tour.json", figures)
-    write_figure(folder / "tour.png", picture(world, outcome.distance, moments))
+    write_figure(folder / "tour.png", tour_figure(world, outcome.distance, samples))
     return figures
 
 
-def picture(world: World, distance: float, moments: Sequence[Moment]) -> Figure:
-    """The robot's way on the map of the world; below, distance to the person and speed over time."""
-    figure = draw(world)
-    way = np.array([one.pose[:2] for one in moments])
-    time = np.array([one.time - moments[0].time for one in moments]) / 60.0
-    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in moments])
-    speed = np.array([np.hypot(*one.velocity[:2]) for one in moments])
+def tour_figure(world: World, distance: float, samples: Sequence[TourSample]) -> Figure:
+    """Draw the robot's path on the map, and distance and speed over time distance_axis.
+
+    Args:
+        world: World of the tour.
+        distance: Set distance to the person, m.
+        samples: Samples of the tour.
+
+    Returns:
+        The figure.
+    """
+    figure = draw_world(world)
+    path = np.array([one.pose[:2] for one in samples])
+    time = np.array([one.time - samples[0].time for one in samples]) / 60.0
+    away = np.array([np.hypot(*(one.person - one.pose)[:2]) for one in samples])
+    speed = np.array([np.hypot(*one.velocity[:2]) for one in samples])
     world_map = figure.axes[0]
-    world_map.plot(*way.T, color="tab:red", linewidth=0.8, zorder=7)
+    world_map.plot(*path.T, color="tab:red", linewidth=0.8, zorder=7)
     wide, high = figure.get_size_inches()
     figure.set_size_inches(wide, high + 3.0)
     figure.set_layout_engine("none")
     low = 2.4 / (high + 3.0)
     world_map.set_position((0.07, low + 0.12, 0.9, 0.8 - low))
-    below = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
-    below.axhspan(distance - BAND, distance + BAND, color="tab:green", alpha=0.15)
-    below.plot(time, away, color="tab:blue", linewidth=0.8)
-    lost = np.array([one.state in (State.LOST, State.LOOKING) for one in moments])
-    below.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
-    below.set(
+    distance_axis = figure.add_axes((0.07, 0.09, 0.86, low - 0.05))
+    distance_axis.axhspan(
+        distance - DISTANCE_BAND_M, distance + DISTANCE_BAND_M, color="tab:green", alpha=0.15
+    )
+    distance_axis.plot(time, away, color="tab:blue", linewidth=0.8)
+    lost = np.array([one.state in (State.LOST, State.LOOKING) for one in samples])
+    distance_axis.plot(time[lost], away[lost], ".", color="tab:red", markersize=2)
+    distance_axis.set(
         xlabel="min",
         ylabel="distance, m",
         ylim=(0.0, max(4.0, float(away.max()))),
         xlim=(0.0, float(time[-1])),
     )
-    beside = below.twinx()
-    beside.plot(time, speed, color="0.6", linewidth=0.6)
-    beside.set(ylabel="speed, m/s", ylim=(0.0, 4.0))
+    speed_axis = distance_axis.twinx()
+    speed_axis.plot(time, speed, color="0.6", linewidth=0.6)
+    speed_axis.set(ylabel="speed, m/s", ylim=(0.0, 4.0))
     return figure
 
 
 def tour_table(figures: Mapping[str, Any]) -> Table:
-    """The figures, for people, beside what the paper reports of its own."""
+    """Create a table of the figures, next to those of the paper.
+
+    Args:
+        figures: Result of `summarise_tour`.
+
+    Returns:
+        The table.
+    """
     table = Table("", "here", "paper", title=f"Following through {figures['world']}, seed {figures['seed']}")
     touched = ", ".join(f"{name} {count}x" for name, count in figures["touched"].items()) or "nothing"
     n = number_text
     rows = [
-        ("way", f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min", "3100 m in 37 min"),
+        (
+            "path length",
+            f"{n(figures['walked'], '.0f')} m in {n(figures['minutes'], '.1f')} min",
+            "3100 m in 37 min",
+        ),
         ("fell", "yes" if figures["fell"] else "no", "no"),
         ("touched", touched, ""),
         ("error of the velocity, mean", f"{n(figures['error_xy'], '.3f')} m/s", f"{PAPER_XY} m/s"),
         ("error of the yaw rate, mean", f"{n(figures['error_wz'], '.3f')} rad/s", f"{PAPER_WZ} rad/s"),
         ("distance, mean", f"{n(figures['distance_mean'], '.2f')} m", ""),
-        (f"within {BAND} m of the set distance", f"{n(figures['distance_kept'], '.0%')} of the time", ""),
-        ("least clearance from things", _metres(figures["least_clearance"]), ""),
-        ("least clearance from persons", _metres(figures["least_gap"]), ""),
+        (
+            f"within {DISTANCE_BAND_M} m of the set distance",
+            f"{n(figures['distance_kept'], '.0%')} of the time",
+            "",
+        ),
+        ("smallest clearance from obstacles", _metres(figures["least_clearance"]), ""),
+        ("smallest clearance from people", _metres(figures["least_gap"]), ""),
         ("person lost", f"{figures['losses']} times, {n(figures['lost_seconds'], '.0f')} s together", ""),
     ]
     if planner := figures.get("planner_ms"):
@@ -86,4 +122,5 @@ def tour_table(figures: Mapping[str, Any]) -> Table:
 
 
 def _metres(value: float | None) -> str:
-    return "nothing was near" if value is None else f"{value:.2f} m"
+    """Distance as text; null means that nothing was near."""
+    return "nothing near" if value is None else f"{value:.2f} m"

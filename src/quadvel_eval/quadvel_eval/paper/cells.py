@@ -1,4 +1,4 @@
-"""Walks of one command, as the grid of `quadvel eval` makes them, as jobs and records of the paper's sections."""
+"""Jobs and records of walks of one command, as on the grid of `quadvel eval`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,30 @@ Command = tuple[float, float, float]
 
 
 def cell_job(setup: Setup, command: Command, seed: int, **labels: Any) -> Job:
-    """Six seconds of a command (vx, vy, wz) from standing, of which the last four count."""
+    """Create a job that walks one command from standing for 6 s; the last 4 s count.
+
+    Args:
+        setup: Robot, policy and ground.
+        command: vx, vy (m/s), wz (rad/s).
+        seed: Seed of the run.
+        **labels: Further columns.
+
+    Returns:
+        The job.
+    """
     return Job(labels, (run_cell, setup, Cell(command, seed), ()))
 
 
 def cell_record(labels: Record, result: CellResult) -> Record:
-    """The line of the CSV: command, seed, mean velocity and errors (m/s, rad/s), jitter (rad), cost of transport."""
+    """Create the record of a run.
+
+    Args:
+        labels: Further columns.
+        result: Figures of the run.
+
+    Returns:
+        Command, seed, mean velocity and errors (m/s, rad/s), jitter (rad), cost of transport.
+    """
     cell, segment = result.cell, result.segment
     mean = [None] * 3 if segment is None else segment.mean.tolist()
     return {
@@ -40,43 +58,102 @@ def cell_record(labels: Record, result: CellResult) -> Record:
     }
 
 
-def falls(records: Sequence[Record]) -> float:
-    """How many robots fell."""
+def count_falls(records: Sequence[Record]) -> float:
+    """Count the falls.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Number of robots that fell.
+    """
     return float(column(records, "fell").sum())
 
 
 def mean_error(records: Sequence[Record]) -> float:
-    """Of the mean velocities of the robots that did not fall, m/s."""
+    """Return the mean velocity error of the robots that did not fall.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Error, m/s.
+    """
     return mean(records, "error_xy")
 
 
 def largest_error(records: Sequence[Record]) -> float:
-    """Of the mean velocities of the robots that did not fall, m/s."""
+    """Return the largest velocity error of the robots that did not fall.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Error, m/s.
+    """
     return largest(records, "error_xy")
 
 
 def mean_turn_error(records: Sequence[Record]) -> float:
-    """Of the mean yaw rates of the robots that did not fall, rad/s."""
+    """Return the mean yaw rate error of the robots that did not fall.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Error, rad/s.
+    """
     return mean(records, "error_wz")
 
 
 def largest_turn_error(records: Sequence[Record]) -> float:
-    """Of the mean yaw rates of the robots that did not fall, rad/s."""
+    """Return the largest yaw rate error of the robots that did not fall.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Error, rad/s.
+    """
     return largest(records, "error_wz")
 
 
-def limits(study: Study, policy: str) -> CommandLimits:
-    """The commands that a policy takes."""
+def command_limits(study: Study, policy: str) -> CommandLimits:
+    """Read the command limits of a policy from its file.
+
+    Args:
+        study: Policies by name.
+        policy: Name of the policy.
+
+    Returns:
+        The limits.
+    """
     return PolicyFile(study.policies[policy]).metadata.limits
 
 
-def within(command: Command, taken: CommandLimits) -> bool:
-    """Whether a policy with these limits takes the command as it is."""
-    return bool(np.allclose(taken.clamp(command), command, rtol=0.0, atol=1e-9))
+def is_within_limits(command: Command, bounds: CommandLimits) -> bool:
+    """Return whether command limits leave a command unchanged.
+
+    Args:
+        command: vx, vy (m/s), wz (rad/s).
+        bounds: Limits of a policy.
+
+    Returns:
+        True if the policy receives the command as it is.
+    """
+    return bool(np.allclose(bounds.clamp(command), command, rtol=0.0, atol=1e-9))
 
 
-def reach(direction: Command, bounds: CommandLimits) -> float:
-    """How long the command along `direction` (one axis, of length 1) may become; m/s or rad/s."""
+def max_command_along(direction: Command, bounds: CommandLimits) -> float:
+    """Return the largest command along one axis.
+
+    Args:
+        direction: Unit vector along one axis.
+        bounds: Limits of a policy.
+
+    Returns:
+        Largest length of the command, m/s or rad/s.
+    """
     ends = [
         (high if d > 0 else -low) / abs(d)
         for d, low, high in zip(direction, bounds.low, bounds.high, strict=True)

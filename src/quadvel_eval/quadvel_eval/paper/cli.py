@@ -1,4 +1,4 @@
-"""The command `quadvel paper`, as a function for a typer application."""
+"""Defines the command `quadvel paper` for Typer."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from rich.console import Console
 from quadvel_estimator.learned import SHIPPED_MODEL, LearnedEstimator
 from quadvel_policy.policy_file import PolicyFile
 
-from ..cli import Cluster, walks_bar
+from ..cli import ClusterOption, walk_progress_bar
 from ..output import output_folder
-from .files import PAGE
+from .files import PAGE_FILE
 from .section import Section, Study
-from .study import SECTIONS, Progress, run
+from .study import SECTIONS, Progress, run_sections
 
 
 def paper_command(
@@ -43,15 +43,17 @@ def paper_command(
     ] = "learned",
     estimator_file: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file of the learned one.", show_default="the shipped one"),
+        typer.Option(
+            metavar="<file>", help="ONNX file of the learned estimator.", show_default="the shipped one"
+        ),
     ] = SHIPPED_MODEL,
     seeds: Annotated[int, typer.Option(min=1, help="Runs of each walk, with seeds 0, 1, ...")] = 3,
-    again: Annotated[bool, typer.Option("--again", help="Run sections that are done already, too.")] = False,
-    cluster: Cluster = None,
+    again: Annotated[bool, typer.Option("--again", help="Run finished sections, too.")] = False,
+    cluster: ClusterOption = None,
 ) -> None:
-    """Measure what Section 4 of the paper shows: a page with its values beside ours, pictures and CSV files.
+    """Repeat Section 4 of the paper in simulation: a page with both values, pictures and CSV files.
 
-    Sections whose files were made with the same networks, seeds and settings are kept; what was stopped goes on.
+    Sections made with the same networks, seeds and settings are kept; an interrupted run continues.
 
     \b
     For example:
@@ -66,14 +68,14 @@ def paper_command(
         seeds=seeds,
     )
     for path in study.policies.values():
-        PolicyFile(path)  # what is wrong with the files shows here, once, before any run
+        PolicyFile(path)  # fail on a bad file here, once, before any run
     LearnedEstimator(estimator_file)
     sections = _sections(only or [])
     folder = output_folder(out)
-    with walks_bar() as bar:
+    with walk_progress_bar() as bar:
         task = bar.add_task("walks", total=None)
 
-        def tell(progress: Progress) -> None:
+        def show_progress(progress: Progress) -> None:
             bar.update(task, completed=progress.done, total=progress.total)
             if progress.completed:
                 bar.console.print(
@@ -81,27 +83,27 @@ def paper_command(
                     highlight=False,
                 )
 
-        done = run(study, sections, folder, again, cluster, tell)
+        done = run_sections(study, sections, folder, again, cluster, show_progress)
     kept = [section.name for section in sections if section.name not in done]
     console = Console()
     if kept:
-        console.print(f"kept as they were: {', '.join(kept)}")
-    console.print(f"written: {folder}/{PAGE}")
+        console.print(f"unchanged: {', '.join(kept)}")
+    console.print(f"written: {folder}/{PAGE_FILE}")
 
 
 def _policies(given: list[str]) -> dict[str, Path]:
-    """NAME=FILE, each name once."""
+    """Parse NAME=FILE, each name once."""
     policies: dict[str, Path] = {}
     for text in given:
         name, equals, file = text.partition("=")
         if not (name and equals and file) or name in policies:
-            raise ValueError(f"--policy: found {text!r}, expected NAME=FILE with a name of its own")
+            raise ValueError(f"--policy: found {text!r}, expected NAME=FILE with a unique name")
         policies[name] = Path(file)
     return policies
 
 
 def _sections(only: list[str]) -> list[Section]:
-    """The sections of these names, all where there are none."""
+    """Sections of the given names; all if none is given."""
     known = {section.name: section for section in SECTIONS}
     for name in only:
         if name not in known:

@@ -1,4 +1,4 @@
-"""Sections that walk the same commands on many plants: what a condition is, and how survival and error are shown."""
+"""Walks of the same commands on many plants: conditions, survival rate and error plots."""
 
 from __future__ import annotations
 
@@ -11,77 +11,114 @@ from matplotlib.axes import Axes
 
 from quadvel_sim.physics import SECOND
 
-from ..grid import DURATION, PLANTS, Cell, CellResult, judge, mass
-from ..walk import Setup, make_loop, record
+from ..grid import COMMAND_DURATION_S, PLANTS, Cell, CellResult, evaluate_walk, robot_mass
+from ..walk import Setup, make_loop, record_walk
 from .cells import Command
 from .section import Job, Record, Study, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
-"""ahead, sideways, along an arc; m/s, rad/s"""
-LOOSE: Mapping[str, Any] = {"physics": SECOND, "joint_friction": np.zeros(12), "joint_damping": np.zeros(12)}
-"""Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
-HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE}
+"""Forward, lateral and curved walk: vx, vy (m/s), wz (rad/s)."""
+LOOSE_JOINTS: Mapping[str, Any] = {
+    "physics": SECOND,
+    "joint_friction": np.zeros(12),
+    "joint_damping": np.zeros(12),
+}
+"""Fields of `SimulatorConfig`: second plant, with joints without friction and damping."""
+HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE_JOINTS}
 PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}
-"""As rows name those of HARD_PLANTS that are not the usual one."""
-PUSH_TIME, PUSH_SECONDS = 1.0, 0.2  # s after the start of a walk, and for how long
+"""Names in table rows of the plants of HARD_PLANTS other than the usual one."""
+PUSH_START_S, PUSH_DURATION_S = 1.0, 0.2  # after the start of the walk
 
 
 @attrs.frozen
 class Condition:
-    """What differs from the nominal robot on flat ground."""
+    """Deviation from the nominal robot on flat ground.
+
+    Attributes:
+        group: Group of the condition.
+        level: Name within the group.
+        plant: Fields of `SimulatorConfig`.
+        push: Force on the trunk for PUSH_DURATION_S, N, world frame; None: no push.
+        standing_time: Time that the robot stands before its command, s.
+    """
 
     group: str
     level: str
     plant: Mapping[str, Any] = attrs.field(factory=dict)
-    """fields of SimulatorConfig"""
     push: tuple[float, float, float] | None = None
-    """N on the trunk, world frame, for PUSH_SECONDS"""
-    stood: float = 0.0
-    """s that the robot stands there before its command"""
+    standing_time: float = 0.0
 
     @property
     def labels(self) -> Record:
-        """As records hold it."""
+        """Group and level, as columns of a record."""
         return {"group": self.group, "level": self.level}
 
 
 def walk_under(
-    setup: Setup, cell: Cell, push: tuple[float, float, float] | None, stood: float = 0.0
+    setup: Setup, cell: Cell, push: tuple[float, float, float] | None, standing_time: float = 0.0
 ) -> CellResult:
-    """As `grid.run_cell`, without other estimators, after standing, and with a push if there is one.
+    """Walk one command like `grid.run_cell`, after standing, and with an optional push.
 
     Args:
-        setup: robot, policy and estimator.
-        cell: the command and the seed.
-        push: force on the trunk, N, world frame, for PUSH_SECONDS from PUSH_TIME on.
-        stood: how long the robot is commanded to stand first, s.
+        setup: Robot, policy and estimator.
+        cell: Command and seed.
+        push: Force on the trunk, N, world frame, for PUSH_DURATION_S from PUSH_START_S on.
+        standing_time: Time that the robot stands first, s.
+
+    Returns:
+        The figures of the walk.
     """
     loop = make_loop(setup, cell.seed, ())
-    if stood and record(loop, [((0.0, 0.0, 0.0), stood)]) is None:
+    if standing_time and record_walk(loop, [((0.0, 0.0, 0.0), standing_time)]) is None:
         return CellResult(cell)
     if push is not None:
-        if record(loop, [(cell.command, PUSH_TIME)]) is None:
+        if record_walk(loop, [(cell.command, PUSH_START_S)]) is None:
             return CellResult(cell)
-        loop.simulator.push("trunk", push, duration=PUSH_SECONDS)
-    walk = record(loop, [(cell.command, DURATION)])
-    return judge(walk, cell, mass(loop)) if walk else CellResult(cell)
+        loop.simulator.push("trunk", push, duration=PUSH_DURATION_S)
+    walk = record_walk(loop, [(cell.command, COMMAND_DURATION_S)])
+    return evaluate_walk(walk, cell, robot_mass(loop)) if walk else CellResult(cell)
 
 
 def condition_job(study: Study, policy: str, one: Condition, command: Command, seed: int) -> Job:
-    """A policy's walk under a condition."""
+    """Create the job of a policy's walk under a condition.
+
+    Args:
+        study: Policies and estimator.
+        policy: Name of the policy.
+        one: The condition.
+        command: vx, vy (m/s), wz (rad/s).
+        seed: Seed of the run.
+
+    Returns:
+        The job.
+    """
     setup = study.setup(policy, **one.plant)
     return Job(
-        {"policy": policy, **one.labels}, (walk_under, setup, Cell(command, seed), one.push, one.stood)
+        {"policy": policy, **one.labels},
+        (walk_under, setup, Cell(command, seed), one.push, one.standing_time),
     )
 
 
-def survival(records: Sequence[Record]) -> float:
-    """Share of the robots that did not fall, %; nan without any."""
+def survival_rate(records: Sequence[Record]) -> float:
+    """Return the share of robots that did not fall.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Share, %; nan without records.
+    """
     return 100.0 * (1.0 - mean(records, "fell"))
 
 
-def draw(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
-    """Mean error and survival of each policy over the levels of one group."""
+def draw_error_and_survival(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
+    """Draw mean error and survival rate of each policy over the levels of one group.
+
+    Args:
+        error: Panel of the error.
+        stood: Panel of the survival rate.
+        records: Records of the group.
+    """
     levels = distinct(records, "level")
     policies = distinct(records, "policy")
     places, width = np.arange(len(levels)), 0.8 / len(policies)
@@ -89,7 +126,7 @@ def draw(error: Axes, stood: Axes, records: Sequence[Record]) -> None:
         groups = [select(records, policy=policy, level=level) for level in levels]
         left = places + k * width
         error.bar(left, [mean(group, "error_xy") for group in groups], width, label=policy, align="edge")
-        stood.bar(left, [survival(group) for group in groups], width, align="edge")
+        stood.bar(left, [survival_rate(group) for group in groups], width, align="edge")
     for panel in (error, stood):
         panel.set_xticks(places + 0.4, [str(level) for level in levels])
         panel.set_xlim(-0.2, len(levels))

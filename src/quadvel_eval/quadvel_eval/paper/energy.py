@@ -8,14 +8,20 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
-from .cells import Command, cell_job, cell_record, limits, within
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, mean, select
+from .cells import Command, cell_job, cell_record, command_limits, is_within_limits
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, mean, select
 
 
 @attrs.frozen
 class Energy(Section):
-    """Straight walks and turns on the spot, m/s and rad/s."""
+    """Cost of straight walks and of turns on the spot.
+
+    Attributes:
+        speeds: Commanded forward velocities, m/s.
+        rates: Commanded yaw rates, rad/s.
+    """
 
     name: ClassVar[str] = "energy"
     title: ClassVar[str] = "Figure 12: cost of transport and of turning"
@@ -27,6 +33,7 @@ class Energy(Section):
     speeds: tuple[float, ...] = (0.25, 0.5, 0.75, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5)
     rates: tuple[float, ...] = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         commands: list[Command] = [(speed, 0.0, 0.0) for speed in self.speeds]
         commands += [(0.0, 0.0, rate) for rate in self.rates]
@@ -34,13 +41,15 @@ class Energy(Section):
             cell_job(study.setup(policy), command, seed, policy=policy)
             for policy in study.policies
             for command in commands
-            if within(command, limits(study, policy))
+            if is_within_limits(command, command_limits(study, policy))
             for seed in range(study.seeds)
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         figure = Figure(figsize=(9.0, 3.5), layout="constrained")
         straight, turning = figure.subplots(1, 2)
@@ -58,6 +67,7 @@ class Energy(Section):
         straight.legend()
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         def least(axis: str) -> dict[str, float | None]:
             moving = [r for r in records if r[axis]]

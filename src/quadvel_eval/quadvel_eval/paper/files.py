@@ -1,6 +1,7 @@
-"""The files of a section, NAME.csv, NAME.png and NAME.json, and the page that shows all sections of a folder.
+"""Writes the files of a section (NAME.csv, NAME.png, NAME.json) and the page of all sections.
 
-The JSON file is written last and says what the section was made with: where it agrees, the section is done.
+The JSON file is written last and records the networks and settings. A section is done if they
+match.
 """
 
 from __future__ import annotations
@@ -22,12 +23,20 @@ from ..report import read_json, write_figure, write_json
 from .section import Record, Row, Section, Study, distinct
 
 SCHEMA = 1
-PAGE = "README.md"
-DIGEST = 12  # letters of a SHA-256 that tell one file from another
+PAGE_FILE = "README.md"
+DIGEST_LENGTH = 12  # hexadecimal digits of a SHA-256
 
 
-def made_with(section: Section, study: Study) -> dict[str, Any]:
-    """All that a section's result depends on, as JSON keeps it; networks by the digest of their files."""
+def provenance(section: Section, study: Study) -> dict[str, Any]:
+    """Return everything that determines the result of a section.
+
+    Args:
+        section: Section with its settings.
+        study: Policies, estimator and seeds.
+
+    Returns:
+        JSON content; networks as digests of their files.
+    """
     return {
         "policies": {name: _digest(path) for name, path in study.policies.items()},
         "estimator": study.estimator,
@@ -38,42 +47,64 @@ def made_with(section: Section, study: Study) -> dict[str, Any]:
 
 
 def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGEST]
+    """First letters of the SHA-256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()[:DIGEST_LENGTH]
 
 
 def is_done(folder: Path, section: Section, study: Study) -> bool:
-    """Whether the folder holds this section, made with just these networks, seeds and settings."""
+    """Return whether a folder holds a section made with the same networks, seeds and settings.
+
+    Args:
+        folder: Folder of the files.
+        section: The section.
+        study: Policies, estimator and seeds.
+
+    Returns:
+        True if the section need not run.
+    """
     path = folder / f"{section.name}.json"
-    return path.exists() and bool(read_json(path)["made_with"] == made_with(section, study))
+    return path.exists() and bool(read_json(path)["made_with"] == provenance(section, study))
 
 
 def write_section(folder: Path, section: Section, study: Study, records: Sequence[Record]) -> None:
-    """CSV, picture and JSON of a section; picture and table are made of what the CSV says."""
+    """Write CSV, figure and JSON of a section; figure and table are made from the CSV.
+
+    Args:
+        folder: Folder of the files.
+        section: The section.
+        study: Policies, estimator and seeds.
+        records: Its records.
+    """
     write_records(folder / f"{section.name}.csv", records)
     kept = read_records(folder / f"{section.name}.csv")
-    write_figure(folder / f"{section.name}.png", section.figure(kept) if kept else _nothing())
+    write_figure(folder / f"{section.name}.png", section.figure(kept) if kept else _empty_figure())
     rows = [attrs.asdict(row) for row in section.rows(kept)]
-    about = {name: _about(path) for name, path in study.policies.items()}
-    content = {"made_with": made_with(section, study), "policies": about, "rows": rows}
+    about = {name: _policy_info(path) for name, path in study.policies.items()}
+    content = {"made_with": provenance(section, study), "policies": about, "rows": rows}
     write_json(folder / f"{section.name}.json", {"schema": SCHEMA, **content})
 
 
-def _nothing() -> Figure:
-    """The picture of a section in which no robot got anywhere."""
+def _empty_figure() -> Figure:
+    """Figure of a section without records."""
     figure = Figure(figsize=(4.0, 1.0))
     figure.text(0.5, 0.5, "every robot fell before there was anything to show", ha="center", va="center")
     return figure
 
 
-def _about(path: Path) -> dict[str, Any]:
-    """What a policy says of itself."""
+def _policy_info(path: Path) -> dict[str, Any]:
+    """File name, command limits and recipe of a policy."""
     metadata = PolicyFile(path).metadata
     limits = {axis: list(bounds) for axis, bounds in metadata.command_limits.items()}
     return {"file": path.name, "command_limits": limits, "recipe": metadata.recipe}
 
 
 def write_records(path: Path, records: Sequence[Record]) -> None:
-    """The records as CSV: numbers with six digits, nothing where there is None."""
+    """Write records as CSV: numbers with six significant digits, None as an empty field.
+
+    Args:
+        path: The file.
+        records: The records.
+    """
     with replacing(path) as draft, draft.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(records[0]) if records else [], lineterminator="\n")
         writer.writeheader()
@@ -82,18 +113,27 @@ def write_records(path: Path, records: Sequence[Record]) -> None:
 
 
 def _text(value: Any) -> str:
+    """Value as text of a CSV field."""
     if value is None:
         return ""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def read_records(path: Path) -> list[Record]:
-    """What `write_records` wrote."""
+    """Read records from a CSV file of `write_records`.
+
+    Args:
+        path: The file.
+
+    Returns:
+        The records.
+    """
     with path.open(newline="") as file:
         return [{name: _value(text) for name, text in line.items()} for line in csv.DictReader(file)]
 
 
 def _value(text: str) -> Any:
+    """Value of a CSV field: int, float, text, or None if empty."""
     for kind in (int, float):
         try:
             return kind(text)
@@ -103,7 +143,12 @@ def _value(text: str) -> Any:
 
 
 def write_page(folder: Path, sections: Sequence[Section]) -> None:
-    """The page with those of the sections that the folder holds."""
+    """Write the page with all sections whose files are in the folder.
+
+    Args:
+        folder: Folder of the files.
+        sections: Sections in the order of the page.
+    """
     there = [section for section in sections if (folder / f"{section.name}.json").exists()]
     rows = {section: section.rows(read_records(folder / f"{section.name}.csv")) for section in there}
     lines = [
@@ -118,11 +163,12 @@ def write_page(folder: Path, sections: Sequence[Section]) -> None:
     ]
     for section in there:
         lines += _chapter(section, rows[section], read_json(folder / f"{section.name}.json"))
-    with replacing(folder / PAGE) as draft:
+    with replacing(folder / PAGE_FILE) as draft:
         draft.write_text("\n".join(lines))
 
 
 def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) -> list[str]:
+    """Lines of a section on the page."""
     made = content["made_with"]
     policies = ", ".join(f"{name} ({digest})" for name, digest in made["policies"].items())
     seeds = "1 seed" if made["seeds"] == 1 else f"{made['seeds']} seeds"
@@ -141,6 +187,7 @@ def _chapter(section: Section, rows: Sequence[Row], content: Mapping[str, Any]) 
 
 
 def _table(rows: Sequence[Row]) -> list[str]:
+    """Lines of a Markdown table of rows."""
     policies = distinct([{"policy": name} for row in rows for name in row.ours], "policy")
     lines = [
         f"| | paper | {' | '.join(policies)} |",
@@ -154,10 +201,12 @@ def _table(rows: Sequence[Row]) -> list[str]:
 
 
 def _cell(row: Row, value: float | None) -> str:
+    """Our value, with its difference from the paper's in brackets."""
     if value is None or row.paper is None:
         return _number(row, value)
     return f"{_number(row, value)} ({value - row.paper:+.{row.digits}f})"
 
 
 def _number(row: Row, value: float | None) -> str:
+    """Number with the decimals of the row; a dash for None."""
     return "–" if value is None else f"{value:.{row.digits}f}"

@@ -1,4 +1,4 @@
-"""Figure 6: how the gait changes while the robot speeds up, and what is counted of any gait."""
+"""Figure 6: change of the gait over a velocity ramp, with gait figures per window."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
+from typing_extensions import override
 
 from quadvel_description import robot
 
 from ..gait_kind import GaitKind, gait_frequency
-from ..robot_loop import PERIOD
-from ..walk import Setup, Walk, make_loop, record_to_the_fall
+from ..robot_loop import CONTROL_PERIOD_S
+from ..walk import Setup, Walk, make_loop, record_until_fall
 from .section import (
-    Answers,
     Job,
+    JobResults,
     Record,
     Row,
     Section,
@@ -36,12 +37,12 @@ from .section import (
 
 Array = NDArray[np.float64]
 
-WINDOW = 1.0  # s, over which a gait is counted
-STEADY = 5  # ticks: a shorter touch or gap is a bounce
-SHOWN = 4  # ticks from one line of the CSV to the next
-KIND_SPEEDS = (0.5, 1.0, 2.0, 2.75)  # m/s of the ramp, at which the kind of gait is in the table,
-KIND_SPAN = 0.125  # m/s, from so much below to so much above
-KINDS = {  # what the table has of a gait's kind, with units and factors
+WINDOW_S = 1.0  # for gait figures
+MEDIAN_FILTER_TICKS = 5  # touches or gaps shorter than half of it are bounces
+CSV_INTERVAL_TICKS = 4  # between lines of the CSV
+GAIT_KIND_SPEEDS = (0.5, 1.0, 2.0, 2.75)  # m/s, in the table
+GAIT_KIND_HALF_SPAN = 0.125  # m/s around each of GAIT_KIND_SPEEDS
+GAIT_KIND_FIGURES = {  # name, unit and factor in the table
     "diagonal": ("diagonal feet alike", "%", 100.0),
     "side": ("feet of one side alike", "%", 100.0),
     "frequency": ("gait frequency", "Hz", 1.0),
@@ -51,24 +52,48 @@ KINDS = {  # what the table has of a gait's kind, with units and factors
 SHOWN_LEGS = ("FL", "FR", "RL", "RR")
 
 
-def contacts(raw: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Contacts (n, 4) at 200 Hz without bounces: what half of `STEADY` ticks around say."""
-    steady: NDArray[np.bool_] = median_filter(raw, size=(STEADY, 1), mode="nearest")
+def debounce_contacts(raw: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Remove short touches and gaps from foot contacts by a median filter.
+
+    Args:
+        raw: Contacts (n, 4) at 200 Hz.
+
+    Returns:
+        Filtered contacts (n, 4).
+    """
+    steady: NDArray[np.bool_] = median_filter(raw, size=(MEDIAN_FILTER_TICKS, 1), mode="nearest")
     return steady
 
 
-def ramp(setup: Setup, seed: int, top: float, slope: float, hold: float) -> tuple[Walk | None, bool]:
-    """Stand for `hold` (s), speed up to `top` (m/s) by `slope` (m/s^2), and hold that."""
-    times = np.arange(round((top / slope + 2 * hold) / PERIOD)) * PERIOD
+def walk_ramp(setup: Setup, seed: int, top: float, slope: float, hold: float) -> tuple[Walk | None, bool]:
+    """Stand, accelerate forward at a constant rate, and hold the final velocity.
+
+    Args:
+        setup: Robot, policy and ground.
+        seed: Seed of the run.
+        top: Final velocity, m/s.
+        slope: Acceleration, m/s^2.
+        hold: Duration of standing and of the final velocity, s.
+
+    Returns:
+        The walk, and whether the robot stayed on its feet.
+    """
+    times = np.arange(round((top / slope + 2 * hold) / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S
     speeds = np.clip(slope * (times - hold), 0.0, top)
-    return record_to_the_fall(
-        make_loop(setup, seed, ()), [((speed, 0.0, 0.0), PERIOD) for speed in speeds.tolist()]
+    return record_until_fall(
+        make_loop(setup, seed, ()), [((speed, 0.0, 0.0), CONTROL_PERIOD_S) for speed in speeds.tolist()]
     )
 
 
 @attrs.frozen
 class Gait(Section):
-    """One ramp a policy; speeds in m/s, m/s^2, s."""
+    """One velocity ramp per policy.
+
+    Attributes:
+        top: Final velocity, m/s.
+        slope: Acceleration, m/s^2.
+        hold: Duration of standing and of the final velocity, s.
+    """
 
     name: ClassVar[str] = "gait"
     title: ClassVar[str] = "Figure 6: gait over a velocity ramp"
@@ -84,13 +109,15 @@ class Gait(Section):
     slope: float = 0.25
     hold: float = 2.0
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         return [
-            Job({"policy": policy}, (ramp, study.setup(policy), 0, self.top, self.slope, self.hold))
+            Job({"policy": policy}, (walk_ramp, study.setup(policy), 0, self.top, self.slope, self.hold))
             for policy in study.policies
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         records: list[Record] = []
         for labels, (walk, stood) in answers:
             if walk is not None:
@@ -98,19 +125,20 @@ class Gait(Section):
         return records
 
     def _lines(self, walk: Walk, stood: bool) -> list[Record]:
-        contact, half = contacts(walk.contact), round(0.5 * WINDOW / PERIOD)
+        """Records of a walk, one every CSV_INTERVAL_TICKS."""
+        contact, half = debounce_contacts(walk.contact), round(0.5 * WINDOW_S / CONTROL_PERIOD_S)
         lines = []
-        for i in range(0, len(walk.time), SHOWN):
+        for i in range(0, len(walk.time), CSV_INTERVAL_TICKS):
             part = slice(max(0, i - half), i + half)
             window = contact[part]
-            kind = GaitKind.of(walk.contact[part], walk.velocity[part, 1], PERIOD)
+            kind = GaitKind.of(walk.contact[part], walk.velocity[part, 1], CONTROL_PERIOD_S)
             feet = {leg: int(contact[i, robot.LEGS.index(leg)]) for leg in SHOWN_LEGS}
             lines.append(
                 {
                     "time": round(float(walk.time[i]), 3),
                     "command": float(np.clip(self.slope * (walk.time[i] - self.hold), 0.0, self.top)),
                     "vx": float(walk.velocity[part, 0].mean()),
-                    "frequency": gait_frequency(window, PERIOD),
+                    "frequency": gait_frequency(window, CONTROL_PERIOD_S),
                     "contact_ratio": float(window.mean()),
                     "diagonal": kind.diagonal,
                     "side": kind.side,
@@ -121,6 +149,7 @@ class Gait(Section):
             )
         return lines
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         policies = distinct(records, "policy")
         figure = Figure(figsize=(7.5 * len(policies), 6.0), layout="constrained")
@@ -130,6 +159,7 @@ class Gait(Section):
         return figure
 
     def _draw(self, panels: Any, policy: str, records: Sequence[Record]) -> None:
+        """Draw velocity, contacts and gait figures of a policy in three panels."""
         speed, feet, gait = panels
         time = column(records, "time")
         speed.plot(time, column(records, "command"), "k--", linewidth=1.0, label="command")
@@ -147,6 +177,7 @@ class Gait(Section):
         ratio.set_ylim(0.0, 1.05)
         gait.set_xlabel("time, s")
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         def walking(mine: Sequence[Record]) -> list[Record]:
             return [r for r in mine if r["frequency"] > 0.0 and r["vx"] > 0.2]
@@ -165,19 +196,19 @@ class Gait(Section):
             Row("contact ratio, standing", "", 1.0, by_policy(records, lambda r: r[0]["contact_ratio"]), 2),
             Row("contact ratio at the end", "", 0.39, by_policy(records, last("contact_ratio")), 2, key=True),
             Row("fell during the ramp", "", 0.0, by_policy(records, lambda r: r[0]["fell"]), 0),
-            *_kind_rows(records),
+            *_gait_kind_rows(records),
         ]
 
 
 def _mean_near(records: Sequence[Record], speed: float, name: str) -> float:
-    """Mean of a column over the part of the ramp within KIND_SPAN of a speed (m/s); nan where there is none."""
-    return mean([r for r in records if abs(r["command"] - speed) < KIND_SPAN], name)
+    """Mean of a column within GAIT_KIND_HALF_SPAN of a commanded speed (m/s); nan without records."""
+    return mean([r for r in records if abs(r["command"] - speed) < GAIT_KIND_HALF_SPAN], name)
 
 
-def _kind_rows(records: Sequence[Record]) -> list[Row]:
-    """The kind of gait at each of KIND_SPEEDS; nothing where the ramp ends before."""
+def _gait_kind_rows(records: Sequence[Record]) -> list[Row]:
+    """Rows of the gait kind at each of GAIT_KIND_SPEEDS; None beyond the end of the ramp."""
     rows = []
-    for speed, (name, (what, unit, factor)) in itertools.product(KIND_SPEEDS, KINDS.items()):
+    for speed, (name, (what, unit, factor)) in itertools.product(GAIT_KIND_SPEEDS, GAIT_KIND_FIGURES.items()):
         ours = by_policy(records, partial(_mean_near, speed=speed, name=name))
         scaled = {policy: None if value is None else factor * value for policy, value in ours.items()}
         digits, key = (0, speed == 1.0) if unit == "%" else (2, False)
@@ -186,8 +217,8 @@ def _kind_rows(records: Sequence[Record]) -> list[Row]:
 
 
 def _draw_contacts(panel: Axes, time: Array, records: Sequence[Record]) -> None:
-    """A bar where a foot is on the ground."""
-    step = time[1] - time[0] if len(time) > 1 else PERIOD
+    """Draw a bar while a foot is on the ground."""
+    step = time[1] - time[0] if len(time) > 1 else CONTROL_PERIOD_S
     for row, leg in enumerate(reversed(SHOWN_LEGS)):
         down = time[column(records, leg) > 0]
         panel.broken_barh([(t, step) for t in down], (row + 0.1, 0.8), color="tab:blue")

@@ -1,4 +1,4 @@
-"""The gap: policies on plants whose drives hold what the actuator model lacks."""
+"""Reality gap: policies on plants whose drives have effects that the actuator model lacks."""
 
 from __future__ import annotations
 
@@ -9,62 +9,89 @@ from typing import Any, ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from quadvel_actuator import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES
 
 from ..output import replacing
-from .cells import Command, cell_record, falls, largest_error, limits, mean_error
-from .conditions import Condition, condition_job, draw
-from .identification import mixed
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, mean, select
+from .cells import Command, cell_record, command_limits, count_falls, largest_error, mean_error
+from .conditions import Condition, condition_job, draw_error_and_survival
+from .identification import record_mixed_walk
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, mean, select
 
-MORE_DELAY = 0.003  # s
+EXTRA_DELAY_S = 0.003  # s
 COMMANDS: tuple[Command, ...] = (
     (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, 1.0),
     (0.0, 0.0, -1.0), (1.0, 0.4, 0.0), (1.0, -0.4, 0.0), (0.8, 0.0, 0.8), (0.8, 0.0, -0.8),
 )  # fmt: skip
 
 
-def _with(name: str, settings: Mapping[str, Any] | None = None, **parameters: float) -> ActuatorParameters:
+def _default_with_effect(
+    name: str, settings: Mapping[str, Any] | None = None, **parameters: float
+) -> ActuatorParameters:
     """The shipped actuator model with an effect on all joints."""
     effect = Effect(name, JOINT_NAMES, {**(settings or {}), **parameters})
     return attrs.evolve(ActuatorParameters.default(), name=f"aliengo with {name}", effects=(effect,))
 
 
-def _delayed() -> ActuatorParameters:
+def _default_with_extra_delay() -> ActuatorParameters:
     """The shipped actuator model with commands that take MORE_DELAY longer."""
     default = ActuatorParameters.default()
-    pairs = tuple(attrs.evolve(p, input_delay_s=p.input_delay_s + MORE_DELAY) for p in default.pairs)
+    pairs = tuple(attrs.evolve(p, input_delay_s=p.input_delay_s + EXTRA_DELAY_S) for p in default.pairs)
     return attrs.evolve(default, name="aliengo with more delay", pairs=pairs)
 
 
-def plants() -> list[Condition]:
-    """The plant of the actuator model, and those whose drives hold more."""
+def drive_conditions() -> list[Condition]:
+    """List the plant of the actuator model and the plants with additional effects.
+
+    Returns:
+        One condition per plant.
+    """
     drives = {
         "as in training": ActuatorParameters.default(),
-        "friction": _with("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
-        "torque-speed limit": _with("torque_speed_limit", stall=24.0, no_load=12.0),
-        "3 ms more delay": _delayed(),
-        "backlash": _with("backlash", {"on": "q"}, gap=0.015),
+        "friction": _default_with_effect("stribeck_friction", c=1.2, c_s=1.8, v_s=0.3, v_0=0.05),
+        "torque-speed limit": _default_with_effect("torque_speed_limit", stall=24.0, no_load=12.0),
+        "3 ms more delay": _default_with_extra_delay(),
+        "backlash": _default_with_effect("backlash", {"on": "q"}, gap=0.015),
     }
     return [Condition("drives", name, {"actuator": parameters}) for name, parameters in drives.items()]
 
 
-def record_walk(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
-    """Write a log (NPZ, 1 kHz) of a mixed walk on one of the `plants`, for `quadvel identify`. ValueError: no such plant."""
-    known = {one.level: one for one in plants()}
+def write_walk_log(policy: Path, plant: str, out: Path, seed: int = 0) -> None:
+    """Write a log of a mixed walk on one of the plants, for `quadvel identify`.
+
+    Args:
+        policy: ONNX file of the policy.
+        plant: Level of one of `drive_conditions`.
+        out: NPZ file to write, rows at 1 kHz.
+        seed: Seed of the run.
+
+    Raises:
+        ValueError: The plant is unknown.
+    """
+    known = {one.level: one for one in drive_conditions()}
     if plant not in known:
         raise ValueError(f"plant: found {plant!r}, expected one of {', '.join(known)}")
     study = Study(policies={"walker": policy})
-    log = mixed(study.setup("walker", **known[plant].plant), seed, limits(study, "walker"))
+    log = record_mixed_walk(
+        study.setup("walker", **known[plant].plant), seed, command_limits(study, "walker")
+    )
     fields = {name: getattr(log, name) for name in ("t", "q", "dq", "tau", "q_des", "tau_ff", "kp", "kd")}
     with replacing(out) as draft:
         np.savez_compressed(draft, joint_names=np.array(log.joints), **fields)
 
 
-def cut(records: Sequence[Record], policy: str) -> dict[str, float | None]:
-    """By how much (%) the mean error of each other policy is below that of `policy`, on walks that neither fell on."""
+def error_reduction(records: Sequence[Record], policy: str) -> dict[str, float | None]:
+    """Return how much lower the mean error of each other policy is, on walks without a fall.
+
+    Args:
+        records: Records of `cell_record`.
+        policy: Reference policy.
+
+    Returns:
+        Reduction relative to the reference, %, by policy.
+    """
 
     def errors(name: str) -> dict[tuple[Any, ...], Record]:
         mine = select(records, policy=name, fell=0)
@@ -83,7 +110,11 @@ def cut(records: Sequence[Record], policy: str) -> dict[str, float | None]:
 
 @attrs.frozen
 class Gap(Section):
-    """Every plant with every command and seed."""
+    """Walks of every command on every plant.
+
+    Attributes:
+        commands: vx, vy (m/s), wz (rad/s) of each walk.
+    """
 
     name: ClassVar[str] = "gap"
     title: ClassVar[str] = "The gap: drives that hold what the model lacks"
@@ -97,36 +128,40 @@ class Gap(Section):
     )
     commands: tuple[Command, ...] = COMMANDS
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         return [
             condition_job(study, policy, one, command, seed)
             for policy in study.policies
-            for one in plants()
+            for one in drive_conditions()
             for command in self.commands
             for seed in range(study.seeds)
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         figure = Figure(figsize=(8.0, 5.0), layout="constrained")
         error, stood = figure.subplots(2, 1, sharex=True)
-        draw(error, stood, records)
+        draw_error_and_survival(error, stood, records)
         error.set_ylabel("mean error, m/s")
         stood.set_ylabel("survival, %")
         error.legend()
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows, first = [], distinct(records, "policy")[0]
         for level in distinct(records, "level"):
             mine = select(records, level=level)
             rows += [
-                Row(f"{level}: falls", "", 0.0, by_policy(mine, falls), 0),
+                Row(f"{level}: falls", "", 0.0, by_policy(mine, count_falls), 0),
                 Row(f"{level}: mean error", "m/s", None, by_policy(mine, mean_error)),
                 Row(f"{level}: largest error", "m/s", 0.084, by_policy(mine, largest_error), key=True),
             ]
-            if against := cut(mine, first):
+            if against := error_reduction(mine, first):
                 rows.append(Row(f"{level}: mean error below that of {first}", "%", None, against, 0))
         return rows

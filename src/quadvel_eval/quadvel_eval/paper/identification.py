@@ -1,4 +1,4 @@
-"""Section 4.2 and Figure 4: the actuator model identified from a simulated log of Eq. 9, held against the paper's."""
+"""Section 4.2 and Figure 4: identifies the actuator model from a simulated log of Eq. 9."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
@@ -19,23 +20,23 @@ from quadvel_sysid.excitation import FootLifting, limit_torque
 from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.log import Log
 
-from ..robot_loop import PERIOD, STEPS, RobotLoop, make_estimator
-from ..walk import Setup, record_to_the_fall
-from .cells import limits
-from .section import Answers, Job, Record, Row, Section, Study, column, select
+from ..robot_loop import CONTROL_PERIOD_S, SIMULATOR_STEPS_PER_TICK, RobotLoop, make_estimator
+from ..walk import Setup, record_until_fall
+from .cells import command_limits
+from .section import Job, JobResults, Record, Row, Section, Study, column, select
 
-EASE = 1.5  # s, from standing to where the motion begins
-JOINT = "FR_calf_joint"  # of the picture, as in the paper's Figure 4
-SHOWN = 0.5  # s of it
+TRANSITION_TIME_S = 1.5  # from standing to the first target
+PLOTTED_JOINT = "FR_calf_joint"  # as in the paper's Figure 4
+PLOTTED_TIME_S = 0.5  # at the end of the log
 TORQUES = {"measured": "measured", "pd": "ideal PD", "before": "EAM"}
-PAPER: dict[str, dict[str, float]] = {
+PAPER_VALUES: dict[str, dict[str, float]] = {
     "Eq. 9": {
         "delta_kp": -0.706, "delta_kd": -0.021, "input_delay": 7.0, "output_delay": 1.0,
         "eam_error": 0.066, "pd_error": 0.503, "cut": 86.9,
     },
     "mixed motion": {"eam_error": 0.387, "pd_error": 5.149, "cut": 92.5},
 }  # fmt: skip
-NAMES = {
+QUANTITY_NAMES = {
     "delta_kp": ("ΔKp", "N m/rad"),
     "delta_kd": ("ΔKd", "N m s/rad"),
     "input_delay": ("input delay (paper: middle of 6 to 8)", "ms"),
@@ -46,28 +47,37 @@ NAMES = {
 }
 
 
-class RecordedSimulator(Simulator):
-    """Keeps what the robot reports and what it is commanded, each millisecond."""
+class RecordingSimulator(Simulator):
+    """Simulator that records state and command of each millisecond."""
 
+    @override
     def reset(self, keyframe: str = "lie", seed: int | None = None) -> None:
-        """As `Simulator.reset`, with an empty log."""
         self._rows: list[tuple[RobotState, JointCommand]] = []
         self._held = JointCommand.damping()
         super().reset(keyframe, seed)
 
+    @override
     def command(self, command: JointCommand) -> None:
-        """As `Simulator.command`."""
         super().command(command)
         self._held = command
 
+    @override
     def step(self, n: int = 1) -> None:
-        """As `Simulator.step`."""
         for _ in range(n):
             self._rows.append((self.state(), self._held))
             super().step()
 
     def log(self, name: str, start: float, end: float = np.inf) -> Log:
-        """What there was from `start` to `end` (s), at 1 kHz."""
+        """Return the recorded rows of an interval.
+
+        Args:
+            name: Name of the log.
+            start: Start of the interval, s.
+            end: End of the interval, s.
+
+        Returns:
+            A log at 1 kHz whose time starts at 0.
+        """
         rows = [(state, command) for state, command in self._rows if start <= state.time <= end]
         states, commands = zip(*rows, strict=True)
         t = np.array([state.time for state in states]) - start
@@ -79,24 +89,41 @@ class RecordedSimulator(Simulator):
         return Log(name, robot.JOINT_NAMES, t, q, dq, t, q_des, valid, tau=tau, tau_ff=tau_ff, kp=kp, kd=kd)
 
 
-def lifting(seed: int, seconds: float) -> Log:
-    """The paper's foot-lifting motion, commanded as the policy commands and with its gains, on the ground."""
-    simulator = RecordedSimulator(SimulatorConfig(seed=seed))
+def record_foot_lifting(seed: int, seconds: float) -> Log:
+    """Record the paper's foot-lifting motion (Eq. 9) on the ground, with the policy's rate and gains.
+
+    Args:
+        seed: Seed of the simulator.
+        seconds: Duration, s.
+
+    Returns:
+        The log.
+    """
+    simulator = RecordingSimulator(SimulatorConfig(seed=seed))
     simulator.reset("stand")
-    start, targets = simulator.state().q, FootLifting(seconds).targets()[::STEPS]
+    start, targets = simulator.state().q, FootLifting(seconds).targets()[::SIMULATOR_STEPS_PER_TICK]
     kp, kd = np.full(12, robot.KP), np.full(12, robot.KD)
-    rise = np.linspace(0.0, 1.0, round(EASE / PERIOD))[:, None]
+    rise = np.linspace(0.0, 1.0, round(TRANSITION_TIME_S / CONTROL_PERIOD_S))[:, None]
     for target in np.vstack([start + rise * (targets[0] - start), targets]):
         state = simulator.state()
         q = limit_torque(target, state.q, state.dq, robot.KP, robot.KD)
         simulator.command(JointCommand(q=q, kp=kp, kd=kd))
-        simulator.step(STEPS)
-    return simulator.log(f"Eq. 9, seed {seed}", EASE)
+        simulator.step(SIMULATOR_STEPS_PER_TICK)
+    return simulator.log(f"Eq. 9, seed {seed}", TRANSITION_TIME_S)
 
 
-def mixed(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
-    """A walk of all kinds: stand, walk, run, turn, sideways, and stops in between; as far as the robot got."""
-    simulator = RecordedSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
+def record_mixed_walk(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
+    """Record a walk with standing, running, turns, sideways steps and stops, up to a fall.
+
+    Args:
+        setup: Policy, estimator and plant.
+        seed: Seed of the simulator.
+        bounds: Limits of the policy.
+
+    Returns:
+        The log.
+    """
+    simulator = RecordingSimulator(SimulatorConfig(**{"seed": seed, **setup.plant}))
     simulator.reset("stand")
     estimator = make_estimator(setup.estimator, simulator, setup.estimator_file)
     loop = RobotLoop(simulator, Supervisor(PolicyFile(setup.policy)), estimator)
@@ -107,14 +134,24 @@ def mixed(setup: Setup, seed: int, bounds: CommandLimits) -> Log:
         (0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (fast, 0.0, 0.0), (0.0, 0.0, 0.0),
         (0.0, 0.0, turn), (0.0, -aside, 0.0), (bounds.low[0], 0.0, 0.0), (0.5 * fast, 0.0, -0.7 * turn),
     ]  # fmt: skip
-    walk, _ = record_to_the_fall(loop, [(velocity, 1.5) for velocity in program])
+    walk, _ = record_until_fall(loop, [(velocity, 1.5) for velocity in program])
     return simulator.log("mixed motion", start, start + (walk.time[-1] if walk else 0.0))
 
 
-def identified(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -> list[Record]:
-    """Fit Eq. 9, judge on `data` (a key of PAPER); quantities, and the torques of the picture."""
-    heldout = lifting(1, seconds) if data == "Eq. 9" else mixed(setup, 1, bounds)
-    found = identify([lifting(0, seconds)], [heldout])
+def identify_and_evaluate(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -> list[Record]:
+    """Fit the actuator model to the motion of Eq. 9 and evaluate it on held-out data.
+
+    Args:
+        setup: Policy, estimator and plant of the mixed walk.
+        data: Held-out data, a key of PAPER_VALUES.
+        bounds: Limits of the policy.
+        seconds: Duration of the motion of Eq. 9, s.
+
+    Returns:
+        Records of the quantities, then of the torques in the figure.
+    """
+    heldout = record_foot_lifting(1, seconds) if data == "Eq. 9" else record_mixed_walk(setup, 1, bounds)
+    found = identify([record_foot_lifting(0, seconds)], [heldout])
     before = found.report["before"]
     eam, pd = before["heldout_mse"], found.report["pd"]["heldout_mse"]
     numbers = {
@@ -123,8 +160,8 @@ def identified(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -
         "eam_error": eam, "pd_error": pd, "cut": 100.0 * (1.0 - eam / pd),
         "added_effects": len(found.report["effects"]),
     }  # fmt: skip
-    trace = found.traces[JOINT]
-    last = trace.t >= trace.t[-1] - SHOWN
+    trace = found.traces[PLOTTED_JOINT]
+    last = trace.t >= trace.t[-1] - PLOTTED_TIME_S
     torques: list[Record] = [
         {"quantity": name, "time": float(t), "value": float(value)}
         for name in TORQUES
@@ -138,7 +175,12 @@ def identified(setup: Setup, data: str, bounds: CommandLimits, seconds: float) -
 
 @attrs.frozen
 class Identification(Section):
-    """Both sets of Section 4.2; seconds: of Eq. 9."""
+    """Identification with both held-out sets of Section 4.2.
+
+    Attributes:
+        data: Keys of PAPER_VALUES.
+        seconds: Duration of the motion of Eq. 9, s.
+    """
 
     name: ClassVar[str] = "identification"
     title: ClassVar[str] = "Section 4.2 and Figure 4: actuator identification"
@@ -147,23 +189,26 @@ class Identification(Section):
         "commanded at 200 Hz and recorded at 1 kHz; `quadvel identify` fits that log. Errors are those on logs that were not "
         "fitted: the same motion with other noise, and a walk with standing, running, turning and stops. The truth is known "
         "here: parameters should come back (input delay 7 ms, output delay 1 ms; on a log with 1 ms between rows a sum of "
-        "delays of 8 ms can't be told from anything above 7), and the error should be the torque noise of 0.066 N² m². The "
+        "delays of 8 ms is indistinguishable from anything above 7), and the error should be the torque noise of 0.066 N² m². The "
         "paper's second error holds what its model lacks; our simulated drives hold no such thing."
     )
-    data: tuple[str, ...] = tuple(PAPER)
+    data: tuple[str, ...] = tuple(PAPER_VALUES)
     seconds: float = 5.0
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         policy = next(iter(study.policies))
-        bounds = limits(study, policy)
+        bounds = command_limits(study, policy)
         return [
-            Job({"data": data}, (identified, study.setup(policy), data, bounds, self.seconds))
+            Job({"data": data}, (identify_and_evaluate, study.setup(policy), data, bounds, self.seconds))
             for data in self.data
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [{**labels, **line} for labels, lines in answers for line in lines]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         data = records[-1]["data"]
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
@@ -174,18 +219,19 @@ class Identification(Section):
                 {"color": "0.6", "linewidth": 2.5} if name == "measured" else {"linewidth": 1.0}
             )
             panel.plot(column(mine, "time"), column(mine, "value"), label=label, **style)
-        panel.set_title(f"{JOINT}, {data}, not fitted")
+        panel.set_title(f"{PLOTTED_JOINT}, {data}, not fitted")
         panel.set_xlabel("time, s")
         panel.set_ylabel("torque, N m")
         figure.legend(loc="outside lower center", ncols=3)
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
-        for data, known in PAPER.items():
+        for data, known in PAPER_VALUES.items():
             for quantity, paper in known.items():
                 found = select(records, data=data, quantity=quantity)
-                what, unit = NAMES[quantity]
+                what, unit = QUANTITY_NAMES[quantity]
                 digits = 1 if unit in ("ms", "%") else 3
                 if found:
                     rows.append(

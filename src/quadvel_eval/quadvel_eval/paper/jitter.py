@@ -8,14 +8,19 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
-from .cells import cell_job, cell_record, limits
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, mean, select
+from .cells import cell_job, cell_record, command_limits
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, mean, select
 
 
 @attrs.frozen
 class Jitter(Section):
-    """Straight walks at some speeds, m/s."""
+    """Jitter of straight walks.
+
+    Attributes:
+        speeds: Commanded forward velocities, m/s.
+    """
 
     name: ClassVar[str] = "jitter"
     title: ClassVar[str] = "Figure 9: action jitter"
@@ -25,18 +30,21 @@ class Jitter(Section):
     )
     speeds: tuple[float, ...] = (0.5, 1.0, 1.5, 2.0, 2.5)
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            top = limits(study, policy).high[0]
+            top = command_limits(study, policy).high[0]
             for speed in (s for s in self.speeds if s <= top):
                 for seed in range(study.seeds):
                     jobs.append(cell_job(study.setup(policy), (speed, 0.0, 0.0), seed, policy=policy))
         return jobs
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         policies, speeds = distinct(records, "policy"), distinct(records, "vx")
         figure = Figure(figsize=(6.0, 3.5), layout="constrained")
@@ -51,6 +59,7 @@ class Jitter(Section):
         panel.legend()
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         speeds = distinct(records, "vx")
         rows = [
@@ -61,4 +70,5 @@ class Jitter(Section):
 
 
 def _jitter(records: Sequence[Record]) -> float:
+    """Mean jitter, mrad."""
     return 1e3 * mean(records, "jitter")

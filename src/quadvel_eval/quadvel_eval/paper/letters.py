@@ -1,4 +1,4 @@
-"""Figure 11: the letters ZJU, walked in open loop, and how far the robot strays from them."""
+"""Figure 11: walks the letters ZJU in open loop and measures the deviation from them."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from quadvel_follow.trajectory import SHIPPED, Trajectory, read_table
 
-from ..robot_loop import PERIOD
-from ..walk import Setup, Walk, make_loop, record_to_the_fall
+from ..robot_loop import CONTROL_PERIOD_S
+from ..walk import Setup, Walk, make_loop, record_until_fall
 from .cells import Command
 from .section import (
-    Answers,
     Job,
+    JobResults,
     Record,
     Row,
     Section,
@@ -28,69 +29,104 @@ from .section import (
     largest,
     mean,
     select,
-    walks,
+    walk_jobs,
 )
 
 Array = NDArray[np.float64]
 
-SHOWN = 10  # ticks from one line of the CSV to the next
-Stroke = tuple[Command, float]  # velocity in the body frame and its seconds
+CSV_INTERVAL_TICKS = 10  # between lines of the CSV
+Stroke = tuple[Command, float]  # velocity in the body frame, and duration (s)
 
 
-def _strokes() -> tuple[Stroke, ...]:
-    """Z without turning, J from its hook, U sideways over to its top."""
+def _read_strokes() -> tuple[Stroke, ...]:
+    """Read the letters: Z without turning, J from its hook, U sideways to its top."""
     _, rows = read_table(SHIPPED / "zju.csv")
     return tuple(((vx, vy, wz), seconds) for seconds, vx, vy, wz in rows.tolist())
 
 
-LETTERS = _strokes()
+LETTERS = _read_strokes()
 
 
-def reference(strokes: Sequence[Stroke]) -> Array:
-    """Where the commands lead (n, 3): x, y (m) and heading (rad), a row a tick, from the origin facing +x."""
+def reference_path(strokes: Sequence[Stroke]) -> Array:
+    """Integrate the commands to a path from the origin, facing +x.
+
+    Args:
+        strokes: Velocity and duration of each stroke.
+
+    Returns:
+        x, y (m) and heading (rad), (n, 3), one row per tick.
+    """
     commands, seconds = zip(*strokes, strict=True)
-    return Trajectory.of_commands(seconds, commands, PERIOD).pose
+    return Trajectory.of_commands(seconds, commands, CONTROL_PERIOD_S).pose
 
 
-def walked(walk: Walk) -> Array:
-    """Where the robot went (n, 3): x, y (m) and heading (rad), from where and as it stood at the first command."""
+def walked_path(walk: Walk) -> Array:
+    """Transform the path of a robot into its frame at the first command.
+
+    Args:
+        walk: The walk.
+
+    Returns:
+        x, y (m) and heading (rad), (n, 3), one row per tick.
+    """
     cos, sin = np.cos(walk.heading[0]), np.sin(walk.heading[0])
     x, y = (walk.position[:, :2] - walk.position[0, :2]).T
     return np.column_stack([cos * x + sin * y, -sin * x + cos * y, walk.heading - walk.heading[0]])
 
 
-def write_letters(setup: Setup, seed: int, strokes: Sequence[Stroke]) -> tuple[Array | None, bool]:
-    """The way of a robot that is commanded the strokes, (n, 3), and whether it stood to the end."""
-    walk, stood = record_to_the_fall(make_loop(setup, seed, ()), strokes)
-    return (None if walk is None else walked(walk)), stood
+def walk_letters(setup: Setup, seed: int, strokes: Sequence[Stroke]) -> tuple[Array | None, bool]:
+    """Walk the strokes in open loop.
+
+    Args:
+        setup: Robot, policy and ground.
+        seed: Seed of the run.
+        strokes: Velocity and duration of each stroke.
+
+    Returns:
+        The walked path (n, 3) or None, and whether the robot stayed on its feet.
+    """
+    walk, stood = record_until_fall(make_loop(setup, seed, ()), strokes)
+    return (None if walk is None else walked_path(walk)), stood
 
 
 @attrs.frozen
 class Letters(Section):
-    """One walk a policy and seed."""
+    """One walk per policy and seed.
+
+    Attributes:
+        strokes: Velocity and duration of each stroke.
+    """
 
     name: ClassVar[str] = "letters"
     title: ClassVar[str] = "Figure 11: open-loop letters"
     method: ClassVar[str] = (
         "The robot is commanded the velocities of the letters Z, J and U (1.5 m high, 0.5 m/s, with sideways walking, turns "
-        "on the spot and arcs) and is not told where it is. The deviation is the distance between the robot and the place "
+        "on the spot and arcs) without position feedback. The deviation is the distance between the robot and the place "
         "that the commands lead to at the same instant."
     )
     strokes: tuple[Stroke, ...] = LETTERS
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
-        return walks(study, write_letters, self.strokes)
+        return walk_jobs(study, walk_letters, self.strokes)
 
-    def judge(self, answers: Answers) -> list[Record]:
-        asked = reference(self.strokes)
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
+        commanded = reference_path(self.strokes)
         records: list[Record] = []
-        for labels, (way, stood) in answers:
-            for i in range(0, 0 if way is None else len(way), SHOWN):
-                numbers = (i * PERIOD, *asked[i], *way[i], float(np.hypot(*(way[i] - asked[i])[:2])))
+        for labels, (path, stood) in answers:
+            for i in range(0, 0 if path is None else len(path), CSV_INTERVAL_TICKS):
+                numbers = (
+                    i * CONTROL_PERIOD_S,
+                    *commanded[i],
+                    *path[i],
+                    float(np.hypot(*(path[i] - commanded[i])[:2])),
+                )
                 names = ("time", "asked_x", "asked_y", "asked_heading", "x", "y", "heading", "deviation")
                 records.append({**labels, **dict(zip(names, numbers, strict=True)), "fell": int(not stood)})
         return records
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         policies = distinct(records, "policy")
         figure = Figure(figsize=(6.5 * len(policies), 4.2), layout="constrained")
@@ -108,6 +144,7 @@ class Letters(Section):
             panel.legend(fontsize="small", loc="upper left", bbox_to_anchor=(0.0, -0.18), ncols=4)
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         def end(mine: Sequence[Record], name: str) -> float:
             return mean([select(mine, seed=seed)[-1] for seed in distinct(mine, "seed")], name)

@@ -1,4 +1,4 @@
-"""Robustness: friction, payload, rough ground and pushes; who survives and how well it tracks. Slopes: `slopes`."""
+"""Robustness to friction, payload, rough ground and pushes; module `slopes` covers slopes."""
 
 from __future__ import annotations
 
@@ -8,24 +8,32 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from quadvel_sim.terrain import Terrain
 
 from .cells import Command, cell_record, largest_error, mean_error
-from .conditions import COMMANDS, Condition, condition_job, draw, survival
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
+from .conditions import COMMANDS, Condition, condition_job, draw_error_and_survival, survival_rate
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
-FORCE = 60.0  # N
-XLABELS = {
+PUSH_FORCE_N = 60.0  # N
+GROUP_LABELS = {
     "friction": "friction coefficient",
     "payload": "payload, kg",
     "rough ground": "height of the humps, cm",
-    "push": f"push of {FORCE:g} N for 0.2 s",
+    "push": f"push of {PUSH_FORCE_N:g} N for 0.2 s",
 }
 
 
 def conditions(seed: int) -> list[Condition]:
-    """All of them; the seed is that of rough ground."""
+    """List all conditions.
+
+    Args:
+        seed: Seed of the rough ground.
+
+    Returns:
+        The conditions.
+    """
     found = [Condition("friction", f"{f:g}", {"friction": np.full(4, f)}) for f in (0.3, 0.5, 0.8, 1.0)]
     found += [Condition("payload", f"{m:g}", {"payload": m}) for m in (-2.0, 0.0, 2.5, 5.0)]
     for roughness in (0.03, 0.06):
@@ -37,13 +45,18 @@ def conditions(seed: int) -> list[Condition]:
         ("left", (0, 1, 0)),
         ("right", (0, -1, 0)),
     ):
-        found.append(Condition("push", name, push=(FORCE * push[0], FORCE * push[1], 0.0)))
+        found.append(Condition("push", name, push=(PUSH_FORCE_N * push[0], PUSH_FORCE_N * push[1], 0.0)))
     return found
 
 
 @attrs.frozen
 class Robustness(Section):
-    """Every condition with every command and seed."""
+    """Walks of every command under every condition.
+
+    Attributes:
+        groups: Groups of conditions.
+        commands: vx, vy (m/s), wz (rad/s) of each walk.
+    """
 
     name: ClassVar[str] = "robustness"
     title: ClassVar[str] = "Robustness"
@@ -52,9 +65,10 @@ class Robustness(Section):
         "friction of all feet, a mass on the trunk or taken off it, rough ground (Perlin noise), a push of 60 N for 0.2 s on the "
         "trunk after 1 s. Survival: share of the robots that did not fall. The paper shows such walks and gives no figures."
     )
-    groups: tuple[str, ...] = tuple(XLABELS)
+    groups: tuple[str, ...] = tuple(GROUP_LABELS)
     commands: tuple[Command, ...] = COMMANDS
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         return [
             condition_job(study, policy, one, command, seed)
@@ -65,31 +79,34 @@ class Robustness(Section):
             for command in self.commands
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
     def _shown(self, records: Sequence[Record]) -> list[str]:
-        """Those of its groups that the records hold."""
+        """Groups of this section that the records hold."""
         return [group for group in distinct(records, "group") if group in self.groups]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         groups = self._shown(records)
         figure = Figure(figsize=(3.2 * len(groups), 4.6), layout="constrained")
         panels = figure.subplots(2, len(groups), sharey="row", squeeze=False)
         for (error, stood), group in zip(panels.T, groups, strict=True):
-            draw(error, stood, select(records, group=group))
-            stood.set_xlabel(XLABELS[group])
+            draw_error_and_survival(error, stood, select(records, group=group))
+            stood.set_xlabel(GROUP_LABELS[group])
         panels[0, 0].set_ylabel("mean error, m/s")
         panels[1, 0].set_ylabel("survival, %")
         panels[0, 0].legend()
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
         for group in self._shown(records):
             mine = select(records, group=group)
             rows += [
-                Row(f"{group}: survival", "%", None, by_policy(mine, survival), 1, key=True),
+                Row(f"{group}: survival", "%", None, by_policy(mine, survival_rate), 1, key=True),
                 Row(f"{group}: mean error", "m/s", None, by_policy(mine, mean_error)),
                 Row(f"{group}: largest error", "m/s", None, by_policy(mine, largest_error)),
             ]

@@ -1,6 +1,6 @@
-"""What a section of the paper's evaluation is: walks to make, a judgement of them, a picture and rows of a table.
+"""Interface of a section of the paper's evaluation: jobs, records, a figure and table rows.
 
-Here stands the interface alone; each section has a module of its own, `study` runs them and writes their files.
+Each section has its own module. Module `study` runs the sections and writes their files.
 """
 
 from __future__ import annotations
@@ -21,12 +21,19 @@ from ..pool import Call
 from ..walk import Setup
 
 Record: TypeAlias = dict[str, Any]
-"""one line of a section's CSV: names and numbers, None where there is none"""
+"""One line of a section's CSV: column names and values, None if undefined."""
 
 
 @attrs.frozen(kw_only=True)
 class Study:
-    """What is evaluated: policies by the names they have in tables, the estimator in the loop, seeds 0, 1, ..."""
+    """Policies, estimator and seeds of an evaluation.
+
+    Attributes:
+        policies: ONNX files by their names in tables.
+        estimator: Velocity estimator in the loop.
+        estimator_file: ONNX file of the learned estimator.
+        seeds: Number of seeds; they are 0, 1, ...
+    """
 
     policies: Mapping[str, Path] = attrs.field(factory=lambda: {SHIPPED_POLICY.stem: SHIPPED_POLICY})
     estimator: str = "learned"
@@ -34,7 +41,15 @@ class Study:
     seeds: int = 3
 
     def setup(self, policy: str, **plant: Any) -> Setup:
-        """How the policy of this name walks; `plant`: fields of SimulatorConfig that differ."""
+        """Return the walk setup of a policy.
+
+        Args:
+            policy: Name of the policy.
+            **plant: Fields of `SimulatorConfig` that differ from the nominal robot.
+
+        Returns:
+            The setup.
+        """
         return Setup(
             policy=self.policies[policy],
             estimator=self.estimator,
@@ -45,14 +60,28 @@ class Study:
 
 @attrs.frozen
 class Job:
-    """A call that another process can make, and what its answer stands for."""
+    """A call for another process, with labels for its answer.
+
+    Attributes:
+        labels: Columns of the records made from the answer.
+        call: Function and arguments.
+    """
 
     labels: Record
     call: Call
 
 
-def walks(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[Job]:
-    """`walk(setup, seed, *arguments)` for each policy and seed."""
+def walk_jobs(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[Job]:
+    """Create a job `walk(setup, seed, *arguments)` for each policy and seed.
+
+    Args:
+        study: Policies and seeds.
+        walk: Function that another process can import.
+        *arguments: Further arguments.
+
+    Returns:
+        The jobs.
+    """
     return [
         Job({"policy": policy, "seed": seed}, (walk, study.setup(policy), seed, *arguments))
         for policy in study.policies
@@ -60,13 +89,22 @@ def walks(study: Study, walk: Callable[..., Any], *arguments: Any) -> list[Job]:
     ]
 
 
-Answers: TypeAlias = Sequence[tuple[Record, Any]]
-"""labels of each job and what it returned, in the order of the jobs"""
+JobResults: TypeAlias = Sequence[tuple[Record, Any]]
+"""Labels and answer of each job, in the order of the jobs."""
 
 
 @attrs.frozen
 class Row:
-    """One line of the page: the paper's value (its CRL-EAM) beside those of our policies, None where unknown."""
+    """One line of the page: the paper's value (its CRL-EAM) next to those of our policies.
+
+    Attributes:
+        what: Name of the quantity.
+        unit: Its unit.
+        paper: Value of the paper; None if unknown.
+        ours: Values by policy; None if undefined.
+        digits: Decimals in the table.
+        key: Whether the page repeats the row in its first table.
+    """
 
     what: str
     unit: str
@@ -74,55 +112,120 @@ class Row:
     ours: Mapping[str, float | None]
     digits: int = 3
     key: bool = False
-    """whether the page begins with it"""
 
 
 @attrs.frozen
 class Section(ABC):
-    """A part of the evaluation. Its fields (attrs) are what a short run may make smaller."""
+    """A section of the evaluation; subclasses are attrs classes.
+
+    The fields of a subclass are settings that a short run may reduce.
+
+    Attributes:
+        name: Name of its files and on the command line.
+        title: Heading on the page.
+        method: What was done, for the page.
+    """
 
     name: ClassVar[str]
-    """of its files and on the command line"""
     title: ClassVar[str]
     method: ClassVar[str]
-    """what was done, for the page"""
 
     @abstractmethod
     def jobs(self, study: Study) -> list[Job]:
-        """All that has to be run; no job waits for another."""
+        """List all independent jobs of the section.
+
+        Args:
+            study: Policies, estimator and seeds.
+
+        Returns:
+            The jobs.
+        """
 
     @abstractmethod
-    def judge(self, answers: Answers) -> list[Record]:
-        """What the CSV holds; picture and table are made of it alone."""
+    def to_records(self, answers: JobResults) -> list[Record]:
+        """Convert the answers to the records of the CSV, from which figure and table are made.
+
+        Args:
+            answers: Labels and answer of each job, in the order of the jobs.
+
+        Returns:
+            The records.
+        """
 
     @abstractmethod
     def figure(self, records: Sequence[Record]) -> Figure:
-        """The picture."""
+        """Draw the figure.
+
+        Args:
+            records: The records.
+
+        Returns:
+            The figure.
+        """
 
     @abstractmethod
     def rows(self, records: Sequence[Record]) -> list[Row]:
-        """The table."""
+        """Compute the rows of the table.
+
+        Args:
+            records: The records.
+
+        Returns:
+            The rows.
+        """
 
 
 def select(records: Iterable[Record], **wanted: Any) -> list[Record]:
-    """The records that have these values."""
+    """Select the records with given values.
+
+    Args:
+        records: The records.
+        **wanted: Value of each column.
+
+    Returns:
+        The matching records.
+    """
     return [r for r in records if all(r[name] == value for name, value in wanted.items())]
 
 
 def distinct(records: Iterable[Record], name: str) -> list[Any]:
-    """The values of a column, each once, in the order in which they come first."""
+    """Return the distinct values of a column, in order of first appearance.
+
+    Args:
+        records: The records.
+        name: The column.
+
+    Returns:
+        The values.
+    """
     return list(dict.fromkeys(r[name] for r in records))
 
 
 def column(records: Iterable[Record], name: str) -> np.ndarray:
-    """The numbers of a column, nan where there is none."""
+    """Return a column as an array.
+
+    Args:
+        records: The records.
+        name: The column.
+
+    Returns:
+        Numbers (n,), nan for None.
+    """
     return np.array([np.nan if r[name] is None else r[name] for r in records], float)
 
 
 def by_policy(
     records: Sequence[Record], measure: Callable[[Sequence[Record]], float | None]
 ) -> dict[str, float | None]:
-    """`measure(records of a policy)` for each policy; what is not finite becomes None."""
+    """Compute a figure for each policy.
+
+    Args:
+        records: The records.
+        measure: Function from the records of a policy to a number.
+
+    Returns:
+        Values by policy; None if not finite.
+    """
     found: dict[str, float | None] = {}
     for policy in distinct(records, "policy"):
         value = measure(select(records, policy=policy))
@@ -131,12 +234,28 @@ def by_policy(
 
 
 def largest(records: Sequence[Record], name: str) -> float:
-    """Of a column's numbers; nan where there are none."""
+    """Return the largest number of a column.
+
+    Args:
+        records: The records.
+        name: The column.
+
+    Returns:
+        The number; nan without any.
+    """
     values = column(records, name)
     return float(np.nanmax(values)) if np.isfinite(values).any() else float("nan")
 
 
 def mean(records: Sequence[Record], name: str) -> float:
-    """Of a column's numbers; nan where there are none."""
+    """Return the mean of the numbers of a column.
+
+    Args:
+        records: The records.
+        name: The column.
+
+    Returns:
+        The mean; nan without any.
+    """
     values = column(records, name)
     return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")

@@ -1,4 +1,4 @@
-"""Slopes: who survives and who also follows, after standing there or started at once, each angle by itself, on three plants."""
+"""Robustness to slopes: survival and tracking after two kinds of start, on three plants."""
 
 from __future__ import annotations
 
@@ -9,47 +9,79 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from quadvel_sim.terrain import Terrain
 
 from .cells import Command, cell_record, largest_error, mean_error
-from .conditions import COMMANDS, HARD_PLANTS, PLANT_NAMES, Condition, condition_job, draw, survival
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
+from .conditions import (
+    COMMANDS,
+    HARD_PLANTS,
+    PLANT_NAMES,
+    Condition,
+    condition_job,
+    draw_error_and_survival,
+    survival_rate,
+)
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
 SLOPES = {-15.0: "15 degrees down", -7.5: "7.5 degrees down", 7.5: "7.5 degrees up", 15.0: "15 degrees up"}
 """Slopes (degrees, rising ahead of the robot at the start) and their names."""
-STOOD = 2.0  # s that a robot stands on a slope before it is commanded to walk
-STARTS = {"": STOOD, "started at once": 0.0}
-"""Names of the starts, and how long the robot stands before it walks, s."""
-FOLLOWED = 0.15  # m/s: a robot whose error over the judged 4 s is larger is stuck: it does not follow
+STANDING_TIME_S = 2.0  # on the slope before the command to walk
+STARTS = {"": STANDING_TIME_S, "started at once": 0.0}
+"""Names of the starts, and standing time before the walk, s."""
+MAX_FOLLOWING_ERROR = 0.15  # m/s, over the evaluated 4 s; a robot with a larger error is stuck
 
 
 def survival_and_following(records: Sequence[Record]) -> float:
-    """Share of the robots that neither fell nor were off their command by more than FOLLOWED, %; nan without any."""
-    good = [not r["fell"] and r["error_xy"] <= FOLLOWED for r in records]
+    """Return the share of robots that neither fell nor exceeded MAX_FOLLOWING_ERROR.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Share, %; nan without records.
+    """
+    good = [not r["fell"] and r["error_xy"] <= MAX_FOLLOWING_ERROR for r in records]
     return 100.0 * float(np.mean(good)) if good else float("nan")
 
 
-def group(plant: str, start: str) -> str:
-    """Name of the walks on one of HARD_PLANTS with one of STARTS."""
+def group_name(plant: str, start: str) -> str:
+    """Return the name of the walks on a plant with a start.
+
+    Args:
+        plant: Key of HARD_PLANTS.
+        start: Key of STARTS.
+
+    Returns:
+        The name.
+    """
     return f"{plant}, {start}" if start else plant
 
 
 TITLES = {
-    group(plant, start): "".join(f"{name}, " for name in (PLANT_NAMES.get(plant), start) if name)
+    group_name(plant, start): "".join(f"{name}, " for name in (PLANT_NAMES.get(plant), start) if name)
     for plant, start in itertools.product(HARD_PLANTS, STARTS)
 }
-"""What the rows of a group begin with."""
+"""Start of the row names of each group."""
 
 
 def conditions(plant: str, start: str) -> list[Condition]:
-    """All slopes on one of HARD_PLANTS with one of STARTS."""
+    """List all slopes on a plant with a start.
+
+    Args:
+        plant: Key of HARD_PLANTS.
+        start: Key of STARTS.
+
+    Returns:
+        The conditions.
+    """
     return [
         Condition(
-            group(plant, start),
+            group_name(plant, start),
             f"{degrees:g}",
             {**HARD_PLANTS[plant], "terrain": Terrain(kind="slope", slope=float(np.radians(degrees)))},
-            stood=STARTS[start],
+            standing_time=STARTS[start],
         )
         for degrees in SLOPES
     ]
@@ -57,7 +89,13 @@ def conditions(plant: str, start: str) -> list[Condition]:
 
 @attrs.frozen
 class Slopes(Section):
-    """Every slope with every command and seed on each plant, after standing and at once."""
+    """Walks of every command on every slope, plant and start.
+
+    Attributes:
+        plants: Keys of HARD_PLANTS.
+        starts: Keys of STARTS.
+        commands: vx, vy (m/s), wz (rad/s) of each walk.
+    """
 
     name: ClassVar[str] = "slopes"
     title: ClassVar[str] = "Robustness: slopes"
@@ -72,6 +110,7 @@ class Slopes(Section):
     starts: tuple[str, ...] = tuple(STARTS)
     commands: tuple[Command, ...] = COMMANDS
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         return [
             condition_job(study, policy, one, command, seed)
@@ -81,15 +120,17 @@ class Slopes(Section):
             for command in self.commands
         ]
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         groups = distinct(records, "group")
         figure = Figure(figsize=(3.2 * len(groups), 4.6), layout="constrained")
         panels = figure.subplots(2, len(groups), sharey="row", squeeze=False)
         for (error, stood), name in zip(panels.T, groups, strict=True):
-            draw(error, stood, select(records, group=name))
+            draw_error_and_survival(error, stood, select(records, group=name))
             error.set_title(name)
             stood.set_xlabel("slope, degrees")
         panels[0, 0].set_ylabel("mean error, m/s")
@@ -97,6 +138,7 @@ class Slopes(Section):
         panels[0, 0].legend()
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
         for name, degrees in itertools.product(distinct(records, "group"), SLOPES):
@@ -105,7 +147,7 @@ class Slopes(Section):
             following = by_policy(mine, survival_and_following)
             rows += [
                 Row(f"{what}: survive and follow", "%", None, following, 1, key=True),
-                Row(f"{what}: survival", "%", None, by_policy(mine, survival), 1),
+                Row(f"{what}: survival", "%", None, by_policy(mine, survival_rate), 1),
                 Row(f"{what}: mean error", "m/s", None, by_policy(mine, mean_error)),
                 Row(f"{what}: largest error", "m/s", None, by_policy(mine, largest_error)),
             ]

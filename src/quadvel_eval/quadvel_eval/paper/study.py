@@ -1,7 +1,7 @@
-"""Runs sections: all their walks in parallel, each section's files as soon as its last walk is through.
+"""Runs sections of the paper's evaluation in parallel and writes each when its last walk ends.
 
-A section whose files were made with the same networks, seeds and settings is done and stays; what is stopped in the
-middle goes on with the sections that are missing.
+A section is skipped if its files were made with the same networks, seeds and settings.
+Therefore an interrupted study continues with the missing sections.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import attrs
 
-from ..pool import in_parallel
+from ..pool import run_in_parallel
 from .energy import Energy
 from .estimator import Estimator
 from .files import is_done, write_page, write_section
@@ -46,37 +46,54 @@ SECTIONS: tuple[Section, ...] = (
     Stance(),
     Estimator(),
 )
-"""in the order of the page"""
+"""All sections, in the order of the page."""
 
 
 @attrs.frozen
 class Progress:
-    """What is told after each walk: how many of how many, and of the section that it completed."""
+    """Progress after a walk.
+
+    Attributes:
+        done: Number of finished walks.
+        total: Number of all walks.
+        completed: Name of the section that this walk completed, or None.
+        seconds: CPU time of all walks of the section so far, s.
+    """
 
     done: int
     total: int
     completed: str | None
-    """its name"""
     seconds: float
-    """CPU time of all its walks, s"""
 
 
-def run(
+def run_sections(
     study: Study,
     sections: Sequence[Section],
     folder: Path,
-    again: bool = False,
+    rerun: bool = False,
     cluster: str | None = None,
-    tell: Callable[[Progress], None] = lambda progress: None,
+    report_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> list[str]:
-    """Run the sections that are not done yet, all of them where `again`; their names."""
-    todo = [section for section in sections if again or not is_done(folder, section, study)]
+    """Run the sections that are not done, and write their files and the page.
+
+    Args:
+        study: Policies, estimator and seeds.
+        sections: Sections to run.
+        folder: Folder of the files.
+        rerun: Whether to run finished sections, too.
+        cluster: Address of a Dask scheduler; None for the cores of this machine.
+        report_progress: Called after each walk.
+
+    Returns:
+        Names of the sections that ran.
+    """
+    todo = [section for section in sections if rerun or not is_done(folder, section, study)]
     jobs = [(section, job) for section in todo for job in section.jobs(study)]
     answers: list[Any] = [None] * len(jobs)
     left = Counter(section.name for section, _ in jobs)
     seconds = {section.name: 0.0 for section in todo}
-    calls = [(timed, *job.call) for _, job in jobs]
-    for done, (i, (answer, spent)) in enumerate(in_parallel(calls, cluster), start=1):
+    calls = [(call_with_cpu_time, *job.call) for _, job in jobs]
+    for done, (i, (answer, spent)) in enumerate(run_in_parallel(calls, cluster), start=1):
         section = jobs[i][0]
         answers[i] = answer
         left[section.name] -= 1
@@ -84,15 +101,23 @@ def run(
         completed = section.name if not left[section.name] else None
         if completed:
             own = [(job.labels, answers[k]) for k, (s, job) in enumerate(jobs) if s is section]
-            write_section(folder, section, study, section.judge(own))
+            write_section(folder, section, study, section.to_records(own))
             write_page(folder, SECTIONS)
-        tell(Progress(done, len(jobs), completed, seconds[section.name]))
+        report_progress(Progress(done, len(jobs), completed, seconds[section.name]))
     write_page(folder, SECTIONS)
     return [section.name for section in todo]
 
 
-def timed(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
-    """What a call returned and the CPU time that it took, s."""
+def call_with_cpu_time(function: Callable[..., Any], *arguments: Any) -> tuple[Any, float]:
+    """Call a function and measure its CPU time.
+
+    Args:
+        function: The function.
+        *arguments: Its arguments.
+
+    Returns:
+        Its answer, and the CPU time, s.
+    """
     before = time.process_time()
     answer = function(*arguments)
     return answer, time.process_time() - before

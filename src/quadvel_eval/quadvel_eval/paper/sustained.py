@@ -1,5 +1,4 @@
-"""Section 4.3: the largest velocities that the robot keeps up, forward, backward, sideways and spinning, and what they
-ask of the drives."""
+"""Section 4.3: largest sustained velocities in six directions, and the load of the drives."""
 
 from __future__ import annotations
 
@@ -11,19 +10,32 @@ from typing import ClassVar
 import attrs
 import numpy as np
 from matplotlib.figure import Figure
+from typing_extensions import override
 
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 
-from ..robot_loop import PERIOD
-from ..walk import Setup, make_loop, record_to_the_fall
-from .cells import Command, falls, limits, reach
+from ..robot_loop import CONTROL_PERIOD_S
+from ..walk import Setup, make_loop, record_until_fall
+from .cells import Command, command_limits, count_falls, max_command_along
 from .conditions import HARD_PLANTS, PLANT_NAMES
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, largest, select
+from .section import (
+    Job,
+    JobResults,
+    Record,
+    Row,
+    Section,
+    Study,
+    by_policy,
+    column,
+    distinct,
+    largest,
+    select,
+)
 
-ACCELERATION = 0.7  # m/s^2, rad/s^2 times 1.4: how the command rises
-KEPT = 5.0  # s at the full command, of which the last 4 count
-COUNTED = 4.0  # s
-DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s, rad/s
+ACCELERATION = 0.7  # of the command, m/s^2; twice as many rad/s^2 for spins
+HOLD_TIME_S = 5.0  # at the full command
+EVALUATED_TIME_S = 4.0  # at the end of HOLD_TIME_S
+DIRECTIONS: dict[str, tuple[Command, float]] = {  # direction, and the paper's largest velocity, m/s, rad/s
     "forward": ((1.0, 0.0, 0.0), 4.2),
     "backward": ((-1.0, 0.0, 0.0), 3.2),
     "left": ((0.0, 1.0, 0.0), 2.0),
@@ -31,23 +43,34 @@ DIRECTIONS: dict[str, tuple[Command, float]] = {  # and the paper's largest, m/s
     "spin left": ((0.0, 0.0, 1.0), 6.0),
     "spin right": ((0.0, 0.0, -1.0), 6.0),
 }
-DRIVES = {
+DRIVE_FIGURES = {
     "joint_speed": "fastest joint, share of its drive's speed",
     "torque": "largest torque, share of its drive's",
 }
 
 
-def sustain(setup: Setup, seed: int, direction: Command, speed: float) -> Record:
-    """What became of a command of `speed` that is kept up, over the last seconds, or those before the robot fell or stopped.
+def measure_sustained(setup: Setup, seed: int, direction: Command, speed: float) -> Record:
+    """Hold one command, and measure the last EVALUATED_TIME_S before the end or the fall.
 
-    `reached`: mean velocity along `direction` (m/s, rad/s), None where it `fell`; `ended`: the supervisor's reason then;
-    `joint_speed`, `torque`: the largest of all joints, as shares of what their drives can do.
+    Args:
+        setup: Robot, policy and plant.
+        seed: Seed of the run.
+        direction: Unit vector of the command.
+        speed: Length of the command, m/s or rad/s.
+
+    Returns:
+        `reached`: mean velocity along `direction` (m/s, rad/s), None after a fall; `fell`;
+        `ended`: reason of the supervisor for the end; `joint_speed` and `torque`: largest of all
+        joints, divided by the limit of the drive.
     """
+    # The command rises as min(t / rise, 1) * speed, then stays for HOLD_TIME_S.
     along = np.array(direction)
     rise = speed / (2 * ACCELERATION if along[2] else ACCELERATION)
-    shares = np.minimum(np.arange(round((rise + KEPT) / PERIOD)) * PERIOD / rise, 1.0)
-    loop, last = make_loop(setup, seed, ()), slice(-round(COUNTED / PERIOD), None)
-    walk, stood = record_to_the_fall(loop, [(share * speed * along, PERIOD) for share in shares])
+    shares = np.minimum(
+        np.arange(round((rise + HOLD_TIME_S) / CONTROL_PERIOD_S)) * CONTROL_PERIOD_S / rise, 1.0
+    )
+    loop, last = make_loop(setup, seed, ()), slice(-round(EVALUATED_TIME_S / CONTROL_PERIOD_S), None)
+    walk, stood = record_until_fall(loop, [(share * speed * along, CONTROL_PERIOD_S) for share in shares])
     assert walk is not None  # it stood when it began
     return {
         "reached": float(walk.velocity[last].mean(axis=0) @ along) if stood else None,
@@ -60,13 +83,18 @@ def sustain(setup: Setup, seed: int, direction: Command, speed: float) -> Record
 
 @attrs.frozen
 class Sustained(Section):
-    """Each direction at some shares of what the policy takes."""
+    """Walks in each direction at some shares of the policy's limit.
+
+    Attributes:
+        shares: Shares of the largest command.
+        directions: Keys of DIRECTIONS.
+    """
 
     name: ClassVar[str] = "sustained"
     title: ClassVar[str] = "Section 4.3: largest sustained velocities"
     method: ClassVar[str] = (
         "The command rises at 0.7 m/s² (spins: 1.4 rad/s²) to 60, 80, 90 and 100 % of the policy's own limit in that "
-        "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and is held for 5 s. What counts is the "
+        "direction, or of 1.1 times the paper's velocity where the limit is beyond it, and stays there for 5 s. The result is the "
         "mean true velocity of the last 4 s; the largest of the robots that did not fall is in the table. With it stands what "
         "the command asks of the drives: the largest speed and torque of any joint, as shares of what its drive can do. The "
         "supervisor stops a robot whose joints move at 1.25 times that speed, which counts as a fall. The second plant is that of "
@@ -75,13 +103,14 @@ class Sustained(Section):
     shares: tuple[float, ...] = (0.6, 0.8, 0.9, 1.0)
     directions: tuple[str, ...] = tuple(DIRECTIONS)
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            bounds = limits(study, policy)
+            bounds = command_limits(study, policy)
             for name in self.directions:
                 direction, paper = DIRECTIONS[name]
-                top = min(reach(direction, bounds), 1.1 * paper)
+                top = min(max_command_along(direction, bounds), 1.1 * paper)
                 speeds = [round(share * top, 3) for share in self.shares]
                 for (plant, fields), speed in itertools.product(HARD_PLANTS.items(), speeds):
                     labels = {
@@ -91,12 +120,16 @@ class Sustained(Section):
                         "command": speed,
                         "limit": top,
                     }
-                    jobs.append(Job(labels, (sustain, study.setup(policy, **fields), 0, direction, speed)))
+                    jobs.append(
+                        Job(labels, (measure_sustained, study.setup(policy, **fields), 0, direction, speed))
+                    )
         return jobs
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [{**labels, **became} for labels, became in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         records = select(records, plant="usual")
         policies = distinct(records, "policy")
@@ -124,6 +157,7 @@ class Sustained(Section):
         drives.legend(fontsize="small")
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows = []
         usual = select(records, plant="usual")
@@ -136,7 +170,7 @@ class Sustained(Section):
                 Row(f"{name}: largest command that was tried", unit, None, tried, 2),
                 *_drive_rows(name, mine),
             ]
-        rows.append(Row("falls", "", 0.0, by_policy(usual, falls), 0))
+        rows.append(Row("falls", "", 0.0, by_policy(usual, count_falls), 0))
         for plant in distinct(records, "plant"):
             if plant != "usual":
                 rows += _plant_rows(plant, select(records, plant=plant))
@@ -144,15 +178,16 @@ class Sustained(Section):
 
 
 def _drive_rows(what: str, records: Sequence[Record]) -> list[Row]:
+    """Rows of the largest joint speed and torque."""
     return [
         Row(f"{what}: {drive}", "", None, by_policy(records, partial(largest, name=key)), 2)
-        for key, drive in DRIVES.items()
+        for key, drive in DRIVE_FIGURES.items()
     ]
 
 
 def _plant_rows(plant: str, records: Sequence[Record]) -> list[Row]:
-    """What another plant's drives are asked for, in each direction, and where robots fell or were stopped."""
+    """Rows of another plant: load of the drives in each direction, and falls."""
     rows = []
     for name in distinct(records, "direction"):
         rows += _drive_rows(f"{PLANT_NAMES[plant]}, {name}", select(records, direction=name))
-    return [*rows, Row(f"{PLANT_NAMES[plant]}: falls", "", None, by_policy(records, falls), 0)]
+    return [*rows, Row(f"{PLANT_NAMES[plant]}: falls", "", None, by_policy(records, count_falls), 0)]

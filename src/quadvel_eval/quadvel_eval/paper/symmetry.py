@@ -1,4 +1,4 @@
-"""Figures 7 and 8: torque over velocity of left and right legs, and what the policy asks for, over a gait cycle."""
+"""Figures 7 and 8: torque over velocity of left and right legs, and actions over a gait cycle."""
 
 from __future__ import annotations
 
@@ -10,60 +10,93 @@ import attrs
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from typing_extensions import override
 
 from quadvel_description import robot
 from quadvel_description.symmetry import JOINTS as MIRROR
 
 from ..gait_kind import touchdowns
-from ..walk import Setup, Walk, make_loop, record
-from .cells import limits
-from .gait import contacts
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, column, distinct, select
+from ..walk import Setup, Walk, make_loop, record_walk
+from .cells import command_limits
+from .gait import debounce_contacts
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, column, distinct, select
 
 Array = NDArray[np.float64]
 
-SECONDS, SETTLED = 7.0, 3.0  # s of a walk, and from where on it counts
-PHASES = 80  # of a gait cycle
+WALK_DURATION_S, SETTLING_TIME_S = 7.0, 3.0  # duration, and start of the evaluated part
+PHASES_PER_CYCLE = 80
 PARTS = ("hip", "thigh", "calf")
 PAIRS = (("FL", "FR"), ("RL", "RR"))
 
 
-def walk_ahead(setup: Setup, seed: int, speed: float) -> Walk | None:
-    """`SECONDS` of walking ahead."""
-    return record(make_loop(setup, seed, ()), [((speed, 0.0, 0.0), SECONDS)])
+def walk_forward(setup: Setup, seed: int, speed: float) -> Walk | None:
+    """Walk straight ahead for WALK_DURATION_S.
+
+    Args:
+        setup: Robot, policy and ground.
+        seed: Seed of the run.
+        speed: Commanded velocity, m/s.
+
+    Returns:
+        The walk; None if the robot fell.
+    """
+    return record_walk(make_loop(setup, seed, ()), [((speed, 0.0, 0.0), WALK_DURATION_S)])
 
 
-def cycles(down: NDArray[np.intp], values: Array) -> Array:
-    """The series `values` (n, k) between touchdowns of a foot, at PHASES even phases each: (cycles, PHASES, k)."""
-    ticks, phases = np.arange(len(values)), np.arange(PHASES) / PHASES
+def resample_cycles(down: NDArray[np.intp], values: Array) -> Array:
+    """Cut series into gait cycles and interpolate each at PHASES_PER_CYCLE even phases.
+
+    Args:
+        down: Samples of the touchdowns of a foot.
+        values: Series (n, k).
+
+    Returns:
+        Values (cycles, PHASES_PER_CYCLE, k).
+    """
+    # Phase p of a cycle from tick t_k to t_{k+1} lies at t_k + p (t_{k+1} - t_k).
+    ticks, phases = np.arange(len(values)), np.arange(PHASES_PER_CYCLE) / PHASES_PER_CYCLE
     at = [begin + (end - begin) * phases for begin, end in pairwise(down)]
     each = [np.column_stack([np.interp(places, ticks, series) for series in values.T]) for places in at]
-    return np.array(each).reshape(-1, PHASES, values.shape[1])
+    return np.array(each).reshape(-1, PHASES_PER_CYCLE, values.shape[1])
 
 
 def leg_curves(walk: Walk, leg: str) -> dict[str, Array] | None:
-    """Of one leg's joints (PHASES, 3) from touchdown on: mean torque (N m) and velocity (rad/s), targets (rad) of one cycle.
+    """Compute torque, velocity and targets of a leg's joints over the gait cycle.
 
-    Right legs as their mirror images, so that a symmetric gait gives equal curves. None without two full cycles.
+    Right legs are mirrored, so that a symmetric gait gives equal curves.
+
+    Args:
+        walk: The walk.
+        leg: Name of the leg.
+
+    Returns:
+        Mean torque (N m), mean velocity (rad/s) and targets of one cycle (rad), each
+        (PHASES_PER_CYCLE, 3) from touchdown on; None without two full cycles.
     """
-    late = walk.time >= SETTLED
+    late = walk.time >= SETTLING_TIME_S
     i = robot.LEGS.index(leg)
-    down = touchdowns(contacts(walk.contact[late])[:, i])
+    down = touchdowns(debounce_contacts(walk.contact[late])[:, i])
     if len(down) < 3:
         return None
     sign = np.ones(3) if robot.LEFT[leg] > 0 else MIRROR.sign[3 * i : 3 * i + 3]
     joints = slice(3 * i, 3 * i + 3)
     torque, velocity, target = (
-        cycles(down, series[late][:, joints] * sign)
+        resample_cycles(down, series[late][:, joints] * sign)
         for series in (walk.torque, walk.joint_velocity, walk.targets)
     )
     return {"torque": torque.mean(axis=0), "velocity": velocity.mean(axis=0), "target": target[0]}
 
 
 def asymmetry(records: Sequence[Record]) -> float:
-    """Difference of left and right torque curves over their mean, root mean squares over legs, joints and phases.
+    """Return the asymmetry of the torque curves of left and right legs.
 
-    0: mirror images. 2: one side does it all.
+    It is the RMS of their difference over the RMS of their mean, over legs, joints and phases.
+
+    Args:
+        records: Records of one policy and speed.
+
+    Returns:
+        0 for mirror images, 2 if one side does all the work; nan without all legs.
     """
     names = [f"{part}_torque" for part in PARTS]
     apart, together = [], []
@@ -76,12 +109,17 @@ def asymmetry(records: Sequence[Record]) -> float:
             return float("nan")
         apart.append(sides[0] - sides[1])
         together.append(0.5 * (sides[0] + sides[1]))
+    # ||left - right|| / ||(left + right) / 2||, over legs, joints and phases.
     return float(np.linalg.norm(apart) / np.linalg.norm(together))
 
 
 @attrs.frozen
 class Symmetry(Section):
-    """One walk a policy and speed (m/s)."""
+    """One straight walk per policy and speed.
+
+    Attributes:
+        speeds: Commanded velocities, m/s.
+    """
 
     name: ClassVar[str] = "symmetry"
     title: ClassVar[str] = "Figures 7 and 8: symmetry and actions over a gait cycle"
@@ -93,24 +131,29 @@ class Symmetry(Section):
     )
     speeds: tuple[float, ...] = (1.0, 2.0)
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            top = limits(study, policy).high[0]
+            top = command_limits(study, policy).high[0]
             for speed in self.speeds:
                 labels = {"policy": policy, "speed": min(speed, top)}
-                jobs.append(Job(labels, (walk_ahead, study.setup(policy), 0, labels["speed"])))
+                jobs.append(Job(labels, (walk_forward, study.setup(policy), 0, labels["speed"])))
         return jobs
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         records: list[Record] = []
         for labels, walk in answers:
             for leg in robot.LEGS if walk is not None else ():
                 curves = leg_curves(walk, leg)
                 if curves is not None:
-                    records += [{**labels, "leg": leg, **_line(curves, k)} for k in range(PHASES)]
+                    records += [
+                        {**labels, "leg": leg, **_phase_record(curves, k)} for k in range(PHASES_PER_CYCLE)
+                    ]
         return records
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         shown = [
             (policy, speed)
@@ -131,22 +174,24 @@ class Symmetry(Section):
         figure.legend(*panels[0, 3].get_legend_handles_labels(), loc="outside lower right", ncols=6)
         return figure
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         indices = {v: by_policy(select(records, speed=v), asymmetry) for v in distinct(records, "speed")}
         return [Row(f"asymmetry at {v:g} m/s", "", None, index, key=True) for v, index in indices.items()]
 
 
-def _line(curves: dict[str, Array], k: int) -> Record:
+def _phase_record(curves: dict[str, Array], k: int) -> Record:
+    """Columns of one phase."""
     values = {
         f"{part}_{name}": float(curve[k, joint])
         for joint, part in enumerate(PARTS)
         for name, curve in curves.items()
     }
-    return {"phase": k / PHASES, **values}
+    return {"phase": k / PHASES_PER_CYCLE, **values}
 
 
 def _draw_loops(panels: Any, records: Sequence[Record]) -> None:
-    """Torque over velocity of the front legs, a panel a joint."""
+    """Draw torque over velocity of the front legs, one panel per joint."""
     for panel, part in zip(panels, PARTS, strict=True):
         for leg, style in (("FL", "-"), ("FR", "--")):
             mine = select(records, leg=leg)
@@ -158,7 +203,7 @@ def _draw_loops(panels: Any, records: Sequence[Record]) -> None:
 
 
 def _draw_actions(panel: Any, records: Sequence[Record]) -> None:
-    """Joint targets of the front legs over one cycle."""
+    """Draw joint targets of the front legs over one cycle."""
     for leg, style in (("FL", "-"), ("FR", "--")):
         mine = select(records, leg=leg)
         for part, colour in zip(PARTS, ("tab:blue", "tab:orange", "tab:green"), strict=True):

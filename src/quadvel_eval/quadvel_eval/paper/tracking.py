@@ -1,4 +1,4 @@
-"""Figure 10: velocity tracking over the paper's grid, and over the quick grid, where the robot turns as it walks; on two plants."""
+"""Figure 10: velocity tracking over the paper's grid and over the quick grid, on two plants."""
 
 from __future__ import annotations
 
@@ -8,27 +8,35 @@ from typing import ClassVar
 
 import attrs
 from matplotlib.figure import Figure
+from typing_extensions import override
 
-from ..grid import PLANTS, cells
-from ..report import heatmaps
+from ..grid import PLANTS, grid_cells
+from ..report import error_heatmaps
 from .cells import (
     cell_job,
     cell_record,
-    falls,
+    command_limits,
+    count_falls,
+    is_within_limits,
     largest_error,
     largest_turn_error,
-    limits,
     mean_error,
     mean_turn_error,
-    within,
 )
-from .section import Answers, Job, Record, Row, Section, Study, by_policy, distinct, select
+from .section import Job, JobResults, Record, Row, Section, Study, by_policy, distinct, select
 
-LARGEST = 0.084  # m/s, the paper's largest error
+PAPER_LARGEST_ERROR = 0.084  # m/s, the paper's largest error
 
 
-def left_right(records: Sequence[Record]) -> float:
-    """Largest difference (m/s) between the errors of a command and its mirror image; nan where there is no pair."""
+def left_right_difference(records: Sequence[Record]) -> float:
+    """Return the largest difference between the errors of a command and its mirror image.
+
+    Args:
+        records: Records of `cell_record`.
+
+    Returns:
+        Difference, m/s; nan without a pair.
+    """
     errors = {(r["vx"], r["vy"], r["wz"], r["seed"]): r["error_xy"] for r in records}
     pairs = [
         (error, errors.get((vx, -vy, -wz, seed)))
@@ -40,7 +48,11 @@ def left_right(records: Sequence[Record]) -> float:
 
 @attrs.frozen
 class Tracking(Section):
-    """Each command of the grids with each seed."""
+    """Walks of each command of the grids with each seed.
+
+    Attributes:
+        grids: Keys of `grid.GRIDS`.
+    """
 
     name: ClassVar[str] = "tracking"
     title: ClassVar[str] = "Figure 10: velocity tracking"
@@ -48,35 +60,39 @@ class Tracking(Section):
         "Each robot follows one command for 6 s from standing; the error is the length of commanded minus mean velocity "
         "over the last 4 s. The paper's grid is vx -2.5 to 2.5 by 0.5 and vy -1 to 1 by 0.2 m/s; the quick grid holds vx -1 "
         "to 1.5, vy -0.4 to 0.4 m/s and wz -1 to 1 rad/s. A command beyond the limits in a policy's file is cut to them "
-        "before the policy sees it, and judged as it was asked for. A cross in the picture: a robot fell. The second "
+        "before the policy sees it, and evaluated against the original command. A cross in the picture: a robot fell. The second "
         "plant is MuJoCo at 0.5 ms with pyramidal friction cones, contacts twice as stiff, friction against turning feet, and "
         "links 3 % heavier with 15 % more inertia."
     )
     grids: tuple[str, ...] = ("paper", "quick")
 
+    @override
     def jobs(self, study: Study) -> list[Job]:
         jobs = []
         for policy in study.policies:
-            bounds = limits(study, policy)
+            bounds = command_limits(study, policy)
             for (plant, fields), grid in itertools.product(PLANTS.items(), self.grids):
                 setup = study.setup(policy, **fields)
-                for cell in cells(grid, study.seeds):
-                    inside = int(within(cell.command, bounds))
+                for cell in grid_cells(grid, study.seeds):
+                    inside = int(is_within_limits(cell.command, bounds))
                     labels = {"policy": policy, "plant": plant, "grid": grid, "within": inside}
                     jobs.append(cell_job(setup, cell.command, cell.seed, **labels))
         return jobs
 
-    def judge(self, answers: Answers) -> list[Record]:
+    @override
+    def to_records(self, answers: JobResults) -> list[Record]:
         return [cell_record(labels, result) for labels, result in answers]
 
+    @override
     def figure(self, records: Sequence[Record]) -> Figure:
         panels = {}
         for policy in distinct(records, "policy"):
             mine = select(records, policy=policy, plant="usual", grid=self.grids[0])
             title = f"{policy}: mean {mean_error(mine):.3f}, max {largest_error(mine):.3f} m/s"
             panels[title] = [{**r, "command": [r["vx"], r["vy"], r["wz"]]} for r in mine]
-        return heatmaps(panels)
+        return error_heatmaps(panels)
 
+    @override
     def rows(self, records: Sequence[Record]) -> list[Row]:
         rows: list[Row] = []
         for grid in distinct(records, "grid"):
@@ -86,11 +102,11 @@ class Tracking(Section):
 
 
 def _second_rows(grid: str, records: Sequence[Record]) -> list[Row]:
-    """Of one grid on the second plant, within the policies' limits."""
+    """Rows of one grid on the second plant, within the policies' limits."""
     where = f"{grid} grid, second plant"
     return [
         Row(f"{where}: runs", "", None, by_policy(records, len), 0),
-        Row(f"{where}: falls", "", 0.0, by_policy(records, falls), 0, key=True),
+        Row(f"{where}: falls", "", 0.0, by_policy(records, count_falls), 0, key=True),
         Row(f"{where}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
         Row(f"{where}: largest error", "m/s", None, by_policy(records, largest_error), key=True),
         *_turn_rows(where, records),
@@ -98,6 +114,7 @@ def _second_rows(grid: str, records: Sequence[Record]) -> list[Row]:
 
 
 def _turn_rows(where: str, records: Sequence[Record]) -> list[Row]:
+    """Rows of the yaw rate errors."""
     return [
         Row(
             f"{where}: mean error of the yaw rate",
@@ -117,19 +134,25 @@ def _turn_rows(where: str, records: Sequence[Record]) -> list[Row]:
 
 
 def _rows(grid: str, records: Sequence[Record]) -> list[Row]:
-    """Of one grid on the usual plant; the paper's figure is that of its own."""
-    paper = LARGEST if grid == "paper" else None
+    """Rows of one grid on the usual plant; the paper gives a value for its own grid only."""
+    paper = PAPER_LARGEST_ERROR if grid == "paper" else None
     every, inside = f"{grid} grid, all", f"{grid} grid, within the policy's limits"
-    taken = select(records, within=1)
+    within_limits = select(records, within=1)
     return [
         Row(f"{every}: runs", "", None, by_policy(records, len), 0),
-        Row(f"{every}: falls", "", 0.0, by_policy(records, falls), 0, key=True),
+        Row(f"{every}: falls", "", 0.0, by_policy(records, count_falls), 0, key=True),
         Row(f"{every}: mean error", "m/s", None, by_policy(records, mean_error), key=True),
         Row(f"{every}: largest error", "m/s", paper, by_policy(records, largest_error), key=True),
-        Row(f"{inside}: runs", "", None, by_policy(taken, len), 0),
-        Row(f"{inside}: falls", "", 0.0, by_policy(taken, falls), 0),
-        Row(f"{inside}: mean error", "m/s", None, by_policy(taken, mean_error), key=True),
-        Row(f"{inside}: largest error", "m/s", paper, by_policy(taken, largest_error), key=True),
-        *_turn_rows(inside, taken),
-        Row(f"{inside}: largest left-right difference", "m/s", None, by_policy(taken, left_right), key=True),
+        Row(f"{inside}: runs", "", None, by_policy(within_limits, len), 0),
+        Row(f"{inside}: falls", "", 0.0, by_policy(within_limits, count_falls), 0),
+        Row(f"{inside}: mean error", "m/s", None, by_policy(within_limits, mean_error), key=True),
+        Row(f"{inside}: largest error", "m/s", paper, by_policy(within_limits, largest_error), key=True),
+        *_turn_rows(inside, within_limits),
+        Row(
+            f"{inside}: largest left-right difference",
+            "m/s",
+            None,
+            by_policy(within_limits, left_right_difference),
+            key=True,
+        ),
     ]

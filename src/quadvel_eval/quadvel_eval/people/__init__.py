@@ -1,1 +1,1 @@
-"""How well persons are found and tracked in laser scans: real ones, and those of simulated scenes in the plane."""
+"""Measures person detection and tracking in laser scans, on recorded scans and simulated scenes."""

@@ -1,4 +1,4 @@
-"""The command `quadvel people`, as a function for a typer application."""
+"""Defines the command `quadvel people` for Typer."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from quadvel_nodes.number_text import number_text
 
 from ..output import output_folder, replacing
 from .figure import draw_tracks
-from .measure import Recording, measure_files, measure_scenes
+from .measure import ScanRecording, measure_files, measure_scenes
 
 Figures = Mapping[str, Mapping[str, float]]
 HEADS = {
     "recall": "recall",
     "precision": "precision",
-    "persons": "persons",
+    "persons": "people",
     "persons_per_minute": "a minute",
     "switches_per_minute": "switches a minute",
     "kept": "right person kept",
@@ -45,10 +45,10 @@ def people_command(
     runs: Annotated[int, typer.Option(min=0, help="Simulated scenes of each kind.")] = 100,
     model: Annotated[
         Path,
-        typer.Option(metavar="<file>", help="ONNX file that knows legs.", show_default="the shipped one"),
+        typer.Option(metavar="<file>", help="ONNX file of the leg detector.", show_default="the shipped one"),
     ] = SHIPPED_MODEL,
 ) -> None:
-    """Measure how well persons are found and tracked in laser scans, real and simulated."""
+    """Measure how well people are found and tracked in laser scans, real and simulated."""
     detector, console = LegDetector(model), Console()
     output_folder(out)
     found: dict[str, Figures] = {}
@@ -56,7 +56,7 @@ def people_command(
         found["scans"] = measure_files(scans, detector)
         console.print(_table("real scans", found["scans"]))
         for path in sorted(scans.glob("legs_*.npz")):
-            draw_tracks(Recording.load(path), detector, out / f"{path.stem}.png")
+            draw_tracks(ScanRecording.load(path), detector, out / f"{path.stem}.png")
     if runs:
         found["scenes"] = measure_scenes(runs, detector)
         console.print(_table(f"simulated, {runs} each", found["scenes"]))
@@ -66,6 +66,7 @@ def people_command(
 
 
 def _table(title: str, figures: Figures) -> Table:
+    """Table of scores; columns without a value are left out."""
     heads = [head for head in HEADS if any(head in row for row in figures.values())]
     table = Table(title, *(HEADS[head] for head in heads))
     for name, row in figures.items():

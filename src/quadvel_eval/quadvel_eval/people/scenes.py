@@ -1,4 +1,4 @@
-"""Simulated scenes in which trackers go wrong, each from a seed: people crossing, a person behind a tree, a way along walls."""
+"""Simulates scenes that are hard for person trackers: crossing, occlusion, walking along walls."""
 
 from __future__ import annotations
 
@@ -14,24 +14,41 @@ from .laser import FloorPlan, Laser
 
 Array = NDArray[np.float64]
 
-STEP = 0.01  # s, in which persons walk
+WALKING_STEP_S = 0.01  # simulation step of the people
 RESOLUTIONS = np.deg2rad([0.25, 0.36, 0.5, 1.0])
-RATES = (10.0, 20.0, 40.0)  # Hz
+SCAN_RATES_HZ = (10.0, 20.0, 40.0)
 
 
 @attrs.frozen
-class Instant:
-    """One scan: time in s, ranges (rays,) in m, the sensor's pose x, y, yaw, and where the persons are, (persons, 2), m."""
+class SceneScan:
+    """One scan of a scene.
+
+    Attributes:
+        time: Time, s.
+        ranges: Ranges (rays,), m.
+        pose: x, y (m) and yaw (rad) of the scanner.
+        people: True positions of the people (people, 2), m.
+    """
 
     time: float
     ranges: Array
     pose: Array
-    persons: Array
+    people: Array
 
 
 @attrs.frozen
 class Scene:
-    """Persons on a floor plan, seen by a scanner of so many scans a second, whose pose is a function of the persons' positions."""
+    """People who walk on a floor plan, and a scanner that sees them.
+
+    Attributes:
+        laser: The scanner.
+        rate: Scan rate, Hz.
+        plan: Static obstacles.
+        walkers: The people.
+        duration: Duration, s.
+        rng: Random number generator of the noise.
+        pose: Function from the people's positions (people, 2) to the scanner's pose x, y, yaw.
+    """
 
     laser: Laser
     rate: float
@@ -39,41 +56,61 @@ class Scene:
     walkers: list[Walker]
     duration: float
     rng: np.random.Generator
-    pose: Callable[[Array], Array] = lambda persons: np.zeros(3)
+    pose: Callable[[Array], Array] = lambda people: np.zeros(3)
 
-    def instants(self) -> Iterator[Instant]:
-        """The scans, in order."""
-        steps = round(1.0 / self.rate / STEP)
+    def scans(self) -> Iterator[SceneScan]:
+        """Simulate the scene.
+
+        Yields:
+            The scans in order.
+        """
+        steps = round(1.0 / self.rate / WALKING_STEP_S)
         for k in range(int(self.duration * self.rate)):
-            persons = np.array([walker.position for walker in self.walkers])
-            pose = self.pose(persons)
+            people = np.array([walker.position for walker in self.walkers])
+            pose = self.pose(people)
             ranges = self.laser.scan(self.plan.with_circles(circles(self.walkers)), pose, self.rng)
-            yield Instant(k * steps * STEP, ranges, pose, persons)
+            yield SceneScan(k * steps * WALKING_STEP_S, ranges, pose, people)
             for walker in self.walkers:
                 for _ in range(steps):
-                    walker.step(STEP)
+                    walker.step(WALKING_STEP_S)
 
 
 def crossing(seed: int) -> Scene:
-    """Two persons whose ways cross at any angle; they meet there, and pass within half a metre of each other."""
+    """Create two people whose paths cross at a random angle, within half a metre of each other.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([1, seed])
     meeting = np.array([rng.uniform(2.0, 4.5), rng.uniform(-1.0, 1.0)])
     first, angle = rng.uniform(-np.pi, np.pi), rng.uniform(np.deg2rad(40.0), np.pi) * rng.choice([-1.0, 1.0])
     walkers = []
     for direction, aside in ((first, 0.2), (first + angle, 0.2)):
         ahead = np.array([np.cos(direction), np.sin(direction)])
-        beside = meeting + aside * np.array([ahead[1], -ahead[0]])
+        path_centre = meeting + aside * np.array([ahead[1], -ahead[0]])
         speed = rng.uniform(0.8, 1.5)
-        way = [beside - 3.0 * speed * ahead, beside + 3.0 * speed * ahead]
+        way = [path_centre - 3.0 * speed * ahead, path_centre + 3.0 * speed * ahead]
         walkers.append(_walker(rng, way, speed))
-    return Scene(_laser(rng), rng.choice(RATES), _trees(rng, meeting), walkers, 6.0, rng)
+    return Scene(_laser(rng), rng.choice(SCAN_RATES_HZ), _trees(rng, meeting), walkers, 6.0, rng)
 
 
 def occlusion(seed: int) -> Scene:
-    """A person who passes behind a tree, out of sight for 1.5 s."""
+    """Create a person who is hidden behind a tree for 1.5 s.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([2, seed])
     distance, speed, hidden = rng.uniform(2.5, 5.0), rng.uniform(0.8, 1.4), 1.5
     to_tree = distance * rng.uniform(0.4, 0.6)
+    # The shadow of the tree at the walker's distance has width 2 r distance / to_tree; the walker
+    # crosses it in `hidden` seconds.
     radius = 0.5 * hidden * speed * to_tree / distance
     side = rng.choice([-1.0, 1.0])
     way = np.array([[distance, -3.0 * side * speed], [distance, 4.0 * side * speed]])
@@ -81,11 +118,22 @@ def occlusion(seed: int) -> Scene:
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     tree = rotation @ [to_tree, 0.0]
     plan = _trees(rng, rotation @ [distance, 0.0]).with_circles([[*tree, radius]])
-    return Scene(_laser(rng), rng.choice(RATES), plan, [_walker(rng, way @ rotation.T, speed)], 6.0, rng)
+    return Scene(
+        _laser(rng), rng.choice(SCAN_RATES_HZ), plan, [_walker(rng, way @ rotation.T, speed)], 6.0, rng
+    )
 
 
 def along_walls(seed: int) -> Scene:
-    """A person 20 m down a corridor with doors and tables, the scanner 1.5 m behind; stops and goes on, on the way."""
+    """Create a person who walks 20 m through a corridor with doors and tables, with one stop.
+
+    The scanner follows 1.5 m behind.
+
+    Args:
+        seed: Seed of the scene.
+
+    Returns:
+        The scene.
+    """
     rng = np.random.default_rng([3, seed])
     half, aside, speed = rng.uniform(0.8, 1.6), rng.uniform(-0.3, 0.3), rng.uniform(0.8, 1.4)
     segments: list[list[float]] = []
@@ -107,12 +155,12 @@ def along_walls(seed: int) -> Scene:
     walker.stops = [(stop, stop + 2.0)]
     return Scene(
         _laser(rng),
-        rng.choice(RATES),
+        rng.choice(SCAN_RATES_HZ),
         FloorPlan(posts, segments),
         [walker],
         20.0 / speed + 2.0,
         rng,
-        lambda persons: np.array([persons[0, 0] - 1.5, 0.0, 0.1 * np.sin(persons[0, 0])]),
+        lambda people: np.array([people[0, 0] - 1.5, 0.0, 0.1 * np.sin(people[0, 0])]),
     )
 
 
@@ -124,6 +172,7 @@ SCENES: Mapping[str, Callable[[int], Scene]] = {
 
 
 def _walker(rng: np.random.Generator, way: ArrayLike, speed: float) -> Walker:
+    """Create a walker with random legs and gait."""
     return Walker(
         way=way,
         speed=speed,
@@ -135,6 +184,7 @@ def _walker(rng: np.random.Generator, way: ArrayLike, speed: float) -> Walker:
 
 
 def _laser(rng: np.random.Generator) -> Laser:
+    """Create a scanner with random resolution, range and noise."""
     resolution = rng.choice(RESOLUTIONS)
     return Laser(
         rays=round(2.0 * np.pi / resolution),
@@ -146,7 +196,7 @@ def _laser(rng: np.random.Generator) -> Laser:
 
 
 def _trees(rng: np.random.Generator, free: Array) -> FloorPlan:
-    """Some trees and a wall, not within 2 m of `free`."""
+    """Create some trees farther than 2 m from `free`, and two walls."""
     trees = [(*rng.uniform(-7.0, 7.0, 2), rng.uniform(0.1, 0.3)) for _ in range(6)]
     kept = [tree for tree in trees if np.hypot(*(tree[:2] - free)) > 2.0 and np.hypot(*tree[:2]) > 1.0]
     return FloorPlan(kept, [[-8.0, 7.5, 8.0, 7.5], [-8.0, -7.5, 8.0, -7.5]])
