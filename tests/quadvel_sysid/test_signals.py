@@ -50,7 +50,7 @@ def test_guesses_of_a_hard_deadband_leave_few_errors_between_them():
     """Each error between two guesses is a jump of the torque that a slope along the width does not see."""
     samples = Samples([_log(seconds=1.0)])
     s = samples.at(0.009, 0.003, 0.0)
-    starts = registry()["deadband"](edge="hard").starts(s, samples.tau, samples.tau)
+    starts = registry()["deadband"](edge="hard").initial_guesses(s, samples.tau, samples.tau)
     widths = np.array([one["width"] for one in starts])
     share = (np.abs(s.q_des - s.q) < widths[:, None]).mean(axis=1)
     assert np.diff(share, axis=0).max() < 0.05
