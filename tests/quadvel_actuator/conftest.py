@@ -1,4 +1,4 @@
-"""Makes `simulated_joints`, which lies beside the tests of quadvel_sysid, importable by name."""
+"""Put `simulated_joints`, a module in the tests of quadvel_sysid, on the import path."""
 
 import sys
 from pathlib import Path

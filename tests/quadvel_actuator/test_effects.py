@@ -1,4 +1,4 @@
-"""Every law of the registry: runs in the actuator model, and step by step the same as over a series."""
+"""Every effect of the registry: it runs in the model, and steps give the same as a series."""
 
 import attrs
 import numpy as np
@@ -7,7 +7,7 @@ from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
 from quadvel_actuator.effects import MemoryLaw, Stage, registry
-from quadvel_actuator.effects.base import of_each
+from quadvel_actuator.effects.base import evaluate_distinct
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.model import DELAY_STEP_S, AppliedEffect, Model, Unknowns, jacobian, pack, with_slots
 from quadvel_sysid.signals import Samples
@@ -69,7 +69,7 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
     settings = {k: v for k, v in TRUTH[name].items() if isinstance(v, (str, list)) or k == "full"}
     if name == "cross_coupling":
         settings["source"] = [*settings["source"], settings["source"][0]]
-    law = registry()[name].configured(settings, joints)
+    law = registry()[name].from_settings(settings, joints)
     values = np.array([np.full(4, TRUTH[name][parameter]) for parameter in law.names])
     active = np.array([True, True, True, False])
     zero = np.zeros(4, dtype=int)
@@ -86,13 +86,13 @@ def test_a_law_gives_the_same_torque_step_by_step_and_over_a_series(name):
 
 @pytest.mark.parametrize("name", ["slew_limit", "velocity_filter", "backlash", "hysteresis"])
 def test_a_law_of_another_package_needs_its_step_alone_to_be_run_over_a_series(name):
-    """Whatever the stretches and the guesses; a law's own series is but a faster way."""
+    """For any stretches and guesses; `series` of an effect is only a faster way."""
     t, q, dq, q_des = _motion(200)
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
     s = samples.at(0.0, 0.0, 0.0)
     s = attrs.evolve(s, start=s.start | (np.arange(200) % 70 == 0)[:, None])
     settings = {"on": "error"} if name == "backlash" else {}
-    law = registry()[name].configured(settings, NAMES[:4])
+    law = registry()[name].from_settings(settings, NAMES[:4])
     guesses = np.array([0.7, 1.0, 1.6])[:, None, None]
     p = {parameter: TRUTH[name][parameter] * guesses + np.zeros(4) for parameter in law.names}
     x = (s.q_des - s.q, s.dq_des - s.dq) if law.stage == Stage.ERRORS else s.stiffness_torque
@@ -103,7 +103,7 @@ def test_a_law_of_another_package_needs_its_step_alone_to_be_run_over_a_series(n
 
 def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over():
     t, q, dq, q_des = _motion(300)
-    law = registry()["cross_coupling"].configured({"source": [f"{NAMES[1]}/tau"] * 4}, NAMES[:4])
+    law = registry()["cross_coupling"].from_settings({"source": [f"{NAMES[1]}/tau"] * 4}, NAMES[:4])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     coupled = AppliedEffect(law, every, np.full((1, 4), 0.2), np.arange(4))
     torques = []
@@ -116,9 +116,9 @@ def test_a_coupling_to_a_torque_does_not_carry_the_noise_of_its_measurement_over
 
 
 def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
-    """Else it would stand for an offset of a joint that no neighbour moves."""
+    """Otherwise it would explain a constant offset that no neighbour causes."""
     sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
-    law = registry()["cross_coupling"].configured({"source": sources}, NAMES[:4])
+    law = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
     t, q, dq, q_des = _motion(300)
     s = Samples([Log("still", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)]).at(0, 0, 0)
     torque = law.torque(s.stiffness_torque, s, {"a": np.zeros(4), "offset": np.ones(4)})
@@ -128,17 +128,17 @@ def test_a_coupling_has_an_offset_where_it_is_of_an_angle_and_nowhere_else():
 
 
 def test_a_coupling_that_is_of_no_angle_on_its_joints_is_the_same_in_a_file():
-    """Which names the sources of these joints alone."""
+    """The file names the sources of these joints only."""
     sources = [f"{NAMES[1]}/q", f"{NAMES[0]}/dq", f"{NAMES[0]}/tau", f"{NAMES[0]}/dq"]
-    law = registry()["cross_coupling"].configured({"source": sources}, NAMES[:4])
+    law = registry()["cross_coupling"].from_settings({"source": sources}, NAMES[:4])
     kept = _on(law, np.ones((2, 4)), 1, 2)
-    filed = registry()["cross_coupling"].configured({"source": sources[1:3]}, NAMES[:4])
+    filed = registry()["cross_coupling"].from_settings({"source": sources[1:3]}, NAMES[:4])
     assert kept.law.names == filed.names
     assert _on(kept.law, kept.values, 0, 1, 2).law.names == law.names
 
 
 def _on(law, values, *joints):
-    """The law as it stays on these joints after a fit."""
+    """The effect that remains on these joints after a fit."""
     active = np.isin(np.arange(4), joints)
     return AppliedEffect(law, active, values, np.arange(4)).canonical()
 
@@ -147,10 +147,10 @@ def _on(law, values, *joints):
 @pytest.mark.parametrize("source", ["q", "tau"])
 @pytest.mark.parametrize("name", [name for name, law in registry().items() if law.stage == Stage.ADDED])
 def test_slopes_of_a_fit_are_those_of_the_torque(name, source, at):
-    """Whether the law depends on the torque of the drive, or on delays, or says that it does not."""
+    """Whether or not the effect depends on the drive's torque or on delays."""
     t, q, dq, q_des = _motion(300)
     forms = {"cross_coupling": {"source": [f"{NAMES[1]}/{source}"] * 4}, "armature": {"of": "ddq_sharp"}}
-    law = registry()[name].configured({"at": at, **forms.get(name, {})}, NAMES[:4])
+    law = registry()[name].from_settings({"at": at, **forms.get(name, {})}, NAMES[:4])
     values = np.array([np.full(4, TRUTH[name].get(one, 0.0)) for one in law.names])
     every, zero = np.ones(4, dtype=bool), np.zeros(4, dtype=int)
     samples = Samples([Log("steps", NAMES[:4], t, q, dq, t, q_des, np.ones(q.shape, bool), tau=q)])
@@ -181,9 +181,9 @@ def test_what_is_equal_in_a_batch_is_computed_once():
 
     q, n, phi = np.linspace(0.0, 1.0, 6).reshape(3, 2), np.full((4, 1, 2), 5.0), np.full((4, 1, 2), 0.3)
     n[2] += 0.1
-    np.testing.assert_array_equal(of_each(wave, n, phi), np.sin(n * q + phi))
-    np.testing.assert_array_equal(of_each(wave, n, phi[0, 0]), np.sin(n * q + 0.3))
-    np.testing.assert_array_equal(of_each(wave, n[0, 0], phi[0, 0]), np.sin(5.0 * q + 0.3))
+    np.testing.assert_array_equal(evaluate_distinct(wave, n, phi), np.sin(n * q + phi))
+    np.testing.assert_array_equal(evaluate_distinct(wave, n, phi[0, 0]), np.sin(n * q + 0.3))
+    np.testing.assert_array_equal(evaluate_distinct(wave, n[0, 0], phi[0, 0]), np.sin(5.0 * q + 0.3))
     assert given == [(2, 1, 2), (2, 1, 2), (2,)]
 
 
@@ -223,7 +223,7 @@ def test_an_environment_that_is_reset_forgets_its_memory_and_others_do_not():
     assert np.abs(both[0][0] - both[1][0]).max() > 1e-4
 
 
-def test_peeking_leaves_the_memory_of_effects_as_it_is():
+def test_peeking_does_not_change_the_memory_of_effects():
     effects = [Effect(name, JOINTS, TRUTH[name]) for name in ("hysteresis", "slew_limit", "timestamp_skew")]
     truth = attrs.evolve(parameters(effects, noise=0.0), joints=JOINTS)
     _, q, dq, q_des = (x[..., :3] if np.ndim(x) > 1 else x for x in _motion(60))
@@ -234,7 +234,7 @@ def test_peeking_leaves_the_memory_of_effects_as_it_is():
         np.testing.assert_array_equal(ours, plain.step(q[k], dq[k], q_des[k], 30.0, 0.5))
 
 
-def test_commands_are_lost_with_the_asked_share():
+def test_commands_are_lost_with_the_given_probability():
     effect = Effect("command_hold", JOINTS, {"share": 0.2})
     truth = attrs.evolve(
         parameters([effect], delta_kp=0.0, delta_kd=0.0, input_delay=0.0, output_delay=0.0, noise=0.0),
@@ -288,7 +288,7 @@ def test_an_effect_that_cannot_run_is_refused_by_name(effect, message):
 
 @pytest.mark.parametrize("name", sorted(set(registry()) - {"command_hold"}))
 def test_a_sampled_environment_runs_as_a_model_of_the_parameters_that_were_drawn(name):
-    """Environments of a batch, one of them not sampled; each parameter within its interval, alike for all joints."""
+    """Environments of a batch, one not sampled; each parameter is within its interval, equal for all joints."""
     _, q, dq, q_des = _motion(60, 0.0025)
     numbers = {k: v for k, v in TRUTH[name].items() if isinstance(v, float)}
     intervals = {k: sorted((0.5 * v, 1.5 * v)) for k, v in numbers.items() if k != "full"}
@@ -329,7 +329,7 @@ def test_an_interval_the_wrong_way_round_is_refused_by_name():
 
 
 def test_a_setting_that_is_a_number_counts():
-    """A drive of 25 degrees Celsius, which the model takes for granted, is colder than `cold`, and stronger for it."""
+    """A running model assumes 25 degrees Celsius; a drive colder than `cold` is stronger."""
     effect = {"of": "temperature", "rate": -0.01}
     torques = []
     for cold in ({}, {"cold": 40.0}):

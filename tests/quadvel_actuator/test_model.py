@@ -1,4 +1,4 @@
-"""The empirical actuator model against closed form."""
+"""The empirical actuator model against closed-form solutions."""
 
 import attrs
 import numpy as np
@@ -24,7 +24,7 @@ def _parameters(input_delay=0.0, output_delay=0.0, noise=0.0, limit=UNLIMITED, d
 
 
 def _held(signal, delay, dt):
-    """Step means of the delayed `signal`, one value per step, its first one held before time 0."""
+    """Step means of the delayed `signal`, one value per step, constant before time 0."""
     fine = 1e-5
     per_step = round(dt / fine)
     time = (np.arange(len(signal) * per_step) + 0.5) * fine - delay
@@ -90,7 +90,7 @@ def test_damping_without_stiffness_never_drives_the_joint():
     np.testing.assert_allclose(torque, -2.0 * (0.5 - 0.021) / 0.5 * dq, atol=1e-12)
 
 
-def test_the_torque_noise_has_the_asked_variance_and_no_memory():
+def test_the_torque_noise_has_the_given_variance_and_is_white():
     model = ActuatorModel(_parameters(noise=0.066), (50, 12), seed=3)
     noise = np.array([model.step(np.zeros((50, 12)), 0.0, 0.0, 30.0, 0.5) for _ in range(200)]).ravel()
     low, high = stats.chi2.interval(0.999, noise.size)
@@ -123,7 +123,7 @@ def test_the_first_step_after_a_reset_has_no_memory():
     np.testing.assert_allclose(model.step(ZERO, Q, Q, 30.0, 0.5), 29.5 * Q, atol=1e-12)
 
 
-def test_a_reset_of_some_environments_leaves_the_others_alone():
+def test_a_reset_of_some_environments_does_not_change_the_others():
     rng = np.random.default_rng(4)
     q, dq, q_des = rng.normal(size=(3, 80, 3, 12))
     kp = np.where(np.arange(80) < 30, 30.0, 40.0)[:, None] + np.zeros((1, 3))
@@ -180,7 +180,7 @@ def test_sampling_stays_within_the_probable_set_and_fills_it():
         assert (scale == scale[:, :1]).all()
 
 
-def test_sampling_some_environments_leaves_the_others_as_they_are():
+def test_sampling_some_environments_does_not_change_the_others():
     model = ActuatorModel(ActuatorParameters.default(), (6, 12))
     model.sample([1, 4], np.random.default_rng(7))
     changed = (model.kp_scale != 1 - 0.706 / 30).any(axis=1)

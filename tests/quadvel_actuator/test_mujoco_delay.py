@@ -32,7 +32,7 @@ def _model(input_delay: float, output_delay: float) -> ActuatorModel:
 
 
 def _motion(actuator: str, model: ActuatorModel | None) -> np.ndarray:
-    """Joint angle (rad) every ms; the control is the target, or what `model` makes of it."""
+    """Joint angle (rad) every ms; the control is the target, or the torque of `model`."""
     plant = _pendulum(actuator)
     data = mujoco.MjData(plant)
     angles = []

@@ -1,4 +1,4 @@
-"""The actuator parameter file: Table 4, round trip, and errors that say what is wrong."""
+"""The actuator parameter file: Table 4, round trip, and errors that name field and value."""
 
 import attrs
 import pytest

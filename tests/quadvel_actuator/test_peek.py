@@ -1,4 +1,4 @@
-"""`ActuatorModel.peek` tells the next torque without any trace in what follows."""
+"""`ActuatorModel.peek` predicts the next torque and does not change later ones."""
 
 import attrs
 import numpy as np
@@ -14,7 +14,7 @@ def parameters(input_delay: float, output_delay: float) -> ActuatorParameters:
 
 
 def run(model: ActuatorModel, peek_every: int) -> np.ndarray:
-    """Torques under random joint states, targets held for 5 ms and gains that change now and then."""
+    """Torques under random joint states, with targets constant for 5 ms and gains that change sometimes."""
     rng = np.random.default_rng(7)
     torques = np.zeros((STEPS, 12))
     for k in range(STEPS):
@@ -35,7 +35,7 @@ def run(model: ActuatorModel, peek_every: int) -> np.ndarray:
 
 @pytest.mark.parametrize("delays", [(0.0, 0.0), (0.007, 0.001), (0.0073, 0.0014), (0.05, 0.05)])
 @pytest.mark.parametrize("peek_every", [1, 7])
-def test_peek_foretells_the_step_and_leaves_the_run_as_it_is(
+def test_peek_predicts_the_step_and_does_not_change_the_run(
     delays: tuple[float, float], peek_every: int
 ) -> None:
     np.testing.assert_array_equal(

@@ -1,4 +1,4 @@
-"""Compiled loops are kept on disk, where several identifications at once may find or put them."""
+"""Compiled loops are cached on disk; several processes may read and write them concurrently."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ print(recurrence.rate_limit_series(rows, 0.0 * one, 0.001 * one, start, 1000.0)[
 SEVERAL, AGAIN = 3, 2
 
 
-def test_loops_compiled_by_several_processes_at_once_serve_the_ones_to_come(tmp_path: Path) -> None:
+def test_loops_compiled_by_concurrent_processes_serve_later_ones(tmp_path: Path) -> None:
     for attempt in range(AGAIN):
         environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / str(attempt)), "OMP_NUM_THREADS": "1"}
         for together in (SEVERAL, 1):

@@ -1,4 +1,4 @@
-"""Terms of named signals: over series and step by step the same, saved and loaded, bounded."""
+"""Terms of named signals: steps give the same as series; entries of files; bounds."""
 
 from types import SimpleNamespace
 
@@ -8,7 +8,7 @@ import pytest
 from simulated_joints import NAMES, parameters
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters, Effect
-from quadvel_actuator.effects.terms import Curve, Filter, Lag, Resonance, Term, Wave, loaded
+from quadvel_actuator.effects.terms import Curve, Filter, Lag, Resonance, Term, Wave, load_term
 
 JOINTS = NAMES[:3]
 DT = 0.001
@@ -60,7 +60,7 @@ def test_a_curve_is_a_spline_that_stays_at_its_ends():
     np.testing.assert_allclose(value, -1.0 + 3.0 / 7.0 + slope * np.clip(x, 0.0, 1.0), atol=1e-12)
 
 
-def test_a_resonance_rings_as_its_equation_says():
+def test_a_resonance_rings_as_in_its_equation():
     shape, t = Resonance(18.0, 0.05), np.arange(400) * DT
     pole = 2 * np.pi * 18.0 * complex(-0.05, np.sqrt(1 - 0.05**2))
     u = np.where(np.arange(400) < 1, 0.0, 1.0)[:, None]
@@ -78,11 +78,11 @@ def test_a_lag_follows_a_step_as_an_exponential():
 
 @pytest.mark.parametrize("kind", SHAPES)
 @pytest.mark.parametrize(("signal", "times"), [("q", ""), ("FL_hip_joint/tau", "direction"), ("t", "tau")])
-def test_a_term_comes_back_from_its_entry_unchanged(kind, signal, times):
+def test_a_term_survives_its_entry_unchanged(kind, signal, times):
     names = (*JOINTS[:2], "FL_hip_joint")
-    shape = SHAPES[kind] if signal == "q" else SHAPES[kind].at(np.array([0]))
+    shape = SHAPES[kind] if signal == "q" else SHAPES[kind].for_columns(np.array([0]))
     term = _term(shape, signal, times)
-    again = loaded(term.saved(names), names)
+    again = load_term(term.to_entry(names), names)
     tau = np.array([1.0, -2.0, 3.0])
     memories = [one.rest(_views()[0], tau, names, DT) for one in (term, again)]
     for view in _views():
@@ -110,11 +110,11 @@ def test_a_term_comes_back_from_its_entry_unchanged(kind, signal, times):
 )
 def test_a_wrong_entry_is_refused_by_name(changes, said):
     with pytest.raises(ValueError, match=said):
-        loaded(_term(SHAPES["curve"]).saved(JOINTS) | changes, JOINTS)
+        load_term(_term(SHAPES["curve"]).to_entry(JOINTS) | changes, JOINTS)
 
 
 def _model(shape=(3,), bound=50.0, kind="filter", at="drive"):
-    entries = [_term(SHAPES[kind], bound=bound, at=at).saved(JOINTS)]
+    entries = [_term(SHAPES[kind], bound=bound, at=at).to_entry(JOINTS)]
     effect = Effect("learned_residual", (JOINTS[0], JOINTS[2]), {"terms": entries})
     truth = attrs.evolve(parameters((effect,), noise=0.0), joints=JOINTS)
     return ActuatorModel(truth, shape, DT)
@@ -122,7 +122,7 @@ def _model(shape=(3,), bound=50.0, kind="filter", at="drive"):
 
 @pytest.mark.parametrize(("at", "late"), [("drive", 1), ("joint", 0)])
 def test_a_model_adds_its_terms_after_its_parameters_went_through_a_file(tmp_path, at, late):
-    """Those of the drive come an output delay late, of one step here; those at the joint at once."""
+    """Terms in the drive pass the output delay, one step here; terms at the joint do not."""
     model = _model(at=at)
     model.parameters.save(tmp_path / "actuator.yaml")
     assert ActuatorParameters.load(tmp_path / "actuator.yaml") == model.parameters
@@ -140,9 +140,9 @@ def test_a_model_adds_its_terms_after_its_parameters_went_through_a_file(tmp_pat
 
 
 def test_an_entry_that_names_no_place_is_of_the_drive():
-    entry = _term(SHAPES["curve"]).saved(JOINTS)
+    entry = _term(SHAPES["curve"]).to_entry(JOINTS)
     del entry["at"]
-    assert loaded(entry, JOINTS).at == "drive"
+    assert load_term(entry, JOINTS).at == "drive"
 
 
 def test_no_term_gives_more_than_its_bound():

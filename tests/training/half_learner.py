@@ -1,4 +1,4 @@
-"""One update of a policy on a part of 8 robots, and a run of them. As a program: a process of two, with the last 4 of them."""
+"""One update of a policy on some of 8 robots; as a program, the second of two processes with the last 4."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def update(part: slice) -> dict[str, torch.Tensor]:
 
 
 def run(checkpoint: Path) -> tuple[dict[str, torch.Tensor], np.ndarray, np.ndarray, int]:
-    """Two updates of stage 1, and one more of a run that goes on: the weights, grid, commands and samples of this process."""
+    """Two updates of stage 1, and one more of a resumed run: the weights, grid, commands and samples of this process."""
     config = PrivilegedConfig(n=8, threads=1, length=4)
     loop.train(PrivilegedRun(config), loop.Budget(2 * 8 * 4, 10.0), checkpoint)
     again = PrivilegedRun(config)
@@ -45,8 +45,8 @@ if __name__ == "__main__":
     parallel.join("cpu")
     update(slice(4, 8))
     parallel.gather(run(Path(sys.argv[1])))
-    assert parallel.from_first("second") == "first"
+    assert parallel.broadcast("second") == "first"
     assert parallel.gather("second") == ["first", "second"]
-    parallel.leave()
+    parallel.destroy_group()
     names = [(thread / "comm").read_text() for thread in Path("/proc/self/task").iterdir()]
     assert not any("gloo" in name for name in names), names

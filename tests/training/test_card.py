@@ -1,4 +1,4 @@
-"""Model cards say what the file and its evaluation say."""
+"""Model cards agree with the file and its evaluation."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_a_policys_card_names_its_figures_and_where_it_fails(evaluation):
         assert said in text
 
 
-def test_an_estimators_card_says_under_which_policy_it_was_measured(evaluation):
+def test_an_estimators_card_names_the_policy_of_its_evaluation(evaluation):
     text = card(SHIPPED_MODEL, [evaluation])
     assert "| learned estimator, largest RMSE, m/s | 0.01 |" in text
     assert "largest error" not in text

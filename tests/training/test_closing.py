@@ -1,4 +1,4 @@
-"""The closed loop as one command: each step once, each on what the one before left, in folders with any name."""
+"""The closed loop as one command: each step once, with the files of the step before, in any folder."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def test_steps_whose_files_are_there_are_not_run_again(tmp_path, monkeypatch, ca
     def run(command, check):
         assert check
         ran.append(command)
-        file = next(file for file, arguments in closing.steps(*given(out)) if arguments == command[1:])
+        file = next(file for file, arguments in closing.fill_steps(*given(out)) if arguments == command[1:])
         file.parent.mkdir(exist_ok=True)
         file.touch()
 

@@ -1,4 +1,4 @@
-"""Stage 3: the pull of the teacher and the constraints over the samples, resuming, the policy file."""
+"""Stage 3: schedules of pull and constraints, resumption, and the policy file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def files(tmp_path_factory):
     teacher, student = folder / "privileged.pt", folder / "dagger.pt"
     run = PrivilegedRun(PrivilegedConfig(n=4, threads=1, length=2))
     for command in ((0.5, 0.0, 0.0), (-0.5, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.7)):
-        run.grid.note(np.tile([*command, 0.0], (4, 1)), np.zeros((4, 2)), np.zeros(4, bool))
+        run.grid.record(np.tile([*command, 0.0], (4, 1)), np.zeros((4, 2)), np.zeros(4, bool))
     loop.save(run.state(), teacher)
     loop.save(DaggerRun(DaggerConfig(n=8, threads=1, length=2), teacher).state(), student)
     return student, teacher
@@ -56,7 +56,7 @@ def test_the_pull_alone_brings_the_policy_to_its_teacher(files):
     assert away[-1] < 0.5 * away[0]
 
 
-def test_it_starts_as_its_student_and_goes_on_from_a_checkpoint(files, tmp_path):
+def test_it_starts_as_its_student_and_resumes_from_a_checkpoint(files, tmp_path):
     run = ConstrainedRun(SMALL, *files)
     known = loop.load(files[0])["student"]
     assert all(torch.equal(known[name], value) for name, value in run.policy().state_dict().items())

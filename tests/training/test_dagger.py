@@ -1,4 +1,4 @@
-"""Stage 2: the student, its teacher at every tick, and the policy file that is the network and no more."""
+"""Stage 2: the student, its teacher at every tick, and the policy file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def teacher_file(tmp_path_factory):
     run = PrivilegedRun(PrivilegedConfig(n=4, threads=1, length=2))
     followed = [(0.5, 0, 0), (1.0, 0, 0), (1.5, 0, 0), (2.0, 0, 0), (0, 0.4, 0), (0, 0, 0.7)]
     for command in followed:
-        run.grid.note(np.tile([*command, 0.0], (4, 1)), np.zeros((4, 2)), np.zeros(4, bool))
+        run.grid.record(np.tile([*command, 0.0], (4, 1)), np.zeros((4, 2)), np.zeros(4, bool))
     loop.save(run.state(), path)
     return path
 
@@ -54,7 +54,7 @@ def test_the_file_does_what_the_network_does(run, tmp_path):
     assert np.abs(found - expected[:, 0].numpy()).max() < 1e-4
 
 
-def test_the_file_says_which_commands_it_answers_and_how_to_run_it(run, tmp_path):
+def test_the_file_holds_its_command_limits_and_how_to_run_it(run, tmp_path):
     limits = CommandLimits((-1.0, -0.4, -0.7), (2.0, 0.5, 0.7), 3.0)
     dagger.export_policy(run.student, run.env, limits, tmp_path / "policy.onnx", {})
     metadata = PolicyFile(tmp_path / "policy.onnx").metadata
@@ -74,7 +74,7 @@ def test_the_teacher_knows_what_was_done_20_ms_ago(run):
     assert seen == [0, 0, 0, 0, 0, 1]
 
 
-def test_what_the_teacher_says_comes_as_late_as_actions_that_are_held_and_forgets_who_starts_over(run):
+def test_the_teachers_actions_lag_as_held_ones_do_and_restart_with_a_robot(run):
     teacher, values = run.teacher, iter([0.3, 0.6, 0.9, 1.2])
     teacher.actor = lambda obs: (torch.full((8, 12), next(values)), None)
     said = [teacher.action()[:, 0] for _ in range(3)]
@@ -100,7 +100,7 @@ def test_the_student_gets_its_share_as_soon_as_it_grows(run):
     assert run.driven.mean() == pytest.approx(SMALL.driven, abs=0.1)
 
 
-def test_the_student_comes_to_do_what_the_teacher_does(run):
+def test_the_student_learns_to_imitate_the_teacher(run):
     losses = [run.step(0.0)["imitation"] for _ in range(25)]
     assert np.mean(losses[-5:]) < 0.5 * np.mean(losses[:3])
 
@@ -117,7 +117,7 @@ def test_a_robot_that_fell_teaches_nothing_until_it_starts_over(run):
     assert not run.env.fallen[3]
 
 
-def test_a_killed_run_goes_on(run, teacher_file, tmp_path):
+def test_a_killed_run_resumes(run, teacher_file, tmp_path):
     run.step(0.0)
     loop.save(run.state(), tmp_path / "dagger.pt")
     other = DaggerRun(SMALL, teacher_file)

@@ -1,4 +1,4 @@
-"""The training environment, its rewards, and how runs go on."""
+"""The training environment, its rewards, and resumption of runs."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput  # noqa: 
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, recipe, stages  # noqa: E402
 from quadvel_training.constrained import PARTS, ConstrainedConfig, ConstrainedRun  # noqa: E402
-from quadvel_training.env import RAMP_AXES, RAMP_DOWN, TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.env import RAMP_AXES, RAMP_DOWN, TICK_S, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.privileged import PrivilegedConfig  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.rewards import RewardWeights, Table2  # noqa: E402
@@ -80,9 +80,9 @@ def test_led_commands_go_the_way_that_the_command_mux_leads_them():
         [0.0, 0.0, 0.0, 1.0],
     ):
         env._goal[:] = goal
-        for _ in range(round(1.0 / TICK)):
+        for _ in range(round(1.0 / TICK_S)):
             stand(env)
-            time += TICK
+            time += TICK_S
             mux.receive("planner", time, goal[:3])
             wanted = mux.update(time)
             np.testing.assert_allclose(env.command[2], [*wanted.velocity, wanted.stance], atol=1e-9)
@@ -112,7 +112,7 @@ def test_velocity_is_the_derivative_of_position_in_the_body_frame():
     slow = env.velocity.copy()
     env.tick(np.tile(env.stand_q, (4, 1)))
     mean = 0.5 * (slow + env.velocity)
-    moved = (env.batch.qpos[:, :3] - before) / TICK
+    moved = (env.batch.qpos[:, :3] - before) / TICK_S
     assert np.abs(rotate(env.quaternion, mean) - moved).max() < 0.05
 
 
@@ -134,7 +134,7 @@ def test_rewards_of_table_2_at_a_state_computed_by_hand():
     assert terms["orientation"] == pytest.approx(-0.3)
     assert terms["torso_stability"] == pytest.approx(-0.5 - 0.1)
     assert terms["joint_velocity"] == pytest.approx(-0.12)
-    assert terms["joint_acceleration"] == pytest.approx(-12 * (0.1 / TICK) ** 2)
+    assert terms["joint_acceleration"] == pytest.approx(-12 * (0.1 / TICK_S) ** 2)
     assert terms["slippage"] == pytest.approx(-0.04)
     assert terms["energy"] == pytest.approx(-12 * (0.2 * 4.0 - 0.2))
     assert terms["velocity_compensation"] == pytest.approx(np.hypot(0.2, 0.3))
@@ -169,7 +169,7 @@ def test_joints_nearly_as_fast_as_their_drives_are_fined():
 
 
 class Counter:
-    """A run that counts."""
+    """A run that counts its steps."""
 
     def __init__(self) -> None:
         self.samples = 0
@@ -233,14 +233,14 @@ def test_robots_start_with_four_feet_on_a_slope_whichever_way_they_look(degrees)
     config = EnvConfig(n=16, threads=1, terrain=slope, randomisation=Randomisation.none())
     env = VelocityEnv(config)
     env._qpos[:, 7:] = robot.NOMINAL_Q
-    env._read()
+    env._update_state()
     across = env.clearance * np.cos(np.radians(degrees))  # m, from the ground, at right angles to it
     assert np.ptp(across, axis=1).max() < 0.002
     assert np.hypot(*env.roll_pitch.T) == pytest.approx(np.radians(abs(degrees)), abs=0.03)
 
 
 def test_the_field_of_hills_slopes_by_up_to_20_degrees():
-    ground = recipe.read(PrivilegedConfig, stages.RECIPES / "privileged_rough.yaml").terrain
+    ground = recipe.read_recipe(PrivilegedConfig, stages.RECIPES / "privileged_rough.yaml").terrain
     ground = attrs.evolve(ground, roughness=0.001)
     x, y = np.random.default_rng(0).uniform(-24.0, 24.0, (2, 20000))
     steep = [

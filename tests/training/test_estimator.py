@@ -1,4 +1,4 @@
-"""What the estimators learn from and how: walks with their modes, the network, the Kalman filter's tuning."""
+"""Training of the estimators: walks and their modes, the network, tuning of the Kalman filter."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from quadvel_estimator.odometry import leg_velocity  # noqa: E402
 from quadvel_policy.modes import ModeInput, Posture  # noqa: E402
 from quadvel_policy.supervisor import SupervisorConfig  # noqa: E402
 from quadvel_training import kalman_tuning, walks  # noqa: E402
-from quadvel_training.env import TICK, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
+from quadvel_training.env import TICK_S, CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.estimator import EstimatorConfig, EstimatorRun, VelocityNetwork  # noqa: E402
 from quadvel_training.networks import Recurrent  # noqa: E402
 from quadvel_training.randomisation import Randomisation  # noqa: E402
@@ -34,18 +34,18 @@ def actor():
 
 def only(monkeypatch, mode):
     """Every walk begins in `mode`."""
-    monkeypatch.setattr(walks, "FIRST", np.eye(len(Mode))[mode])
+    monkeypatch.setattr(walks, "FIRST_MODE_SHARES", np.eye(len(Mode))[mode])
 
 
 def test_postures_are_those_of_the_controller(monkeypatch):
-    """Standing up, from a robot whose joints are anywhere: targets and their speeds, tick by tick."""
+    """Targets and their speeds, tick by tick, while a robot stands up from any joint positions."""
     only(monkeypatch, Mode.DAMPING)
     rng = np.random.default_rng(0)
     modes = Modes(1, rng)
     modes.begin(np.array([0]))
     q = robot.LIE_Q + rng.normal(0, 0.1, 12)
     while modes.mode[0] == Mode.DAMPING:
-        modes.ask(np.zeros((1, 12)), robot.KP, robot.KD)
+        modes.set_targets(np.zeros((1, 12)), robot.KP, robot.KD)
         modes.advance(q[None])
     c = SupervisorConfig()
     fold = Posture([(c.fold_time, robot.LIE_Q)], c.stand_kp, c.stand_kd)
@@ -53,9 +53,9 @@ def test_postures_are_those_of_the_controller(monkeypatch):
         0.0, 0, q, np.zeros(12), np.zeros(12), np.array([1.0, 0, 0, 0]), *np.zeros((2, 3)), np.zeros(4)
     )
     fold.enter(ModeInput(0.0, state, None, np.zeros(4), JointCommand.damping(c.damping_kd)))
-    for k in range(round(c.fold_time / TICK)):
-        wanted = fold.tick(ModeInput(k * TICK, state, None, np.zeros(4), JointCommand.damping(1.0)))
-        speed = modes.ask(np.zeros((1, 12)), robot.KP, robot.KD)
+    for k in range(round(c.fold_time / TICK_S)):
+        wanted = fold.tick(ModeInput(k * TICK_S, state, None, np.zeros(4), JointCommand.damping(1.0)))
+        speed = modes.set_targets(np.zeros((1, 12)), robot.KP, robot.KD)
         np.testing.assert_allclose(modes.target[0], wanted.q, atol=1e-9)
         np.testing.assert_allclose(speed[0], wanted.dq, atol=1e-9)
         assert (modes.kp == c.stand_kp).all()
@@ -73,22 +73,22 @@ def test_what_the_policy_asks_for_fades_in(monkeypatch):
     asked, q = np.full((1, 12), 0.3), np.zeros((1, 12))
     torque = []
     while modes.mode[0] == Mode.STANCE or modes.elapsed[0] < c.blend_time + 0.02:
-        modes.ask(asked, robot.KP, robot.KD)
+        modes.set_targets(asked, robot.KP, robot.KD)
         torque.append((modes.kp * (modes.target - q))[0, 0])
         modes.advance(q)
     assert torque[-1] == pytest.approx(robot.KP * 0.3)
     step = c.stand_kp * abs(robot.NOMINAL_Q[0]) + robot.KP * 0.3
-    assert np.abs(np.diff(torque)).max() == pytest.approx(step * TICK / c.blend_time, rel=0.01)
+    assert np.abs(np.diff(torque)).max() == pytest.approx(step * TICK_S / c.blend_time, rel=0.01)
 
 
 def test_robots_that_lie_stand_up(monkeypatch, actor):
     only(monkeypatch, Mode.DAMPING)
-    monkeypatch.setattr(walks, "LONGEST", walks.SHORTEST)  # stance after 0.2 + 0.8 + 1.2 s
+    monkeypatch.setattr(walks, "MAX_MODE_S", walks.MIN_MODE_S)  # stance after 0.2 + 0.8 + 1.2 s
     env = VelocityEnv(EnvConfig(n=3, threads=1, seed=1, randomisation=Randomisation.none(), commands=STILL))
     walking = Walks(env, actor)
     assert env.height.max() < robot.LIE_HEIGHT + 0.1
     assert (walking.previous_action == 0.0).all()
-    for _ in range(round(2.5 / TICK)):
+    for _ in range(round(2.5 / TICK_S)):
         walking.advance(walking.sense(), walking.truth)
     assert not walking.over.any()
     assert env.height == pytest.approx(robot.NOMINAL_HEIGHT, abs=0.03)  # the gains give way
@@ -114,7 +114,7 @@ KEEP = 4
 
 
 def believing(which: int) -> VelocityNetwork:
-    """A network that corrects nothing and gives all to one leg, 0 to 3, or to inertia, KEEP."""
+    """A network without corrections whose only share is that of a leg, 0 to 3, or of inertia, 4."""
     torch.manual_seed(0)
     network = VelocityNetwork()
     last = network.body[-1]
@@ -126,7 +126,7 @@ def believing(which: int) -> VelocityNetwork:
 
 
 def seen(sensed: RobotState, ticks: int) -> torch.Tensor:
-    """The network's input (T, 1, 69) where the state stays as it is."""
+    """The network's input (T, 1, 69) of a constant state."""
     x = features.build(sensed, np.zeros(12))
     return torch.from_numpy(np.tile(x, (ticks, 1, 1)))
 
@@ -162,8 +162,8 @@ def test_the_network_can_go_on_by_inertia_alone():
     state[0][0, 0, -3:] = torch.tensor([1.0, 0.5, 0.0])
     with torch.no_grad():
         output, _ = network(seen(spinning, ticks), state)
-    turned = (1.0 + 0.5j) * np.exp(-1j * rate * ticks * TICK)
-    expected = [turned.real, turned.imag, -robot.GRAVITY * ticks * TICK]
+    turned = (1.0 + 0.5j) * np.exp(-1j * rate * ticks * TICK_S)
+    expected = [turned.real, turned.imag, -robot.GRAVITY * ticks * TICK_S]
     np.testing.assert_allclose(output[-1, 0, :3].numpy(), expected, rtol=0.02)
 
 
@@ -188,7 +188,7 @@ def test_tuning_does_not_make_the_filter_worse(actor):
     config = kalman_tuning.TuningConfig(n=4, window=0.75, windows=1)
     recording = kalman_tuning.record(config, actor)
     assert recording.truth.shape == (150, 4, 3)
-    assert not recording.judged[:100].any()
+    assert not recording.is_scored[:100].any()
     tuned = kalman_tuning.tune(recording, evaluations=10)
     before, after = (kalman_tuning.rmse(c, recording).mean() for c in (KalmanConfig(), tuned))
     assert after <= before

@@ -1,4 +1,4 @@
-"""What the network that knows legs learns from, and the file that comes of it."""
+"""Examples for the leg classifier, and its file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ ROOM = FloorPlan([[2.0, -1.5, 0.02]], [[-1.0, 4.0, 6.0, 4.0], [5.5, -4.0, 5.5, 4
 
 
 def recorded(path: Path, person: bool, labels: bool) -> Path:
-    """A file of scans as they are kept: a person who walks, or nobody, before a scanner that stands."""
+    """A file of scans of a fixed scanner: a person who walks, or nobody."""
     rng = np.random.default_rng(3)
     walker = Walker(way=[[2.5, -1.0], [2.5, 3.0]], speed=1.0)
     ranges, legs = [], []
@@ -35,17 +35,19 @@ def recorded(path: Path, person: bool, labels: bool) -> Path:
 
 
 def test_labels_name_legs_and_what_is_fixed_is_none(tmp_path: Path) -> None:
-    found = leg_examples.from_file(recorded(tmp_path / "legs_a.npz", True, True), np.random.default_rng(0))
+    found = leg_examples.read_examples_file(
+        recorded(tmp_path / "legs_a.npz", True, True), np.random.default_rng(0)
+    )
     assert 60 < found.legs.sum() < 240  # 40 scans of one or two things, each thinned three times
     assert (~found.legs).sum() > 40
 
 
-def test_who_walks_before_a_scanner_that_stands_is_told_without_labels(tmp_path: Path) -> None:
-    walking = leg_examples.from_file(
+def test_a_walking_person_is_found_without_labels_if_the_scanner_is_fixed(tmp_path: Path) -> None:
+    walking = leg_examples.read_examples_file(
         recorded(tmp_path / "legs_walk.npz", True, False), np.random.default_rng(0)
     )
     assert walking.legs.sum() > 40
-    nobody = leg_examples.from_file(
+    nobody = leg_examples.read_examples_file(
         recorded(tmp_path / "legs_none.npz", False, False), np.random.default_rng(0)
     )
     assert not nobody.legs.any()

@@ -36,7 +36,7 @@ def another(monkeypatch, tmp_path):
             parallel.join("cpu")
             yield process
         finally:
-            parallel.leave()
+            parallel.destroy_group()
             process.kill()
 
 
@@ -51,9 +51,9 @@ def test_two_processes_with_half_of_the_robots_each_learn_as_one(another, monkey
     assert not np.array_equal(command, other[2])
     for name, mine in weights.items():
         assert torch.equal(mine, other[0][name]), name
-    assert parallel.from_first("first") == "first"
+    assert parallel.broadcast("first") == "first"
     assert parallel.gather("first") == ["first", "second"]
     assert another.wait(30) == 0
-    parallel.leave()
+    parallel.destroy_group()
     for name, expected in update(slice(0, 8)).items():
         assert torch.allclose(together[name], expected, atol=1e-6), name

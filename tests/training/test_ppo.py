@@ -1,4 +1,4 @@
-"""The learner against closed form."""
+"""The learner against closed-form solutions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 
 from quadvel_description import symmetry  # noqa: E402
 from quadvel_training.networks import Gaussian, Mlp, Recurrent, torch_mirror  # noqa: E402
-from quadvel_training.ppo import Ppo, PpoConfig, Rollout, select, spreads  # noqa: E402
+from quadvel_training.ppo import Ppo, PpoConfig, Rollout, exploration_scales, select  # noqa: E402
 
 MIRROR_OBS, MIRROR_ACTION = torch_mirror(symmetry.OBSERVATION), torch_mirror(symmetry.JOINTS)
 
@@ -72,7 +72,7 @@ def test_the_critic_takes_its_steps_for_one_of_the_actor(steps):
     assert float(ppo.critic.value.detach()) == pytest.approx(1e-3 * steps, rel=0.01)  # Adam's rate a step
 
 
-def test_an_action_that_has_become_likely_beyond_all_numbers_leaves_the_weights_finite():
+def test_an_overflowing_likelihood_ratio_keeps_the_weights_finite():
     ppo = learner(epochs=2, mini_batches=1)
     one = rollout([[1.0], [-1.0]] * 3)
     one.mean[:] = 500.0  # from which the action, held to its bounds, was far
@@ -90,7 +90,7 @@ def test_a_run_ends_before_it_spoils_its_weights():
 
 
 @pytest.mark.parametrize(("target_kl", "rate"), [(None, 2e-3), (0.01, 1e-3)])
-def test_a_rate_that_is_not_adapted_is_that_of_the_recipe_where_a_run_goes_on(target_kl, rate):
+def test_a_fixed_learning_rate_comes_from_the_recipe_when_a_run_resumes(target_kl, rate):
     again = learner(learning_rate=2e-3, target_kl=target_kl)
     again.restore(learner(learning_rate=1e-3).state())
     assert again.learning_rate == again.actor_optimiser.param_groups[0]["lr"] == rate
@@ -143,7 +143,7 @@ def test_who_stands_may_prefer_a_side():
 
 
 def test_the_mirrored_sequence_of_a_mirrored_memory_is_the_mirror_of_the_past():
-    """Running the mirror of a whole sequence equals carrying the mirrored memory over a cut."""
+    """A mirrored sequence gives the same as two parts with the mirrored memory carried over."""
     torch.manual_seed(0)
     network = Recurrent(48, 12, memory=16, hidden=(16,))
     obs = torch.randn(10, 3, 48)
@@ -166,13 +166,13 @@ def test_each_robots_actions_are_judged_by_its_own_spread():
     torch.manual_seed(0)
     ppo = learner(correlation=0.9)
     r = rollout(0.0, t=5, n=8)
-    r.action, r.spread = 0.1 * torch.randn(5, 8, 12), torch.from_numpy(spreads(8))
+    r.action, r.spread = 0.1 * torch.randn(5, 8, 12), torch.from_numpy(exploration_scales(8))
     ids = torch.tensor([7, 2, 6, 0])
     assert torch.equal(ppo._log_prob(r, ids, r.mean[:, ids]), ppo._log_prob(r, slice(None), r.mean)[:, ids])
 
 
 def test_the_gradient_under_correlated_exploration_is_that_of_the_return():
-    """A mean that swings at 8 Hz: exploration carries each draw on, which turns a naive gradient's phase by 60 degrees."""
+    """A mean that oscillates at 8 Hz; correlated noise turns a naive gradient's phase by 60 degrees."""
     torch.manual_seed(0)
     t, n, correlation, wanted = 75, 40000, 0.9, torch.tensor([1.0, 0.0])
     angle = 2 * torch.pi * 8.0 * 0.005 * torch.arange(t)
@@ -189,7 +189,7 @@ def test_the_gradient_under_correlated_exploration_is_that_of_the_return():
     network = Swing()
     actor = Gaussian(network, 1, 0.1)
     ppo = Ppo(actor, ConstantCritic(0.0), PpoConfig(correlation=correlation), lambda x: x, lambda x: x)
-    noise, spread = torch.zeros(t, n, 1), torch.from_numpy(spreads(n))
+    noise, spread = torch.zeros(t, n, 1), torch.from_numpy(exploration_scales(n))
     for k in range(t):
         noise[k] = (correlation * noise[k - 1] if k else 0.0) + 0.1 * spread * torch.randn(n, 1)
     reward = -((noise - (wave @ wanted)[:, None, None]) ** 2)[..., 0]

@@ -1,4 +1,4 @@
-"""Stage 1: the grid of commands, the rewards, and a run that survives broken physics and being killed."""
+"""Stage 1: the command grid, and a run that survives diverged physics and being killed."""
 
 from __future__ import annotations
 
@@ -11,17 +11,23 @@ torch = pytest.importorskip("torch", reason="training needs torch: pip install '
 from quadvel_description import robot, symmetry  # noqa: E402
 from quadvel_sim.terrain import Terrain  # noqa: E402
 from quadvel_training import loop, parallel, privileged  # noqa: E402
-from quadvel_training.command_grid import FIRST, WIDTH, CommandGrid, GridConfig  # noqa: E402
+from quadvel_training.command_grid import CELL_WIDTH, INITIAL_REACH, CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import EnvConfig, VelocityEnv  # noqa: E402
-from quadvel_training.privileged import Judgement, Numbered, Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
+from quadvel_training.privileged import (  # noqa: E402
+    CommandScorer,
+    NumberedCheckpoints,
+    Past,
+    PrivilegedConfig,
+    PrivilegedRun,
+)
 from quadvel_training.randomisation import Randomisation  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
-    HIGHEST,
-    LIFTING,
-    LOWEST,
+    AIRBORNE_RANGE,
+    MAX_REWARD,
+    MIN_REWARD,
     WalkingRewards,
     WalkingWeights,
-    hips_astray,
+    hip_deviation,
 )
 
 SMALL = PrivilegedConfig(n=6, threads=1, length=4)
@@ -40,7 +46,7 @@ def follow(grid, command, times, error=(0.0, 0.0), fell=False):
 
 def test_commands_begin_near_rest_and_lie_within_the_limits(grid):
     drawn = grid.draw(np.random.default_rng(0), 2000)
-    assert (np.abs(drawn[:, :3]) <= np.array(FIRST) + 0.5 * np.array(WIDTH)).all()
+    assert (np.abs(drawn[:, :3]) <= np.array(INITIAL_REACH) + 0.5 * np.array(CELL_WIDTH)).all()
     grid.open[:] = grid.allowed
     limits = grid.config.limits()
     drawn = grid.draw(np.random.default_rng(0), 2000)
@@ -53,7 +59,9 @@ def test_commands_begin_near_rest_and_lie_within_the_limits(grid):
 def test_slow_commands_stay_frequent_however_large_the_grid(grid):
     grid.open[:] = grid.allowed
     drawn = grid.draw(np.random.default_rng(0), 4000)
-    slow = (np.abs(drawn[:, :3]) <= np.array(FIRST) + 0.5 * np.array(WIDTH)).all(axis=1) & (drawn[:, 3] == 0)
+    slow = (np.abs(drawn[:, :3]) <= np.array(INITIAL_REACH) + 0.5 * np.array(CELL_WIDTH)).all(axis=1) & (
+        drawn[:, 3] == 0
+    )
     assert np.mean(slow) > 0.2
     assert 0.2 < np.mean(drawn[slow, 2] == 0.0) < 0.8
 
@@ -81,11 +89,11 @@ def test_cells_close_again_where_commands_are_followed_no_more(grid):
     for ahead in (1.0, 1.5, 2.0):
         follow(grid, (ahead, 0.0, 0.0), 4)
     assert grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
-    assert grid.reach()["forward"] == 2.0
+    assert grid.summary()["forward"] == 2.0
     follow(grid, (2.0, 0.0, 0.0), 5, fell=True)
     assert not grid.open[grid.cell_of(np.array((2.5, 0.0, 0.0)))]
     assert grid.open[grid.cell_of(np.array((2.0, 0.0, 0.0)))]
-    assert grid.reach()["forward"] == 1.5
+    assert grid.summary()["forward"] == 1.5
 
 
 def test_what_is_followed_to_the_left_is_open_to_the_right(grid):
@@ -97,7 +105,7 @@ def test_what_is_followed_to_the_left_is_open_to_the_right(grid):
 
 
 def test_the_teachers_mirror_undoes_itself():
-    x = np.random.default_rng(0).normal(size=(3, privileged.SIZE))
+    x = np.random.default_rng(0).normal(size=(3, privileged.OBSERVATION_SIZE))
     assert np.array_equal(privileged.MIRROR(privileged.MIRROR(x)), x)
 
 
@@ -112,7 +120,7 @@ def test_the_mirrored_robot_observes_the_mirror_image():
         env._qpos[ids, 7:] = mirror(joints) + privileged.robot.NOMINAL_Q
         env._qvel[ids, 6:] = mirror(3 * joints)
         env._qvel[ids, :6] = [0.5, (0.1, -0.1)[ids], 0.0, (0.2, -0.2)[ids], 0.3, (0.4, -0.4)[ids]]
-    env._read()
+    env._update_state()
     past.advance(env.command)
     one, other = privileged.observe(env, past, np.stack([joints, symmetry.JOINTS(joints)]))
     assert np.allclose(privileged.MIRROR(one), other, atol=1e-5)
@@ -150,10 +158,10 @@ def test_an_error_that_lasts_is_that_of_this_command_alone_and_without_its_begin
     command = np.zeros((4, 4))
     command[:, :2], command[:, 2] = env.velocity[:, :2] + error[:2], env.angular_velocity[:, 2] + error[2]
     env.changed[:] = False
-    for _ in range(round(0.9 * privileged.TRANSIENT / env.config.period)):
+    for _ in range(round(0.9 * privileged.TRANSIENT_S / env.config.period)):
         past.advance(command)
     assert (past.lasting == 0.0).all()
-    for _ in range(round(10 * privileged.LONG / env.config.period)):
+    for _ in range(round(10 * privileged.LASTING_S / env.config.period)):
         past.advance(command)
     assert past.lasting == pytest.approx(np.tile(error, (4, 1)), rel=1e-3)
     env.changed[1] = True
@@ -169,7 +177,7 @@ def test_who_runs_off_rough_ground_has_no_time_left_but_has_not_fallen():
     env._qpos[:, :2] = 0.0
     env._qpos[2, 0] = 3.9
     env._qpos[:, 2] = 0.42
-    env._read()
+    env._update_state()
     assert env.timed_out.tolist() == [False, False, True, False]
     assert not env.fallen.any()
 
@@ -178,8 +186,8 @@ def test_no_sample_is_worth_more_or_less_than_the_bounds():
     env = VelocityEnv(CALM)
     rewards = WalkingRewards(env, WalkingWeights(scale=1.0, fall=0.0))
     awful, great = {"one": np.full(4, -1e9)}, {"one": np.full(4, 1e9)}
-    assert (rewards.total(awful, np.zeros(4, bool)) == LOWEST).all()
-    assert (rewards.total(great, np.zeros(4, bool)) == HIGHEST).all()
+    assert (rewards.total(awful, np.zeros(4, bool)) == MIN_REWARD).all()
+    assert (rewards.total(great, np.zeros(4, bool)) == MAX_REWARD).all()
 
 
 def test_following_turns_pays_as_following_speeds_does():
@@ -214,10 +222,10 @@ def test_a_robot_stands_once_its_four_feet_have_been_down_for_a_while():
     env = VelocityEnv(CALM)
     past, command = Past(env), np.zeros((4, 4))
     env.contact[:] = True
-    for _ in range(round(0.5 * privileged.STOOD / env.config.period)):
+    for _ in range(round(0.5 * privileged.STANDING_S / env.config.period)):
         past.advance(command)
     assert not past.standing.any()
-    for _ in range(round(privileged.STOOD / env.config.period)):
+    for _ in range(round(privileged.STANDING_S / env.config.period)):
         past.advance(command)
         env.contact[1, 2] = False
     assert past.standing.tolist() == [True, False, True, True]
@@ -232,17 +240,17 @@ def test_exploration_stays_wide_until_feet_lift_and_the_first_samples_are_over()
     run.samples = int(SMALL.formed)
     run._bound_exploration()
     assert run.actor.log_std.detach().exp().min() == pytest.approx(SMALL.forming_std)
-    run._note_airborne(LIFTING[1], 1.0)
+    run._update_airborne_share(AIRBORNE_RANGE[1], 1.0)
     with torch.no_grad():
         run.actor.log_std.fill_(-5.0)
     run._bound_exploration()
     assert run.actor.log_std.detach().exp().max() < 0.2
 
 
-def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
+def test_a_killed_run_resumes_with_its_random_numbers(tmp_path):
     first = PrivilegedRun(SMALL)
     first.step(0.0)
-    first._note_airborne(0.25, 1.0)
+    first._update_airborne_share(0.25, 1.0)
     follow(first.grid, (1.0, 0.0, 0.0), 4)
     loop.save(first.state(), tmp_path / "privileged.pt")
     second = PrivilegedRun(SMALL)
@@ -262,17 +270,17 @@ def test_a_killed_run_goes_on_as_it_was_with_numbers_drawn_on(tmp_path):
 
 def test_the_grid_hears_how_robots_of_all_processes_followed(monkeypatch, grid):
     command, fell = np.array([[1.0, 0, 0, 0], [0.5, 0, 0, 0]]), np.zeros(2, bool)
-    mine, other = Judgement(2), Judgement(2)
+    mine, other = CommandScorer(2), CommandScorer(2)
     for _ in range(100):
         other.advance(np.zeros((2, 3)), 0.02)
-    other.end(command, np.ones(2, bool), fell)
+    other.finish(command, np.ones(2, bool), fell)
     monkeypatch.setattr(parallel, "gather", lambda own: [own, other._over])
-    mine.tell(grid)
+    mine.report_to(grid)
     assert grid.success[grid.cell_of(command[0, :3])] > 0.0
     monkeypatch.setattr(parallel, "gather", lambda own: [own])
-    other.tell(again := CommandGrid(GridConfig()))
+    other.report_to(again := CommandGrid(GridConfig()))
     assert np.array_equal(again.success, grid.success)
-    other.tell(fresh := CommandGrid(GridConfig()))
+    other.report_to(fresh := CommandGrid(GridConfig()))
     assert not fresh.success.any()
 
 
@@ -294,7 +302,7 @@ def test_a_checkpoint_of_another_grid_is_refused_with_both_shapes():
 
 def test_the_learning_rate_is_bounded_once_a_gait_has_formed():
     run = PrivilegedRun(attrs.evolve(SMALL, formed=0.0, formed_rate=1e-5))
-    run._note_airborne(1.0, 1.0)
+    run._update_airborne_share(1.0, 1.0)
     run.step(0.0)
     assert run.ppo.learning_rate == 1e-5
     assert run.ppo.actor_optimiser.param_groups[0]["lr"] == 1e-5
@@ -302,7 +310,7 @@ def test_the_learning_rate_is_bounded_once_a_gait_has_formed():
 
 def test_numbered_checkpoints_are_kept(tmp_path):
     run = PrivilegedRun(attrs.evolve(SMALL, keep=1000.0))
-    keeper = Numbered(run, tmp_path)
+    keeper = NumberedCheckpoints(run, tmp_path)
     assert not keeper.due(900)
     assert keeper.due(1100)
     run.samples = 1100
@@ -314,7 +322,7 @@ def test_hips_away_from_straight_down_cost_and_less_so_sideways():
     env = VelocityEnv(EnvConfig(n=2, threads=1, randomisation=Randomisation.none()))
     env.q = np.tile(robot.NOMINAL_Q, (2, 1))
     env.q[:, ::3] = [0.1, -0.2, 0.0, 0.3]
-    assert hips_astray(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
+    assert hip_deviation(env, np.array([[1.0, 0.0, 0.5, 0.0], [0.0, -0.5, 0.0, 0.0]])) == pytest.approx(
         [0.6, 0.3]
     )
 

@@ -17,12 +17,15 @@ from quadvel_training.dagger import DaggerConfig
 from quadvel_training.estimator import EstimatorConfig
 from quadvel_training.loop import Budget
 from quadvel_training.privileged import PrivilegedConfig
-from quadvel_training.randomisation import actuator, sample_actuators
+from quadvel_training.randomisation import load_actuator, sample_actuators
 
 
 @pytest.fixture
 def ablation():
-    return {name: recipe.read(ConstrainedConfig, stages.RECIPES / f"{name}.yaml") for name in stages.ABLATION}
+    return {
+        name: recipe.read_recipe(ConstrainedConfig, stages.RECIPES / f"{name}.yaml")
+        for name in stages.ABLATION
+    }
 
 
 def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
@@ -55,15 +58,15 @@ def test_the_recipes_of_the_ablation_differ_in_what_is_compared_alone(ablation):
     ],
 )
 def test_the_stages_share_robots_and_commands(name, kind):
-    config = recipe.read(kind, stages.RECIPES / f"{name}.yaml")
+    config = recipe.read_recipe(kind, stages.RECIPES / f"{name}.yaml")
     assert config.randomisation.payload == (-2.0, 5.0)
-    teacher = recipe.read(PrivilegedConfig, stages.RECIPES / "privileged.yaml")
+    teacher = recipe.read_recipe(PrivilegedConfig, stages.RECIPES / "privileged.yaml")
     assert config.grid.limits() == teacher.grid.limits()
 
 
 def test_plain_pd_joints_have_gains_and_delays_of_their_own(ablation):
     config, ids = ablation["rl_pd"], np.arange(400)
-    joints = ActuatorModel(actuator(config.actuator), (400, 12))
+    joints = ActuatorModel(load_actuator(config.actuator), (400, 12))
     for _ in range(2):  # drawing again starts from the nominal joints, not from those drawn before
         sample_actuators(joints, ids, config.randomisation, np.random.default_rng(0))
     for drawn, (low, high) in (
@@ -90,12 +93,12 @@ def test_a_recipe_with_a_mistake_is_refused_by_file_and_field(tmp_path, text, co
     path = tmp_path / "mine.yaml"
     path.write_text(text)
     with pytest.raises(recipe.RecipeError, match=rf"mine[.]yaml: .*{complaint}"):
-        recipe.read(ConstrainedConfig, path)
+        recipe.read_recipe(ConstrainedConfig, path)
 
 
 def small(monkeypatch):
-    """Every stage takes a few robots and samples, whatever its recipe says."""
-    read, few = recipe.read, {"n": 4, "length": 4, "budget": Budget(40, 5.0)}
+    """Run every stage with few robots and samples, in place of its recipe's."""
+    read, few = recipe.read_recipe, {"n": 4, "length": 4, "budget": Budget(40, 5.0)}
 
     def read_small(kind, source):
         config = read(kind, source)
@@ -103,21 +106,21 @@ def small(monkeypatch):
         fields |= {"mini_batches": 2} if kind is EstimatorConfig else {}
         return attrs.evolve(config, **fields)
 
-    monkeypatch.setattr(recipe, "read", read_small)
+    monkeypatch.setattr(recipe, "read_recipe", read_small)
 
 
 def test_all_stages_follow_each_other_and_what_is_done_is_not_done_again(tmp_path, monkeypatch):
     small(monkeypatch)
-    assert stages.everything(tmp_path, "cpu")
+    assert stages.train_all(tmp_path, "cpu")
     assert PolicyFile(tmp_path / "constrained_fine" / stages.POLICY_FILE).metadata.recipe["samples"] >= 40
     LearnedEstimator(tmp_path / "estimator" / stages.ESTIMATOR_FILE)
     kept = {path: loop.load(path)["samples"] for path in tmp_path.glob("*/*.pt")}
     assert len(kept) == 5
-    assert stages.everything(tmp_path, "cpu")
+    assert stages.train_all(tmp_path, "cpu")
     assert {path: loop.load(path)["samples"] for path in kept} == kept
 
 
-def test_the_ablation_gives_every_recipe_the_same_and_goes_on_where_it_was_stopped(tmp_path, monkeypatch):
+def test_the_ablation_gives_every_recipe_the_same_budget_and_resumes(tmp_path, monkeypatch):
     runs, stop_after = [], 2
 
     def train(config, source, start, teacher, folder, device):
@@ -131,10 +134,10 @@ def test_the_ablation_gives_every_recipe_the_same_and_goes_on_where_it_was_stopp
 
     monkeypatch.setattr(stages, "train_policy", train)
     start, teacher = tmp_path / "start.pt", tmp_path / "teacher.pt"
-    assert not stages.ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
-    assert stages.ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
+    assert not stages.train_ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
+    assert stages.train_ablation(start, teacher, 100.0, 64, 7, tmp_path, "cpu")
     order = ["rl_pd", "rl_eam", "rl_pd", "rl_eam", "crl_eam"]
-    own = recipe.read(ConstrainedConfig, stages.RECIPES / "crl_eam.yaml")
+    own = recipe.read_recipe(ConstrainedConfig, stages.RECIPES / "crl_eam.yaml")
     shares = own.pull_samples / own.budget.samples, own.constraint_samples / own.budget.samples
     same = (100.0, 64, 7, *np.round(shares, 9))
     assert runs == [(name, "start.pt", "teacher.pt", same, name) for name in order]

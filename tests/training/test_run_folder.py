@@ -1,4 +1,4 @@
-"""What a run of stage 3 leaves in its directory."""
+"""Content of the run directory of stage 3."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_run_keeps_what_it_is_and_how_it_fared(tmp_path, monkeypatch, drives):
     assert PolicyFile(folder / "kept" / kept[1]).metadata.actuator["effects"][0]["name"] == "coulomb_friction"
     assert loop.load(folder / "kept" / kept[2])["samples"] == 12
 
-    made_of = run_folder.made_of("constrained", None, config, folder / stages.POLICY)
-    assert made_of["samples"] == 18
-    assert made_of["hours"] >= 0.0
-    assert made_of["configuration"]["actuator"] == drives.name  # in a file that goes elsewhere
+    training_record = run_folder.training_record("constrained", None, config, folder / stages.POLICY)
+    assert training_record["samples"] == 18
+    assert training_record["hours"] >= 0.0
+    assert training_record["configuration"]["actuator"] == drives.name  # in a file that goes elsewhere

@@ -1,4 +1,4 @@
-"""Stage 1: the terms that make the teacher trot, each against its formula, and what is logged of its gait."""
+"""Stage 1: rewards of a trot, each against its formula, and the log of the gait."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from quadvel_training import gait_log, privileged  # noqa: E402
 from quadvel_training.command_grid import CommandGrid, GridConfig  # noqa: E402
 from quadvel_training.env import CommandRange, EnvConfig, VelocityEnv  # noqa: E402
 from quadvel_training.privileged import Past, PrivilegedConfig, PrivilegedRun  # noqa: E402
-from quadvel_training.randomisation import RATED_SPEED, RATED_STALL, Randomisation, rated  # noqa: E402
+from quadvel_training.randomisation import RATED_SPEED, RATED_STALL, Randomisation, rated_drives  # noqa: E402
 from quadvel_training.walking_rewards import (  # noqa: E402
-    FAST,
-    LIFTING,
-    PAIRED,
+    AIRBORNE_RANGE,
+    FULL_PAIRING_SHARE,
+    OVERSPEED_SHARE,
     WalkingRewards,
     WalkingWeights,
-    alike,
-    lifting,
-    one_diagonal_in_the_air,
+    is_one_diagonal_airborne,
+    lifting_weight,
+    synchronous_share,
 )
 
 N = 3
@@ -48,22 +48,22 @@ def terms(env, past, command=(0.5, 0.0, 0.0, 0.0), lifted=1.0):
 
 
 def test_lifting_grows_with_the_share_of_the_time_in_the_air():
-    low, high = LIFTING
-    assert [lifting(share) for share in (0.0, low, 0.5 * (low + high), high, 0.9)] == pytest.approx(
+    low, high = AIRBORNE_RANGE
+    assert [lifting_weight(share) for share in (0.0, low, 0.5 * (low + high), high, 0.9)] == pytest.approx(
         [0.0, 0.0, 0.5, 1.0, 1.0]
     )
 
 
 def test_diagonal_feet_are_alike_in_a_trot_and_differ_in_a_pace():
     contact = np.array([STANDING, TROT, PACE, (True, False, False, False)])
-    assert alike(contact) == pytest.approx([1.0, 1.0, 0.0, 0.5])
-    assert one_diagonal_in_the_air(contact).tolist() == [False, True, False, False]
-    assert not one_diagonal_in_the_air(np.zeros((1, 4), bool)).any()
+    assert synchronous_share(contact) == pytest.approx([1.0, 1.0, 0.0, 0.5])
+    assert is_one_diagonal_airborne(contact).tolist() == [False, True, False, False]
+    assert not is_one_diagonal_airborne(np.zeros((1, 4), bool)).any()
 
 
 def test_diagonal_pairs_are_paid_where_one_of_them_is_in_the_air_again_and_again(env, past):
     env.contact[:] = [STANDING, TROT, PACE]
-    past.paired[:] = [0.0, 0.5 * PAIRED, 2 * PAIRED]
+    past.paired[:] = [0.0, 0.5 * FULL_PAIRING_SHARE, 2 * FULL_PAIRING_SHARE]
     weight = WalkingWeights().diagonal
     for lifted in (0.0, 1.0):
         assert terms(env, past, lifted=lifted)["diagonal"] == pytest.approx([0.0, 0.5 * weight, 0.0])
@@ -79,8 +79,8 @@ def test_a_robot_that_trots_is_known_by_its_paired_feet_within_a_second(env, pas
         first = tick // 10 % 2 == 0
         env.contact[:] = [STANDING, TROT if first else other, PACE]
         past.advance(command)
-    assert past.paired == pytest.approx([0.0, 1.0 - (1.0 - 0.02 / privileged.PAIRING) ** 50, 0.0])
-    assert past.paired[1] > 2 * PAIRED
+    assert past.paired == pytest.approx([0.0, 1.0 - (1.0 - 0.02 / privileged.PAIRING_S) ** 50, 0.0])
+    assert past.paired[1] > 2 * FULL_PAIRING_SHARE
 
 
 def test_stance_is_fined_at_lift_off_by_how_far_its_middle_is_from_the_hip(env, past):
@@ -116,7 +116,7 @@ def test_sway_is_the_sideways_velocity_off_its_mean_over_a_stride(env, past):
 def test_roll_rate_and_joints_beyond_eight_tenths_of_their_drives_speed_are_fined(env, past):
     env.angular_velocity[:, 0] = [0.0, 2.0, 100.0]
     env.fastest[:] = 0.0
-    env.fastest[1] = FAST * robot.VELOCITY_LIMIT
+    env.fastest[1] = OVERSPEED_SHARE * robot.VELOCITY_LIMIT
     env.fastest[1, 2] += 1.5
     env.fastest[2, 0] = 1e3
     w = WalkingWeights()
@@ -166,10 +166,10 @@ def test_commands_reverse_where_the_contrary_may_be_drawn(commands):
 
 def test_a_rated_drive_gives_full_torque_at_rest_and_none_at_its_top_speed():
     stall, no_load = (
-        np.concatenate([[effect.intervals[name]] * len(effect.joints) for effect in rated().effects])
+        np.concatenate([[effect.intervals[name]] * len(effect.joints) for effect in rated_drives().effects])
         for name in ("stall", "no_load")
     )
-    names = [joint for effect in rated().effects for joint in effect.joints]
+    names = [joint for effect in rated_drives().effects for joint in effect.joints]
     order = robot.joint_index(names)
     assert sorted(order) == list(range(12))
     assert stall == pytest.approx(np.outer(robot.TORQUE_LIMIT[order], RATED_STALL))

@@ -1,1 +1,1 @@
-"""Training of quadvel's policy and velocity estimator. Needs torch; nothing of the run-time stack imports it."""
+"""Training of quadvel's policy, velocity estimator and leg classifier."""

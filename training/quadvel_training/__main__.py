@@ -1,4 +1,7 @@
-"""`python -m quadvel_training`: the stages of training, each resumable, and what makes policy files and their cards of them."""
+"""Command line of training, `python -m quadvel_training`.
+
+It runs the stages, each resumable, and tools for policy files.
+"""
 
 from __future__ import annotations
 
@@ -37,10 +40,10 @@ from .card import card
 
 app = typer.Typer(
     no_args_is_help=True,
-    help="Train quadvel's policy and estimator. `all` runs the stages one after the other: privileged, dagger, constrained, "
-    "estimator; `ablation` and `tune` run the last but one with recipes of their own. Every run resumes where its directory "
-    "stands; Ctrl-C saves. Stages learn in several processes where torchrun starts them, on several "
-    "machines if these share the directory: torchrun --nproc-per-node 2 -m -- quadvel_training all",
+    help="Train quadvel's policy and estimator. `all` runs the stages in order: privileged, dagger, constrained, "
+    "estimator; `ablation` and `tune` run constrained with other recipes. Ctrl-C saves; the same command resumes. "
+    "torchrun trains in several processes, on several machines if these share the directory: "
+    "torchrun --nproc-per-node 2 -m -- quadvel_training all",
 )
 
 Out = Annotated[
@@ -52,13 +55,13 @@ Recipe = Annotated[
         "--recipe", help="YAML file whose fields replace the defaults; see training/recipes.", dir_okay=False
     ),
 ]
-Minutes = Annotated[float | None, typer.Option(help="Stop after this long.")]
-Device = Annotated[str, typer.Option(help="Where networks are: cpu or cuda. Physics stays on the CPU.")]
+Minutes = Annotated[float | None, typer.Option(help="Time limit, minutes.")]
+Device = Annotated[str, typer.Option(help="Device of the networks: cpu or cuda. Physics runs on the CPU.")]
 TEACHER = Path("out/training/privileged") / stages.TEACHER
 STUDENT = Path("out/training/dagger") / stages.STUDENT
 POLICY = Path("out/training/constrained_fine") / stages.POLICY
 TeacherFile = Annotated[
-    Path, typer.Option("--teacher", help="Checkpoint of `privileged`, a numbered one too.", dir_okay=False)
+    Path, typer.Option("--teacher", help="Checkpoint of `privileged`, also a numbered one.", dir_okay=False)
 ]
 PolicyCheckpoint = Annotated[
     Path, typer.Option("--policy", help="Checkpoint of the policy, of `constrained` or `dagger`.")
@@ -66,26 +69,26 @@ PolicyCheckpoint = Annotated[
 
 
 def _configured(kind: type[Any], source: Path | None, minutes: float | None) -> Any:
-    """A configuration of `kind` from its defaults, the recipe's fields and the command line's budget."""
-    config = recipe.read(kind, source)
+    """Build a configuration from its defaults, the recipe's fields and the command line's budget."""
+    config = recipe.read_recipe(kind, source)
     if minutes is not None:
         config = attrs.evolve(config, budget=attrs.evolve(config.budget, minutes=minutes))
     return config
 
 
 def _written(*paths: Path) -> None:
-    """Say so, in the one process that wrote them."""
+    """Print the written files, in the process that wrote them."""
     if parallel.rank() == 0:
         print("written:", *paths)
 
 
 @app.command("all")
 def train_everything(out: Out = Path("out/training"), device: Device = "cpu") -> None:
-    """From random weights to policy and estimator: every stage with its recipe, in folders of DIR; days of two cores.
+    """Run all stages with their recipes, from random weights to policy and estimator; days on two cores.
 
-    Ends with DIR/constrained_fine/policy.onnx and DIR/estimator/estimator.onnx. Goes on where it was stopped.
+    Writes DIR/constrained_fine/policy.onnx and DIR/estimator/estimator.onnx. The same command resumes it.
     """
-    if not stages.everything(out, device):
+    if not stages.train_all(out, device):
         raise typer.Exit(1)
     _written(out / "constrained_fine" / stages.POLICY_FILE, out / "estimator" / stages.ESTIMATOR_FILE)
 
@@ -94,9 +97,9 @@ def train_everything(out: Out = Path("out/training"), device: Device = "cpu") ->
 def train_privileged(
     out: Out = Path("out/training/privileged"), source: Recipe = None, minutes: Minutes = None
 ) -> None:
-    """Stage 1: a memoryless teacher finds its gait from random weights, by rewards alone.
+    """Stage 1: train a memoryless teacher from random weights, by rewards alone.
 
-    Numbered checkpoints go to DIR/kept; any of them, copied to DIR/privileged.pt, is where the same command goes on from.
+    Numbered checkpoints go to DIR/kept. To resume from one, copy it to DIR/privileged.pt and run the command again.
     """
     stages.train_teacher(_configured(privileged.PrivilegedConfig, source, minutes), source, out)
 
@@ -108,9 +111,9 @@ def train_dagger(
     source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
-    """Stage 2: the paper's network learns from that teacher while it drives itself.
+    """Stage 2: train the paper's network on the teacher's actions while it drives the robots (DAgger).
 
-    Writes DIR/policy.onnx; `quadvel eval --policy DIR/policy.onnx` says how it walks.
+    Writes DIR/policy.onnx; evaluate it with `quadvel eval --policy DIR/policy.onnx`.
     """
     stages.train_student(_configured(dagger.DaggerConfig, source, minutes), source, teacher, out)
     _written(out / stages.POLICY_FILE)
@@ -125,9 +128,9 @@ def train_constrained(
     minutes: Minutes = None,
     device: Device = "cpu",
 ) -> None:
-    """Stage 3: constrained reinforcement learning of that network, pulled by the teacher, strongly at first.
+    """Stage 3: train that network by constrained reinforcement learning, with a pull to the teacher that fades.
 
-    Writes DIR/policy.onnx; on the way, policies and what a quick evaluation says of them go to DIR/kept.
+    Writes DIR/policy.onnx. Intermediate policies and their quick evaluations go to DIR/kept.
     """
     config = _configured(constrained.ConstrainedConfig, source, minutes)
     stages.train_policy(config, source, start, teacher, out, device)
@@ -138,29 +141,32 @@ def train_constrained(
 def train_ablation(
     start: Annotated[Path, typer.Option(help="Checkpoint of `dagger` that all three start from.")] = STUDENT,
     teacher: TeacherFile = TEACHER,
-    samples: Annotated[float, typer.Option(help="Of each recipe, the budget that is equal for all.")] = 6e7,
-    robots: Annotated[int, typer.Option(min=2, help="Fewer learn in more, noisier steps.")] = 512,
-    seed: Annotated[int, typer.Option(help="Of all draws.")] = 3,
+    samples: Annotated[float, typer.Option(help="Budget of each recipe, in samples.")] = 6e7,
+    robots: Annotated[
+        int, typer.Option(min=2, help="Number of robots; fewer mean more and noisier steps.")
+    ] = 512,
+    seed: Annotated[int, typer.Option(help="Seed of all draws.")] = 3,
     out: Annotated[Path, typer.Option(help="Folder for the runs and their policy files.")] = Path(
         "out/ablation"
     ),
     device: Device = "cpu",
 ) -> None:
-    """Train rl_pd, rl_eam and crl_eam from one start, one after the other; goes on where it was stopped.
+    """Train rl_pd, rl_eam and crl_eam from one start, in order; the same command resumes it.
 
-    Pull, exploration and constraints change over the same shares of the budget as in the recipe's own.
+    Schedules of pull, exploration and constraints scale with the budget.
 
     \b
     Then:
       quadvel paper --out out/ablation/paper --policy rl_pd=out/ablation/rl_pd/policy.onnx \\
         --policy rl_eam=out/ablation/rl_eam/policy.onnx --policy crl_eam=out/ablation/crl_eam/policy.onnx
     """
-    if not stages.ablation(start, teacher, samples, robots, seed, out, device):
+    if not stages.train_ablation(start, teacher, samples, robots, seed, out, device):
         raise typer.Exit(1)
     _written(*(out / name / stages.POLICY_FILE for name in stages.ABLATION))
 
 
 def _actuator_file(path: Path) -> Path:
+    """Check an actuator file given as an option."""
     try:
         ActuatorParameters.load(path)
     except ValueError as error:
@@ -176,15 +182,15 @@ def tune_policy(
     ],
     policy: PolicyCheckpoint = POLICY,
     minutes: Annotated[
-        float, typer.Option(min=0.1, help="How long; counts anew where it is resumed.")
+        float, typer.Option(min=0.1, help="Duration, minutes; starts again when resumed.")
     ] = 20.0,
     out: Out = Path("out/tuned"),
     device: Device = "cpu",
 ) -> None:
-    """Tune a policy on a corrected actuator model for a short while: DIR/policy.onnx.
+    """Tune a policy on a corrected actuator model for a short time; writes DIR/policy.onnx.
 
     \b
-    Before and after, on the plants of the gap:
+    Compare before and after on the plants of the gap:
       quadvel paper --out out/gap --only gap --policy before=BEFORE.onnx --policy after=DIR/policy.onnx
     """
     _written(stages.tune(actuator, policy, minutes, out, device))
@@ -202,7 +208,7 @@ def record_log(
     out: Annotated[Path, typer.Option(help="NPZ file for `quadvel identify`.")],
     policy: WalkingPolicy = SHIPPED_POLICY,
 ) -> None:
-    """Record a walk on a plant whose drives hold what training never saw, as a log for `quadvel identify`."""
+    """Record a walk on a plant whose drives have an effect that training never saw, as a log for `quadvel identify`."""
     try:
         gap.write_walk_log(policy, plant, out)
     except ValueError as error:
@@ -217,12 +223,12 @@ def close_the_loop(
     ],
     plant: Plant = "friction",
     policy: WalkingPolicy = SHIPPED_POLICY,
-    minutes: Annotated[float, typer.Option(min=0.1, help="How long the policy is tuned.")] = 20.0,
-    out: Annotated[Path, typer.Option(help="Folder for all that comes of it.")] = Path("out/loop"),
+    minutes: Annotated[float, typer.Option(min=0.1, help="Duration of the tuning, minutes.")] = 20.0,
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("out/loop"),
 ) -> None:
     """Record a walk on a plant that training never saw, correct the model, tune the policy on it, and compare.
 
-    Runs `record`, `quadvel identify`, `tune` and `quadvel paper --only gap`; files that are there already are kept.
+    Runs `record`, `quadvel identify`, `tune` and `quadvel paper --only gap`; existing files are kept.
     """
     try:
         _written(closing.close_the_loop(plant, policy, checkpoint, minutes, out))
@@ -237,16 +243,16 @@ def train_estimator(
     source: Recipe = None,
     minutes: Minutes = None,
 ) -> None:
-    """The linear-velocity estimator, on the policy's own walks: DIR/estimator.onnx."""
+    """Train the linear-velocity estimator on the policy's walks; writes DIR/estimator.onnx."""
     stages.train_estimator(_configured(estimator.EstimatorConfig, source, minutes), source, policy, out)
     _written(out / stages.ESTIMATOR_FILE)
 
 
 @app.command("kalman")
 def tune_kalman(policy: PolicyCheckpoint = POLICY, source: Recipe = None) -> None:
-    """Tune the Kalman filter's noise on the same kind of walks; prints what belongs into `KalmanConfig`."""
-    config = recipe.read(kalman_tuning.TuningConfig, source)
-    recording = kalman_tuning.record(config, dagger.policy_of(policy))
+    """Tune the Kalman filter's noise on the same kind of walks; prints the fields of `KalmanConfig`."""
+    config = recipe.read_recipe(kalman_tuning.TuningConfig, source)
+    recording = kalman_tuning.record(config, dagger.load_policy(policy))
     before = kalman_tuning.rmse(KalmanConfig(), recording)
     with Progress(*Progress.get_default_columns(), TextColumn("{task.fields[error]}")) as progress:
         task = progress.add_task("kalman", total=config.evaluations, error="")
@@ -266,9 +272,9 @@ Scans = Annotated[Path, typer.Option(help="Folder with files legs_*.npz of real 
 
 @app.command("legs")
 def train_legs(scans: Scans, out: Out = Path("out/training/legs"), source: Recipe = None) -> None:
-    """The network that tells legs in laser scans, on real and simulated ones: DIR/legs.onnx; minutes."""
-    config = recipe.read(leg_classifier.LegConfig, source)
-    run_folder.describe(out, "legs", source, config)
+    """Train the network that finds legs in laser scans, on real and simulated scans; writes DIR/legs.onnx in minutes."""
+    config = recipe.read_recipe(leg_classifier.LegConfig, source)
+    run_folder.write_run_file(out, "legs", source, config)
     real, made = leg_classifier.read_examples(config, scans)
     network = leg_classifier.train(config, list(real.values()), made)
     about = {"files": [file.name for file in real], "configuration": attrs.asdict(config)}
@@ -278,8 +284,8 @@ def train_legs(scans: Scans, out: Out = Path("out/training/legs"), source: Recip
 
 @app.command("legs-left-out")
 def cross_validate_legs(scans: Scans, source: Recipe = None) -> None:
-    """How well that network does on each file of scans when it has learned from the others alone."""
-    config = recipe.read(leg_classifier.LegConfig, source)
+    """Cross-validate that network: evaluate each file of scans with a network trained on the others."""
+    config = recipe.read_recipe(leg_classifier.LegConfig, source)
     for name, figures in leg_classifier.cross_validate(config, *leg_classifier.read_examples(config, scans)):
         print(
             f"{name}: " + ", ".join(f"{figure} {value:.3g}" for figure, value in figures.items()), flush=True
@@ -288,15 +294,15 @@ def cross_validate_legs(scans: Scans, source: Recipe = None) -> None:
 
 @app.command("limit")
 def limit(
-    policy: Annotated[Path, typer.Argument(help="Policy file; its metadata are rewritten.", dir_okay=False)],
+    policy: Annotated[Path, typer.Argument(help="Policy file; its metadata is rewritten.", dir_okay=False)],
     forward: Annotated[float | None, typer.Option(help="Fastest forward, m/s.", min=0.0)] = None,
     backward: Annotated[float | None, typer.Option(help="Fastest backward, m/s.", min=0.0)] = None,
     sideways: Annotated[float | None, typer.Option(help="Fastest to either side, m/s.", min=0.0)] = None,
     turn: Annotated[float | None, typer.Option(help="Fastest turn either way, rad/s.", min=0.0)] = None,
 ) -> None:
-    """Narrow the commands that a policy file answers; what is not given stays. Write its card again afterwards.
+    """Narrow the commands that a policy file accepts; limits that are not given stay. Write its card again afterwards.
 
-    `quadvel paper --only sustained` shows which share of the drives' speed a command needs.
+    `quadvel paper --only sustained` shows the share of the drives' speed that each command needs.
     """
     known = PolicyFile(policy).metadata.limits
     low, high = list(known.low), list(known.high)
@@ -329,8 +335,8 @@ def write_card(
 
 
 def main() -> None:
-    """The program; what is wrong with a file is told in one sentence."""
-    torch.set_num_threads(env.cores())
+    """Run the program; errors in files are printed in one sentence."""
+    torch.set_num_threads(env.available_cores())
     try:
         app()
     except (recipe.RecipeError, loop.CheckpointError, FileNotFoundError) as error:

@@ -1,7 +1,8 @@
-"""Our learner against cusrl's recurrent PPO: the measurement behind docs/decisions/0007-own-learner.md.
+"""Speed of our learner compared with cusrl's recurrent PPO (docs/decisions/0007-own-learner.md).
 
-Same networks, environments, sequence length, epochs and mini-batches, one thread, taken in turns. What counts is
-processor time, so that the ratios hold on a busy machine. It measures speed only, not how well either learns.
+Both have the same networks, environments, sequence length, epochs and mini-batches, run on one
+thread, and take turns. It measures processor time, so that the ratios hold on a busy machine. It
+does not measure how well either learns.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import attrs
 import numpy as np
 import torch
 import typer
+from typing_extensions import override
 
 from quadvel_description import symmetry
 from quadvel_policy.observation import DEFAULT_OBSERVATION
@@ -40,11 +42,16 @@ class OurLearner:
     """Inference and update of `ConstrainedRun` on random observations without resets."""
 
     def __init__(self, config: ConstrainedConfig) -> None:
+        """Create policy, critic and learner.
+
+        Args:
+            config: configuration of stage 3.
+        """
         self.config = config
         self.actor = Gaussian(Recurrent(OBS, 12), 12, config.std)
         self.actor.log_std.requires_grad_(False)
         self.ppo = Ppo(self.actor, Mlp(STATE, 1, CRITIC), config.ppo, MIRROR_OBS, MIRROR_ACTION)
-        self.seen = self.ppo.mirrored(config.n)
+        self.seen = self.ppo.mirrored_count(config.n)
         self.state = self.actor.network.initial_state(config.n)
         self.mirrored = self.actor.network.initial_state(self.seen)
 
@@ -68,13 +75,20 @@ class Noise(cusrl.Environment):
     """Random observations without resets, with the robot's sizes and mirrors."""
 
     def __init__(self, n: int) -> None:
-        # the symmetry loss asks for a mirror of the critic's input and never calls it
+        """Set sizes and mirrors.
+
+        Args:
+            n: number of environments.
+        """
+        # the symmetry loss requires a mirror of the critic's input but never calls it
         mirrors = {"mirror_action": MIRROR_ACTION, "mirror_state": MIRROR_OBS}
         super().__init__(OBS, 12, num_instances=n, state_dim=STATE, mirror_observation=MIRROR_OBS, **mirrors)
 
+    @override
     def reset(self, **_: Any) -> tuple[Any, ...]:
         return torch.randn(self.num_instances, OBS), torch.randn(self.num_instances, STATE), {}
 
+    @override
     def step(self, action: torch.Tensor) -> tuple[Any, ...]:
         never = torch.zeros(self.num_instances, 1, dtype=torch.bool)
         return *self.reset()[:2], torch.randn(self.num_instances, 1), never, never, {}
@@ -84,6 +98,11 @@ class Walk(Noise):
     """The environment, rewards and sensing of a `ConstrainedRun`."""
 
     def __init__(self, run: ConstrainedRun) -> None:
+        """Wrap a training run.
+
+        Args:
+            run: its environments and rewards are used.
+        """
         super().__init__(run.config.n)
         self.run, self.action = run, np.zeros((run.config.n, 12), np.float32)
 
@@ -91,6 +110,7 @@ class Walk(Noise):
         obs = dagger.observe(self.run.env, self.action)
         return torch.from_numpy(obs), torch.from_numpy(self.run._critic_obs())
 
+    @override
     def reset(self, *, indices: Any = None, **_: Any) -> tuple[Any, ...]:
         ids = np.arange(self.num_instances) if indices is None else np.asarray(indices)
         self.run.env.reset(ids)
@@ -99,6 +119,7 @@ class Walk(Noise):
         obs, state = self._observe()
         return obs[ids], state[ids], {}
 
+    @override
     def step(self, action: torch.Tensor) -> tuple[Any, ...]:
         env, self.action = self.run.env, action.numpy().copy()
         env.tick(self.run.map.targets(self.action))
@@ -110,6 +131,7 @@ class Walk(Noise):
 class PartSymmetry(cusrl.hook.MirrorSymmetryLoss):
     """The symmetry loss on a quarter of each mini-batch, as in ours."""
 
+    @override
     def objective(self, metadata: dict[str, Any], batch: dict[str, Any]) -> Any:
         names = {"observation", "done", "curr_action_dist", "mirrored_actor_memory"} & set(batch)
         seen = batch["done"].shape[1] // 4
@@ -118,9 +140,16 @@ class PartSymmetry(cusrl.hook.MirrorSymmetryLoss):
 
 
 def cusrl_agent(config: ConstrainedConfig, env: Noise, recurrent_critic: bool, lean: bool) -> Any:
-    """cusrl's PPO of our sizes, and its defaults for what costs no time.
+    """Create cusrl's PPO with our sizes, and its defaults where they cost no time.
 
-    `lean`: symmetry on a quarter of each mini-batch, and no statistics pass after each update.
+    Args:
+        config: configuration of stage 3.
+        env: environment.
+        recurrent_critic: whether the critic is an LSTM, too.
+        lean: symmetry on a quarter of each mini-batch, and no statistics pass after each update.
+
+    Returns:
+        The agent.
     """
     p, preset, hook = config.ppo, cusrl.preset, cusrl.hook
     mlp = partial(cusrl.Mlp.Factory, activation_fn="SiLU", ends_with_activation=True)
@@ -145,9 +174,17 @@ def cusrl_agent(config: ConstrainedConfig, env: Noise, recurrent_critic: bool, l
 
 
 class TheirLoop:
-    """cusrl's rollout and update, as its trainer does them, without logging."""
+    """Rollout and update of cusrl, as its trainer does them, without logging."""
 
     def __init__(self, config: ConstrainedConfig, env: Noise, recurrent_critic: bool, lean: bool) -> None:
+        """Create the agent.
+
+        Args:
+            config: configuration of stage 3.
+            env: environment.
+            recurrent_critic: whether the critic is an LSTM, too.
+            lean: as in `cusrl_agent`.
+        """
         self.env, self.agent = env, cusrl_agent(config, env, recurrent_critic, lean)
         self.seen = env.reset()[:2]
 
@@ -165,7 +202,14 @@ class TheirLoop:
 
 
 def contestants(config: ConstrainedConfig) -> dict[str, Jobs]:
-    """By name: a call of the learner alone, and one of the whole loop with physics."""
+    """Create what is compared.
+
+    Args:
+        config: configuration of stage 3.
+
+    Returns:
+        By name: a call of the learner alone, and one of the whole loop with physics.
+    """
     everywhere = attrs.evolve(config, ppo=attrs.evolve(config.ppo, symmetric_share=1.0))
     jobs: dict[str, Jobs] = {}
     for name, c in {"ours, symmetry on a quarter": config, "ours, symmetry on all": everywhere}.items():

@@ -1,8 +1,8 @@
-"""How far training is from what its parts allow on this machine, as ratios measured in one run.
+"""Benchmark of training: its speed as a ratio to what its parts allow on this machine.
 
-`environment`: a tick with actuators, sensing and rewards against bare `mujoco.batch` steps from the same states. `training`:
-a whole update (rollout and learning, symmetry and smoothness on) against the bare steps and bare passes of the same
-networks over the same sizes, and the shares that its parts have in it.
+`environment` compares a tick with actuators, sensing and rewards to bare `mujoco.batch` steps from
+the same states. `training` compares a whole update (rollout and learning, with symmetry and
+smoothness) to bare steps and bare passes of the same networks over the same sizes.
 """
 
 from __future__ import annotations
@@ -24,11 +24,13 @@ from .networks import Mlp, Recurrent
 from .rewards import RewardWeights, Table2
 
 
-def _in_turn(jobs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str, NDArray[np.float64]]:
-    """Seconds (rounds,) that each job took, after a call of each to warm up.
+def _time_interleaved(
+    jobs: Mapping[str, Callable[[], object]], rounds: int
+) -> dict[str, NDArray[np.float64]]:
+    """Time jobs in turn, after a warm-up call of each; return seconds (rounds,) of each job.
 
-    In each round they run one after the other, so that what slows the machine down for a while falls on all of them
-    alike: ratios within a round hold where times do not.
+    In each round the jobs run one after the other, so that a slow phase of the machine affects all
+    of them: ratios within a round hold where times do not.
     """
     for job in jobs.values():
         job()
@@ -44,7 +46,7 @@ def _in_turn(jobs: Mapping[str, Callable[[], object]], rounds: int) -> dict[str,
 def _rate_and_ratio(
     amount: str, count: int, whole: NDArray[np.float64], bare: NDArray[np.float64]
 ) -> dict[str, float]:
-    """How many of `count` a second the whole and its bare parts do, and the ratio of both; medians over the rounds."""
+    """Return median rates per second of the whole and its bare parts, and their ratio."""
     return {
         f"{amount}_per_s": count / float(np.median(whole)),
         f"bare_{amount}_per_s": count / float(np.median(bare)),
@@ -53,9 +55,10 @@ def _rate_and_ratio(
 
 
 def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
-    """One tick's physics alone: the steps of as many robots, none of them varied, from the states of `env` and on its torques.
+    """Physics of one tick for nominal robots, from the states and torques of `env`.
 
-    From the same states, as robots on their feet are quicker to simulate than robots pushed and stumbling.
+    It uses the same states because robots on their feet are faster to simulate than robots that
+    stumble.
     """
     batch = Batch(training_model(env.config.timestep, env.config.terrain), env.config.n, env.config.threads)
     rows = [(batch.bind(name), env.batch.bind(name)) for name in ("qpos", "qvel", "ctrl")]
@@ -70,7 +73,16 @@ def _bare_tick(env: VelocityEnv) -> Callable[[], None]:
 
 
 def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict[str, float]:
-    """Steps a second of the environment with everything on, of the bare batch, and their ratio."""
+    """Measure the environment against the bare batch.
+
+    Args:
+        n: number of robots.
+        threads: threads of the physics.
+        timestep: s, of the physics.
+
+    Returns:
+        Steps per second of both, and their ratio.
+    """
     config = EnvConfig(n=n, threads=threads, timestep=timestep)
     env = VelocityEnv(config)
     rewards = Table2(env, RewardWeights())
@@ -81,14 +93,14 @@ def environment(n: int = 512, threads: int = 2, timestep: float = 0.001) -> dict
         env.tick(np.tile(env.stand_q, (n, 1)))
         rewards(action)
 
-    seconds = _in_turn({"whole": tick, "bare": _bare_tick(env)}, 60)
+    seconds = _time_interleaved({"whole": tick, "bare": _bare_tick(env)}, 60)
     return _rate_and_ratio("steps", n * env.substeps, seconds["whole"], seconds["bare"])
 
 
 def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], float]]:
-    """What an update can't do without, each with how often it needs it: physics, and passes of networks of its sizes.
+    """Physics and network passes that an update needs at least, each with its number of calls.
 
-    The passes are inference, and forward and backward those of actor, mirrored actor and critic.
+    The passes are inference, and forward and backward passes of actor, mirrored actor and critic.
     """
     config, size = run.config, DEFAULT_OBSERVATION.size
     p, n, length = config.ppo, config.n, config.length
@@ -105,7 +117,7 @@ def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], fl
         return lambda: network(x, state)[0].square().mean().backward()
 
     batch, batches = n // p.mini_batches, p.epochs * p.mini_batches
-    few = 16  # ticks at once, to be seen beside a whole update
+    few = 16  # ticks per call, long enough to be timed next to an update
     return {
         "physics": (_repeated(_bare_tick(run.env), few), length / few),
         "inference": (_repeated(infer, few), length / few),
@@ -116,6 +128,8 @@ def _bare_parts(run: ConstrainedRun) -> dict[str, tuple[Callable[[], object], fl
 
 
 def _repeated(job: Callable[[], object], times: int) -> Callable[[], None]:
+    """Return a function that calls `job` several times."""
+
     def repeated() -> None:
         for _ in range(times):
             job()
@@ -124,12 +138,20 @@ def _repeated(job: Callable[[], object], times: int) -> Callable[[], None]:
 
 
 def training(config: ConstrainedConfig | None = None, updates: int = 5) -> dict[str, float]:
-    """Policy samples a second of the whole loop, of its bare parts, their ratio, and the shares of the loop's parts."""
+    """Measure a whole update against its bare parts.
+
+    Args:
+        config: configuration of stage 3, the default if None.
+        updates: number of updates.
+
+    Returns:
+        Policy samples per second of both, their ratio, and the shares of the parts.
+    """
     config = config or ConstrainedConfig(critic_first=0)
     run = ConstrainedRun(config)
     seen: list[dict[str, float]] = []
     parts = _bare_parts(run)
-    seconds = _in_turn(
+    seconds = _time_interleaved(
         {"whole": lambda: seen.append(run.step(0.0))} | {name: job for name, (job, _) in parts.items()},
         updates,
     )

@@ -1,6 +1,7 @@
-"""The model card of a policy or estimator file: what its metadata and an evaluation say, as Markdown.
+"""Model card of a policy or estimator file, from its metadata and evaluations, as Markdown.
 
-Nothing is measured here, and nothing is said that does not follow from the two files, but that no robot was there.
+Nothing is measured here. The only statement that does not follow from these files is that no robot
+was involved.
 """
 
 from __future__ import annotations
@@ -21,12 +22,16 @@ UNITS = {"vx": "m/s", "vy": "m/s", "wz": "rad/s"}
 
 
 def card(network: Path, evaluations: Sequence[Path], paper: Path | None = None) -> str:
-    """The text of a network file's card.
+    """Write the text of a model card.
 
     Args:
-        network: the policy or estimator file.
+        network: policy or estimator file.
         evaluations: results of `quadvel eval`, files or folders.
-        paper: folder of `quadvel paper`; its gait, sustained and robustness sections go into a policy's card.
+        paper: folder of `quadvel paper`; its gait, sustained and slopes sections go into a policy's
+            card.
+
+    Returns:
+        Markdown.
 
     Raises:
         ValueError: results of another network.
@@ -64,6 +69,7 @@ ESTIMATOR = "A recurrent estimator of the AlienGo's linear velocity from IMU, en
 
 
 def _metadata(network: Path) -> dict[str, Any]:
+    """Read the metadata of a network file."""
     texts = {entry.key: entry.value for entry in read_network(network).metadata_props}
     if METADATA_KEY not in texts:
         raise ValueError(f"{network}: no metadata {METADATA_KEY}, expected a policy or an estimator")
@@ -72,7 +78,7 @@ def _metadata(network: Path) -> dict[str, Any]:
 
 
 def _check_belongs(network: Path, evaluated: str, evaluation: Path) -> None:
-    """Refuse an evaluation of another network."""
+    """Raise ValueError if an evaluation is of another network."""
     other = Path(evaluated)
     same = other.read_bytes() == network.read_bytes() if other.exists() else other.name == network.name
     if not same:
@@ -80,6 +86,7 @@ def _check_belongs(network: Path, evaluated: str, evaluation: Path) -> None:
 
 
 def _origin(metadata: Json) -> Iterable[tuple[str, str]]:
+    """Yield rows about the training."""
     recipe = metadata.get("recipe") or {}
     for name in ("stage", "recipe", "samples"):
         value = recipe.get(name, "not kept")
@@ -89,10 +96,11 @@ def _origin(metadata: Json) -> Iterable[tuple[str, str]]:
         yield f"`{field}`", f"`{json.dumps(setting)}`"
     yield "commit", metadata["commit"]
     if "actuator" in metadata:
-        yield "actuator model", _drives(metadata["actuator"])
+        yield "actuator model", _actuator_text(metadata["actuator"])
 
 
-def _drives(actuator: Json | None) -> str:
+def _actuator_text(actuator: Json | None) -> str:
+    """Describe the actuator model in one line."""
     if not actuator:
         return "not kept"
     delays = [1e3 * (pair["input_delay_s"] + pair["output_delay_s"]) for pair in actuator["pairs"]]
@@ -104,13 +112,14 @@ def _drives(actuator: Json | None) -> str:
 
 
 def _conditions(setup: Json) -> str:
+    """Describe the conditions of an evaluation."""
     drawn = "drawn at random" if setup["randomised"] else "nominal"
     seeds = "1 seed" if setup["seeds"] == 1 else f"{setup['seeds']} seeds"
     return f"{setup['grid']} grid, {seeds}, {setup['terrain']} ground, {drawn} robot, {setup['estimator']} estimator"
 
 
 def _measured(found: Json, estimator: bool) -> list[str]:
-    """The table of an evaluation; of an estimator's, what is said of estimators."""
+    """Return the table of an evaluation; for an estimator, its figures alone."""
     rows = [
         (name, _number(value))
         for name, value in comparison_figures(found).items()
@@ -121,11 +130,11 @@ def _measured(found: Json, estimator: bool) -> list[str]:
 
 SECTIONS = ("gait.json", "sustained.json", "slopes.json")
 Rows = Sequence[tuple[str, str, float | None]]
-"""What was measured, its unit, and the figure."""
+"""Name, unit and value of a figure"""
 
 
 def _read_section(network: Path, file: Path) -> Rows:
-    """The rows of a section of `quadvel paper`. Raises ValueError where it was not made with this network."""
+    """Read a section of `quadvel paper`; raise ValueError for another network."""
     content = json.loads(file.read_text())
     digest = hashlib.sha256(network.read_bytes()).hexdigest()
     names = [name for name, made in content["made_with"]["policies"].items() if digest.startswith(made)]
@@ -135,7 +144,7 @@ def _read_section(network: Path, file: Path) -> Rows:
 
 
 def _section(network: Path, file: Path) -> list[str]:
-    """The table of a section of `quadvel paper`."""
+    """Return the table of a section of `quadvel paper`."""
     rows = [
         (f"{what}, {unit}" if unit else what, _number(value))
         for what, unit, value in _read_section(network, file)
@@ -144,7 +153,7 @@ def _section(network: Path, file: Path) -> list[str]:
 
 
 def _paper_limits(network: Path, paper: Path) -> Iterable[str]:
-    """Limits that sections of `quadvel paper` show: the kind of gait, the drives' speed, slopes."""
+    """Yield limits shown by sections of `quadvel paper`: kind of gait, speed of the drives, slopes."""
     gait, sustained, slopes = (_read_section(network, paper / name) for name in SECTIONS)
     yield from _gait_limit(gait)
     yield from _drive_limits(sustained)
@@ -152,7 +161,7 @@ def _paper_limits(network: Path, paper: Path) -> Iterable[str]:
 
 
 def _gait_limit(rows: Rows) -> Iterable[str]:
-    """The kind of gait at 0.5 m/s."""
+    """Yield the kind of gait at 0.5 m/s."""
     found = {what: value for what, _, value in rows}
     names = ("feet of one side alike", "diagonal feet alike", "gait frequency")
     side, diagonal, steps = (found.get(f"0.5 m/s: {name}") for name in names)
@@ -166,7 +175,7 @@ def _gait_limit(rows: Rows) -> Iterable[str]:
 
 
 def _drive_limits(rows: Rows) -> Iterable[str]:
-    """The fastest joint of each plant, at the commands of the section."""
+    """Yield the fastest joint of each plant, at the commands of the section."""
     fastest: dict[str, float] = {}
     for what, _, value in rows:
         where, _, drive = what.rpartition(": ")
@@ -178,7 +187,7 @@ def _drive_limits(rows: Rows) -> Iterable[str]:
 
 
 def _slope_limits(rows: Rows) -> Iterable[str]:
-    """Slopes on which a robot fell or was stuck."""
+    """Yield the slopes on which robots fell or were stuck."""
     for what, _, value in rows:
         where, _, measured = what.rpartition(": ")
         if measured == "survive and follow" and value is not None and value < 100.0:
@@ -186,6 +195,7 @@ def _slope_limits(rows: Rows) -> Iterable[str]:
 
 
 def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
+    """Yield the known limits of a policy."""
     limits = metadata["command_limits"]
     spans = ", ".join(
         f"{axis} {limits[axis][0]:g} to {limits[axis][1]:g} {unit}" for axis, unit in UNITS.items()
@@ -194,7 +204,7 @@ def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
     if curve := metadata.get("curve_limit"):
         yield "Together vx and vy are held to the ellipse that these limits span, of which they use the part r."
         yield f"In curves |wz| is cut to {curve:g} m/s² (1 - r²) / (|vx| + |vy|)."
-    yield f"Its gains are part of it: kp {_one(metadata['kp'])} N m/rad, kd {_one(metadata['kd'])} N m s/rad."
+    yield f"Its gains are part of it: kp {_value_or_range(metadata['kp'])} N m/rad, kd {_value_or_range(metadata['kd'])} N m s/rad."
     for one in found:
         where, stood = _conditions(one["setup"]), [cell for cell in one["cells"] if not cell["fell"]]
         fell = sorted({_command(cell) for cell in one["cells"] if cell["fell"]})
@@ -207,23 +217,27 @@ def _policy_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
 
 
 def _estimator_limits(metadata: Json, found: Sequence[Json]) -> Iterable[str]:
+    """Yield the known limits of an estimator."""
     policies = ", ".join(sorted({Path(one["setup"]["policy"]).name for one in found}))
     yield f"Measured on walks under {policies} that ended on their feet; other gaits were not tried."
 
 
 def _command(cell: Json) -> str:
+    """Format the command of a cell."""
     return "({:g}, {:g}, {:g})".format(*cell["command"])
 
 
-def _one(values: Any) -> str:
-    """One number where all are alike."""
+def _value_or_range(values: Any) -> str:
+    """Format one number if all are equal, else their range."""
     numbers = sorted(set(values))
     return f"{numbers[0]:g}" if len(numbers) == 1 else f"{numbers[0]:g} to {numbers[-1]:g}"
 
 
 def _number(value: float | None) -> str:
+    """Format a figure; a dash if it is missing."""
     return "–" if value is None else f"{value:.4g}"
 
 
 def _table(head: str, second: str, rows: Iterable[tuple[str, str]]) -> list[str]:
+    """Return the lines of a table."""
     return [f"| {head} | {second} |", "|---|---|", *(f"| {name} | {value} |" for name, value in rows)]

@@ -1,5 +1,8 @@
-"""The loop closed on a plant that training never saw, as the commands that one would type: a walk is recorded, the model
-corrected from it, the policy tuned on that model, and both policies compared on the same plants."""
+"""Closed loop on a plant that training never saw, as a sequence of commands.
+
+A walk is recorded, the model corrected from it, the policy tuned on that model, and both policies
+compared on the same plants.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-from .env import cores
+from .env import available_cores
 
-STEPS = (  # the file that a step ends with, and what python runs for it
+STEPS = (  # file that a step writes, and arguments of python
     ("{out}/walk.npz", "-m quadvel_training record --plant {plant} --policy {policy} --out {file}"),
     ("{out}/identified/actuator.yaml", "-m quadvel_bringup identify {out}/walk.npz --out {out}/identified"),
     (
@@ -25,12 +28,23 @@ STEPS = (  # the file that a step ends with, and what python runs for it
 )
 
 
-def steps(
+def fill_steps(
     plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path
 ) -> list[tuple[Path, list[str]]]:
-    """STEPS for these: files and arguments of python. policy: the policy file that was written from `checkpoint`."""
+    """Fill `STEPS` in.
+
+    Args:
+        plant: plant of the gap.
+        policy: policy file that was written from `checkpoint`.
+        checkpoint: checkpoint of `constrained`.
+        minutes: how long the policy is tuned.
+        out: folder of the results.
+
+    Returns:
+        For each step, the file that it ends with and the arguments of python.
+    """
     known = {"plant": plant, "policy": policy, "checkpoint": checkpoint, "minutes": minutes, "out": out}
-    known["cores"] = cores()
+    known["cores"] = available_cores()
     filled = [(file.format(**known), command) for file, command in STEPS]
     return [
         (Path(file), [word.format(file=file, **known) for word in command.split()])
@@ -39,12 +53,23 @@ def steps(
 
 
 def close_the_loop(plant: str, policy: Path, checkpoint: Path, minutes: float, out: Path) -> Path:
-    """Run the steps whose files are not there yet; returns the page with both policies' errors.
+    """Run the steps whose files are missing; each command is printed before it runs.
 
-    Each command is printed before it runs. subprocess.CalledProcessError where one fails.
+    Args:
+        plant: plant of the gap.
+        policy: policy file that was written from `checkpoint`.
+        checkpoint: checkpoint of `constrained`.
+        minutes: how long the policy is tuned.
+        out: folder of the results.
+
+    Returns:
+        The page with the errors of both policies.
+
+    Raises:
+        subprocess.CalledProcessError: a command failed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    for file, arguments in (all_of_them := steps(plant, policy, checkpoint, minutes, out)):
+    for file, arguments in (all_of_them := fill_steps(plant, policy, checkpoint, minutes, out)):
         if file.exists():
             print(f"kept: {file}", flush=True)
         else:

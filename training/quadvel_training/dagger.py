@@ -1,9 +1,12 @@
-"""Stage 2: a recurrent student learns from the privileged teacher while it drives itself (DAgger).
+"""Stage 2: a recurrent student learns from the privileged teacher (DAgger, Ross et al. 2011).
 
-The student is the paper's plain network on the paper's 48 observations, nothing in front of it and nothing in its memory but
-what it learns. The teacher says everywhere what it would do, at every tick. Who drives a robot changes with an episode alone:
-a teacher that takes over from a stumbling student falls far more often than by itself, and its advice is worth little. Who
-drives is a matter of the robot, not drawn anew: else few are left to a student that falls soon.
+The student drives itself; it is the paper's plain network on the paper's 48 observations. The
+teacher labels every tick with its own action.
+
+The driver of a robot changes only with an episode: a teacher that takes over from a stumbling
+student falls far more often than by itself, and its advice is worth little. Each robot has a fixed
+place in the order in which the student takes over. If drivers were drawn for each episode, few
+robots would stay with a student that falls soon.
 """
 
 from __future__ import annotations
@@ -30,89 +33,139 @@ from quadvel_sim.terrain import Terrain
 
 from . import parallel, privileged
 from .command_grid import CommandGrid, GridConfig
-from .env import TICK, EnvConfig, VelocityEnv, cores
+from .env import TICK_S, EnvConfig, VelocityEnv, available_cores
 from .loop import Budget, CheckpointError, cosine, linear, load, set_rate
 from .networks import Gaussian, Mlp, Recurrent, State, select
 from .onnx_file import commit, export
-from .ppo import FAR, living_mean
+from .ppo import IMITATION_HUBER_DELTA, masked_mean
 from .privileged import ACTION_BOUND, ACTION_SCALE, Past
-from .randomisation import Randomisation, actuator
-from .walking_rewards import SAMPLE, sizes
+from .randomisation import Randomisation, load_actuator
+from .walking_rewards import SAMPLE_S, error_magnitudes
 
-AGO = round(SAMPLE / TICK)  # ticks between the teacher's actions as it learned them
-SPREAD = 3
-"""Ticks over which what it says is averaged: it learned with actions that are held, which come so much later than at once"""
+HOLD_TICKS = round(SAMPLE_S / TICK_S)  # the teacher learned with actions held for so long
+AVERAGED_TICKS = 3
+"""Ticks over which the teacher's actions are averaged: held actions act late by as much"""
 
 
 @attrs.frozen
 class DaggerConfig:
-    """One run of stage 2."""
+    """Configuration of stage 2; a recipe file sets these fields.
+
+    Attributes:
+        budget: when the run ends.
+        n: number of robots, of all processes together.
+        threads: threads of the physics.
+        length: ticks per sequence; 64 are 0.32 s.
+        mini_batches: optimiser steps per sequence.
+        learning_rate: at the start.
+        final_learning_rate: at the end.
+        driven: share of robots that the student drives at the end.
+        first_driven: the same at the start.
+        takeover: samples from `first_driven` to `driven`.
+        noise: standard deviation of the noise of every action, in the network's unit.
+        noise_time: s, time constant of the noise.
+        timestep: s, of the physics.
+        actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
+        seed: seed of all draws.
+        grid: commands; has to match the grid of the teacher, whose open cells are taken over.
+        terrain: ground.
+        randomisation: what varies between robots.
+    """
 
     budget: Budget = Budget(samples=2e7, minutes=60.0)
-    n: int = 512  # robots, of all processes together
-    threads: int = attrs.field(factory=cores)
-    length: int = 64  # ticks a sequence, 0.32 s
-    mini_batches: int = 8  # steps of the optimiser a sequence
+    n: int = 512
+    threads: int = attrs.field(factory=available_cores)
+    length: int = 64
+    mini_batches: int = 8
     learning_rate: float = 7e-4
     final_learning_rate: float = 7e-5
-    driven: float = 0.9  # share of robots that the student drives in the end,
-    first_driven: float = 0.2  # at first,
-    takeover: float = 2e6  # and ticks in between
-    noise: float = 0.09  # of every action, in the network's unit: standard deviation,
-    noise_time: float = 0.05  # s, and how long it lasts
-    timestep: float = 0.0025  # s, of physics
+    driven: float = 0.9
+    first_driven: float = 0.2
+    takeover: float = 2e6
+    noise: float = 0.09
+    noise_time: float = 0.05
+    timestep: float = 0.0025
     actuator: str = "eam"
     seed: int = 1
-    grid: GridConfig = GridConfig()  # the teacher's; its open cells come with it
+    grid: GridConfig = GridConfig()
     terrain: Terrain = Terrain()
     randomisation: Randomisation = Randomisation()
 
 
 class Teacher:
-    """The teacher of a checkpoint in a batch of environments, evaluated at every tick, its actions averaged over SPREAD of them.
+    """Teacher of a checkpoint, evaluated at every tick, with averaged actions.
 
-    Asked at every tick and not averaged, a teacher that learned with actions held for 20 ms falls where it does not fall held
-    (decision 43).
+    Actions are averaged over `AVERAGED_TICKS`, because it learned with actions held for 20 ms.
+    Evaluated at every tick without the average, it falls where it does not fall otherwise (decision
+    43).
+
+    Attributes:
+        actor: policy of the teacher.
+        env: environments.
     """
 
     def __init__(self, checkpoint: dict[str, Any], env: VelocityEnv, past: Past) -> None:
-        """past: what the robots of `env` have done, which whoever drives them keeps."""
-        self.actor = Gaussian(Mlp(privileged.SIZE, 12), 12, 1.0)
+        """Load the teacher.
+
+        Args:
+            checkpoint: content of a checkpoint of `privileged`.
+            env: environments.
+            past: past of their robots, which the caller advances.
+        """
+        self.actor = Gaussian(Mlp(privileged.OBSERVATION_SIZE, 12), 12, 1.0)
         self.actor.load_state_dict(checkpoint["actor"])
         self.env, self._past = env, past
         n = env.config.n
-        self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(AGO)], AGO)
-        self._said = np.zeros((SPREAD, n, 12), np.float32)  # the newest first
+        self._executed = deque([np.zeros((n, 12), np.float32) for _ in range(HOLD_TICKS)], HOLD_TICKS)
+        self._recent = np.zeros((AVERAGED_TICKS, n, 12), np.float32)  # newest first
         self._starts = np.ones(n, bool)
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget what `ids` did."""
+        """Clear the past of some robots.
+
+        Args:
+            ids: their indices.
+        """
         for action in self._executed:
             action[ids] = 0.0
         self._starts[ids] = True
 
     def action(self) -> np.ndarray:
-        """What it would do now, (n, 12); asked once a tick."""
+        """Evaluate the teacher; call it once per tick.
+
+        Returns:
+            (n, 12), action in the network's unit.
+        """
         obs = privileged.observe(self.env, self._past, self._executed[0])
         with torch.no_grad():
             now: np.ndarray = self.actor(torch.from_numpy(obs))[0].numpy().clip(-ACTION_BOUND, ACTION_BOUND)
-        self._said = np.concatenate([now[None], self._said[:-1]])
-        self._said[:, self._starts] = now[self._starts]
+        self._recent = np.concatenate([now[None], self._recent[:-1]])
+        self._recent[:, self._starts] = now[self._starts]
         self._starts[:] = False
-        mean: np.ndarray = self._said.mean(axis=0)
+        mean: np.ndarray = self._recent.mean(axis=0)
         return mean
 
     def advance(self, executed: np.ndarray) -> None:
-        """After a tick in which the actions `executed` (n, 12) were taken."""
+        """Record the actions of a tick.
+
+        Args:
+            executed: (n, 12), actions taken, in the network's unit.
+        """
         self._executed.append(executed.copy())
 
 
 class DaggerRun:
-    """Teacher, student and environment of stage 2."""
+    """Training run of stage 2: teacher, student and environments."""
 
     def __init__(self, config: DaggerConfig, teacher_file: Path) -> None:
+        """Create environments and student, and load the teacher.
+
+        Args:
+            config: configuration.
+            teacher_file: checkpoint of `privileged`.
+        """
         parallel.join("cpu")
-        self.config = c = attrs.evolve(config, n=parallel.share(config.n))
+        self.config = c = attrs.evolve(config, n=parallel.local_share(config.n))
         torch.manual_seed(c.seed)
         checkpoint = load(teacher_file)
         self.grid = CommandGrid(c.grid)
@@ -120,9 +173,9 @@ class DaggerRun:
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=parallel.seed_of(c.seed),
+            seed=parallel.process_seed(c.seed),
             timestep=c.timestep,
-            actuator=actuator(c.actuator),
+            actuator=load_actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
         )
@@ -136,13 +189,15 @@ class DaggerRun:
         self._memory: State = self.student.initial_state(c.n)
         self._previous = np.zeros((c.n, 12), np.float32)
         self._noise = np.zeros((c.n, 12), np.float32)
-        self._turn = (
-            np.random.default_rng(c.seed).permutation(c.n) / c.n
-        )  # share at which the student takes a robot
+        self._turn = np.random.default_rng(c.seed).permutation(c.n) / c.n  # order of takeover
         self.driven = self._turn < self._share()
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run needs."""
+        """Return everything that a resumed run needs.
+
+        Returns:
+            Tensors and plain values, for `restore`.
+        """
         return {
             "student": self.student.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -152,18 +207,24 @@ class DaggerRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of the teacher's grid as it is now."""
+        """Resume from a checkpoint; robots start over.
+
+        Args:
+            state: what `state` returned.
+        """
         self.student.load_state_dict(state["student"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.samples = state["samples"]
-        parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
+        parallel.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def _share(self) -> float:
+        """Share of robots that the student drives now."""
         c = self.config
         return linear(c.first_driven, c.driven, self.samples / c.takeover)
 
     def _start_over(self, ids: np.ndarray) -> None:
+        """Replace robots by new ones without a past."""
         if not len(ids):
             return
         self.env.reset(ids)
@@ -176,7 +237,14 @@ class DaggerRun:
             memory[:, ids] = 0.0
 
     def step(self, done: float) -> dict[str, float]:
-        """One sequence of every robot, some steps of the optimiser."""
+        """Collect one sequence of every robot and learn from it.
+
+        Args:
+            done: share of the budget that is spent.
+
+        Returns:
+            Figures for the log.
+        """
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
         start = self._memory
@@ -187,15 +255,22 @@ class DaggerRun:
         return {"imitation": loss} | seen
 
     def _act(self, obs: np.ndarray) -> np.ndarray:
+        """Run the student for one tick; return its actions (n, 12)."""
         with torch.no_grad():
             action, self._memory = self.student(torch.from_numpy(obs[None]), self._memory)
         own: np.ndarray = action[0].numpy()
         return own
 
     def collect(self) -> tuple[Tensor, Tensor, Tensor, dict[str, float]]:
-        """One sequence: observations (T, N, 48), the teacher's actions (T, N, 12), mask (T, N) of robots that are up."""
+        """Collect one sequence of every robot.
+
+        Returns:
+            Observations (T, N, 48), the teacher's actions (T, N, 12), the mask (T, N) of robots
+            that are up, and figures for the log.
+        """
         env, c = self.env, self.config
-        decay = np.float32(np.exp(-TICK / c.noise_time))
+        # Ornstein-Uhlenbeck noise: n <- d n + noise sqrt(1 - d^2) w, d = exp(-dt / noise_time)
+        decay = np.float32(np.exp(-TICK_S / c.noise_time))
         drawn_std = np.float32(c.noise * np.sqrt(1 - decay**2))
         alive, fell = np.ones(c.n, bool), np.zeros(c.n, bool)
         observations: list[np.ndarray] = []
@@ -224,23 +299,37 @@ class DaggerRun:
         return obs_t, label_t, mask_t, self._figures(alive, fell)
 
     def _figures(self, alive: np.ndarray, fell: np.ndarray) -> dict[str, float]:
-        """Errors over a stride (m/s, rad/s) and falls a robot-minute, of robots driven by the student and by the teacher."""
+        """Return errors over a stride (m/s, rad/s) and falls per robot-minute, by driver."""
         error = self.past.stride
         seen = {"driven": float(self.driven.mean())}
         for name, driver in (("student", self.driven), ("teacher", ~self.driven)):
-            up, minutes = driver & alive, driver.sum() * self.config.length * TICK / 60
+            up, minutes = driver & alive, driver.sum() * self.config.length * TICK_S / 60
             if up.any():
-                seen[f"{name}_xy"], seen[f"{name}_wz"] = (float(size.mean()) for size in sizes(error[up]))
+                seen[f"{name}_xy"], seen[f"{name}_wz"] = (
+                    float(size.mean()) for size in error_magnitudes(error[up])
+                )
                 seen[f"{name}_falls"] = float((fell & driver).sum() / minutes)
         return seen
 
     def learn(self, obs: Tensor, label: Tensor, mask: Tensor, start: State) -> float:
-        """A step for each mini-batch of robots, from the memory at the start of the sequence; the mean loss."""
+        """Take an optimiser step for each mini-batch of robots.
+
+        Args:
+            obs: (T, N, 48), observations.
+            label: (T, N, 12), actions of the teacher.
+            mask: (T, N), 1 for robots that are up.
+            start: memory of the student at the start of the sequence.
+
+        Returns:
+            Mean loss.
+        """
         total = 0.0
         for ids in torch.randperm(self.config.n).chunk(self.config.mini_batches):
             action, _ = self.student(obs[:, ids], select(start, ids))
-            error = torch.nn.functional.huber_loss(action, label[:, ids], reduction="none", delta=FAR)
-            loss = living_mean(error.mean(-1), mask[:, ids])
+            error = torch.nn.functional.huber_loss(
+                action, label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
+            )
+            loss = masked_mean(error.mean(-1), mask[:, ids])
             self.optimiser.zero_grad()
             loss.backward()
             parallel.share_gradients(self.student)
@@ -250,8 +339,19 @@ class DaggerRun:
         return total / self.config.mini_batches
 
 
-def policy_of(checkpoint: Path) -> Recurrent:
-    """The policy's network in a checkpoint of this stage or of `constrained`. Raises FileNotFoundError, CheckpointError."""
+def load_policy(checkpoint: Path) -> Recurrent:
+    """Load the policy's network from a checkpoint.
+
+    Args:
+        checkpoint: checkpoint of this stage or of `constrained`.
+
+    Returns:
+        The network; of `constrained` the averaged one.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        CheckpointError: the checkpoint has no policy.
+    """
     content, network = load(checkpoint), Recurrent(DEFAULT_OBSERVATION.size, 12)
     weights = content.get("average") or content.get("student")
     if weights is None:
@@ -261,12 +361,29 @@ def policy_of(checkpoint: Path) -> Recurrent:
 
 
 def action_map(env: VelocityEnv) -> ActionMap:
-    """Zero stands: the offset is the nominal posture with the gravity torque fed forward through kp."""
+    """Return the map from actions to joint targets; action 0 stands.
+
+    The offset is the nominal posture with the gravity torque fed forward through kp.
+
+    Args:
+        env: environments.
+
+    Returns:
+        The map.
+    """
     return ActionMap(env.stand_q, ACTION_SCALE, ACTION_BOUND)
 
 
 def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
-    """The student's noisy observation (n, 48); previous (n, 12): its action of the tick before."""
+    """Noisy observations of the student.
+
+    Args:
+        env: environments.
+        previous: (n, 12), action of the tick before.
+
+    Returns:
+        (n, 48).
+    """
     return build_observation(
         DEFAULT_OBSERVATION, command=env.command, previous_action=previous, **env.sense()
     )
@@ -275,7 +392,15 @@ def observe(env: VelocityEnv, previous: np.ndarray) -> np.ndarray:
 def export_policy(
     network: Recurrent, env: VelocityEnv, limits: CommandLimits, path: Path, about: dict[str, Any]
 ) -> None:
-    """Write the policy file: the network as it is. limits: the commands that it answers; about: how it came to be."""
+    """Write a policy file.
+
+    Args:
+        network: policy.
+        env: environment that it was trained in, for gains and posture.
+        limits: commands that the policy accepts.
+        path: ONNX file.
+        about: how the policy was trained, for the metadata.
+    """
     metadata = PolicyMetadata(
         action_offset=tuple(env.stand_q),
         action_scale=(ACTION_SCALE,) * 12,

@@ -1,7 +1,7 @@
-"""The batched walking environment: MuJoCo's batch, the actuator model, randomisation and sensing, at 200 Hz.
+"""Batched walking environment at 200 Hz: MuJoCo batch, actuator model, randomisation and sensing.
 
-It knows no reward and no gait: trainers read `VelocityEnv`'s arrays. Frames and joint order as everywhere in quadvel.
-A robot whose physics has blown up is put down as fallen at once, so that no trainer ever sees a number that is none.
+It has no rewards and no gait: trainers read the arrays of `VelocityEnv`. A robot whose physics has
+diverged is laid down as fallen within the same tick, so trainers never see NaN.
 """
 
 from __future__ import annotations
@@ -26,41 +26,61 @@ from quadvel_sim.terrain import Terrain
 
 from .randomisation import PlantSampler, Randomisation, sample_actuators
 
-TICK = 0.005  # s, one sample of the policy on the robot
-HEAT = 0.2  # W/(N m)^2, k_r of the paper's energy
-RAMP = (
-    0.7,
-    5.0,
-)  # m/s^2, from and to: how fast commands that are led grow; they fall RAMP_DOWN times as fast,
-RAMP_DOWN = 4.0
-RAMP_AXES = np.array([1.0, 0.7, 1.25])  # and on the axes vx, vy (m/s^2), wz (rad/s^2) in these proportions
-EDGE = 0.6  # m, before the end of rough ground, at which an episode ends as if its time was over
-ABSURD_SPEED = 150.0  # m/s or rad/s of any body or joint: physics that has blown up, or is about to
-STANCE_LENGTH, STANCE_WIDTH = np.ptp(
-    foot_positions(robot.NOMINAL_Q)[:, :2], axis=0
-)  # m, between nominal feet
+TICK_S = 0.005  # one sample of the policy on the robot
+HEAT_LOSS_W_PER_N2M2 = 0.2  # k_r of the paper's energy term
+RAMP_RANGE = (0.7, 5.0)  # m/s^2, from and to: slope of commands that ramp
+RAMP_DOWN = 4.0  # factor of the slope of commands that decrease
+RAMP_AXES = np.array([1.0, 0.7, 1.25])  # factors of vx, vy and, in rad/m, wz
+EDGE_MARGIN_M = 0.6  # before the end of rough ground, where episodes time out
+MAX_PLAUSIBLE_SPEED = 150.0  # m/s or rad/s of any body or joint; beyond it the physics diverges
+STANCE_LENGTH, STANCE_WIDTH = np.ptp(foot_positions(robot.NOMINAL_Q)[:, :2], axis=0)  # m
 
 
-def cores() -> int:
-    """How many this process may use; torchrun's processes on this machine share them."""
+def available_cores() -> int:
+    """Number of cores that this process may use; torchrun's processes on one machine share them.
+
+    Returns:
+        At least 1.
+    """
     return max(1, len(os.sched_getaffinity(0)) // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
 
 
 @attrs.frozen
 class CommandRange:
-    """How velocity commands are drawn: from a box, or from the paper's ellipsoid, there the radius in proportion to itself."""
+    """Range of velocity commands: a box, or the paper's ellipsoid with a density that falls outwards.
+
+    Attributes:
+        vx: m/s, from and to.
+        vy: m/s, either way.
+        wz: rad/s, either way.
+        ellipsoid: draw from the ellipsoid within the box, with a radius drawn in proportion to
+            itself.
+        curve: m/s^2, limit in curves as in `quadvel_policy.observation.CommandLimits`; None for no
+            limit.
+        stance: share of commands to stand.
+        straight: share of the walking commands without yaw.
+        hold: s, from and to, until the next command.
+    """
 
     vx: tuple[float, float] = (-1.4, 2.0)
     vy: float = 0.7
     wz: float = 1.4
     ellipsoid: bool = False
-    curve: float | None = None  # m/s^2, held together as by `quadvel_policy.observation.CommandLimits`
-    stance: float = 0.15  # share of stance commands
-    straight: float = 0.2  # share of the walking commands without turning
-    hold: tuple[float, float] = (2.0, 6.0)  # s until the next command
+    curve: float | None = None
+    stance: float = 0.15
+    straight: float = 0.2
+    hold: tuple[float, float] = (2.0, 6.0)
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        """Draw commands.
+
+        Args:
+            rng: source of randomness.
+            n: number of commands.
+
+        Returns:
+            (n, 4): vx, vy (m/s), wz (rad/s), 1 for stance.
+        """
         unit = rng.uniform(-1, 1, (n, 3))
         if self.ellipsoid:
             unit = rng.normal(size=(n, 3))
@@ -79,50 +99,98 @@ class CommandRange:
         return command
 
     def contains(self, command: np.ndarray) -> np.ndarray:
-        """Which of the velocities (n, 3) lie in the box, (n,) bool."""
+        """Whether velocities lie in the box.
+
+        Args:
+            command: (n, 3), m/s, m/s, rad/s.
+
+        Returns:
+            (n,) bool.
+        """
         low, high = [self.vx[0], -self.vy, -self.wz], [self.vx[1], self.vy, self.wz]
         return np.asarray(((command >= low) & (command <= high)).all(axis=1))
 
 
 class Commands(Protocol):
-    """Where velocity commands come from."""
+    """Source of velocity commands."""
 
     @property
     def hold(self) -> tuple[float, float]:
-        """For how long a command lasts, from and to, s."""
+        """Time until the next command, from and to, s."""
         ...
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
-        """(n, 4): vx, vy (m/s), wz (rad/s), stance."""
+        """Draw commands.
+
+        Args:
+            rng: source of randomness.
+            n: number of commands.
+
+        Returns:
+            (n, 4): vx, vy (m/s), wz (rad/s), 1 for stance.
+        """
         ...
 
     def contains(self, command: np.ndarray) -> np.ndarray:
-        """Which of the velocities (n, 3) may be drawn, (n,) bool."""
+        """Whether velocities may be drawn.
+
+        Args:
+            command: (n, 3), m/s, m/s, rad/s.
+
+        Returns:
+            (n,) bool.
+        """
         ...
 
 
 @attrs.frozen
 class EnvConfig:
-    """One batch of environments."""
+    """Configuration of a batch of environments.
+
+    Attributes:
+        n: number of environments.
+        threads: threads of the physics.
+        seed: seed of all draws.
+        period: s, one sample of the trainer, for which joint targets are held.
+        timestep: s, of the physics.
+        kp: N m/rad, proportional gain.
+        kd: N m s/rad, derivative gain.
+        episode: s, length of an episode.
+        actuator: parameters of the actuators.
+        randomisation: what varies.
+        commands: range of commands, unless the environment is given another source.
+        ramped: share of the commands that ramp to the new velocity, as the command mux does.
+        reversed: share of the new commands that reverse the one before.
+        terrain: ground.
+    """
 
     n: int = 512
-    threads: int = attrs.field(factory=cores)
+    threads: int = attrs.field(factory=available_cores)
     seed: int = 0
-    period: float = TICK  # s, one sample of the trainer: how long joint targets are held
-    timestep: float = 0.0025  # s, of physics
+    period: float = TICK_S
+    timestep: float = 0.0025
     kp: float = robot.KP
     kd: float = robot.KD
-    episode: float = 20.0  # s
+    episode: float = 20.0
     actuator: ActuatorParameters = attrs.field(factory=ActuatorParameters.default)
     randomisation: Randomisation = Randomisation()
     commands: CommandRange = CommandRange()
-    ramped: float = 0.6  # share of the commands that are led to the new velocity as the command mux does it
-    reversed: float = 0.0  # share of the new commands that reverse the one before
+    ramped: float = 0.6
+    reversed: float = 0.0
     terrain: Terrain = Terrain()
 
 
 def training_model(timestep: float, terrain: Terrain, torsional_friction: float = 0.0) -> mujoco.MjModel:
-    """The AlienGo as it is trained on: feet and trunk collide, no sensors. torsional_friction: of the feet, m."""
+    """Build the MuJoCo model of training: feet and trunk collide, there are no sensors.
+
+    Args:
+        timestep: s, of the physics.
+        terrain: ground.
+        torsional_friction: m, of the feet.
+
+    Returns:
+        The compiled model.
+    """
     plant = mjcf.Plant(timestep=timestep, plane=False, only_feet_and_trunk=True, sensors=False)
     spec = mjcf.build_spec(plant)
     terrain.add_to(spec)
@@ -132,26 +200,49 @@ def training_model(timestep: float, terrain: Terrain, torsional_friction: float 
 
 
 class VelocityEnv:
-    """`n` robots. After every `tick`, a sample of `config.period`, the arrays below describe the new state; `reset(ids)`
-    starts some over.
+    """Batch of `n` simulated robots under velocity commands.
 
-    command (n, 4); q, dq, torque (n, 12); quaternion (n, 4); velocity, angular_velocity, acceleration (n, 3) in the body
-    frame; feet, foot_velocity (n, 4, 3) in the world frame (m, m/s); clearance (n, 4) of each foot above ground (m);
-    contact (n, 4) bool; height (n,) of the trunk above ground; power (n,) of the joints by the paper's energy term, mean of
-    the sample, W; fastest (n, 12) of each joint's speeds in the sample, rad/s; foot_position (n, 4, 3) in the body frame, m;
-    fallen, timed_out (n,) bool; broken (n,) bool: fallen because physics has blown up; changed (n,) bool:
-    command is new. `command` may be on its way yet to the velocity that was drawn.
+    After each `tick`, a sample of `config.period`, the arrays describe the new state. `reset(ids)`
+    starts robots over. Vectors are in the body frame unless stated.
+
+    Attributes:
+        config: configuration.
+        commands: source of commands.
+        command: (n, 4), command in force; it may still ramp to the one that was drawn.
+        q: (n, 12), rad.
+        dq: (n, 12), rad/s.
+        torque: (n, 12), N m.
+        quaternion: (n, 4), w first, body to world.
+        velocity: (n, 3), m/s.
+        angular_velocity: (n, 3), rad/s.
+        acceleration: (n, 3), m/s^2, proper acceleration of the trunk.
+        roll_pitch: (n, 2), rad.
+        feet: (n, 4, 3), m, world frame.
+        foot_position: (n, 4, 3), m.
+        foot_velocity: (n, 4, 3), m/s, world frame.
+        clearance: (n, 4), m, of each foot above ground.
+        contact: (n, 4) bool.
+        height: (n,), m, of the trunk above ground.
+        power: (n,), W, energy term of the paper, mean of the sample.
+        fastest: (n, 12), rad/s, largest speed of each joint in the sample.
+        fallen: (n,) bool.
+        timed_out: (n,) bool.
+        broken: (n,) bool, fallen because the physics diverged.
+        changed: (n,) bool, whether the command is new.
     """
 
     def __init__(self, config: EnvConfig, commands: Commands | None = None) -> None:
-        """`commands`: where they are drawn instead of the configuration's range."""
+        """Create the environments and start all robots.
+
+        Args:
+            config: configuration.
+            commands: source of commands in place of the configuration's range.
+        """
         self.config = c = config
         self.commands: Commands = commands or c.commands
         self.model = training_model(c.timestep, c.terrain, c.randomisation.torsional_friction[1])
         self.substeps = round(c.period / c.timestep)
-        self._resend = max(
-            1, int(TICK / c.timestep)
-        )  # steps between packets: the controller sends every TICK
+        self._resend = max(1, int(TICK_S / c.timestep))  # steps between command packets
         self.rng = np.random.default_rng(c.seed)
         self.batch = Batch(self.model, c.n, c.threads)
         self.plants = PlantSampler(self.batch, c.randomisation, self.rng)
@@ -175,11 +266,16 @@ class VelocityEnv:
         self._velocity_drift = np.zeros((n, 3))
         rough = c.terrain.kind == "rough"
         self._spawn_radius = 0.4 * c.terrain.size if rough else 0.0  # m
-        self._edge = 0.5 * c.terrain.size - EDGE if rough else np.inf  # m
+        self._edge = 0.5 * c.terrain.size - EDGE_MARGIN_M if rough else np.inf  # m
         self.reset(np.arange(n))
 
     def reset(self, ids: np.ndarray, posture: np.ndarray = robot.NOMINAL_Q) -> None:
-        """Start the environments `ids` over: new plant, new actuators, near `posture` (12,) or (n, 12), a new command."""
+        """Start robots over: new plant, new actuators, a new command.
+
+        Args:
+            ids: their indices.
+            posture: rad, (12,) or (n, 12), joint positions up to some noise.
+        """
         if not len(ids):
             return
         n, rng = len(ids), self.rng
@@ -189,26 +285,26 @@ class VelocityEnv:
         qpos, qvel = np.zeros((n, 19)), rng.normal(0, 0.1, (n, 18))
         heading = rng.uniform(-np.pi, np.pi, n)
         qpos[:, :2] = rng.uniform(-1, 1, (n, 2)) * self._spawn_radius
-        qpos[:, 3:7] = self._along_the_ground(qpos[:, :2], heading)
+        qpos[:, 3:7] = self._ground_attitudes(qpos[:, :2], heading)
         qpos[:, 7:] = posture + rng.normal(0, 0.08, (n, 12))
         feet = rotate(qpos[:, None, 3:7], foot_positions(qpos[:, 7:])) + qpos[:, None, :3]
         qpos[:, 2] = np.max(self._ground(feet) - feet[..., 2], axis=1) + robot.FOOT_RADIUS + 0.002
         self._qpos[ids], self._qvel[ids] = qpos, qvel
-        self._clock[ids] = self.config.period  # not 0, which MuJoCo's own starting over would not differ from
+        self._clock[ids] = self.config.period  # above 0, so that MuJoCo's own resets are seen
         self.time[ids] = rng.uniform(0, 0.2, n) * self.config.episode
         self._velocity_drift[ids] = 0.0
         self.command[ids] = [0.0, 0.0, 0.0, 1.0]
         self._new_commands(ids)
-        self._read()
+        self._update_state()
         self.torque[ids] = 0.0
         self.acceleration[ids] = rotate_inverse(self.quaternion[ids], np.array([0, 0, robot.GRAVITY]))
 
-    def _along_the_ground(self, place: np.ndarray, heading: np.ndarray) -> np.ndarray:
-        """Attitudes of trunks that stand on the ground as it slopes there.
+    def _ground_attitudes(self, place: np.ndarray, heading: np.ndarray) -> np.ndarray:
+        """Attitude of trunks that stand parallel to the ground.
 
         Args:
-            place: x, y (n, 2), m, world.
-            heading: (n,) rad.
+            place: x, y (n, 2), m, world frame.
+            heading: (n,), rad.
 
         Returns:
             Quaternions (n, 4), w first, body to world.
@@ -216,20 +312,21 @@ class VelocityEnv:
         level = Rotation.from_euler("Z", heading[:, None])
         corners = foot_positions(robot.NOMINAL_Q)
         feet = np.stack([level.apply(corner) for corner in corners], axis=1)
-        forward, left = self._falls(self._ground(feet[..., :2] + place[:, None]))
+        forward, left = self._ground_drop(self._ground(feet[..., :2] + place[:, None]))
         pitch = np.arctan(forward)
         leaning = Rotation.from_euler("YX", np.stack([pitch, -np.arctan(left * np.cos(pitch))], axis=1))
         return np.roll((level * leaning).as_quat(), 1, axis=1)
 
     @staticmethod
-    def _falls(ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """By how much ground of heights (n, 4) below the four feet falls away, for 1 m forward and for 1 m to the left."""
+    def _ground_drop(ground: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Drop of the ground per metre forward and left, from its height (n, 4) at the feet."""
         forward = ground[:, 2:].mean(axis=1) - ground[:, :2].mean(axis=1)
         left = ground[:, ::2].mean(axis=1) - ground[:, 1::2].mean(axis=1)
         return forward / STANCE_LENGTH, left / STANCE_WIDTH
 
     def _new_commands(self, ids: np.ndarray) -> None:
-        n, (slow, quick) = len(ids), RAMP
+        """Draw new commands, some of them reversals of the one before, and their ramps."""
+        n, (slow, quick) = len(ids), RAMP_RANGE
         before = self._goal[ids]
         self._goal[ids] = goal = self.commands.draw(self.rng, n)
         back = self.rng.random(n) < self.config.reversed
@@ -237,14 +334,17 @@ class VelocityEnv:
         self._goal[ids[back]] = np.where([True, True, True, False], -before, 0.0 * goal)[back]
         led = self.rng.random(n) < self.config.ramped
         self._ramp[ids] = np.where(led, slow * (quick / slow) ** self.rng.random(n), np.inf)
-        self._lead_commands(ids)
+        self._ramp_commands(ids)
         self._next_command[ids] = self.time[ids] + self.rng.uniform(*self.commands.hold, len(ids))
         self.changed[ids] = True
 
-    def _lead_commands(self, ids: np.ndarray | slice) -> None:
-        """Take the commands a sample nearer to what was drawn; a robot is told to stand once its command is at rest."""
+    def _ramp_commands(self, ids: np.ndarray | slice) -> None:
+        """Move commands a sample closer to what was drawn; the stance flag follows once the velocity
+        is 0.
+        """
         goal, command = self._goal[ids, :3], self.command[ids, :3]
         way = goal - command
+        # c <- c + d / max(1, max_i |d_i| / step_i), d = goal - c: all axes arrive together
         slower = np.abs(goal) < np.abs(command)
         step = self._ramp[ids, None] * RAMP_AXES * np.where(slower, RAMP_DOWN, 1.0) * self.config.period
         command = command + way / np.maximum(np.abs(way) / step, 1.0).max(axis=1, keepdims=True)
@@ -258,9 +358,16 @@ class VelocityEnv:
         kp: np.ndarray | None = None,
         kd: np.ndarray | None = None,
     ) -> None:
-        """One sample with the joint targets (n, 12) sent from its start on; other gains (n, 12) if given.
+        """Simulate one sample, with joint targets sent at its start.
 
-        Targets beyond the range of commands are sent as the controller sends them.
+        Targets beyond the range of commands are sent as the controller sends them: the excess as
+        torque.
+
+        Args:
+            target: rad, (n, 12), joint targets.
+            target_speed: rad/s, (n, 12) or a number.
+            kp: N m/rad, (n, 12), or None for the configured gain.
+            kd: N m s/rad, (n, 12), or None for the configured gain.
         """
         gains = self.config.kp if kp is None else kp, self.config.kd if kd is None else kd
         self.changed[:] = False
@@ -277,25 +384,31 @@ class VelocityEnv:
             self._ctrl[:] = self.torque
             self.batch.step()
             np.maximum(self.fastest, np.abs(dq), out=self.fastest)
-            self.power += np.maximum(HEAT * self.torque**2 + self.torque * dq, 0.0).sum(axis=1)
+            # P = sum over joints of max(k_r tau^2 + tau dq, 0)
+            self.power += np.maximum(HEAT_LOSS_W_PER_N2M2 * self.torque**2 + self.torque * dq, 0.0).sum(
+                axis=1
+            )
         self.power /= self.substeps
         self.time += self.config.period
-        self._put_down_broken(end, before)
-        self._read()
+        self._reset_broken(end, before)
+        self._update_state()
+        # proper acceleration a - g, in the body frame, as an IMU measures it
         proper = (self._qvel[:, :3] - before) / self.config.timestep + [0.0, 0.0, robot.GRAVITY]
         self.acceleration = rotate_inverse(self.quaternion, proper)
-        self._lead_commands(slice(None))
+        self._ramp_commands(slice(None))
         due = np.flatnonzero(self.time >= self._next_command)
         if len(due):
             self._new_commands(due)
 
-    def _put_down_broken(self, end: np.ndarray, before: np.ndarray) -> None:
-        """Lay robots with states that are no numbers, or absurd, on their backs at rest.
+    def _reset_broken(self, end: np.ndarray, before: np.ndarray) -> None:
+        """Lay robots whose state is not finite or implausible on their backs, at rest.
 
-        end (n,): MuJoCo's clock as it should be; it starts such simulations over by itself. before (n, 3): the last velocities.
+        Args:
+            end: (n,), s, what MuJoCo's clock should show; MuJoCo resets such simulations by itself.
+            before: (n, 3), m/s, last velocities, changed in place.
         """
         state = np.concatenate([self._qpos, self._qvel, self.torque, self.power[:, None]], axis=1)
-        absurd = np.abs(self._qvel).max(axis=1) > ABSURD_SPEED
+        absurd = np.abs(self._qvel).max(axis=1) > MAX_PLAUSIBLE_SPEED
         started_over = self._clock.ravel() < end - 0.5 * self.config.timestep
         self.broken = absurd | started_over | ~np.isfinite(state).all(axis=1)
         ids = np.flatnonzero(self.broken)
@@ -306,22 +419,24 @@ class VelocityEnv:
             self.actuators.reset(ids)
 
     def _ground(self, points: np.ndarray) -> np.ndarray:
+        """Height of the ground at points (..., 2), m."""
         return self.config.terrain.height(points[..., 0], points[..., 1])
 
     @property
     def ground_slope(self) -> np.ndarray:
-        """By how much (n, 2) the ground falls away below the four feet, for 1 m forward and for 1 m to the left."""
-        return np.stack(self._falls(self._ground(self.feet)), axis=-1)
+        """Drop of the ground below the feet per metre forward and per metre to the left, (n, 2)."""
+        return np.stack(self._ground_drop(self._ground(self.feet)), axis=-1)
 
     def _push(self) -> None:
+        """Push some robots: a sudden change of velocity."""
         r = self.config.randomisation
         hit = np.flatnonzero(self.rng.random(self.config.n) < self.config.period / r.push_interval)
         if len(hit) and (r.push_velocity or r.push_turn):
             self._qvel[hit, :2] += self.rng.uniform(-1, 1, (len(hit), 2)) * r.push_velocity
             self._qvel[hit, 3:6] += self.rng.uniform(-1, 1, (len(hit), 3)) * r.push_turn
 
-    def _read(self) -> None:
-        """Derive what rewards and observations need from the state rows."""
+    def _update_state(self) -> None:
+        """Compute what rewards and observations need from MuJoCo's state."""
         qpos, qvel = self._qpos, self._qvel
         self.q, self.dq = qpos[:, 7:].copy(), qvel[:, 6:].copy()
         self.quaternion, self.angular_velocity = qpos[:, 3:7].copy(), qvel[:, 3:6].copy()
@@ -331,6 +446,7 @@ class VelocityEnv:
         local, jacobians = foot_kinematics(self.q)
         self.foot_position = local
         self.feet = rotate(quaternion, local) + qpos[:, None, :3]
+        # v_foot = R (J dq + w x r) + v_trunk
         joints = self.dq.reshape(-1, 4, 3, 1)
         swing = (jacobians @ joints)[..., 0] + np.cross(self.angular_velocity[:, None], local)
         self.foot_velocity = rotate(quaternion, swing) + qvel[:, None, :3]
@@ -342,8 +458,13 @@ class VelocityEnv:
         self.timed_out = (self.time >= self.config.episode) | left_the_field
 
     def sense(self) -> dict[str, np.ndarray]:
-        """Noisy readings under the names of the observation's terms (previous action and command apart)."""
+        """Return noisy measurements.
+
+        Returns:
+            Arrays by name of the observation's terms, without previous action and command.
+        """
         r, rng, n = self.config.randomisation, self.rng, self.config.n
+        # Drift of the velocity: an Ornstein-Uhlenbeck process with a time constant of 0.5 s
         decay = np.exp(-self.config.period / 0.5)
         self._velocity_drift *= decay
         self._velocity_drift += rng.normal(0, r.drift_velocity * np.sqrt(1 - decay**2), (n, 3))

@@ -1,7 +1,10 @@
-"""Training of the linear-velocity estimator: on walks of the policy, on flat and rough ground, with every randomisation.
+"""Training of the linear-velocity estimator on the policy's walks.
 
-The estimator reads what the robot has (IMU, encoders, torques, the targets in force). In half of the environments the policy
-walks on the estimate instead of the truth, so that the estimator is trained on the walks that it causes itself.
+The walks are on flat and rough ground, with every randomisation.
+
+The inputs are what the robot has: IMU, encoders, torques, and the targets in force. In half of the
+environments the policy walks on the estimate instead of the truth, so the estimator also learns
+from the walks that it causes.
 """
 
 from __future__ import annotations
@@ -19,54 +22,74 @@ from quadvel_estimator import features
 from quadvel_sim.terrain import Terrain
 
 from . import parallel
-from .env import TICK, CommandRange
+from .env import TICK_S, CommandRange
 from .loop import Budget, cosine, set_rate
 from .networks import Recurrent, State, select
 from .onnx_file import commit, export
-from .ppo import living_mean
+from .ppo import masked_mean
 from .randomisation import Randomisation
-from .walks import Walks, both_grounds
+from .walks import Walks, walks_on_both_grounds
 
 MEMORY = 128
 HIDDEN = (64,)
-KEEP = 2.0  # logit of the share of inertia before training: the legs correct it within some ticks
+INITIAL_INERTIA_LOGIT = 2.0  # before training; the legs correct the velocity within some ticks
 
 
 class VelocityNetwork(Recurrent):
-    """A filter whose gains an LSTM sets: network input to velocity (3) and log variance (3).
+    """Velocity filter whose gains an LSTM sets: network input to velocity (3) and log variance (3).
 
-    At every tick the velocity of the tick before goes on by what the IMU says, and is mixed with what the four legs say; the
-    LSTM gives the five shares, a correction and the variance. The last three numbers of the state's first part are the
-    velocity, the last three of its second part are not used.
+    At every tick the velocity of the tick before, propagated by the IMU, is mixed with the
+    velocities by the four legs. The LSTM gives the five shares, a correction and the variance. In
+    the last three numbers of its first part the state holds the velocity; those of its second part
+    are unused.
     """
 
     def __init__(self) -> None:
+        """Create the network; at first it relies on inertia."""
         super().__init__(features.DEFAULT_LAYOUT.size, 6 + 5, MEMORY, HIDDEN)
         with torch.no_grad():
-            self.body[-1].bias[-1] = KEEP
+            self.body[-1].bias[-1] = INITIAL_INERTIA_LOGIT
         spin = torch.linalg.cross(*torch.broadcast_tensors(torch.eye(3)[:, None], torch.eye(3)))
-        self.register_buffer(
-            "spin", spin.reshape(3, 9), persistent=False
-        )  # w @ spin is, as a matrix, b -> w x b for rows
+        # w @ spin is the matrix of b -> w x b for row vectors
+        self.register_buffer("spin", spin.reshape(3, 9), persistent=False)
 
     def initial_state(self, n: int) -> State:
-        """Zero state of `n` environments, at rest."""
+        """Return the zero memory, at rest.
+
+        Args:
+            n: number of environments.
+
+        Returns:
+            Two parts, (1, n, MEMORY + 3) each.
+        """
         zeros = torch.zeros(1, n, MEMORY + 3)
         return zeros, zeros.clone()
 
     def forward(self, x: torch.Tensor, state: State) -> tuple[torch.Tensor, State]:
-        """Output (T, N, 6) and the new state from x (T, N, 69) and the state (1, N, 131); N may be missing in all."""
+        """Filter a sequence.
+
+        Args:
+            x: (T, N, 69), network input; N may be missing in all shapes.
+            state: two parts, (1, N, 131) each.
+
+        Returns:
+            Velocity (m/s, body frame) and log variance (T, N, 6), and the new state.
+        """
         h, c = (part.split([MEMORY, 3], dim=-1) for part in state)
         y, (hidden, memory) = self.lstm(x, (h[0].contiguous(), c[0].contiguous()))
         correction, log_variance, logits = self.body(torch.nn.functional.silu(y)).split([3, 3, 5], dim=-1)
         share = logits.softmax(-1)
         legs, keep = (
-            (share[..., :4, None] * _read(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
+            (share[..., :4, None] * _quantity(x, "leg_velocity").unflatten(-1, (4, 3))).sum(-2),
             share[..., 4:],
         )
-        gained = TICK * (_read(x, "linear_acceleration") + GRAVITY * _read(x, "gravity"))
+        # v[k] = s_0 (v[k-1] + dt (a + g - w x v[k-1])) + sum_i s_i v_leg_i + correction
+        # with shares s = softmax(logits) of inertia and of the four legs, specific force a, gravity
+        # g and
+        # angular velocity w in the body frame
+        gained = TICK_S * (_quantity(x, "linear_acceleration") + GRAVITY * _quantity(x, "gravity"))
         # for rows: v - dt w x v = v (1 - dt [w]x)
-        turn = torch.eye(3) - TICK * (_read(x, "angular_velocity") @ self.spin).unflatten(-1, (3, 3))
+        turn = torch.eye(3) - TICK_S * (_quantity(x, "angular_velocity") @ self.spin).unflatten(-1, (3, 3))
         carried, added = keep[..., None] * turn, keep * gained + legs + correction
         velocity, track = h[1][0], []
         for k in range(x.shape[0]):
@@ -76,8 +99,8 @@ class VelocityNetwork(Recurrent):
         return output, (torch.cat([hidden, velocity[None]], dim=-1), torch.cat([memory, c[1]], dim=-1))
 
 
-def _read(x: torch.Tensor, name: str) -> torch.Tensor:
-    """The quantity `name` in its unit from the network input (..., 69), as far as it was not clipped."""
+def _quantity(x: torch.Tensor, name: str) -> torch.Tensor:
+    """Extract a quantity from the network input (..., 69), in its unit, as far as it was not clipped."""
     start = 0
     for term in features.DEFAULT_LAYOUT.terms:
         if term.name == name:
@@ -89,10 +112,23 @@ def _read(x: torch.Tensor, name: str) -> torch.Tensor:
 Sequence = tuple[torch.Tensor, torch.Tensor, torch.Tensor]
 
 
-class Walk:
-    """Walks, and what the network makes of them; yields features and true velocities."""
+class EstimatedWalks:
+    """Walks with the memory of the network on them.
+
+    Attributes:
+        walks: the walks.
+        network: the estimator.
+        on_estimate: (n,) bool, robots whose policy gets the estimate instead of the truth.
+        state: memory of the network.
+    """
 
     def __init__(self, walks: Walks, network: VelocityNetwork) -> None:
+        """Start without memory.
+
+        Args:
+            walks: the walks.
+            network: the estimator.
+        """
         self.walks, self.network = walks, network
         n = walks.env.config.n
         self.on_estimate = np.zeros(n, bool)
@@ -100,7 +136,14 @@ class Walk:
         self._estimate = np.zeros((n, 3))
 
     def sequence(self, length: int) -> Sequence:
-        """`length` ticks: features (T, N, 69), true velocity (T, N, 3), mask (T, N)."""
+        """Collect a sequence.
+
+        Args:
+            length: number of ticks.
+
+        Returns:
+            Features (T, N, 69), true velocity (T, N, 3), m/s, and mask (T, N).
+        """
         walks, state = self.walks, self.state
         rows = []
         with torch.no_grad():
@@ -108,7 +151,7 @@ class Walk:
                 sensed = walks.sense()
                 x = features.build(sensed, walks.previous_action)
                 rows.append((x, walks.truth.copy(), ~walks.over))
-                # the controller works with the estimate of the state before
+                # the controller has the estimate of the state before
                 believed = np.where(self.on_estimate[:, None], self._estimate, walks.noisy_truth())
                 output, state = self.network(torch.from_numpy(x[None]), state)
                 self._estimate = output[0, :, :3].numpy()
@@ -116,13 +159,23 @@ class Walk:
         inputs, truth, mask = (torch.from_numpy(np.array(r, np.float32)) for r in zip(*rows, strict=True))
         return inputs, truth, mask
 
-    def remember(self, ids: torch.Tensor, state: State) -> None:
-        """Take over the memory (of `ids`) from the learner's pass."""
+    def store_memory(self, ids: torch.Tensor, state: State) -> None:
+        """Take over the memory from the learner's pass.
+
+        Args:
+            ids: robots of the pass.
+            state: their memory.
+        """
         for kept, new in zip(self.state, state, strict=True):
             kept[:, ids] = new.detach()
 
     def start_over(self, forget: float) -> None:
-        """Start anew where a walk ended; a share `forget` of the others loses its memory, as after a gap in the stream."""
+        """Start new walks where one ended; some of the others lose their memory, as after a gap in the
+        stream.
+
+        Args:
+            forget: share of these others.
+        """
         ended = self.walks.over.copy()
         self.walks.start_over(np.flatnonzero(ended))
         lost = ended | (self.walks.env.rng.random(len(ended)) < forget)
@@ -133,18 +186,34 @@ class Walk:
 
 @attrs.frozen
 class EstimatorConfig:
-    """One run; half of the `n` robots of all processes walk on flat ground, half on rough."""
+    """Configuration of the estimator; half of the robots walk on flat ground, half on rough.
+
+    Attributes:
+        budget: when the run ends.
+        n: number of robots, of all processes together.
+        length: ticks per sequence.
+        epochs: passes over a sequence; learning costs less than walking.
+        learning_rate: at the start.
+        final_learning_rate: at the end.
+        mini_batches: mini-batches per epoch.
+        truth_first: share of the budget before the policy walks on the estimate.
+        seed: seed of all draws.
+        forget: share of the memories lost per sequence, as after a gap in the stream.
+        commands: range of commands.
+        randomisation: what varies.
+        rough: the rough ground.
+    """
 
     budget: Budget = Budget(samples=8e6, minutes=15.0)
     n: int = 512
-    length: int = 48  # ticks a sequence
-    epochs: int = 2  # learning costs less than walking
+    length: int = 48
+    epochs: int = 2
     learning_rate: float = 2e-3
     final_learning_rate: float = 1e-4
     mini_batches: int = 8
-    truth_first: float = 0.4  # share of the budget before the policy walks on the estimate anywhere
+    truth_first: float = 0.4
     seed: int = 2
-    forget: float = 0.005  # share of the memories lost a sequence, as after a gap in the stream
+    forget: float = 0.005
     commands: CommandRange = CommandRange(vx=(-1.8, 2.6), vy=0.8, wz=1.6)
     randomisation: Randomisation = Randomisation()
     rough: Terrain = Terrain(kind="rough", roughness=0.06, blend=10.0)
@@ -153,31 +222,48 @@ class EstimatorConfig:
 def loss_terms(
     output: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Squared error for the velocity, Gaussian likelihood for the variance alone; a sample each.
+    """Losses of velocity and variance.
 
-    Trained on the likelihood together, a velocity that is hard to see is given up for a large variance.
+    The likelihood trains the variance alone. Trained on it as well, the network gives up velocities
+    that are hard to see for a large variance.
+
+    Args:
+        output: (T, N, 6), velocity and log variance.
+        truth: (T, N, 3), m/s.
+        mask: (T, N).
+
+    Returns:
+        Mean squared error, summed over axes, and negative log likelihood.
     """
+    # L_v = |v - v_hat|^2
+    # L_nll = sum((v - v_hat)^2 / sigma^2 + log sigma^2) / 2, without gradient to v_hat
     square = (truth - output[..., :3]) ** 2
     log_variance = output[..., 3:].clamp(-10.0, 4.0)
     likelihood = 0.5 * (square.detach() * (-log_variance).exp() + log_variance)
-    return living_mean(square.sum(-1), mask), living_mean(likelihood.sum(-1), mask)
+    return masked_mean(square.sum(-1), mask), masked_mean(likelihood.sum(-1), mask)
 
 
 class EstimatorRun:
-    """Walks on both grounds, one network, one optimiser."""
+    """Training run of the estimator: walks on both grounds, a network, an optimiser."""
 
     def __init__(self, config: EstimatorConfig, actor: Recurrent) -> None:
+        """Create walks and network.
+
+        Args:
+            config: configuration.
+            actor: policy of the walks.
+        """
         parallel.join("cpu")
-        self.config = config = attrs.evolve(config, n=parallel.share(config.n))
+        self.config = config = attrs.evolve(config, n=parallel.local_share(config.n))
         torch.manual_seed(config.seed)
         self.network = VelocityNetwork()
         self.optimiser = torch.optim.Adam(self.network.parameters(), lr=config.learning_rate)
         self.samples = 0
         self.walks = [
-            Walk(walks, self.network)
-            for walks in both_grounds(
+            EstimatedWalks(walks, self.network)
+            for walks in walks_on_both_grounds(
                 config.n,
-                parallel.seed_of(config.seed),
+                parallel.process_seed(config.seed),
                 config.commands,
                 config.randomisation,
                 config.rough,
@@ -186,7 +272,11 @@ class EstimatorRun:
         ]
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run needs."""
+        """Return everything that a resumed run needs.
+
+        Returns:
+            Tensors and plain values, for `restore`.
+        """
         return {
             "network": self.network.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -194,18 +284,34 @@ class EstimatorRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint."""
+        """Resume from a checkpoint.
+
+        Args:
+            state: what `state` returned.
+        """
         self.network.load_state_dict(state["network"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.samples = state["samples"]
 
     def export(self, path: Path, recipe: dict[str, Any]) -> None:
-        """Write the estimator file."""
+        """Write the estimator file.
+
+        Args:
+            path: ONNX file.
+            recipe: how it was trained, for the metadata.
+        """
         metadata = features.metadata((1, 1, MEMORY + 3), recipe, commit())
         export(self.network, features.DEFAULT_LAYOUT.size, path, list(features.OUTPUTS), json.dumps(metadata))
 
     def step(self, done: float) -> dict[str, float]:
-        """One sequence on each ground, and steps of the optimiser for mini-batches of both."""
+        """Collect a sequence on each ground and learn from both.
+
+        Args:
+            done: share of the budget that is spent.
+
+        Returns:
+            RMS error per axis on each ground (m/s), and the likelihood.
+        """
         c = self.config
         set_rate(self.optimiser, cosine(c.learning_rate, c.final_learning_rate, done))
         for walk in self.walks:
@@ -223,7 +329,7 @@ class EstimatorRun:
         return {"flat": seen["flat"] ** 0.5, "rough": seen["rough"] ** 0.5, "nll": seen["nll"]}
 
     def _learn(self, ids: torch.Tensor, data: list[Sequence], remember: bool) -> dict[str, float]:
-        """One step; returns the mean squared error an axis on each ground, and the likelihood."""
+        """Take one step; return the mean squared error per axis on each ground, and the likelihood."""
         losses, squares = [], []
         for walk, (inputs, truth, mask) in zip(self.walks, data, strict=True):
             output, state = self.network(inputs[:, ids], select(walk.state, ids))
@@ -231,7 +337,7 @@ class EstimatorRun:
             losses.append(10.0 * square + 0.1 * likelihood)
             squares.append(float(square.detach()) / 3)
             if remember:
-                walk.remember(ids, state)
+                walk.store_memory(ids, state)
         loss = torch.stack(losses).mean()
         self.optimiser.zero_grad()
         loss.backward()

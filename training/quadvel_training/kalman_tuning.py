@@ -1,4 +1,4 @@
-"""Tuning of the Kalman filter's noise on the walks that the learned estimator learns from, so that the two can be compared."""
+"""Tuning of the Kalman filter's noise on the walks that the learned estimator learns from."""
 
 from __future__ import annotations
 
@@ -12,21 +12,32 @@ from quadvel_description.state import RobotState
 from quadvel_estimator.kalman import KalmanConfig, KalmanEstimator
 from quadvel_sim.terrain import Terrain
 
-from .env import TICK, CommandRange
+from .env import TICK_S, CommandRange
 from .networks import Recurrent
 from .randomisation import Randomisation
-from .walks import Walks, both_grounds
+from .walks import Walks, walks_on_both_grounds
 
-SETTLE = 0.5  # s, at the start of a window, in which the filter finds its state; not judged
-FIRST_STEP = np.log(1.5)  # of each parameter, in the search
+SETTLE_S = 0.5  # at the start of a window, for the filter to settle; not scored
+FIRST_STEP = np.log(1.5)  # of the search, in log units
 
 
 @attrs.frozen
 class TuningConfig:
-    """One run; half of the `n` environments walk on flat ground, half on rough."""
+    """Configuration of the tuning; half of the robots walk on flat ground, half on rough.
+
+    Attributes:
+        n: number of robots.
+        window: s, length of a window; each one is filtered separately.
+        windows: number of windows per robot.
+        evaluations: evaluations of the search.
+        seed: seed of all draws.
+        commands: range of commands.
+        randomisation: what varies.
+        rough: the rough ground.
+    """
 
     n: int = 64
-    window: float = 2.0  # s; every one is filtered on its own, all at once
+    window: float = 2.0
     windows: int = 8
     evaluations: int = 200
     seed: int = 4
@@ -36,20 +47,34 @@ class TuningConfig:
 
 
 @attrs.frozen
-class Recording:
-    """`robots` windows of T ticks at once, the first half on flat ground."""
+class WalkRecording:
+    """Windows of T ticks of R robots, the first half of them on flat ground.
 
-    states: list[RobotState]  # T, each of (robots, ...)
-    truth: np.ndarray  # (T, robots, 3) m/s, body frame
-    judged: np.ndarray  # (T, robots) bool
+    Attributes:
+        states: T readings, each of arrays (R, ...).
+        truth: (T, R, 3), m/s, true velocity in the body frame.
+        is_scored: (T, R) bool, ticks that count: the robot is up and the filter has settled.
+    """
+
+    states: list[RobotState]
+    truth: np.ndarray
+    is_scored: np.ndarray
 
 
-def record(config: TuningConfig, actor: Recurrent) -> Recording:
-    """Walks of `actor`, which knows the true velocity."""
-    ticks = round(config.window / TICK)
+def record(config: TuningConfig, actor: Recurrent) -> WalkRecording:
+    """Record walks of a policy that gets the true velocity.
+
+    Args:
+        config: configuration.
+        actor: policy.
+
+    Returns:
+        The recording.
+    """
+    ticks = round(config.window / TICK_S)
     grounds = [
         [_window(walks, ticks) for _ in range(config.windows)]
-        for walks in both_grounds(
+        for walks in walks_on_both_grounds(
             config.n, config.seed, config.commands, config.randomisation, config.rough, actor
         )
     ]
@@ -57,17 +82,18 @@ def record(config: TuningConfig, actor: Recurrent) -> Recording:
     names = [f.name for f in attrs.fields(RobotState) if f.name not in ("time", "tick")]
     states = [
         RobotState(
-            time=k * TICK,
+            time=k * TICK_S,
             tick=k,
             **{name: np.concatenate([getattr(part.states[k], name) for part in parts]) for name in names},
         )
         for k in range(ticks)
     ]
     truth = np.concatenate([part.truth for part in parts], axis=1)
-    return Recording(states, truth, np.concatenate([part.judged for part in parts], axis=1))
+    return WalkRecording(states, truth, np.concatenate([part.is_scored for part in parts], axis=1))
 
 
-def _window(walks: Walks, ticks: int) -> Recording:
+def _window(walks: Walks, ticks: int) -> WalkRecording:
+    """Record one window of each robot."""
     states, truth, alive = [], [], []
     for _ in range(ticks):
         states.append(walks.sense())
@@ -76,16 +102,24 @@ def _window(walks: Walks, ticks: int) -> Recording:
         walks.advance(states[-1], walks.noisy_truth())
     walks.start_over(np.flatnonzero(walks.over))
     judged = np.array(alive)
-    judged[: round(SETTLE / TICK)] = False
-    return Recording(states, np.array(truth), judged)
+    judged[: round(SETTLE_S / TICK_S)] = False
+    return WalkRecording(states, np.array(truth), judged)
 
 
-def rmse(config: KalmanConfig, recording: Recording) -> np.ndarray:
-    """Root mean square error (2, 3) on flat and on rough ground, m/s an axis."""
+def rmse(config: KalmanConfig, recording: WalkRecording) -> np.ndarray:
+    """RMS error of a Kalman filter.
+
+    Args:
+        config: noise of the filter.
+        recording: recorded walks.
+
+    Returns:
+        (2, 3), m/s per axis, on flat and on rough ground.
+    """
     robots = recording.truth.shape[1]
     estimator = KalmanEstimator(config, (robots,))
     square, count = np.zeros((robots, 3)), np.zeros((robots, 1))
-    for state, truth, judged in zip(recording.states, recording.truth, recording.judged, strict=True):
+    for state, truth, judged in zip(recording.states, recording.truth, recording.is_scored, strict=True):
         velocity, _ = estimator.update(state)
         square += np.square(velocity - truth) * judged[:, None]
         count += judged[:, None]
@@ -94,9 +128,18 @@ def rmse(config: KalmanConfig, recording: Recording) -> np.ndarray:
 
 
 def tune(
-    recording: Recording, evaluations: int, progress: Callable[[np.ndarray], None] = lambda error: None
+    recording: WalkRecording, evaluations: int, progress: Callable[[np.ndarray], None] = lambda error: None
 ) -> KalmanConfig:
-    """The configuration of the least mean of `rmse`, found from the present one by Nelder and Mead's search."""
+    """Minimise the mean of `rmse` from the present configuration by Nelder and Mead's search.
+
+    Args:
+        recording: recorded walks.
+        evaluations: number of evaluations.
+        progress: called with the errors of each evaluation.
+
+    Returns:
+        The best configuration.
+    """
     start = KalmanConfig()
 
     def cost(vector: np.ndarray) -> float:

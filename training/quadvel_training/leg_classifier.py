@@ -1,4 +1,4 @@
-"""Training of the network that tells legs from other things in a scan, and its file for `quadvel_follow.LegDetector`."""
+"""Training of the leg classifier for laser scans, and its file for `quadvel_follow.LegDetector`."""
 
 from __future__ import annotations
 
@@ -18,13 +18,25 @@ from quadvel_eval.people.measure import ScanRecording, detection_scores, identit
 from quadvel_follow.clusters import NUMBERS, WINDOW
 from quadvel_follow.leg_detector import LegDetector
 
-from .leg_examples import Examples, from_file, simulated
+from .leg_examples import Examples, read_examples_file, simulate_examples
 from .onnx_file import commit
 
 
 @attrs.frozen
 class LegConfig:
-    """One run. scenes: simulated ones; share_real: of a batch, where there are real scans."""
+    """Configuration of the leg classifier.
+
+    Attributes:
+        scenes: number of simulated scenes.
+        share_real: share of real examples in a batch, if there are real scans.
+        share_legs: share of legs in a batch.
+        steps: optimiser steps.
+        batch: examples per step.
+        learning_rate: at the start; it falls along a cosine.
+        hidden: sizes of the hidden layers.
+        dropout: dropout probability.
+        seed: seed of all draws.
+    """
 
     scenes: int = 1000
     share_real: float = 0.7
@@ -38,9 +50,14 @@ class LegConfig:
 
 
 class LegNetwork(nn.Module):
-    """Things (N, NUMBERS) to the probability (N,) that each is a leg or a pair of legs."""
+    """Probability (N,) that each object (N, NUMBERS) is a leg or a pair of legs."""
 
     def __init__(self, config: LegConfig) -> None:
+        """Create the network.
+
+        Args:
+            config: configuration.
+        """
         super().__init__()
         self.register_buffer("mean", torch.zeros(NUMBERS))
         self.register_buffer("scale", torch.ones(NUMBERS))
@@ -52,19 +69,43 @@ class LegNetwork(nn.Module):
         self.body = nn.Sequential(*layers, nn.Linear(size, 1))
 
     def logit(self, things: Tensor) -> Tensor:
-        """Of that probability."""
+        """Logit of the probability.
+
+        Args:
+            things: (N, NUMBERS).
+
+        Returns:
+            (N,).
+        """
         return self.body((things - self.mean) / self.scale)[:, 0]
 
     def forward(self, things: Tensor) -> Tensor:
+        """Evaluate the probability.
+
+        Args:
+            things: (N, NUMBERS).
+
+        Returns:
+            (N,), 0 to 1.
+        """
         return self.logit(things).sigmoid()
 
 
 def train(config: LegConfig, real: Sequence[Examples], made: Examples) -> LegNetwork:
-    """A network from real files, each of which counts alike, and simulated scenes."""
+    """Train a network on real files, each with equal weight, and simulated scenes.
+
+    Args:
+        config: configuration.
+        real: examples of each file.
+        made: simulated examples.
+
+    Returns:
+        The network.
+    """
     torch.manual_seed(config.seed)
     rng = np.random.default_rng(config.seed)
     network = LegNetwork(config)
-    every = Examples.joined([*real, made]).things
+    every = Examples.concatenate([*real, made]).things
     network.mean.copy_(torch.from_numpy(every.mean(0)))
     network.scale.copy_(torch.from_numpy(every.std(0) + 1e-3))
     optimiser = torch.optim.AdamW(network.parameters(), config.learning_rate, weight_decay=1e-2)
@@ -83,14 +124,14 @@ def train(config: LegConfig, real: Sequence[Examples], made: Examples) -> LegNet
 
 
 class _Draws:
-    """Batches: as many legs as other things of each source, half of all mirrored."""
+    """Random batches with equal shares of the sources, half of the examples mirrored."""
 
     def __init__(
         self, config: LegConfig, real: Sequence[Examples], made: Examples, rng: np.random.Generator
     ) -> None:
         self._rng = rng
         share = config.share_real if real else 0.0
-        # What to draw from, which of it, and how many: legs and other things of the real files, then of the simulated.
+        # Source, indices and number of draws: legs, then others; of the real files, then simulated.
         self._pools: list[tuple[Examples, np.ndarray, int]] = []
         for legs, part in ((True, config.share_legs), (False, 1.0 - config.share_legs)):
             having = [source for source in real if (source.legs == legs).any()]
@@ -100,7 +141,7 @@ class _Draws:
                 )
 
     def batch(self) -> tuple[np.ndarray, np.ndarray]:
-        """Things and whether they are legs."""
+        """Draw objects and whether they are legs."""
         drawn = [(source, self._rng.choice(which, count)) for source, which, count in self._pools]
         things = np.concatenate([source.things[which] for source, which in drawn])
         legs = np.concatenate([source.legs[which] for source, which in drawn])
@@ -110,18 +151,38 @@ class _Draws:
 
 
 def read_examples(config: LegConfig, folder: Path) -> tuple[dict[Path, Examples], Examples]:
-    """Of the files legs_*.npz of real scans in a folder, and of simulated scenes. Raises FileNotFoundError."""
+    """Read real scans and simulate others.
+
+    Args:
+        config: configuration.
+        folder: folder with files legs_*.npz.
+
+    Returns:
+        Examples of each file, and simulated ones.
+
+    Raises:
+        FileNotFoundError: there is no such file in the folder.
+    """
     files = sorted(folder.glob("legs_*.npz"))
     if not files:
         raise FileNotFoundError(f"{folder}: has no file legs_*.npz, expected scans with and without people")
     rng = np.random.default_rng(config.seed)
-    return {file: from_file(file, rng) for file in files}, simulated(config.scenes, rng)
+    return {file: read_examples_file(file, rng) for file in files}, simulate_examples(config.scenes, rng)
 
 
 def cross_validate(
     config: LegConfig, real: Mapping[Path, Examples], made: Examples
 ) -> Iterator[tuple[str, dict[str, float]]]:
-    """What `quadvel people` says of each file, with a network that has seen the others alone."""
+    """Evaluate each file with a network that was trained on the others.
+
+    Args:
+        config: configuration.
+        real: examples of each file.
+        made: simulated examples.
+
+    Yields:
+        Name of the file, and its figures as in `quadvel people`.
+    """
     for left_out in real:
         network = train(config, [examples for file, examples in real.items() if file != left_out], made)
         with TemporaryDirectory() as folder:
@@ -135,7 +196,13 @@ def cross_validate(
 
 
 def export(network: LegNetwork, path: Path, about: dict[str, Any]) -> None:
-    """Write the network as ONNX, things (N, NUMBERS) to probability (N,), whole or not at all."""
+    """Write the network as ONNX, objects (N, NUMBERS) to probability (N,), atomically.
+
+    Args:
+        network: the network.
+        path: file.
+        about: how it was trained, for the metadata.
+    """
     part = path.with_suffix(".part")
     path.parent.mkdir(parents=True, exist_ok=True)
     torch.onnx.export(

@@ -1,4 +1,4 @@
-"""What the classifier of legs learns from: labelled scans of real people and places, and simulated ones of any scanner."""
+"""Examples for the leg classifier, from real scans and simulated scans of any scanner."""
 
 from __future__ import annotations
 
@@ -17,31 +17,53 @@ from quadvel_sim.walker import Walker, circles
 
 Array = NDArray[np.float64]
 
-SAME = 0.12  # m, between a label and the thing that it names
-FIXED = 0.05  # m, within which a thing that does not move is found again
-FIXED_SHARE = 0.4  # of a file's scans in which such a thing is found
-NEARER = 0.3  # m before what is usually seen in a direction: somebody walks there
-THINNING = (1, 2, 3)  # every how manieth ray is kept: what coarser scanners would have seen
+LABEL_RADIUS_M = 0.12  # between a label and its object
+FIXED_RADIUS_M = 0.05  # within which a fixed object is found again
+FIXED_SHARE = 0.4  # of the scans that show a fixed object
+NEARER_MARGIN_M = 0.3  # in front of the background: a person
+RAY_STRIDES = (1, 2, 3)  # keep every n-th ray, as coarser scanners do
 
 
 @attrs.frozen
 class Examples:
-    """Things (N, NUMBERS), as `describe` has them, and whether each is a leg or a pair of legs (N,)."""
+    """Objects in scans, and their labels.
+
+    Attributes:
+        things: (N, NUMBERS), objects as `describe` returns them.
+        legs: (N,) bool, whether each is a leg or a pair of legs.
+    """
 
     things: NDArray[np.float32]
     legs: NDArray[np.bool_]
 
     @classmethod
-    def joined(cls, parts: Sequence[Examples]) -> Examples:
-        """All of them."""
+    def concatenate(cls, parts: Sequence[Examples]) -> Examples:
+        """Concatenate examples.
+
+        Args:
+            parts: any number of them.
+
+        Returns:
+            All examples.
+        """
         if not parts:
             return cls(np.zeros((0, NUMBERS), np.float32), np.zeros(0, bool))
         return cls(np.concatenate([p.things for p in parts]), np.concatenate([p.legs for p in parts]))
 
 
-def from_file(path: Path, rng: np.random.Generator) -> Examples:
-    """Of a file of real scans: one with labels, one of a place where nobody is, or one of people who walk before a
-    scanner that stands. What can be neither named nor excluded is left out.
+def read_examples_file(path: Path, rng: np.random.Generator) -> Examples:
+    """Extract examples from a file of real scans.
+
+    Objects that cannot be labelled are left out. The file holds labels, or scans of a place without
+    people (`none` in its name), or scans of people who walk in front of a scanner that stands
+    still.
+
+    Args:
+        path: NPZ file.
+        rng: source of randomness for subsampled rays and noise.
+
+    Returns:
+        The examples.
     """
     content = dict(np.load(path, allow_pickle=False))
     content["ranges"] = np.where(content["ranges"] < content["range_max"], content["ranges"], np.inf)
@@ -51,11 +73,11 @@ def from_file(path: Path, rng: np.random.Generator) -> Examples:
         judge = _empty
     else:
         judge = _walking
-    return Examples.joined([one for step in THINNING for one in judge(content, step, rng)])
+    return Examples.concatenate([one for step in RAY_STRIDES for one in judge(content, step, rng)])
 
 
 def _scans(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Scan]:
-    """Every `step`th ray of each scan, with some noise and some rays lost."""
+    """Yield scans with every `step`th ray, some noise, and some rays lost."""
     increment = float(content["angle_increment"])
     for ranges in content["ranges"].astype(float):
         first = int(rng.integers(step))
@@ -66,42 +88,46 @@ def _scans(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iter
 
 
 def _labelled(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
-    fixed = _Fixed(content)
+    """Yield examples of a file with labels."""
+    fixed = _FixedObjects(content)
     for scan, labels in zip(_scans(content, step, rng), content["legs"].astype(float), strict=True):
         clusters = find_clusters(scan)
         labels = labels[np.isfinite(labels[:, 0])]
-        named = _nearest(clusters.centre, labels) < SAME
-        yield _kept(
+        named = _nearest(clusters.centre, labels) < LABEL_RADIUS_M
+        yield _select_examples(
             scan, named, named | (fixed(clusters.centre) & (_nearest(clusters.centre, labels) > WIDEST))
         )
 
 
 def _empty(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
+    """Yield examples of a file without people."""
     for scan in _scans(content, step, rng):
         found = len(find_clusters(scan).centre)
-        yield _kept(scan, np.zeros(found, bool), np.ones(found, bool))
+        yield _select_examples(scan, np.zeros(found, bool), np.ones(found, bool))
 
 
 def _walking(content: dict[str, Any], step: int, rng: np.random.Generator) -> Iterator[Examples]:
+    """Yield examples of a file with people who walk: what moves and is nearer than the background."""
     ranges = np.where(np.isfinite(content["ranges"]), content["ranges"], 2.0 * content["range_max"])
     usual = np.quantile(ranges, 0.8, axis=0)
     angles = content["angle_min"] + content["angle_increment"] * np.arange(ranges.shape[1])
-    fixed = _Fixed(content)
+    fixed = _FixedObjects(content)
     for scan in _scans(content, step, rng):
         clusters = find_clusters(scan)
         bearing = np.arctan2(*clusters.centre.T[::-1])
-        nearer = np.interp(bearing, angles, usual) - np.hypot(*clusters.centre.T) > NEARER
+        nearer = np.interp(bearing, angles, usual) - np.hypot(*clusters.centre.T) > NEARER_MARGIN_M
         still = fixed(clusters.centre)
         person = nearer & ~still & (clusters.width < WIDEST) & (clusters.count * step >= 4)
-        yield _kept(scan, person, person | (still & ~nearer))
+        yield _select_examples(scan, person, person | (still & ~nearer))
 
 
-def _kept(scan: Scan, legs: NDArray[np.bool_], kept: NDArray[np.bool_]) -> Examples:
+def _select_examples(scan: Scan, legs: NDArray[np.bool_], kept: NDArray[np.bool_]) -> Examples:
+    """Describe the objects of a scan, and select some."""
     return Examples(describe(scan, find_clusters(scan))[kept], legs[kept])
 
 
-class _Fixed:
-    """Says of things in a file of a scanner that stands whether they are there in many of its scans."""
+class _FixedObjects:
+    """Test for objects that are present in many scans of a scanner that stands still."""
 
     def __init__(self, content: dict[str, Any]) -> None:
         scans = [
@@ -111,23 +137,32 @@ class _Fixed:
         self._seen = [find_clusters(scan).centre for scan in scans[:: max(1, len(scans) // 100)]]
 
     def __call__(self, centre: Array) -> NDArray[np.bool_]:
-        shares = np.mean([_nearest(centre, seen) < FIXED for seen in self._seen], axis=0)
+        shares = np.mean([_nearest(centre, seen) < FIXED_RADIUS_M for seen in self._seen], axis=0)
         return shares > FIXED_SHARE
 
 
 def _nearest(points: Array, others: Array) -> Array:
-    """From each point (N, 2) to the nearest of the others, m."""
+    """Distance from each point (N, 2) to the nearest of the others, m."""
     if not len(others):
         return np.full(len(points), np.inf)
     return np.linalg.norm(points[:, None] - others[None], axis=2).min(1)
 
 
-def simulated(scenes: int, rng: np.random.Generator) -> Examples:
-    """Of rooms with people in them, each scene from another room and scanner, at ten instants."""
-    return Examples.joined([one for _ in range(scenes) for one in _scene(rng)])
+def simulate_examples(scenes: int, rng: np.random.Generator) -> Examples:
+    """Simulate scans of rooms with people; each scene has another room and scanner, at ten instants.
+
+    Args:
+        scenes: number of scenes.
+        rng: source of randomness.
+
+    Returns:
+        The examples.
+    """
+    return Examples.concatenate([one for _ in range(scenes) for one in _scene(rng)])
 
 
 def _scene(rng: np.random.Generator) -> Iterator[Examples]:
+    """Yield examples of one scene."""
     laser, place = _laser(rng), _room(rng)
     people = [_walker(rng) for _ in range(rng.integers(1, 5))]
     for _ in range(10):
@@ -139,13 +174,14 @@ def _scene(rng: np.random.Generator) -> Iterator[Examples]:
             laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment
         )
         clusters = find_clusters(scan)
-        named = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < SAME
+        named = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < LABEL_RADIUS_M
         named &= clusters.width < WIDEST
         unclear = _nearest(to_frame(clusters.centre, pose), legs[:, :2]) < WIDEST
-        yield _kept(scan, named, named | ~unclear)
+        yield _select_examples(scan, named, named | ~unclear)
 
 
 def _laser(rng: np.random.Generator) -> Laser:
+    """Draw a scanner."""
     resolution = np.deg2rad(rng.choice([0.25, 0.33, 0.5, 0.72, 1.0]))
     field = rng.choice([np.pi, 1.5 * np.pi, 2.0 * np.pi])
     return Laser(
@@ -161,6 +197,7 @@ def _laser(rng: np.random.Generator) -> Laser:
 
 
 def _walker(rng: np.random.Generator) -> Walker:
+    """Draw a person who walks."""
     start = rng.uniform(0.4, 10.0) * _direction(rng)
     walker = Walker(
         way=[start, start + 6.0 * _direction(rng)],
@@ -176,12 +213,13 @@ def _walker(rng: np.random.Generator) -> Walker:
 
 
 def _direction(rng: np.random.Generator) -> Array:
+    """Draw a unit vector."""
     angle = rng.uniform(-np.pi, np.pi)
     return np.array([np.cos(angle), np.sin(angle)])
 
 
 def _room(rng: np.random.Generator) -> FloorPlan:
-    """Walls all round, or none; walls with door frames, boxes, tables and chairs on their legs, poles and trees."""
+    """Draw a room: walls, doors, boxes, tables and chairs on their legs, poles and trees."""
     segments, posts = [], []
     if rng.random() < 0.8:
         a, b = rng.uniform(2.0, 12.0, 2), -rng.uniform(2.0, 12.0, 2)
@@ -200,7 +238,7 @@ def _room(rng: np.random.Generator) -> FloorPlan:
 
 
 def _rectangle(rng: np.random.Generator, a: float, b: float) -> Array:
-    """Corners (4, 2) of one that lies anywhere."""
+    """Draw a rectangle of these sizes, m; return its corners (4, 2)."""
     along = _direction(rng)
     across = np.array([-along[1], along[0]])
     centre = rng.uniform(0.4, 9.0) * _direction(rng)
@@ -210,11 +248,12 @@ def _rectangle(rng: np.random.Generator, a: float, b: float) -> Array:
 
 
 def _closed(corners: Array) -> list[Array]:
+    """Connect corners to a closed polygon."""
     return [np.r_[a, b] for a, b in zip(corners, np.roll(corners, -1, axis=0), strict=True)]
 
 
 def _wall_with_doors(rng: np.random.Generator) -> list[Array]:
-    """A straight wall with gaps, at whose ends frames stand out by some centimetres."""
+    """Draw a straight wall with gaps, and frames of some centimetres at their ends."""
     along = _direction(rng)
     across = np.array([-along[1], along[0]])
     begin = rng.uniform(0.3, 8.0) * _direction(rng) - 4.0 * along

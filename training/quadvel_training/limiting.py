@@ -1,4 +1,4 @@
-"""Narrower command limits for a policy file that exists: where its drives would be asked for more than they can do."""
+"""Narrower command limits for an existing policy file, where its drives would be overloaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every training run shares: a budget, progress, curves, where the time goes, and checkpoints, whole or absent."""
+"""Training loop of every stage: budget, progress, curves, time shares and atomic checkpoints."""
 
 from __future__ import annotations
 
@@ -18,89 +18,154 @@ from torch.utils.tensorboard import SummaryWriter
 
 from . import parallel
 
-SAVE_EVERY = 60.0  # s
+SAVE_INTERVAL_S = 60.0
 
 
 class CheckpointError(ValueError):
-    """A checkpoint of something else."""
+    """Checkpoint that does not fit."""
 
 
 @attrs.frozen
 class Budget:
-    """A run ends when the first of the two is spent; minutes count from its start or resumption."""
+    """Budget of a run, which ends when the first of the two is spent.
+
+    Attributes:
+        samples: number of samples, from the first start.
+        minutes: duration, from the start or the latest resumption.
+    """
 
     samples: float
     minutes: float
 
 
 class Run(Protocol):
-    """A training run: `samples` so far, one `step` given the spent share of the budget, its state for a checkpoint."""
+    """Interface of a training run.
+
+    Attributes:
+        samples: number of samples so far.
+    """
 
     samples: int
 
     def step(self, done: float) -> dict[str, float]:
-        """One update; returns what is worth plotting."""
+        """Take one update.
+
+        Args:
+            done: share of the budget that is spent, 0 to 1.
+
+        Returns:
+            Figures for the log.
+        """
         ...
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run needs."""
+        """Return everything that a resumed run needs.
+
+        Returns:
+            Tensors and plain values.
+        """
         ...
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Resume from a state.
+
+        Args:
+            state: what `state` returned.
+        """
         ...
 
 
 class Keeper:
-    """Keeps and judges what a run has become, every so many samples."""
+    """Base class of what keeps and evaluates a run at intervals of samples."""
 
     def __init__(self, every: float) -> None:
+        """Set the interval.
+
+        Args:
+            every: number of samples.
+        """
         self._every = every
         self._asked_at: int | None = None
 
     def due(self, samples: int) -> bool:
-        """Whether a multiple of `every` was passed since this was asked last."""
+        """Whether a multiple of the interval was passed since the last call.
+
+        Args:
+            samples: number of samples so far.
+
+        Returns:
+            False at the first call.
+        """
         before, self._asked_at = self._asked_at, samples
         return before is not None and samples // self._every > before // self._every
 
     def keep(self) -> dict[str, float]:
-        """Keep the run as it is now; returns what is worth plotting."""
+        """Keep the run as it is now.
+
+        Returns:
+            Figures for the curves.
+
+        Raises:
+            NotImplementedError: in the base class.
+        """
         raise NotImplementedError
 
 
 class Interrupt:
-    """Ctrl-C, to be taken up between two updates; a second one ends the process where it is."""
+    """Context in which Ctrl-C only sets `requested`; a second one interrupts the process at once.
+
+    Attributes:
+        requested: whether Ctrl-C was pressed.
+    """
 
     def __init__(self) -> None:
-        self.asked = False
+        self.requested = False
 
     def __enter__(self) -> Interrupt:
+        """Install the signal handler.
+
+        Returns:
+            The context.
+        """
         self._before = signal.signal(signal.SIGINT, self._ask)
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Restore the signal handler."""
         signal.signal(signal.SIGINT, self._before)
 
     def _ask(self, *_: object) -> None:
-        self.asked = True
+        """Note the request, and restore the handler for a second one."""
+        self.requested = True
         signal.signal(signal.SIGINT, self._before)
 
 
-class Shares:
-    """Where the time of an update goes."""
+class TimeShares:
+    """Shares of the parts of an update in its time."""
 
     def __init__(self) -> None:
         self._seconds: defaultdict[str, float] = defaultdict(float)
 
     @contextmanager
-    def of(self, part: str) -> Iterator[None]:
-        """Time in the block counts as this part's."""
+    def measure(self, part: str) -> Iterator[None]:
+        """Count the time of a `with` block.
+
+        Args:
+            part: name that the time counts for.
+
+        Yields:
+            Nothing.
+        """
         start = time.perf_counter()
         yield
         self._seconds[part] += time.perf_counter() - start
 
-    def taken(self) -> dict[str, float]:
-        """The share of each part in all that was counted since the last call."""
+    def take(self) -> dict[str, float]:
+        """Return the shares since the last call.
+
+        Returns:
+            Share by part, 0 to 1.
+        """
         total = sum(self._seconds.values())
         shares = {part: seconds / total for part, seconds in self._seconds.items()}
         self._seconds.clear()
@@ -108,7 +173,12 @@ class Shares:
 
 
 def save(content: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint so that a reader finds the old one or the new one, never a part."""
+    """Write a checkpoint atomically: a reader finds the old one or the new one.
+
+    Args:
+        content: tensors and plain values.
+        path: file.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     torch.save(content, part)
@@ -116,7 +186,17 @@ def save(content: dict[str, Any], path: Path) -> None:
 
 
 def load(path: Path) -> dict[str, Any]:
-    """Read a checkpoint, whatever device wrote it. Raises FileNotFoundError with a sentence."""
+    """Read a checkpoint of any device to the CPU.
+
+    Args:
+        path: file.
+
+    Returns:
+        Its content.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+    """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such checkpoint")
     content: dict[str, Any] = torch.load(path, weights_only=True, map_location="cpu")
@@ -124,30 +204,62 @@ def load(path: Path) -> dict[str, Any]:
 
 
 def linear(start: float, end: float, done: float) -> float:
-    """From `start` to `end` in a straight line."""
+    """Interpolate linearly.
+
+    Args:
+        start: value at 0.
+        end: value from 1 on.
+        done: progress.
+
+    Returns:
+        The value at `done`.
+    """
     return start + (end - start) * min(done, 1.0)
 
 
 def cosine(start: float, end: float, done: float) -> float:
-    """From `start` to `end` along half a cosine."""
+    """Interpolate along half a cosine.
+
+    Args:
+        start: value at 0.
+        end: value from 1 on.
+        done: progress.
+
+    Returns:
+        The value at `done`.
+    """
     return end + 0.5 * (start - end) * (1 + math.cos(math.pi * min(done, 1.0)))
 
 
 def set_rate(optimiser: torch.optim.Optimizer, rate: float) -> None:
-    """Set the learning rate of every group."""
+    """Set the learning rate of every parameter group.
+
+    Args:
+        optimiser: optimiser, changed in place.
+        rate: learning rate.
+    """
     for group in optimiser.param_groups:
         group["lr"] = float(rate)
 
 
 def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = None) -> bool:
-    """Resume from `checkpoint` if it is there, run until the budget is spent, save on the way and at the end.
+    """Run until the budget is spent; resume from the checkpoint, save at intervals and at the end.
 
-    Ctrl-C ends it after the update under way, with everything saved; returns whether the budget is spent. Of several
-    processes the first one writes, and says when it is over.
+    Ctrl-C stops the run after the present update, with everything saved. Of several processes the
+    first one writes and decides when to stop.
+
+    Args:
+        run: training run.
+        budget: when to stop.
+        checkpoint: file to resume from, if it exists, and to write.
+        keeper: what keeps and evaluates the run on the way.
+
+    Returns:
+        Whether the budget is spent.
     """
     known = load(checkpoint) if checkpoint.exists() else {}
     if known or parallel.size() > 1:
-        run.restore(parallel.from_first(known or run.state()))
+        run.restore(parallel.broadcast(known or run.state()))
     journal = _Journal(run, checkpoint, keeper, known.get("seconds", 0.0)) if parallel.rank() == 0 else None
     started, done, stopped = time.monotonic(), 0.0, False
     try:
@@ -155,7 +267,7 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
             while True:
                 minutes = (time.monotonic() - started) / 60
                 done = max(run.samples / budget.samples, minutes / budget.minutes)
-                done, stopped = parallel.from_first((done, interrupt.asked))
+                done, stopped = parallel.broadcast((done, interrupt.requested))
                 if stopped or done >= 1.0:
                     break
                 seen = run.step(done)
@@ -167,13 +279,13 @@ def train(run: Run, budget: Budget, checkpoint: Path, keeper: Keeper | None = No
     if journal:
         journal.save()
         if stopped:
-            print("stopped; the checkpoint holds everything so far")
-    parallel.from_first(None)  # none goes on before all is written
+            print("stopped; everything so far is in the checkpoint")
+    parallel.broadcast(None)  # wait until everything is written
     return bool(done >= 1.0)
 
 
 class _Journal:
-    """What the first process writes: progress, curves, the checkpoint."""
+    """Progress, curves and checkpoint, written by the first process."""
 
     def __init__(self, run: Run, checkpoint: Path, keeper: Keeper | None, seconds: float) -> None:
         self._run, self._checkpoint, self._keeper = run, checkpoint, keeper
@@ -185,19 +297,17 @@ class _Journal:
         self._progress.start()
 
     def note(self, done: float, seen: dict[str, float]) -> None:
-        """Tell what the last update showed; save now and then."""
+        """Show and plot the figures of an update; save at intervals."""
         samples = self._run.samples
         if self._keeper and self._keeper.due(samples):
             seen = seen | self._keeper.keep()
         for key, value in seen.items():
             self._curves.add_scalar(f"{self._checkpoint.stem}/{key}", value, samples)
-        told = {
-            key: value for key, value in seen.items() if "/" not in key
-        }  # parts of a figure are for the curves
-        note = "  ".join(f"{key} {value:.3g}" for key, value in told.items())
+        shown = {key: value for key, value in seen.items() if "/" not in key}  # the others are plotted
+        note = "  ".join(f"{key} {value:.3g}" for key, value in shown.items())
         self._progress.update(self._task, completed=done, note=note)
         now = time.monotonic()
-        if now - self._saved > SAVE_EVERY:
+        if now - self._saved > SAVE_INTERVAL_S:
             self.save()
             self._saved = now
             rate = (samples - self._first) / (now - self._started)
@@ -206,11 +316,11 @@ class _Journal:
             )
 
     def save(self) -> None:
-        """Write the checkpoint, with the time that it took in all (s)."""
+        """Write the checkpoint, with the total training time, s."""
         seconds = self._before + time.monotonic() - self._started
         save(self._run.state() | {"seconds": seconds}, self._checkpoint)
 
     def end(self) -> None:
-        """End what is shown."""
+        """Close progress bar and curves."""
         self._progress.stop()
         self._curves.close()

@@ -1,4 +1,4 @@
-"""A recurrent network as an ONNX file of one time step, with the metadata that says how to run it."""
+"""Export of a recurrent network as an ONNX file of one time step, with the metadata to run it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from .networks import Recurrent, State
 
 
 class _Cell(nn.Module):
-    """One time step of an LSTM without batch: x (1, inputs), state (1, memory).
+    """LSTM cell for one time step without batch: x (1, inputs), state (1, memory).
 
-    Written out as one matrix product: at batch size one it is quicker than onnxruntime's own LSTM.
+    Written as one matrix product: at batch size one this is faster than onnxruntime's LSTM.
     """
 
     def __init__(self, lstm: nn.LSTM) -> None:
@@ -31,6 +31,8 @@ class _Cell(nn.Module):
 
     def forward(self, x: Tensor, state: State) -> tuple[Tensor, State]:
         h, c = state
+        # (i, f, g, o) = W [x, h] + b
+        # c' = sigmoid(f) c + sigmoid(i) tanh(g), h' = sigmoid(o) tanh(c')
         gates = torch.addmm(self.bias, torch.cat([x, h], dim=1), self.weight)
         admit, forget, candidate, release = gates.split(h.shape[-1], dim=1)
         memory = forget.sigmoid() * c + admit.sigmoid() * candidate.tanh()
@@ -59,9 +61,16 @@ def export(
     outputs: Sequence[str],
     metadata: str,
 ) -> None:
-    """Write `network` as a one-step ONNX (obs, h_in, c_in) -> (*outputs, h_out, c_out) with its metadata, whole or not at all.
+    """Write a network as a one-step ONNX file, atomically.
 
-    obs has the shape (1, size).
+    The file maps (obs, h_in, c_in) to (*outputs, h_out, c_out).
+
+    Args:
+        network: the network.
+        size: number of observations; `obs` has the shape (1, size).
+        path: file.
+        outputs: names of the outputs, which share the network's output equally.
+        metadata: text stored in the file.
     """
     state = network.initial_state(1)
     part = path.with_suffix(".part")
@@ -86,7 +95,11 @@ def export(
 
 
 def commit() -> str:
-    """The commit that a file was made at, or "unknown" outside a checkout."""
+    """Short hash of the present commit.
+
+    Returns:
+        The hash, or "unknown" outside a checkout.
+    """
     result = subprocess.run(
         ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False
     )

@@ -1,6 +1,7 @@
-"""Several processes as one learner, started by torchrun: mean gradients, one start, one end, one writer.
+"""Several processes as one learner, started by torchrun.
 
-Each process has its share of the robots. A single process, started without torchrun, passes through here for free.
+Gradients are averaged; start, end and writing are common. Each process has its share of the robots.
+In a single process, started without torchrun, these functions do nothing.
 """
 
 from __future__ import annotations
@@ -16,49 +17,88 @@ import torch.distributed as dist
 
 
 def join(device: str) -> torch.device:
-    """Become one of torchrun's processes where it started this one; the device that this process computes on."""
+    """Join the process group if torchrun started this process.
+
+    Args:
+        device: `cpu` or `cuda`.
+
+    Returns:
+        The device of this process.
+    """
     if "LOCAL_RANK" not in os.environ:
         return torch.device(device)
     if not dist.is_initialized():
-        importlib.import_module("torch._dynamo")  # imported later, by an optimiser, it keeps the group
+        importlib.import_module(
+            "torch._dynamo"
+        )  # a later import, by an optimiser, would keep the group alive
         dist.init_process_group("cpu:gloo,cuda:nccl" if torch.cuda.is_available() else "gloo")
-        atexit.register(leave)
+        atexit.register(destroy_group)
     local = int(os.environ["LOCAL_RANK"])
     return torch.device(device, local) if device == "cuda" else torch.device(device)
 
 
-def leave() -> None:
-    """Be one of several no more: a process that ends with threads of its group at work can abort."""
+def destroy_group() -> None:
+    """Destroy the process group: a process that ends while threads of its group run can abort."""
     if dist.is_initialized():
         dist.destroy_process_group()
 
 
 def rank() -> int:
-    """The number of this process; 0 writes."""
+    """Number of this process.
+
+    Returns:
+        0 for the process that writes.
+    """
     return int(dist.get_rank()) if dist.is_initialized() else 0
 
 
 def size() -> int:
-    """How many processes learn together."""
+    """Number of processes.
+
+    Returns:
+        1 without torchrun.
+    """
     return int(dist.get_world_size()) if dist.is_initialized() else 1
 
 
-def share(n: int) -> int:
-    """Of `n` robots those of this process. Raises ValueError where they cannot be shared out."""
+def local_share(n: int) -> int:
+    """Share of the robots that this process has.
+
+    Args:
+        n: number of robots.
+
+    Returns:
+        n over the number of processes.
+
+    Raises:
+        ValueError: n is no multiple of the number of processes.
+    """
     if n % size():
         raise ValueError(f"n is {n} robots, expected a multiple of the {size()} processes")
     return n // size()
 
 
-def seed_of(seed: int) -> int:
-    """Of this process's draws, where all are given `seed`."""
+def process_seed(seed: int) -> int:
+    """Derive the seed of this process from the common one.
+
+    Args:
+        seed: common seed.
+
+    Returns:
+        Seed of this process.
+    """
     return seed + 1000 * rank()
 
 
-def go_on_drawing(kept: dict[str, Any], rng: np.random.Generator, seed: int, samples: int) -> None:
-    """Random numbers that go on after `samples`: those of a checkpoint, `kept`; of several processes new ones for each.
+def resume_random(kept: dict[str, Any], rng: np.random.Generator, seed: int, samples: int) -> None:
+    """Resume random numbers from a checkpoint; several processes draw new ones each.
 
-    kept: {"learner": of torch, "environments": of `rng`}, as one process left them.
+    Args:
+        kept: `learner`, the state of torch, and `environments`, that of `rng`, as one process left
+            them.
+        rng: generator of the environments, changed in place.
+        seed: common seed.
+        samples: number of samples so far.
     """
     if size() == 1:
         torch.set_rng_state(kept["learner"])
@@ -69,7 +109,14 @@ def go_on_drawing(kept: dict[str, Any], rng: np.random.Generator, seed: int, sam
 
 
 def mean(value: torch.Tensor) -> torch.Tensor:
-    """Of all processes' values."""
+    """Mean over all processes.
+
+    Args:
+        value: tensor of the same shape in each process.
+
+    Returns:
+        The mean.
+    """
     if size() > 1:
         value = value.detach().clone()
         dist.all_reduce(value)
@@ -78,7 +125,11 @@ def mean(value: torch.Tensor) -> torch.Tensor:
 
 
 def share_gradients(module: torch.nn.Module) -> None:
-    """Give every process the mean of all gradients."""
+    """Replace the gradients by their mean over all processes.
+
+    Args:
+        module: network with gradients.
+    """
     if size() == 1:
         return
     gradients = [p.grad for p in module.parameters() if p.grad is not None]
@@ -87,8 +138,15 @@ def share_gradients(module: torch.nn.Module) -> None:
         own.copy_(part.view_as(own))
 
 
-def from_first(value: Any) -> Any:
-    """What process 0 has."""
+def broadcast(value: Any) -> Any:
+    """Return the value of process 0.
+
+    Args:
+        value: value of this process.
+
+    Returns:
+        The value of process 0.
+    """
     if size() == 1:
         return value
     kept = [value]
@@ -97,7 +155,14 @@ def from_first(value: Any) -> Any:
 
 
 def gather(value: Any) -> list[Any]:
-    """What each process has, the first one's first."""
+    """Collect the values of all processes.
+
+    Args:
+        value: value of this process.
+
+    Returns:
+        Values in the order of the processes.
+    """
     kept = [value] * size()
     if size() > 1:
         dist.all_gather_object(kept, value)

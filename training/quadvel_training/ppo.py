@@ -1,7 +1,10 @@
-"""Proximal policy optimisation with the paper's two constraints (Eq. 6 to 8), for memoryless and recurrent actors alike.
+"""Proximal policy optimisation (PPO) with the constraints of Eq. 6 to 8.
 
-Sequences are cut at fixed lengths. Those of a recurrent actor never contain a reset: an environment that ends within a
-sequence is masked from there on and starts over with the next one, so a recurrent pass is one call of the fused LSTM.
+The constraints are symmetry and smoothness; actors are memoryless or recurrent.
+
+Sequences have a fixed length. Those of a recurrent actor never contain a reset: an environment that
+ends within a sequence is masked for the rest and starts over with the next one. So one pass is one
+call of the fused LSTM.
 """
 
 from __future__ import annotations
@@ -18,42 +21,59 @@ from . import parallel
 from .loop import set_rate
 from .networks import Gaussian, State, select
 
-LOG_RATIO_BOUND = 10.0  # of the likelihoods now and when it was drawn; the clip of PPO lies far inside
-FAR = (
-    0.5  # of the network's unit: what a teacher asks of a robot that is about to fall must not drown all else
-)
-QUIET_SHARE = 0.25  # of the robots, the last ones, explore little:
-QUIET = 0.3  # of what the others do, so that a policy works without noise, too
-ADVANTAGE_BOUND = 10.0  # standard deviations: a fall must not drown what all others show
+LOG_RATIO_BOUND = 10.0  # bound of |log r|, far outside the clip range of PPO
+IMITATION_HUBER_DELTA = 0.5  # network's unit; labels of robots about to fall must not dominate
+QUIET_ROBOT_SHARE = 0.25  # share of the robots, the last ones, that explore little
+QUIET_NOISE_RATIO = 0.3  # their exploration relative to the others'; trains for no noise
+ADVANTAGE_BOUND = 10.0  # standard deviations; one fall must not dominate an update
 
 
 @attrs.frozen
 class PpoConfig:
-    """Hyperparameters; names and defaults follow Table 3 where it speaks."""
+    """Hyperparameters of PPO; names and defaults follow Table 3 where it gives them.
+
+    Attributes:
+        discount: discount factor gamma per sample.
+        gae: lambda of the generalised advantage estimate.
+        clip: clip range epsilon of the likelihood ratio.
+        epochs: passes over a rollout.
+        mini_batches: mini-batches per epoch.
+        critic_steps: critic steps per actor step; a memoryless critic affords many small ones.
+        learning_rate: initial learning rate of the actor.
+        max_learning_rate: upper bound of the adapted learning rate.
+        target_kl: KL divergence per update that the learning rate is adapted to, computed as if
+            exploration were white and equal for all robots: with correlated noise lasting shifts
+            would count too little. None keeps the rate, as it must if an update is a single step,
+            before which nothing has shifted.
+        entropy: weight of the entropy bonus.
+        symmetry: w_sym of Eq. 8.
+        smoothness: w_smooth of Eq. 8.
+        symmetric_share: share of the environments, the first ones, in the symmetry term.
+        correlation: autocorrelation of the exploration noise from sample to sample.
+        max_grad_norm: bound of the gradient norm.
+        momentum: above 0 the actor uses SGD with this momentum instead of Adam, which takes equal
+            steps in all weights, though most see noise only.
+    """
 
     discount: float = 0.99
     gae: float = 0.95
     clip: float = 0.2
     epochs: int = 4
     mini_batches: int = 4
-    critic_steps: int = 1  # for one of the actor: without a memory, many small ones cost no more
+    critic_steps: int = 1
     learning_rate: float = 5e-4
     max_learning_rate: float = 1e-3
     target_kl: float | None = 0.01
-    """of an update, as if exploration were white, and that of all robots the same: correlated, lasting shifts would count too
-    little; None keeps the rate, as it must where an update is a single step, before which nothing has shifted yet"""
     entropy: float = 0.0
-    symmetry: float = 0.5  # w_sym of Eq. 8
-    smoothness: float = 0.0  # w_smooth of Eq. 8
-    symmetric_share: float = 1.0  # of the environments, the first ones, that the symmetry term sees
-    correlation: float = 0.0  # of the exploration from sample to sample
+    symmetry: float = 0.5
+    smoothness: float = 0.0
+    symmetric_share: float = 1.0
+    correlation: float = 0.0
     max_grad_norm: float = 1.0
-    momentum: float = (
-        0.0  # above 0: plain gradient steps. Adam steps in all weights alike, most of which see but noise
-    )
+    momentum: float = 0.0
 
 
-GENTLE = PpoConfig(
+RECURRENT_PPO = PpoConfig(
     discount=0.995,
     gae=0.97,
     epochs=1,
@@ -68,47 +88,84 @@ GENTLE = PpoConfig(
     symmetric_share=0.25,
     correlation=0.9,
 )
-"""For a recurrent policy at 200 Hz that walks already: one small step a rollout, exploration that lasts"""
+"""For a recurrent policy that already walks: one small step per rollout, correlated exploration"""
 
 
 @attrs.define
 class Rollout:
-    """One stretch of experience; time first. `mask` is 1 while the sequence is alive."""
+    """Experience of T samples of N environments, time first.
 
-    obs: Tensor  # (T, N, O)
-    critic_obs: Tensor  # (T, N, C)
-    action: Tensor  # (T, N, A)
-    mean: Tensor  # (T, N, A) of the policy that acted
-    reward: Tensor  # (T, N)
-    ended: Tensor  # (T, N) 1 where the episode failed at the end of the sample
-    cut: Tensor  # (T, N) 1 where it timed out instead
-    mask: Tensor  # (T, N)
-    noise: Tensor  # (N, A) exploration at the sample before the first
-    last_critic_obs: Tensor  # (N, C)
-    state: State | None = None  # of the actor at the start
-    mirrored_state: State | None = None  # of the actor on the mirrored past, of those the symmetry term sees
-    label: Tensor | None = None  # (T, N, A) what a teacher would have done
-    spread: Tensor | None = None  # (N, 1) of each robot's exploration, a share of the policy's; None: 1
-    standing: Tensor | None = (
-        None  # (T, N) 1 on four feet, where it may prefer a side: it has to begin with one
-    )
+    O, C and A are the sizes of observation, critic observation and action.
+
+    Attributes:
+        obs: (T, N, O), observations.
+        critic_obs: (T, N, C), observations of the critic.
+        action: (T, N, A), actions taken.
+        mean: (T, N, A), mean of the policy that acted.
+        reward: (T, N).
+        ended: (T, N), 1 where the episode failed at the end of the sample.
+        cut: (T, N), 1 where the episode timed out at the end of the sample.
+        mask: (T, N), 1 while the sequence is alive.
+        noise: (N, A), exploration noise of the sample before the first.
+        last_critic_obs: (N, C), observations of the critic after the last sample.
+        state: memory of the actor at the start.
+        mirrored_state: memory of the actor on the mirrored past, of the environments in the
+            symmetry term.
+        label: (T, N, A), actions of a teacher.
+        spread: (N, 1), exploration of each robot as a share of the policy's; None for 1.
+        standing: (T, N), 1 for a robot on four feet; the symmetry term ignores it, as it has to
+            start with one side.
+    """
+
+    obs: Tensor
+    critic_obs: Tensor
+    action: Tensor
+    mean: Tensor
+    reward: Tensor
+    ended: Tensor
+    cut: Tensor
+    mask: Tensor
+    noise: Tensor
+    last_critic_obs: Tensor
+    state: State | None = None
+    mirrored_state: State | None = None
+    label: Tensor | None = None
+    spread: Tensor | None = None
+    standing: Tensor | None = None
 
 
-def living_mean(values: Tensor, mask: Tensor) -> Tensor:
-    """Over the living samples of all processes: the mean of what each process returns here, and so of its gradients."""
+def masked_mean(values: Tensor, mask: Tensor) -> Tensor:
+    """Mean over the living samples of all processes.
+
+    Args:
+        values: (T, N).
+        mask: (T, N), 1 for living samples.
+
+    Returns:
+        A number whose mean over the processes is the mean over all samples; so are its gradients.
+    """
     return (values * mask).sum() / parallel.mean(mask.sum()).clamp(min=1)
 
 
-def spreads(n: int) -> np.ndarray:
-    """How much each of `n` robots explores, (n, 1), as a share of the policy's exploration.
+def exploration_scales(n: int) -> np.ndarray:
+    """Share of the policy's exploration that each robot uses.
 
-    What noise alone does for most of them, such as to begin with one of two legs, the policy has to do for the quiet ones.
+    The last `QUIET_ROBOT_SHARE` of the robots explore little. What noise does for most of them,
+    such as choosing the leg to start with, the policy has to do for the quiet ones.
+
+    Args:
+        n: number of robots.
+
+    Returns:
+        (n, 1).
     """
-    return np.where(np.arange(n)[:, None] < (1.0 - QUIET_SHARE) * n, 1.0, QUIET).astype(np.float32)
+    return np.where(np.arange(n)[:, None] < (1.0 - QUIET_ROBOT_SHARE) * n, 1.0, QUIET_NOISE_RATIO).astype(
+        np.float32
+    )
 
 
 class Ppo:
-    """One learner: an actor, a critic on the simulator's true state, an optimiser."""
+    """PPO learner: an actor, a critic on the simulator's true state, and their optimisers."""
 
     def __init__(
         self,
@@ -118,6 +175,15 @@ class Ppo:
         mirror_obs: Callable[[Tensor], Tensor],
         mirror_action: Callable[[Tensor], Tensor],
     ) -> None:
+        """Create the optimisers.
+
+        Args:
+            actor: policy.
+            critic: value function, (..., C) to (..., 1).
+            config: hyperparameters.
+            mirror_obs: mirror image of observations.
+            mirror_action: mirror image of actions.
+        """
         self.actor, self.critic, self.config = actor, critic, config
         self.mirror_obs, self.mirror_action = mirror_obs, mirror_action
         rate, momentum = config.learning_rate, config.momentum
@@ -129,12 +195,23 @@ class Ppo:
         self.critic_optimiser = torch.optim.Adam(critic.parameters(), lr=1e-3)
         self.learning_rate = config.learning_rate
 
-    def mirrored(self, n: int) -> int:
-        """How many of `n` environments the symmetry term sees."""
+    def mirrored_count(self, n: int) -> int:
+        """Number of environments in the symmetry term.
+
+        Args:
+            n: number of environments.
+
+        Returns:
+            At least 1.
+        """
         return max(1, round(n * self.config.symmetric_share))
 
     def state(self) -> dict[str, Any]:
-        """The optimisers, for a checkpoint."""
+        """Return the state of the optimisers for a checkpoint.
+
+        Returns:
+            The state, for `restore`.
+        """
         return {
             "actor_optimiser": self.actor_optimiser.state_dict(),
             "critic_optimiser": self.critic_optimiser.state_dict(),
@@ -142,7 +219,11 @@ class Ppo:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`; at the configuration's own learning rate where that is not adapted."""
+        """Restore the optimisers; a learning rate that is not adapted comes from the configuration.
+
+        Args:
+            state: what `state` returned.
+        """
         self.actor_optimiser.load_state_dict(state["actor_optimiser"])
         self.critic_optimiser.load_state_dict(state["critic_optimiser"])
         if self.config.target_kl is not None:
@@ -151,11 +232,23 @@ class Ppo:
 
     @torch.no_grad()  # type: ignore[untyped-decorator]
     def advantages(self, r: Rollout) -> tuple[Tensor, Tensor]:
-        """Generalised advantage estimates and value targets, (T, N) each."""
+        """Compute generalised advantage estimates and value targets (Schulman et al. 2016).
+
+        Args:
+            r: rollout.
+
+        Returns:
+            Advantages and value targets, (T, N) each.
+        """
         c = self.config
         value = self.critic(torch.cat([r.critic_obs, r.last_critic_obs[None]]))[0][..., 0]
         advantage = torch.zeros_like(r.reward)
         running = torch.zeros_like(r.reward[0])
+        # delta[t] = r[t] + gamma V[t+1] (1 - ended[t]) - V[t]
+        # A[t] = delta[t] + gamma lambda (1 - ended[t]) (1 - cut[t]) A[t+1], target[t] = A[t] + V[t]
+        # After a timeout the state goes on, but its successor belongs to another episode: V[t]
+        # stands
+        # for V[t+1].
         for t in reversed(range(len(r.reward))):
             going = 1.0 - r.ended[t]
             following = torch.where(r.cut[t] > 0, value[t], value[t + 1])  # a timeout is no failure
@@ -168,14 +261,26 @@ class Ppo:
     def update(
         self, r: Rollout, learn_actor: bool = True, pull: float = 0.0, constraints: float = 1.0
     ) -> dict[str, float]:
-        """Several epochs over one rollout; returns means of the loss terms.
+        """Learn from one rollout.
 
-        pull: weight of the distance to the rollout's labels; constraints: share of the configuration's weights.
+        Args:
+            r: rollout.
+            learn_actor: whether the actor learns, too.
+            pull: weight of the distance to the rollout's labels.
+            constraints: share of the configured constraint weights, 0 to 1.
+
+        Returns:
+            Means of the loss terms, explained variance and learning rate, for the log.
+
+        Raises:
+            FloatingPointError: a gradient is not finite.
         """
         advantage, target = self.advantages(r)
-        explained = 1 - living_mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
-        centre = parallel.mean(living_mean(advantage, r.mask))
-        spread = parallel.mean(living_mean((advantage - centre) ** 2, r.mask)).sqrt()
+        # Normalise over all processes; the bound keeps one fall from dominating the update:
+        #     A <- clamp((A - mean(A)) / std(A), +-ADVANTAGE_BOUND)
+        explained = 1 - masked_mean(advantage**2, r.mask) / target[r.mask > 0].var().clamp(min=1e-8)
+        centre = parallel.mean(masked_mean(advantage, r.mask))
+        spread = parallel.mean(masked_mean((advantage - centre) ** 2, r.mask)).sqrt()
         advantage = ((advantage - centre) / (spread + 1e-6)).clamp(-ADVANTAGE_BOUND, ADVANTAGE_BOUND)
         with torch.no_grad():
             old_log_prob = self._log_prob(r, slice(None), r.mean)
@@ -195,30 +300,35 @@ class Ppo:
             self._adapt_rate(means["kl"], self.config.target_kl)
         return means | {"explained_variance": float(explained), "learning_rate": self.learning_rate}
 
-    def _draws(self, noise: Tensor, before: Tensor) -> Tensor:
-        """What was drawn anew in every sample of correlated exploration (T, N, A), of which `before` (N, A) was the last."""
+    def _innovations(self, noise: Tensor, before: Tensor) -> Tensor:
+        """White innovations of AR(1) noise (T, N, A); `before` (N, A) precedes its first sample."""
+        # n[t] = rho n[t-1] + w[t], so w[t] = n[t] - rho n[t-1]
         return noise - self.config.correlation * torch.cat([before[None], noise[:-1]])
 
     def _log_prob(self, r: Rollout, ids: Tensor | slice, mean: Tensor) -> Tensor:
-        """Log density of the actions that robots `ids` took, (T, N), if the policy meant `mean`, but for a constant.
+        """Log density (T, N), up to a constant, of the actions of robots `ids` under `mean`.
 
-        Of the draws given the whole past: what the actions deviate by now depends on what the mean was then. With the
-        decayed noise taken as a given offset, the gradient would be that of a mean which changes along with the noise.
+        It is the density of the innovations given the whole past: the present deviation depends on
+        what the mean was before. If the decayed noise were a given offset, the gradient would be
+        that of a mean that changes along with the noise.
         """
-        draws = self._draws(r.action[:, ids] - mean, r.noise[ids])
+        draws = self._innovations(r.action[:, ids] - mean, r.noise[ids])
         if r.spread is not None:
             draws = draws / r.spread[ids]
         return self.actor.log_prob(torch.zeros_like(draws), draws)
 
     def _mini_batches(self, n: int, device: torch.device) -> Iterator[Tensor]:
+        """Yield random mini-batches of environment indices for all epochs."""
         for _ in range(self.config.epochs):
             yield from torch.randperm(n).to(device).chunk(self.config.mini_batches)
 
     def _critic_step(self, obs: Tensor, target: Tensor, mask: Tensor) -> dict[str, float]:
+        """Take the critic's steps on one mini-batch."""
         steps, total = self.config.critic_steps, 0.0
         parts = zip(*(x.tensor_split(steps, dim=1) for x in (obs, target, mask)), strict=True)
         for part_obs, part_target, part_mask in parts:
-            loss = living_mean((self.critic(part_obs)[0][..., 0] - part_target) ** 2, part_mask)
+            # L_V = mean((V(s) - target)^2)
+            loss = masked_mean((self.critic(part_obs)[0][..., 0] - part_target) ** 2, part_mask)
             self._step(self.critic_optimiser, self.critic, loss)
             total += float(loss.detach())
         return {"value_loss": total / steps}
@@ -232,48 +342,61 @@ class Ppo:
         mask: Tensor,
         weights: tuple[float, float],
     ) -> dict[str, float]:
+        """Take one step of the actor on one mini-batch."""
         c, actor = self.config, self.actor
         pull, constraints = weights
         mean, _ = actor(r.obs[:, ids], r.state and select(r.state, ids))
+        # PPO's clipped surrogate (Schulman et al. 2017), with r = pi(a) / pi_old(a):
+        #     L_clip = -mean(min(r A, clip(r, 1 - eps, 1 + eps) A))
         log_ratio = self._log_prob(r, ids, mean) - old_log_prob
-        ratio = log_ratio.clamp(
-            -LOG_RATIO_BOUND, LOG_RATIO_BOUND
-        ).exp()  # one that overflows spoils all weights
+        # an overflow would destroy all weights
+        ratio = log_ratio.clamp(-LOG_RATIO_BOUND, LOG_RATIO_BOUND).exp()
         clipped = ratio.clamp(1 - c.clip, 1 + c.clip)
-        surrogate = -living_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
+        surrogate = -masked_mean(torch.minimum(ratio * advantage, clipped * advantage), mask)
         variance = (2 * actor.log_std).exp().detach()
 
-        seen = ids < self.mirrored(r.reward.shape[1])
+        seen = ids < self.mirrored_count(r.reward.shape[1])
         before = r.mirrored_state and select(r.mirrored_state, ids[seen])
-        with torch.set_grad_enabled(c.symmetry > 0.0):  # else the term is but watched
+        with torch.set_grad_enabled(c.symmetry > 0.0):  # weight 0: only logged
             mirrored, _ = actor(self.mirror_obs(r.obs[:, ids[seen]]), before)
+        # Symmetry, Eq. 6: KL divergence between mu(o) and the mirrored action of the mirrored
+        # observation,
+        #     L_sym = mean(sum |mu(o) - M_a mu(M_o o)|^2 / (2 sigma^2))
         gap = (mean[:, seen] - self.mirror_action(mirrored)) ** 2 / (2 * variance)
         stepping = mask[:, seen] if r.standing is None else mask[:, seen] * (1 - r.standing[:, ids[seen]])
-        symmetry = living_mean(gap.sum(-1), stepping)
+        symmetry = masked_mean(gap.sum(-1), stepping)
+        # Smoothness, Eq. 7: second difference of the mean action,
+        #     L_smooth = mean(|mu[t+1] - 2 mu[t] + mu[t-1]|)
         bend = mean[2:] - 2 * mean[1:-1] + mean[:-2]
-        smoothness = living_mean(bend.norm(dim=-1), mask[2:])
+        smoothness = masked_mean(bend.norm(dim=-1), mask[2:])
 
+        # Eq. 8: L = L_clip + constraints (w_sym L_sym + w_smooth L_smooth) - w_ent H
+        #                 + pull mean(Huber(mu - label))
         constrained = constraints * (c.symmetry * symmetry + c.smoothness * smoothness)
         loss = surrogate + constrained - c.entropy * actor.entropy()
         terms = {"surrogate": surrogate, "symmetry": symmetry, "smoothness": smoothness}
         if r.label is not None:
-            away = torch.nn.functional.huber_loss(mean, r.label[:, ids], reduction="none", delta=FAR)
-            terms["away"] = living_mean(away.mean(-1), mask)
+            away = torch.nn.functional.huber_loss(
+                mean, r.label[:, ids], reduction="none", delta=IMITATION_HUBER_DELTA
+            )
+            terms["away"] = masked_mean(away.mean(-1), mask)
             loss = loss + pull * terms["away"]
         self._step(self.actor_optimiser, actor, loss)
+        # KL divergence of two Gaussians with one variance: |mu - mu_old|^2 / (2 sigma^2)
         if c.target_kl is not None:
             shift = ((mean.detach() - r.mean[:, ids]) ** 2 / (2 * variance)).sum(-1)
-            terms["kl"] = parallel.mean(living_mean(shift, mask))
+            terms["kl"] = parallel.mean(masked_mean(shift, mask))
         return {name: float(term.detach()) for name, term in terms.items()}
 
     def _step(self, optimiser: torch.optim.Optimizer, module: torch.nn.Module, loss: Tensor) -> None:
+        """Take an optimiser step with the mean gradient of all processes, clipped in norm."""
         optimiser.zero_grad()
         loss.backward()
         parallel.share_gradients(module)
         norm = torch.nn.utils.clip_grad_norm_(module.parameters(), self.config.max_grad_norm)
         if not torch.isfinite(norm):
             raise FloatingPointError(
-                "the gradient is not finite: the run ends before it spoils its weights; go on from its checkpoint"
+                "the gradient is not finite; the run stops before it changes the weights; resume from its checkpoint"
             )
         optimiser.step()
 

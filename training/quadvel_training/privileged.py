@@ -1,8 +1,9 @@
-"""Stage 1: a memoryless teacher that sees the true state finds a gait from random weights, by rewards alone.
+"""Stage 1: a memoryless teacher that sees the true state finds a gait by rewards alone.
 
-No reference motion. It acts 50 times a second, learns by PPO with a mirror loss, and
-its commands grow with what it follows (`command_grid`). What it sees of the past, errors over a stride and over some
-seconds, a recurrent student can keep for itself.
+It starts from random weights, without a reference motion. The teacher acts 50 times a second and
+learns by PPO with a mirror loss. The range of commands grows with what it follows (`command_grid`).
+What it sees of the past, errors over a stride and over seconds, a recurrent student can keep
+itself.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Any
 import attrs
 import numpy as np
 import torch
+from typing_extensions import override
 
 from quadvel_description import robot, symmetry
 from quadvel_description.symmetry import Mirror
@@ -21,33 +23,34 @@ from quadvel_sim.terrain import Terrain
 
 from . import loop, parallel
 from .command_grid import CommandGrid, GridConfig
-from .env import EnvConfig, VelocityEnv, cores
+from .env import EnvConfig, VelocityEnv, available_cores
 from .loop import Budget
 from .networks import Gaussian, Mlp, torch_mirror
-from .ppo import Ppo, PpoConfig, Rollout, spreads
-from .randomisation import Randomisation, actuator
+from .ppo import Ppo, PpoConfig, Rollout, exploration_scales
+from .randomisation import Randomisation, load_actuator
 from .walking_rewards import (
-    SAMPLE,
+    SAMPLE_S,
     WalkingRewards,
     WalkingWeights,
-    lifting,
-    one_diagonal_in_the_air,
-    sizes,
+    error_magnitudes,
+    is_one_diagonal_airborne,
+    lifting_weight,
 )
 
-ACTION_SCALE = 0.4  # rad a unit of the network's output
-ACTION_BOUND = 4.0  # of the network's unit
-STRIDE = 0.35  # s, over which errors are low-passed: about a stride
-LONG = 1.5  # s, the same for what lasts
-TRANSIENT = 1.0  # s after a new command that what lasts, and the judgement of the command, leave out
-PAIRING = 0.7  # s, over which `Past.paired` is low-passed: about two strides
+ACTION_SCALE = 0.4  # rad per unit of the network's output
+ACTION_BOUND = 4.0  # in the network's unit
+STRIDE_S = 0.35  # time constant of stride errors: about a stride
+LASTING_S = 1.5  # time constant of lasting errors
+TRANSIENT_S = 1.0  # after a new command, not part of lasting errors and scores
+PAIRING_S = 0.7  # time constant of `Past.paired`: about two strides
 HIPS_AHEAD = robot.HIP_OFFSET[0] * np.array([robot.FRONT[leg] for leg in robot.LEGS])  # m, body frame
-AIRBORNE = 0.05  # weight of a rollout's share of feet in the air in the run's mean, about 20 rollouts
-STOOD = 0.2  # s on four feet, after which a robot that sets off has to begin with a side
-TALL = 0.38  # m, about the height of a walking trunk
+AIRBORNE_WEIGHT = 0.05  # weight of a rollout in the run's mean, over about 20 rollouts
+STANDING_S = 0.2  # on four feet; after that, setting off means choosing a side
+WALKING_HEIGHT_M = 0.38  # typical height of the trunk
 
 
 def _signs(*signs: float) -> Mirror:
+    """Build a mirror that only changes signs."""
     return Mirror(np.arange(len(signs)), np.array(signs, float))
 
 
@@ -66,51 +69,70 @@ MIRROR = symmetry.stack(
         _signs(1, -1, 1),  # shift of the centre of mass
     ]
 )
-SIZE = len(MIRROR.index)
-CRITIC_EXTRA = 4 + 4 + 1
-GAIT_EXTRA = 2  # more that this stage's critic alone sees: `Past.paired`, and `lifting`
+OBSERVATION_SIZE = len(MIRROR.index)
+CRITIC_EXTRA_SIZE = 4 + 4 + 1
+GAIT_EXTRA_SIZE = 2  # further inputs of this stage's critic: `Past.paired`, `lifting`
 
 
 class Past:
-    """What `n` robots have done: errors, low-passed, and how long each foot has been in the air or down.
+    """Low-passed errors and foot timing of `n` robots.
 
-    stride, lasting (n, 3): command minus velocity in vx, vy (m/s) and yaw rate (rad/s) over STRIDE and LONG; the latter
-    starts at zero with every new command, TRANSIENT after it. air, down (n, 4): s since the foot left the ground or touched it.
-    paired (n,): share of the time that one diagonal pair of feet alone was in the air, low-passed over PAIRING. off_hip (n, 4): of
-    a foot that has just left the ground, how far ahead of its hip the middle of its stance was, m, body frame; else 0.
+    Attributes:
+        env: environments.
+        stride: (n, 3), command minus velocity in vx, vy (m/s) and yaw rate (rad/s), low-passed over
+            `STRIDE_S`.
+        lasting: (n, 3), the same over `LASTING_S`; set to zero by a new command, it starts
+            `TRANSIENT_S` after it.
+        air: (n, 4), s since the foot left the ground; 0 on the ground.
+        down: (n, 4), s since the foot touched the ground; 0 in the air.
+        paired: (n,), share of the time with exactly one diagonal pair in the air, low-passed over
+            `PAIRING_S`.
+        off_hip: (n, 4), m, body frame: of a foot that has just left the ground, how far ahead of
+            its hip the middle of its stance was; else 0.
     """
 
     def __init__(self, env: VelocityEnv) -> None:
+        """Create the past of robots that start now.
+
+        Args:
+            env: environments.
+        """
         n = env.config.n
         self.env = env
         self.stride, self.lasting = np.zeros((n, 3)), np.zeros((n, 3))
         self.air, self.down = np.zeros((n, 4)), np.zeros((n, 4))
         self.paired, self.off_hip = np.zeros(n), np.zeros((n, 4))
-        self._age = np.zeros(n)  # s, of the command
-        self._landed, self._last = (
-            np.zeros((n, 4)),
-            np.zeros((n, 4)),
-        )  # m ahead of the hip: at touchdown, last on the ground
+        self._age = np.zeros(n)  # age of the command, s
+        self._landed, self._last = np.zeros((n, 4)), np.zeros((n, 4))  # m ahead of the hip: at touchdown, now
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the past of `ids`."""
+        """Clear the past of some robots.
+
+        Args:
+            ids: their indices.
+        """
         for array in (self.stride, self.lasting, self.air, self.down, self.paired, self.off_hip, self._age):
             array[ids] = 0.0
 
     def advance(self, command: np.ndarray) -> None:
-        """After a tick of the environment under `command` (n, 4)."""
+        """Update everything after a tick of the environment.
+
+        Args:
+            command: (n, 4), command that was in force.
+        """
         env, period = self.env, self.env.config.period
+        # First-order low-pass filters: x <- x + (e - x) dt / T
         error = velocity_error(env, command)
-        self.stride += (error - self.stride) * period / STRIDE
+        self.stride += (error - self.stride) * period / STRIDE_S
         self._age += period
-        settled = (self._age > TRANSIENT)[:, None]
-        self.lasting += (error - self.lasting) * settled * period / LONG
+        settled = (self._age > TRANSIENT_S)[:, None]
+        self.lasting += (error - self.lasting) * settled * period / LASTING_S
         self.lasting[env.changed] = self._age[env.changed] = 0.0
         self._advance_stances()
         self.air = np.where(env.contact, 0.0, self.air + period)
         self.down = np.where(env.contact, self.down + period, 0.0)
-        paired = one_diagonal_in_the_air(env.contact)
-        self.paired += (paired - self.paired) * period / PAIRING
+        paired = is_one_diagonal_airborne(env.contact)
+        self.paired += (paired - self.paired) * period / PAIRING_S
 
     def _advance_stances(self) -> None:
         """Note where feet touch down and leave the ground; `down` is still that of the sample before."""
@@ -122,20 +144,36 @@ class Past:
 
     @property
     def standing(self) -> np.ndarray:
-        """Which robots have stood on four feet for so long that setting off means to choose a side, (n,) bool."""
-        return np.asarray((self.down > STOOD).all(axis=1))
+        """Whether robots have stood on four feet for `STANDING_S`, (n,) bool."""
+        return np.asarray((self.down > STANDING_S).all(axis=1))
 
 
 def velocity_error(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
-    """Command minus velocity, (n, 3): vx, vy in m/s, yaw rate in rad/s."""
+    """Command minus velocity in the body frame.
+
+    Args:
+        env: environments.
+        command: (n, 4).
+
+    Returns:
+        (n, 3): vx, vy in m/s, yaw rate in rad/s.
+    """
     velocity = np.concatenate([env.velocity[:, :2], env.angular_velocity[:, 2:]], axis=1)
     return np.asarray(command[:, :3] - velocity)
 
 
 def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
-    """The teacher's input (n, SIZE): the paper's 48 numbers from the true state, feet, height, past errors, ground, plant.
+    """Observations of the teacher, from the true state.
 
-    previous (n, 12): its action SAMPLE ago.
+    They are the paper's 48 numbers, feet, height, past errors, ground and plant.
+
+    Args:
+        env: environments.
+        past: their past.
+        previous: (n, 12), action of the teacher `SAMPLE_S` ago.
+
+    Returns:
+        (n, OBSERVATION_SIZE), scaled to about 1.
     """
     return np.concatenate(
         [
@@ -148,7 +186,7 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
             previous,
             env.contact,
             np.clip(5 * env.clearance, -1, 2),
-            5 * (env.height[:, None] - TALL),
+            5 * (env.height[:, None] - WALKING_HEIGHT_M),
             2 * past.stride,
             2 * past.lasting,
             3 * env.ground_slope,
@@ -161,35 +199,64 @@ def observe(env: VelocityEnv, past: Past, previous: np.ndarray) -> np.ndarray:
 
 
 def critic_extra(env: VelocityEnv, past: Past) -> np.ndarray:
-    """What the critic alone sees: how long each foot has been where it is, and the time left, (n, CRITIC_EXTRA)."""
+    """Further observations of the critic: foot timing and elapsed share of the episode.
+
+    Args:
+        env: environments.
+        past: their past.
+
+    Returns:
+        (n, CRITIC_EXTRA_SIZE).
+    """
     time = env.time[:, None] / env.config.episode
     return np.concatenate([2 * past.air, 2 * np.minimum(past.down, 1.0), time], axis=1).astype(np.float32)
 
 
 @attrs.frozen
 class PrivilegedConfig:
-    """One run of stage 1."""
+    """Configuration of stage 1; a recipe file sets these fields.
+
+    Attributes:
+        budget: when the run ends.
+        n: number of robots, of all processes together.
+        threads: threads of the physics.
+        length: samples of 20 ms per sequence; 24 are 0.48 s.
+        timestep: s, of the physics.
+        std: standard deviation of the exploration at the start, in the network's unit; an upper
+            bound that falls.
+        final_std: the upper bound at the end.
+        std_samples: samples from `std` to `final_std`.
+        formed: samples after which a gait counts as formed if feet lift
+            (`walking_rewards.lifting_weight`).
+        forming_std: lower bound of the exploration until a gait has formed: standing robots have to
+            stumble upon steps.
+        ramped: share of the commands that ramp to their velocity; the others are steps.
+        reversed: share of the commands that reverse the one before.
+        formed_rate: upper bound of the learning rate once a gait has formed.
+        keep: samples between numbered checkpoints.
+        actuator: `eam`, `limited`, `rated`, `ideal`, or an actuator file.
+        seed: seed of all draws.
+        grid: commands.
+        terrain: ground.
+        randomisation: what varies between robots.
+        rewards: weights of the rewards.
+        ppo: hyperparameters of the learner.
+    """
 
     budget: Budget = Budget(samples=2e8, minutes=6e3)
-    n: int = 512  # robots, of all processes together
-    threads: int = attrs.field(factory=cores)
-    length: int = 24  # samples of 20 ms a sequence, 0.48 s
-    timestep: float = 0.004  # s, of physics
-    std: float = 0.7  # of the exploration at first, in the network's unit; an upper bound for it that falls
-    final_std: float = 0.22  # to this
-    std_samples: float = 2.5e7  # with so many samples
-    formed: float = (
-        6e6  # samples after which a gait has formed, if feet lift (`walking_rewards.lifting`) then;
-    )
-    forming_std: float = (
-        0.45  # until then exploration is no less: robots that stand have to stumble upon steps,
-    )
-    ramped: float = (
-        0.6  # share of the commands that are led up to their velocity; the others come in one step
-    )
-    reversed: float = 0.0  # share of the commands that reverse the one before
-    formed_rate: float = 5e-4  # and from then on the learning rate is no more
-    keep: float = 1e6  # samples between numbered checkpoints
+    n: int = 512
+    threads: int = attrs.field(factory=available_cores)
+    length: int = 24
+    timestep: float = 0.004
+    std: float = 0.7
+    final_std: float = 0.22
+    std_samples: float = 2.5e7
+    formed: float = 6e6
+    forming_std: float = 0.45
+    ramped: float = 0.6
+    reversed: float = 0.0
+    formed_rate: float = 5e-4
+    keep: float = 1e6
     actuator: str = "eam"
     seed: int = 0
     grid: GridConfig = GridConfig()
@@ -199,59 +266,91 @@ class PrivilegedConfig:
     ppo: PpoConfig = PpoConfig(target_kl=0.012, entropy=0.002, symmetry=0.3)
 
 
-Judged = tuple[np.ndarray, np.ndarray, np.ndarray]
-"""What `CommandGrid.note` takes: commands, mean errors, falls"""
+ScoredCommands = tuple[np.ndarray, np.ndarray, np.ndarray]
+"""Arguments of `CommandGrid.record`: commands, mean errors, falls"""
 
 
-class Judgement:
-    """How the command that each robot has now has been followed so far, from TRANSIENT after its start on."""
+class CommandScorer:
+    """Mean error of each robot under its present command, from `TRANSIENT_S` after its start on."""
 
     def __init__(self, n: int) -> None:
+        """Create a scorer of commands that start now.
+
+        Args:
+            n: number of robots.
+        """
         self._sum, self._age = np.zeros((n, 3)), np.zeros(n)
-        self._over: list[Judged] = []
+        self._over: list[ScoredCommands] = []
 
     def advance(self, error: np.ndarray, period: float) -> None:
-        """Note the errors (n, 3) of one sample."""
-        self._age += period
-        self._sum += error * period * (self._age > TRANSIENT)[:, None]
+        """Add the errors of one sample.
 
-    def close(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the commands of `ids` that end: mean errors (len, 2) in xy and yaw, and for how long they were judged, s."""
-        judged = np.maximum(self._age[ids] - TRANSIENT, 0.0)
+        Args:
+            error: (n, 3), m/s and rad/s.
+            period: s, duration of the sample.
+        """
+        self._age += period
+        self._sum += error * period * (self._age > TRANSIENT_S)[:, None]
+
+    def take(self, ids: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the scores of commands that end, and start new ones.
+
+        Args:
+            ids: indices of the robots.
+
+        Returns:
+            Mean errors (len, 2) in xy (m/s) and yaw (rad/s), and the scored time, s.
+        """
+        judged = np.maximum(self._age[ids] - TRANSIENT_S, 0.0)
         mean = self._sum[ids] / np.maximum(judged, 1e-6)[:, None]
         self._sum[ids], self._age[ids] = 0.0, 0.0
-        return np.stack(sizes(mean), axis=1), judged
+        return np.stack(error_magnitudes(mean), axis=1), judged
 
-    def end(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
-        """Judge the commands (n, 4) that are `over` (n,); too short ones say nothing, falls always."""
+    def finish(self, command: np.ndarray, over: np.ndarray, fell: np.ndarray) -> None:
+        """Score commands that end; short ones without a fall are dropped.
+
+        Args:
+            command: (n, 4).
+            over: (n,) bool, commands that end.
+            fell: (n,) bool, robots that fell.
+        """
         ids = np.flatnonzero(over)
-        error, judged = self.close(ids)
-        tells = (fell[ids] | (judged > 0.5 * TRANSIENT)) & (command[ids, 3] < 0.5)
+        error, judged = self.take(ids)
+        tells = (fell[ids] | (judged > 0.5 * TRANSIENT_S)) & (command[ids, 3] < 0.5)
         if tells.any():
             self._over.append((command[ids][tells], error[tells], fell[ids][tells]))
 
-    def tell(self, grid: CommandGrid) -> None:
-        """Tell the grid what was judged since the last time, by all processes: all their grids are one."""
+    def report_to(self, grid: CommandGrid) -> None:
+        """Pass the scores of all processes since the last call to the command grid.
+
+        Args:
+            grid: command grid of this process.
+        """
         for judged in itertools.chain(*parallel.gather(self._over)):
-            grid.note(*judged)
+            grid.record(*judged)
         self._over = []
 
 
 class PrivilegedRun:
-    """Environment and learner of stage 1."""
+    """Training run of stage 1."""
 
     def __init__(self, config: PrivilegedConfig) -> None:
+        """Create environments, teacher, critic and learner.
+
+        Args:
+            config: configuration.
+        """
         parallel.join("cpu")
-        self.config = c = attrs.evolve(config, n=parallel.share(config.n))
+        self.config = c = attrs.evolve(config, n=parallel.local_share(config.n))
         torch.manual_seed(c.seed)
         self.grid = CommandGrid(c.grid)
         env_config = EnvConfig(
             n=c.n,
             threads=c.threads,
-            seed=parallel.seed_of(c.seed),
-            period=SAMPLE,
+            seed=parallel.process_seed(c.seed),
+            period=SAMPLE_S,
             timestep=c.timestep,
-            actuator=actuator(c.actuator),
+            actuator=load_actuator(c.actuator),
             terrain=c.terrain,
             randomisation=c.randomisation,
             ramped=c.ramped,
@@ -260,20 +359,22 @@ class PrivilegedRun:
         self.env = VelocityEnv(env_config, self.grid)
         self.past = Past(self.env)
         self.rewards = WalkingRewards(self.env, c.rewards)
-        self.judgement = Judgement(c.n)
-        self.actor = Gaussian(Mlp(SIZE, 12), 12, c.std)
-        self.critic = Mlp(SIZE + CRITIC_EXTRA + GAIT_EXTRA, 1)
+        self.judgement = CommandScorer(c.n)
+        self.actor = Gaussian(Mlp(OBSERVATION_SIZE, 12), 12, c.std)
+        self.critic = Mlp(OBSERVATION_SIZE + CRITIC_EXTRA_SIZE + GAIT_EXTRA_SIZE, 1)
         mirrors = (torch_mirror(mirror) for mirror in (MIRROR, symmetry.JOINTS))
         self.ppo = Ppo(self.actor, self.critic, c.ppo, *mirrors)
         self.samples = 0
-        self._airborne = (
-            0.0  # share of the time that feet of walking robots are in the air, of the last rollouts
-        )
-        self._spread = spreads(c.n)
-        self._actions = np.zeros((2, c.n, 12), np.float32)  # the last ones, the newest first
+        self._airborne = 0.0  # share of the time in the air of walking robots' feet
+        self._spread = exploration_scales(c.n)
+        self._actions = np.zeros((2, c.n, 12), np.float32)  # newest first
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run needs."""
+        """Return everything that a resumed run needs.
+
+        Returns:
+            Tensors and plain values, for `restore`.
+        """
         return {
             "actor": self.actor.state_dict(),
             "critic": self.critic.state_dict(),
@@ -285,10 +386,14 @@ class PrivilegedRun:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a checkpoint; robots start over, under commands of its grid.
+        """Resume from a checkpoint; robots start over, under commands of its grid.
+
+        Args:
+            state: what `state` returned.
 
         Raises:
-            CheckpointError: the checkpoint is of another grid, or of a version whose critic saw less.
+            CheckpointError: the checkpoint has another grid, or comes from a version whose critic
+                had fewer inputs.
         """
         if "airborne" not in state:
             raise loop.CheckpointError(
@@ -299,31 +404,39 @@ class PrivilegedRun:
         self.ppo.restore(state["learner"])
         self.grid.restore(state["grid"])
         self.samples = state["samples"]
-        self._note_airborne(state["airborne"], 1.0)
-        parallel.go_on_drawing(state["random"], self.env.rng, self.config.seed, self.samples)
+        self._update_airborne_share(state["airborne"], 1.0)
+        parallel.resume_random(state["random"], self.env.rng, self.config.seed, self.samples)
         self._start_over(np.arange(self.config.n))
 
     def step(self, done: float) -> dict[str, float]:
-        """One rollout, one update."""
+        """Collect one rollout and learn from it.
+
+        Args:
+            done: share of the budget that is spent; not used, schedules follow samples.
+
+        Returns:
+            Figures for the log.
+        """
         rollout, seen = self.collect()
         self._bound_exploration()
         seen |= self.ppo.update(rollout)
         if self.formed:
             self.ppo.learning_rate = min(self.ppo.learning_rate, self.config.formed_rate)
             loop.set_rate(self.ppo.actor_optimiser, self.ppo.learning_rate)
-        return seen | self.grid.reach() | {"std": float(self.actor.log_std.detach().exp().mean())}
+        return seen | self.grid.summary() | {"std": float(self.actor.log_std.detach().exp().mean())}
 
     @property
     def formed(self) -> bool:
         """Whether a gait has formed: feet lift, and the first samples are over."""
         return self.samples >= self.config.formed and self.rewards.lifting > 0.5
 
-    def _note_airborne(self, share: float, weight: float = AIRBORNE) -> None:
-        """Take up the share of the time in the air of walking robots' feet in the last rollout."""
+    def _update_airborne_share(self, share: float, weight: float = AIRBORNE_WEIGHT) -> None:
+        """Low-pass the airborne share of walking robots' feet, and set `rewards.lifting`."""
         self._airborne += weight * (share - self._airborne)
-        self.rewards.lifting = lifting(self._airborne)
+        self.rewards.lifting = lifting_weight(self._airborne)
 
     def _bound_exploration(self) -> None:
+        """Clamp the standard deviation of the exploration to its present bounds."""
         c = self.config
         most = loop.linear(c.std, c.final_std, self.samples / c.std_samples)
         least = 0.5 * c.final_std if self.formed else c.forming_std
@@ -331,19 +444,25 @@ class PrivilegedRun:
             self.actor.log_std.clamp_(min=float(np.log(least)), max=float(np.log(max(most, least))))
 
     def _start_over(self, ids: np.ndarray) -> None:
+        """Replace robots by new ones without a past."""
         if len(ids):
             self.env.reset(ids)
             self.past.reset(ids)
             self.rewards.reset(ids)
-            self.judgement.close(ids)
+            self.judgement.take(ids)
             self._actions[:, ids] = 0.0
 
     def _critic_obs(self, obs: np.ndarray) -> np.ndarray:
+        """Return the critic's observations."""
         gait = np.stack([self.past.paired, np.full(len(obs), self.rewards.lifting)], axis=1)
         return np.concatenate([obs, critic_extra(self.env, self.past), gait.astype(np.float32)], axis=1)
 
     def collect(self) -> tuple[Rollout, dict[str, float]]:
-        """One sequence of every environment with exploration noise."""
+        """Collect one sequence of every environment with exploration noise.
+
+        Returns:
+            The rollout, and figures for the log.
+        """
         env, c = self.env, self.config
         names = ("obs", "critic_obs", "standing", "action", "mean", "reward", "ended", "cut")
         keep: dict[str, list[np.ndarray]] = {name: [] for name in names}
@@ -361,7 +480,7 @@ class PrivilegedRun:
             touched = self.past.air.copy()
             env.tick(env.stand_q + ACTION_SCALE * action)
             self.past.advance(command)
-            self.judgement.advance(velocity_error(env, command), SAMPLE)
+            self.judgement.advance(velocity_error(env, command), SAMPLE_S)
             parts = self.rewards.terms(command, self.past, touched, np.stack([action, *self._actions]))
             reward = self.rewards.total(parts, env.fallen)
             self._actions = np.concatenate([action[None], self._actions[:-1]])
@@ -371,16 +490,16 @@ class PrivilegedRun:
                 keep[name].append(value)
             for name, value in parts.items():
                 terms[name] = terms.get(name, 0.0) + float(value.mean()) / c.length
-            errors = [size.mean() for size in sizes(self.past.stride)]
+            errors = [size.mean() for size in error_magnitudes(self.past.stride)]
             on_the_way = command[:, 3] < 0.5
             walking += on_the_way.sum()
             lifted = (~env.contact[on_the_way]).mean(axis=1).sum()
             seen += [*errors, fell.mean(), env.broken.sum(), env.contact.mean(), lifted]
-            self.judgement.end(command, fell | late | env.changed, fell)
+            self.judgement.finish(command, fell | late | env.changed, fell)
             self._start_over(np.flatnonzero(fell | late))
-        self.judgement.tell(self.grid)
+        self.judgement.report_to(self.grid)
         airborne = float(np.mean(parallel.gather(seen[5] / max(walking, 1))))
-        self._note_airborne(airborne)
+        self._update_airborne_share(airborne)
         self.samples += c.length * c.n * parallel.size()
         t = {name: torch.from_numpy(np.array(value, dtype=np.float32)) for name, value in keep.items()}
         last = self._critic_obs(observe(env, self.past, self._actions[0]))
@@ -395,7 +514,7 @@ class PrivilegedRun:
         return rollout, {
             "error_xy": xy,
             "error_wz": wz,
-            "falls_per_minute": 60 * falls / SAMPLE,
+            "falls_per_minute": 60 * falls / SAMPLE_S,
             "broken": broken * c.length,
             "contact_ratio": contact,
             "airborne": airborne,
@@ -403,13 +522,20 @@ class PrivilegedRun:
         } | {f"reward/{name}": value for name, value in terms.items()}
 
 
-class Numbered(loop.Keeper):
-    """Keeps a numbered checkpoint in FOLDER/kept every so many samples, the configuration's `keep`."""
+class NumberedCheckpoints(loop.Keeper):
+    """Keeper of numbered checkpoints in FOLDER/kept, at intervals of the configuration's `keep`."""
 
     def __init__(self, run: PrivilegedRun, folder: Path) -> None:
+        """Keep the checkpoints of a run.
+
+        Args:
+            run: training run.
+            folder: run directory.
+        """
         super().__init__(run.config.keep)
         self._run, self._folder = run, folder
 
+    @override
     def keep(self) -> dict[str, float]:
         """Write the checkpoint, named by its thousands of samples."""
         loop.save(self._run.state(), self._folder / "kept" / f"{self._run.samples // 1000:06}k.pt")

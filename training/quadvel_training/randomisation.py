@@ -1,4 +1,4 @@
-"""What varies from one training environment to the next (Section 3.4): bodies, friction, actuators, noise, pushes."""
+"""Domain randomisation (Section 3.4): bodies, friction, actuators, noise and pushes."""
 
 from __future__ import annotations
 
@@ -11,26 +11,34 @@ from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters, Effect
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT, VELOCITY_LIMIT
 
-STALL, NO_LOAD = (24.0, 60.0), (12.0, 30.0)  # N m, rad/s, of `limited`, drawn for each robot
+STALL_RANGE_NM, NO_LOAD_RANGE_RAD_S = (24.0, 60.0), (12.0, 30.0)  # of `limited`, drawn per robot
 RATED_STALL, RATED_SPEED = (
     (1.6, 2.4),
     (1.0, 1.15),
-)  # of `rated`: shares of the joints' torque and speed limits
+)  # of `rated`: shares of the torque and speed limits
 
 
-def limited() -> ActuatorParameters:
-    """The shipped actuator model with torque limits that fall with the speed, of drives from weak to strong."""
-    middle = {"stall": float(np.mean(STALL)), "no_load": float(np.mean(NO_LOAD))}
-    ranges = {"stall": STALL, "no_load": NO_LOAD}
+def limited_drives() -> ActuatorParameters:
+    """Actuators with torque limits that fall with speed, from weak to strong drives.
+
+    Returns:
+        The shipped actuator model with a speed-torque curve drawn for each robot.
+    """
+    middle = {"stall": float(np.mean(STALL_RANGE_NM)), "no_load": float(np.mean(NO_LOAD_RANGE_RAD_S))}
+    ranges = {"stall": STALL_RANGE_NM, "no_load": NO_LOAD_RANGE_RAD_S}
     effect = Effect("torque_speed_limit", JOINT_NAMES, middle, intervals=ranges)
     return attrs.evolve(ActuatorParameters.default(), name="aliengo, limited", effects=(effect,))
 
 
-def rated() -> ActuatorParameters:
-    """The shipped actuator model with the drives' own speed-torque curve: full torque up to about half the top speed, none at it.
+def rated_drives() -> ActuatorParameters:
+    """Actuators with the AlienGo's speed-torque curve: full torque up to about half the top speed,
+    none at it.
 
-    Both ends are drawn for each robot: RATED_STALL times the torque limit (above it the limit itself counts), at rest, and
-    RATED_SPEED times the speed limit.
+    For each robot the stall torque is `RATED_STALL` times the torque limit, which clips it, and the
+    no-load speed is `RATED_SPEED` times the speed limit.
+
+    Returns:
+        The shipped actuator model with these curves.
     """
     kinds = {kind: tuple(name for name in JOINT_NAMES if kind in name) for kind in ("hip", "thigh", "calf")}
     effects = []
@@ -47,52 +55,83 @@ def rated() -> ActuatorParameters:
 
 ACTUATORS = {
     "eam": ActuatorParameters.default,
-    "limited": limited,
-    "rated": rated,
+    "limited": limited_drives,
+    "rated": rated_drives,
     "ideal": ActuatorParameters.ideal,
 }
 
 
 @attrs.frozen
 class Randomisation:
-    """Ranges (low, high) of uniform draws, and standard deviations of noise."""
+    """Ranges (low, high) of uniform draws, and standard deviations of noise.
 
-    foot_friction: tuple[float, float] = (0.3, 1.0)  # each foot on its own
-    payload: tuple[float, float] = (-1.0, 3.0)  # kg on the trunk
-    com_shift: float = 0.03  # m, each axis, either way
-    mass_scale: tuple[float, float] = (0.9, 1.1)  # legs
+    Attributes:
+        foot_friction: friction coefficient of each foot.
+        payload: kg, on the trunk.
+        com_shift: m, shift of the trunk's centre of mass, per axis, either way.
+        mass_scale: factor of the masses of the legs.
+        joint_friction_scale: factor of the dry friction of the joints.
+        joint_damping_scale: factor of the damping of the joints.
+        armature_scale: factor of the rotor inertia.
+        contact_time: s, time constant of the feet's contact spring: stiff to soft ground.
+        contact_damping: damping of the contact, ratio to critical.
+        grip: MuJoCo's impratio: how little a foot creeps within the friction cone.
+        torsional_friction: m, torsional friction of the feet: torque per normal force.
+        pyramidal: share of robots with a pyramidal instead of an elliptic friction cone.
+        transmission_delay: s, in addition to the input delay of the actuator.
+        noise_q: rad.
+        noise_dq: rad/s.
+        noise_roll_pitch: rad.
+        noise_angular_velocity: rad/s.
+        noise_velocity: m/s, white.
+        drift_velocity: m/s, with a time constant of 0.5 s, as an estimator errs.
+        push_interval: s, mean time between pushes.
+        push_velocity: m/s, sudden change of the trunk's velocity.
+        push_turn: rad/s, sudden change of its angular velocity.
+        gain_scale: factor of kp and of kd, drawn separately, for actuators without an identified
+            model.
+    """
+
+    foot_friction: tuple[float, float] = (0.3, 1.0)
+    payload: tuple[float, float] = (-1.0, 3.0)
+    com_shift: float = 0.03
+    mass_scale: tuple[float, float] = (0.9, 1.1)
     joint_friction_scale: tuple[float, float] = (0.2, 1.5)
     joint_damping_scale: tuple[float, float] = (0.2, 1.5)
     armature_scale: tuple[float, float] = (0.8, 1.2)
-    contact_time: tuple[float, float] = (0.01, 0.01)  # s, of the feet's contact spring: stiff to soft ground
-    contact_damping: tuple[float, float] = (1.0, 1.0)  # of critical
+    contact_time: tuple[float, float] = (0.01, 0.01)
+    contact_damping: tuple[float, float] = (1.0, 1.0)
     grip: tuple[float, float] = (
         10.0,
         10.0,
-    )  # MuJoCo's impratio: how little a foot creeps below the cone's edge
+    )
     torsional_friction: tuple[float, float] = (
         0.0,
         0.0,
-    )  # m, of feet: turning one under load costs this times it
-    pyramidal: float = 0.0  # share of robots with a pyramidal friction cone instead of an elliptic one
-    transmission_delay: tuple[float, float] = (0.0, 0.002)  # s, on top of the actuator's own input delay
-    noise_q: float = 0.01  # rad
-    noise_dq: float = 0.1  # rad/s
-    noise_roll_pitch: float = 0.01  # rad
-    noise_angular_velocity: float = 0.05  # rad/s
-    noise_velocity: float = 0.05  # m/s, white
-    drift_velocity: float = 0.05  # m/s, slow (0.5 s), as an estimator errs
-    push_interval: float = 8.0  # s, mean
-    push_velocity: float = 0.4  # m/s, sudden change of the trunk's velocity
-    push_turn: float = 0.5  # rad/s
+    )
+    pyramidal: float = 0.0
+    transmission_delay: tuple[float, float] = (0.0, 0.002)
+    noise_q: float = 0.01
+    noise_dq: float = 0.1
+    noise_roll_pitch: float = 0.01
+    noise_angular_velocity: float = 0.05
+    noise_velocity: float = 0.05
+    drift_velocity: float = 0.05
+    push_interval: float = 8.0
+    push_velocity: float = 0.4
+    push_turn: float = 0.5
     gain_scale: tuple[float, float] = (
         1.0,
         1.0,
-    )  # of kp and of kd, each on its own, where no identified model says more
+    )
 
     @classmethod
     def none(cls) -> Randomisation:
-        """The nominal plant without noise or pushes."""
+        """Return the nominal plant without noise or pushes.
+
+        Returns:
+            Ranges of width 0.
+        """
         one, nil = (1.0, 1.0), (0.0, 0.0)
         return cls(
             foot_friction=(0.8, 0.8),
@@ -115,14 +154,23 @@ class Randomisation:
 
     @classmethod
     def calm(cls) -> Randomisation:
-        """The nominal plant on ordinary grounds, with the noise of good sensors, without pushes."""
+        """Return the nominal plant on ordinary ground, with noise of good sensors and without pushes.
+
+        Returns:
+            Narrow ranges.
+        """
         return attrs.evolve(
             cls.none(), foot_friction=(0.6, 1.0), noise_q=0.005, noise_dq=0.05, noise_velocity=0.02
         )
 
 
 class PlantSampler:
-    """Writes per-environment model fields into a batch; keeps what was drawn for the critic to see."""
+    """Sampler of model fields of a MuJoCo batch, per environment.
+
+    Attributes:
+        drawn: (n, 8), what was drawn, for the critic: four friction coefficients, payload (kg),
+            shift of the centre of mass (share of `com_shift`).
+    """
 
     FIELDS = (
         "body_mass",
@@ -136,6 +184,13 @@ class PlantSampler:
     )
 
     def __init__(self, batch: Batch, ranges: Randomisation, rng: np.random.Generator) -> None:
+        """Prepare the fields that vary.
+
+        Args:
+            batch: MuJoCo batch.
+            ranges: ranges to draw from.
+            rng: source of randomness.
+        """
         self._batch, self._ranges, self._rng = batch, ranges, rng
         model = batch.model
         self._nominal = {name: getattr(model, name).copy() for name in self.FIELDS}
@@ -143,10 +198,14 @@ class PlantSampler:
         self._cone, self._impratio = batch.expand("opt.cone"), batch.expand("opt.impratio")
         self._feet = np.array([i for i in range(model.ngeom) if model.geom(i).name.endswith("_foot")])
         self._trunk = model.body("trunk").id
-        self.drawn = np.zeros((batch.nsim, 8))  # 4 frictions, payload, com shift (3)
+        self.drawn = np.zeros((batch.nsim, 8))
 
     def sample(self, ids: np.ndarray) -> None:
-        """Draw new plants for the environments `ids`, (n,)."""
+        """Draw new plants.
+
+        Args:
+            ids: (n,), indices of the environments.
+        """
         r, rng, n, f = self._ranges, self._rng, len(ids), self._fields
         uniform = rng.uniform
         friction = uniform(*r.foot_friction, (n, len(self._feet)))
@@ -180,17 +239,32 @@ class PlantSampler:
         self.drawn[ids] = np.concatenate([friction, payload[:, None], shift / max(r.com_shift, 1e-3)], axis=1)
 
 
-def actuator(name: str) -> ActuatorParameters:
-    """The joints of a recipe: `eam` (Table 4), `limited` and `rated` (with torque limits), `ideal` (PD), or an actuator file."""
+def load_actuator(name: str) -> ActuatorParameters:
+    """Return the actuators that a recipe names.
+
+    Args:
+        name: `eam` (Table 4), `limited` or `rated` (with speed-torque curves), `ideal` (PD law), or
+            an actuator file.
+
+    Returns:
+        Their parameters.
+    """
     return ACTUATORS[name]() if name in ACTUATORS else ActuatorParameters.load(name)
 
 
 def sample_actuators(
     actuators: ActuatorModel, ids: np.ndarray, ranges: Randomisation, rng: np.random.Generator
 ) -> None:
-    """Draw what the model itself varies (Section 3.1, and effects within their intervals), and what `ranges` adds.
+    """Draw delays, gains and effects of actuators, and reset them.
 
-    The past of `ids` is forgotten.
+    The model varies what Section 3.1 varies, and effects within their intervals; `ranges` adds
+    transmission delay and gain factors.
+
+    Args:
+        actuators: actuator model, changed in place.
+        ids: indices of the environments.
+        ranges: ranges to draw from.
+        rng: source of randomness.
     """
     actuators.sample(ids, rng)
     delay, kp_scale, kd_scale = actuators.input_delay, actuators.kp_scale, actuators.kd_scale

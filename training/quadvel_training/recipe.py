@@ -1,7 +1,7 @@
 """Recipe files: small YAML files whose fields replace the defaults of a stage's configuration.
 
-`base: FILE` (beside the recipe) names another recipe to start from, so that recipes that are to be compared differ in what
-they name and in nothing else.
+`base: FILE`, in the folder of the recipe, names another recipe to start from. So recipes to be
+compared differ only in the fields that they name.
 """
 
 from __future__ import annotations
@@ -17,33 +17,52 @@ BASE = "base"
 
 
 class RecipeError(ValueError):
-    """A recipe that cannot be meant, in one sentence with file and field."""
+    """Invalid recipe; the message names file and field."""
 
 
-def read(kind: type[Any], path: Path | None) -> Any:
-    """A configuration of the attrs class `kind`: its defaults, and instead of them the fields that the recipe names.
+def read_recipe(kind: type[Any], path: Path | None) -> Any:
+    """Read the configuration of a stage.
 
-    Raises RecipeError, and FileNotFoundError where a file is missing.
+    Args:
+        kind: attrs class of the configuration.
+        path: recipe file; None for the defaults.
+
+    Returns:
+        An instance of `kind`.
+
+    Raises:
+        RecipeError: a field is unknown or has a wrong value.
+        FileNotFoundError: a file is missing.
     """
     converter = cattrs.Converter(forbid_extra_keys=True)
     try:
-        fields = fields_of(path) if path else {}
+        fields = read_fields(path) if path else {}
         return converter.structure(_merged(cattrs.unstructure(kind()), fields), kind)
     except cattrs.BaseValidationError as error:
         raise RecipeError(f"{path}: " + "; ".join(cattrs.transform_error(error))) from None
 
 
-def fields_of(path: Path) -> dict[str, Any]:
-    """What a recipe says, with what its base says under it."""
+def read_fields(path: Path) -> dict[str, Any]:
+    """Read the fields of a recipe, merged over those of its base.
+
+    Args:
+        path: recipe file.
+
+    Returns:
+        Fields by name.
+
+    Raises:
+        RecipeError: the file holds no mapping.
+    """
     fields = yaml.safe_load(path.read_text()) or {}
     if not isinstance(fields, dict):
         raise RecipeError(f"{path}: found {fields!r}, expected fields and their values")
     base = fields.pop(BASE, None)
-    return _merged(fields_of(path.parent / base), fields) if base else fields
+    return _merged(read_fields(path.parent / base), fields) if base else fields
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of `over` in place of those of `under`, mapping by mapping."""
+    """Merge two mappings recursively; `over` wins."""
     merged = dict(under)
     for name, value in over.items():
         below = merged.get(name)

@@ -1,4 +1,7 @@
-"""The rewards of Table 2, a tick. Where the printed formula cannot be meant, the reading is listed in docs/decisions/0004."""
+"""Rewards of Table 2, per tick.
+
+Where the printed formula must be a misprint, docs/decisions/0004 gives the reading used here.
+"""
 
 from __future__ import annotations
 
@@ -7,20 +10,36 @@ import numpy as np
 
 from quadvel_description import robot
 
-from .env import HEAT, TICK, VelocityEnv
-from .walking_rewards import hips_astray
+from .env import HEAT_LOSS_W_PER_N2M2, TICK_S, VelocityEnv
+from .walking_rewards import hip_deviation
 
-FAST = 0.9  # share of the speed of a joint's drive, beyond which `overspeed` fines it
+OVERSPEED_SHARE = 0.9  # of a joint's speed limit; `overspeed` penalises more
 
 
 @attrs.frozen
 class RewardWeights:
-    """Coefficients of Table 2.
+    """Coefficients of Table 2, and of rewards that are not in it.
 
-    `action_smoothness` is Section 4.4's, for the recipes without constraints. Five are our own: `tracking_width`, within
-    which the tracking rewards tell errors apart (1 is Table 2's), `hips` against hips away from straight down, `overspeed`
-    against joints that move nearly as fast as their drives can or faster, and, in stance, `stillness` against motion and
-    `posture` against joints that are not where they are in the nominal posture.
+    Attributes:
+        linear_tracking: exp(-e^2 / width^2) of the velocity error in xy.
+        angular_tracking: exp(-e^2 / width^2) of the yaw rate error.
+        orientation: penalty of |roll| + |pitch|, 1/rad.
+        torso_stability: penalty of roll and pitch rate and of vertical speed.
+        joint_velocity: penalty of squared joint velocities.
+        joint_acceleration: penalty of squared joint accelerations.
+        slippage: penalty of the squared speed of feet in contact.
+        energy: penalty of the power of the joints, 1/W.
+        velocity_compensation: reward for speed along the command, up to the commanded one.
+        alive: constant.
+        foot_lift_time: reward at touchdown for time in the air beyond 0.2 s, at low speed.
+        foot_clearance: reward for clearance of feet in the air up to 0.05 m, at low speed.
+        action_smoothness: penalty of the second difference of the action (Section 4.4), for the
+            recipes without constraints.
+        hips: penalty of hips away from straight down (not in Table 2).
+        overspeed: penalty of joint speeds beyond `OVERSPEED_SHARE` of their limit (not in Table 2).
+        stillness: penalty of motion in stance (not in Table 2).
+        posture: penalty in stance of joints away from the nominal posture (not in Table 2).
+        tracking_width: m/s and rad/s, width of the tracking rewards; 1 in Table 2.
     """
 
     linear_tracking: float = 0.5
@@ -40,13 +59,19 @@ class RewardWeights:
     overspeed: float = 0.0
     stillness: float = 0.0
     posture: float = 0.0
-    tracking_width: float = 1.0  # m/s, rad/s
+    tracking_width: float = 1.0
 
 
 class Table2:
-    """The rewards of a batch of environments; remembers what needs a past."""
+    """Rewards of a batch of environments, with the memory that some of them need."""
 
     def __init__(self, env: VelocityEnv, weights: RewardWeights) -> None:
+        """Create the rewards without a past.
+
+        Args:
+            env: environments.
+            weights: coefficients.
+        """
         self.env, self.weights = env, weights
         n = env.config.n
         self._dq = np.zeros((n, 12))
@@ -54,21 +79,40 @@ class Table2:
         self._actions = np.zeros((2, n, 12))
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the past of `ids`."""
+        """Clear the past of some environments.
+
+        Args:
+            ids: their indices.
+        """
         self._dq[ids], self._air_time[ids], self._actions[:, ids] = self.env.dq[ids], 0.0, 0.0
 
     def terms(self, action: np.ndarray) -> dict[str, np.ndarray]:
-        """Each term of the state after a tick with `action` (n, 12), unweighted, (n,)."""
+        """Evaluate all rewards of the present state, without their weights.
+
+        Call it once after each tick.
+
+        Args:
+            action: (n, 12), action of the tick, in the network's unit.
+
+        Returns:
+            Rewards by name, (n,) each; penalties are negative.
+        """
         env, c, width = self.env, self.env.command, self.weights.tracking_width
         v, w = env.velocity, env.angular_velocity
+        # v, w: velocity (m/s) and angular velocity (rad/s) in the body frame; c: command (vx, vy,
+        # wz, stance)
+        #     decay = max(1 - |c_xy|^2, 0) while walking
+        #     lift time = sum over touchdowns of min(t_air - 0.2, 0.5)
+        #     power = max(k_r tau^2 + tau dq, 0)
+        #     bend = a[t] - 2 a[t-1] + a[t-2]
         walking = c[:, 3] < 0.5
         decay = np.maximum(1.0 - np.sum(c[:, :2] ** 2, axis=1), 0.0) * walking
         landed = env.contact & (self._air_time > 0.0)
         lift_time = np.minimum(self._air_time - 0.2, 0.5) * landed
         clearance = np.clip(env.clearance, 0.0, 0.05) * ~env.contact
-        acceleration = (env.dq - self._dq) / TICK
+        acceleration = (env.dq - self._dq) / TICK_S
         along = np.clip(v[:, :2] * np.sign(c[:, :2]), 0.0, np.abs(c[:, :2]))
-        power = np.maximum(HEAT * env.torque**2 + env.torque * env.dq, 0.0)
+        power = np.maximum(HEAT_LOSS_W_PER_N2M2 * env.torque**2 + env.torque * env.dq, 0.0)
         bend = action - 2 * self._actions[0] + self._actions[1]
         terms = {
             "linear_tracking": np.exp(-np.sum((c[:, :2] - v[:, :2]) ** 2, axis=1) / width**2),
@@ -84,17 +128,26 @@ class Table2:
             "foot_lift_time": lift_time.sum(axis=1) * decay,
             "foot_clearance": clearance.sum(axis=1) * decay,
             "action_smoothness": -np.abs(bend).sum(axis=1),
-            "hips": -hips_astray(env, c),
-            "overspeed": -np.maximum(np.abs(env.dq) - FAST * robot.VELOCITY_LIMIT, 0.0).sum(axis=1),
+            "hips": -hip_deviation(env, c),
+            "overspeed": -np.maximum(np.abs(env.dq) - OVERSPEED_SHARE * robot.VELOCITY_LIMIT, 0.0).sum(
+                axis=1
+            ),
             "posture": -np.abs(env.q - robot.NOMINAL_Q).sum(axis=1) * ~walking,
             "stillness": -(np.hypot(v[:, 0], v[:, 1]) + 0.05 * np.abs(env.dq).sum(axis=1)) * ~walking,
         }
-        self._air_time = np.where(env.contact, 0.0, self._air_time + TICK)
+        self._air_time = np.where(env.contact, 0.0, self._air_time + TICK_S)
         self._dq = env.dq
         self._actions = np.stack([action, self._actions[0]])
         return terms
 
     def __call__(self, action: np.ndarray) -> np.ndarray:
-        """The weighted sum, (n,)."""
+        """Sum the weighted rewards of the present state; call it once after each tick.
+
+        Args:
+            action: (n, 12), action of the tick, in the network's unit.
+
+        Returns:
+            (n,).
+        """
         terms = self.terms(action)
         return np.sum([getattr(self.weights, name) * value for name, value in terms.items()], axis=0)

@@ -1,6 +1,7 @@
-"""What a run directory holds beside curves and checkpoint: what was run, and the policies kept on the way with their figures.
+"""Content of a run directory: what was run, and policies kept on the way with their evaluations.
 
-run.json: stage, recipe, configuration, commit. kept/: a checkpoint, its policy file and its evaluation every some samples.
+run.json: stage, recipe, configuration, commit. kept/: checkpoints, their policy files and
+evaluations.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import cattrs
+from typing_extensions import override
 
 from quadvel_eval.grid import grid_cells, run_cell, run_stance, summarise
 from quadvel_eval.pool import Call, run_in_parallel
@@ -18,13 +20,20 @@ from quadvel_eval.walk import Setup
 from . import loop, parallel
 from .constrained import ConstrainedRun
 from .onnx_file import commit
-from .randomisation import ACTUATORS, actuator
+from .randomisation import ACTUATORS, load_actuator
 
-COMMANDS = grid_cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and wz: a minute of one core
+COMMANDS = grid_cells("quick", seeds=1)[::4]  # 14 of 54, with every pair of vy and wz; one minute on one core
 
 
-def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
-    """Write run.json: what this directory's run is; where it is resumed, what it is from now on. One process does."""
+def write_run_file(folder: Path, stage: str, recipe: Path | None, config: Any) -> None:
+    """Write run.json; a resumed run overwrites it. Only the first process writes.
+
+    Args:
+        folder: run directory.
+        stage: name of the stage.
+        recipe: recipe file, if any.
+        config: configuration, an attrs instance.
+    """
     if parallel.rank() > 0:
         return
     folder.mkdir(parents=True, exist_ok=True)
@@ -32,10 +41,19 @@ def describe(folder: Path, stage: str, recipe: Path | None, config: Any) -> None
     write_json(folder / "run.json", about | {"configuration": cattrs.unstructure(config)})
 
 
-def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> dict[str, Any]:
-    """How a network came to be, for the metadata of its file; hours of training where the checkpoint knows them.
+def training_record(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> dict[str, Any]:
+    """Describe how a network was trained, for the metadata of its file.
 
-    An actuator file is told by its name: where it lay says nothing to those whom the network is handed to.
+    An actuator file is reduced to its name: its folder means nothing to others.
+
+    Args:
+        stage: name of the stage.
+        recipe: recipe file, if any.
+        config: configuration, an attrs instance.
+        checkpoint: checkpoint of the run.
+
+    Returns:
+        Stage, recipe, samples, configuration, and hours of training if the checkpoint has them.
     """
     content, configuration = loop.load(checkpoint), cattrs.unstructure(config)
     if "actuator" in configuration:
@@ -50,16 +68,23 @@ def made_of(stage: str, recipe: Path | None, config: Any, checkpoint: Path) -> d
     return about | {"configuration": configuration}
 
 
-class Evaluated(loop.Keeper):
-    """Keeps the run's policy every so many samples and evaluates it on a quarter of the quick grid, one seed.
+class EvaluatedPolicies(loop.Keeper):
+    """Keeper of policies, evaluated on a quarter of the quick grid with one seed.
 
-    On the drives as they are known best: those of an actuator file where the run has one, else Table 4.
+    The drives are the best known ones: those of an actuator file if the run has one, else Table 4.
     """
 
     def __init__(self, run: ConstrainedRun, folder: Path) -> None:
+        """Keep the policies of a run.
+
+        Args:
+            run: training run.
+            folder: run directory.
+        """
         super().__init__(run.config.keep)
         self.run, self.folder = run, folder
 
+    @override
     def keep(self) -> dict[str, float]:
         """Checkpoint, policy file and evaluation; falls and errors (m/s) for the curves."""
         run = self.run
@@ -68,7 +93,7 @@ class Evaluated(loop.Keeper):
         policy = kept.with_suffix(".onnx")
         run.write_policy(policy, {"samples": run.samples})
         name = run.config.actuator
-        plant = {} if name in ACTUATORS else {"actuator": actuator(name)}
+        plant = {} if name in ACTUATORS else {"actuator": load_actuator(name)}
         found = _evaluate(Setup(policy=policy, plant=plant))
         write_json(kept.with_suffix(".json"), found)
         figures = ("falls", "mean_error_xy", "max_error_xy")
@@ -76,7 +101,7 @@ class Evaluated(loop.Keeper):
 
 
 def _evaluate(setup: Setup) -> dict[str, Any]:
-    """As `quadvel eval` would have it in its eval.json, with few commands."""
+    """Evaluate as `quadvel eval` does, with few commands."""
     calls: list[Call] = [(run_cell, setup, cell, ()) for cell in COMMANDS]
     answers = dict(run_in_parallel([*calls, (run_stance, setup, 0)]))
     return summarise([answers[i] for i in range(len(calls))], [answers[len(calls)]])

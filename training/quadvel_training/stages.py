@@ -1,5 +1,7 @@
-"""The stages of training as they are run: each in a folder of its own, where it goes on; all of them one after the other;
-stage 3 with the ablation's recipes, and for a short while on a corrected actuator model."""
+"""The stages of training as they are run, each in its own folder, where it resumes.
+
+`train_all` runs them in turn; `train_ablation` and `tune` run stage 3 with other recipes.
+"""
 
 from __future__ import annotations
 
@@ -10,16 +12,16 @@ import attrs
 
 from . import loop, parallel, recipe
 from .constrained import ConstrainedConfig, ConstrainedRun
-from .dagger import DaggerConfig, DaggerRun, export_policy, policy_of
+from .dagger import DaggerConfig, DaggerRun, export_policy, load_policy
 from .estimator import EstimatorConfig, EstimatorRun
 from .gait_log import GaitLog
 from .loop import Budget
 from .privileged import PrivilegedConfig, PrivilegedRun
-from .run_folder import Evaluated, describe, made_of
+from .run_folder import EvaluatedPolicies, training_record, write_run_file
 
 RECIPES = Path(__file__).parents[1] / "recipes"
-TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, one after the other
-POLICY_PARTS = {"constrained": "crl_eam", "constrained_fine": "crl_eam_fine"}  # folders and recipes, likewise
+TEACHER_PARTS = ("privileged", "privileged_rough")  # recipes, in order
+POLICY_PARTS = {"constrained": "crl_eam", "constrained_fine": "crl_eam_fine"}  # folders and recipes, in order
 ABLATION = ("rl_pd", "rl_eam", "crl_eam")
 TEACHER, STUDENT, POLICY, ESTIMATOR = (
     "privileged.pt",
@@ -32,19 +34,38 @@ NO_LIMIT = 1e6  # minutes
 
 
 def train_teacher(config: PrivilegedConfig, source: Path | None, folder: Path) -> bool:
-    """Stage 1; whether its budget is spent. source, here and below: the recipe file, for the record."""
+    """Run stage 1.
+
+    Args:
+        config: configuration.
+        source: recipe file, for the record.
+        folder: run directory.
+
+    Returns:
+        Whether the budget is spent.
+    """
     run = PrivilegedRun(config)
-    describe(folder, "privileged", source, config)
+    write_run_file(folder, "privileged", source, config)
     return loop.train(run, config.budget, folder / TEACHER, GaitLog(run, folder))
 
 
 def train_student(config: DaggerConfig, source: Path | None, teacher: Path, folder: Path) -> bool:
-    """Stage 2, from a checkpoint of stage 1; the policy file is written where it was stopped, too."""
+    """Run stage 2, and write the policy file, also after an interruption.
+
+    Args:
+        config: configuration.
+        source: recipe file, for the record.
+        teacher: checkpoint of stage 1.
+        folder: run directory.
+
+    Returns:
+        Whether the budget is spent.
+    """
     run, checkpoint = DaggerRun(config, teacher), folder / STUDENT
-    describe(folder, "dagger", source, config)
+    write_run_file(folder, "dagger", source, config)
     spent = loop.train(run, config.budget, checkpoint)
     if parallel.rank() == 0:
-        about = made_of("dagger", source, config, checkpoint)
+        about = training_record("dagger", source, config, checkpoint)
         export_policy(run.student, run.env, config.grid.answered, folder / POLICY_FILE, about)
     return spent
 
@@ -57,29 +78,57 @@ def train_policy(
     folder: Path,
     device: str,
 ) -> bool:
-    """Stage 3, from a checkpoint of stage 2 or of its own, pulled by that of the `teacher`; policy file as in stage 2."""
+    """Run stage 3, and write the policy file, also after an interruption.
+
+    Args:
+        config: configuration.
+        source: recipe file, for the record.
+        start: checkpoint of stage 2 or 3.
+        teacher: checkpoint of stage 1; None for no pull.
+        folder: run directory.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        Whether the budget is spent.
+    """
     run, checkpoint = ConstrainedRun(config, start, teacher, device), folder / POLICY
-    describe(folder, "constrained", source, config)
-    spent = loop.train(run, config.budget, checkpoint, Evaluated(run, folder))
+    write_run_file(folder, "constrained", source, config)
+    spent = loop.train(run, config.budget, checkpoint, EvaluatedPolicies(run, folder))
     if parallel.rank() == 0:
-        run.write_policy(folder / POLICY_FILE, made_of("constrained", source, config, checkpoint))
+        run.write_policy(folder / POLICY_FILE, training_record("constrained", source, config, checkpoint))
     return spent
 
 
 def train_estimator(config: EstimatorConfig, source: Path | None, policy: Path, folder: Path) -> bool:
-    """The velocity estimator on the walks of a checkpoint of stage 2 or 3; its file is written where it was stopped, too."""
-    run, checkpoint = EstimatorRun(config, policy_of(policy)), folder / ESTIMATOR
-    describe(folder, "estimator", source, config)
+    """Train the velocity estimator, and write its file, also after an interruption.
+
+    Args:
+        config: configuration.
+        source: recipe file, for the record.
+        policy: checkpoint of stage 2 or 3, whose walks it learns from.
+        folder: run directory.
+
+    Returns:
+        Whether the budget is spent.
+    """
+    run, checkpoint = EstimatorRun(config, load_policy(policy)), folder / ESTIMATOR
+    write_run_file(folder, "estimator", source, config)
     spent = loop.train(run, config.budget, checkpoint)
     if parallel.rank() == 0:
-        run.export(folder / ESTIMATOR_FILE, made_of("estimator", source, config, checkpoint))
+        run.export(folder / ESTIMATOR_FILE, training_record("estimator", source, config, checkpoint))
     return spent
 
 
-def everything(out: Path, device: str) -> bool:
-    """All stages from random weights on, each with its recipe in a folder of `out`; goes on where it was stopped.
+def train_all(out: Path, device: str) -> bool:
+    """Run all stages from random weights, with the recipes of the project; resumes where it was
+    stopped.
 
-    Returns whether all are done.
+    Args:
+        out: folder for the run directories.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        Whether all stages are done.
     """
     teacher, student, estimator = (out / name for name in ("privileged", "dagger", "estimator"))
     for part in TEACHER_PARTS:
@@ -97,28 +146,46 @@ def everything(out: Path, device: str) -> bool:
 
 
 def _recipe(kind: type[Any], name: str) -> tuple[Any, Path]:
-    """A recipe that comes with the project, as a configuration of `kind`, and its file."""
+    """Read a recipe of the project as a configuration of `kind`; return it with its file."""
     source = RECIPES / f"{name}.yaml"
-    return recipe.read(kind, source), source
+    return recipe.read_recipe(kind, source), source
 
 
-def ablation(
+def train_ablation(
     start: Path, teacher: Path, samples: float, robots: int, seed: int, out: Path, device: str
 ) -> bool:
-    """Train the three recipes from one start, `samples` each, one after the other; policies are OUT/RECIPE/policy.onnx.
+    """Train the three recipes of the ablation from one start; resumes where it was stopped.
 
-    Goes on where it was stopped; whether all are done.
+    Args:
+        start: checkpoint of stage 2.
+        teacher: checkpoint of stage 1.
+        samples: budget of each recipe.
+        robots: number of robots.
+        seed: seed of all draws.
+        out: folder; policies are OUT/RECIPE/policy.onnx.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        Whether all recipes are done.
     """
     for name in ABLATION:
         config, source = _recipe(ConstrainedConfig, name)
-        config = attrs.evolve(within(config, samples), n=robots, seed=seed)
+        config = attrs.evolve(scale_budget(config, samples), n=robots, seed=seed)
         if not train_policy(config, source, start, teacher, out / name, device):
             return False
     return True
 
 
-def within(config: ConstrainedConfig, samples: float) -> ConstrainedConfig:
-    """The run with another budget: what fades or grows in it does so over the same shares of its samples."""
+def scale_budget(config: ConstrainedConfig, samples: float) -> ConstrainedConfig:
+    """Change the budget of a run, and its schedules in proportion.
+
+    Args:
+        config: configuration.
+        samples: new budget.
+
+    Returns:
+        The configuration with this budget.
+    """
     share = samples / config.budget.samples
     scheduled = ("std_samples", "pull_samples", "constraint_samples")
     return attrs.evolve(
@@ -129,7 +196,18 @@ def within(config: ConstrainedConfig, samples: float) -> ConstrainedConfig:
 
 
 def tune(drives: Path, start: Path, minutes: float, out: Path, device: str) -> Path:
-    """Tune the policy of a checkpoint on the actuators of a file; the policy file, written where it was stopped, too."""
+    """Tune a policy on the actuators of a file, for a short while.
+
+    Args:
+        drives: actuator file.
+        start: checkpoint of stage 3 or 2.
+        minutes: duration.
+        out: run directory.
+        device: `cpu` or `cuda`.
+
+    Returns:
+        The policy file, written also after an interruption.
+    """
     config, source = _recipe(ConstrainedConfig, "tune")
     budget = attrs.evolve(config.budget, minutes=minutes)
     train_policy(attrs.evolve(config, actuator=str(drives), budget=budget), source, start, None, out, device)

@@ -1,8 +1,9 @@
-"""The rewards of the teacher: following commands, in xy and yaw alike, with a quiet trunk and feet that step in diagonal pairs.
+"""Rewards of the teacher: track commands in xy and yaw with a quiet trunk and a trot.
 
-No clock and no reference motion: the policy finds when each foot steps. Diagonal pairs that move together are paid from the
-start. What would fine a robot's first clumsy steps (sway, roll rate, fast joints, stance off the hip, and the larger weights
-at low speed) is scaled by `lifting`, which grows from 0 to 1 as the robots' feet leave the ground.
+There is no clock and no reference motion: the policy finds when each foot steps. Diagonal pairs
+that move together are rewarded from the start. Penalties that would prevent a robot's first clumsy
+steps (sway, roll rate, fast joints, stance off the hip, larger weights at low speed) are scaled by
+`lifting_weight`, which grows from 0 to 1 as the robots begin to lift their feet.
 """
 
 from __future__ import annotations
@@ -16,38 +17,37 @@ from quadvel_description import robot
 
 from .env import VelocityEnv
 
-SAMPLE = 0.02  # s, for which the teacher holds an action, and which the weights are for
-LOWEST, HIGHEST = -6.0, 4.0  # of a sample's sum of terms, a fall apart: nothing may drown all else
-CARRIED = 0.36  # m, wanted height of the trunk
-LIFT = 0.06  # m, clearance wanted in swing
-LONG_DOWN = 0.4  # s: a foot that is down for longer while walking is being dragged along
-FAST = 0.8  # share of a drive's speed from which on `overspeed` fines its joint
-PAIRED = (
-    0.3  # share of the time with one diagonal pair alone in the air, from which on `diagonal` is paid in full
-)
-LIFTING = (
-    0.15,
-    0.35,
-)  # share of the time in the air of walking robots' feet: where `lifting` leaves 0, and where it is 1
+SAMPLE_S = 0.02  # how long the teacher holds an action
+MIN_REWARD, MAX_REWARD = -6.0, 4.0  # bounds of a sample's sum of terms, without falls
+TARGET_HEIGHT_M = 0.36  # of the trunk
+SWING_CLEARANCE_M = 0.06  # wanted clearance in swing
+MAX_STANCE_S = 0.4  # a foot that is down for longer while walking is dragged
+OVERSPEED_SHARE = 0.8  # of a joint's speed limit; `overspeed` penalises more
+FULL_PAIRING_SHARE = 0.3  # share of the time with one diagonal in the air that earns all of `diagonal`
+AIRBORNE_RANGE = (0.15, 0.35)  # shares of the time in the air where `lifting_weight` is 0 and 1
 DIAGONALS = ((0, 3), (1, 2))  # feet in the order of robot.LEGS: FR with RL, FL with RR
 
 
-def lifting(airborne: float) -> float:
-    """Weight, 0 to 1, of the terms that wait until feet lift.
+def lifting_weight(airborne: float) -> float:
+    """Weight of the penalties that wait until feet lift.
 
     Args:
-        airborne: share of the time that the feet of walking robots spend in the air, mean of all feet.
+        airborne: share of the time that the feet of walking robots are in the air, mean of all
+            feet.
+
+    Returns:
+        0 to 1, linear over `AIRBORNE_RANGE`.
     """
-    low, high = LIFTING
+    low, high = AIRBORNE_RANGE
     return float(np.clip((airborne - low) / (high - low), 0.0, 1.0))
 
 
-def alike(contact: np.ndarray, pairs: tuple[tuple[int, int], ...] = DIAGONALS) -> np.ndarray:
+def synchronous_share(contact: np.ndarray, pairs: tuple[tuple[int, int], ...] = DIAGONALS) -> np.ndarray:
     """Share of the pairs of feet of which both are on the ground or both in the air.
 
     Args:
         contact: (n, 4) bool, feet in the order of robot.LEGS.
-        pairs: which feet belong together, by index.
+        pairs: indices of the feet of each pair.
 
     Returns:
         (n,), from 0 to 1.
@@ -55,37 +55,63 @@ def alike(contact: np.ndarray, pairs: tuple[tuple[int, int], ...] = DIAGONALS) -
     return np.asarray(np.mean([contact[:, one] == contact[:, other] for one, other in pairs], axis=0))
 
 
-def one_diagonal_in_the_air(contact: np.ndarray) -> np.ndarray:
-    """Which robots have both feet of one diagonal in the air and both of the other on the ground, (n,) bool.
+def is_one_diagonal_airborne(contact: np.ndarray) -> np.ndarray:
+    """Whether both feet of one diagonal are in the air and both of the other on the ground.
 
-    contact: (n, 4) bool, feet in the order of robot.LEGS.
+    Args:
+        contact: (n, 4) bool, feet in the order of robot.LEGS.
+
+    Returns:
+        (n,) bool.
     """
     (a, b), (c, d) = DIAGONALS
     one, other = contact[:, a], contact[:, c]
     return np.asarray((one == contact[:, b]) & (other == contact[:, d]) & (one != other))
 
 
-def sizes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of velocity errors (n, 3) those in xy (n,), m/s, and in yaw (n,), rad/s."""
+def error_magnitudes(error: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Magnitudes of velocity errors.
+
+    Args:
+        error: (n, 3), vx, vy in m/s, yaw rate in rad/s.
+
+    Returns:
+        In xy (n,), m/s, and in yaw (n,), rad/s.
+    """
     return np.hypot(error[:, 0], error[:, 1]), np.abs(error[:, 2])
 
 
-def pace_of(command: np.ndarray) -> np.ndarray:
-    """How fast commands (n, 4) make the feet move, (n,), m/s; 1 rad/s of turning counts as 0.3 m/s."""
+def foot_pace(command: np.ndarray) -> np.ndarray:
+    """Speed at which a command moves the feet; 1 rad/s of yaw counts as 0.3 m/s.
+
+    Args:
+        command: (n, 4).
+
+    Returns:
+        (n,), m/s.
+    """
     return np.asarray(np.hypot(command[:, 0], command[:, 1]) + 0.3 * np.abs(command[:, 2]))
 
 
-def hips_astray(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
-    """By how much the four hips are away from straight down (n,), rad; moving sideways, where they have to swing, it counts less.
+def hip_deviation(env: VelocityEnv, command: np.ndarray) -> np.ndarray:
+    """Deviation of the hips from straight down, less with sideways commands.
 
-    Feet close to the middle cost the least energy, and a robot on them tips over the soonest.
+    Feet close to the middle cost the least energy, but the robot tips over easily.
+
+    Args:
+        env: environments.
+        command: (n, 4).
+
+    Returns:
+        (n,), rad, sum of the four hips.
     """
     astray = np.abs(env.q[:, ::3]).sum(axis=1)
+    # sum |q_hip| / (1 + 2 |vy|)
     return np.asarray(astray / (1.0 + 2.0 * np.abs(command[:, 1])))
 
 
 class Past(Protocol):
-    """What `privileged.Past` keeps."""
+    """Interface of `privileged.Past`, as far as the rewards use it."""
 
     stride: np.ndarray
     lasting: np.ndarray
@@ -97,72 +123,142 @@ class Past(Protocol):
 
 @attrs.frozen
 class WalkingWeights:
-    """Weights of the terms of a SAMPLE; all fines are positive here."""
+    """Weights of the rewards of one teacher sample; penalties have positive weights here.
 
-    linear: float = 1.2  # exp(-e^2 / (0.25 m^2/s^2 (1 + |c| / 2))) of the velocity error e
-    linear_narrow: float = (
-        0.5  # exp(-e^2 / 0.09 m^2/s^2): wide enough for a slow step's own swing of the velocity
-    )
-    angular: float = 0.6  # exp(-e^2 / (0.25 rad^2/s^2 (1 + |c| / 4)))
-    angular_narrow: float = 0.25  # exp(-e^2 / 0.04)
-    stride_linear: float = 1.0  # fine, s/m, of the error over a stride,
-    stride_angular: float = 0.5  # s/rad, the same of yaw
-    lasting_linear: float = 1.0  # fine, s/m, of the error that lasts,
-    lasting_angular: float = 0.5  # s/rad, the same of yaw,
-    steady: float = 0.3  # and exp(-(e / 0.06)^2) of it, xy and yaw
-    bounce: float = 0.6  # fine: vertical speed squared
-    rocking: float = 0.03  # fine: roll and pitch rate squared
-    tilt: float = 2.0  # fine: roll and pitch against the ground, squared
-    height: float = 30.0  # fine: height off what is wanted, squared
-    power: float = 6e-4  # fine, 1/W; at speed |c| divided by 1 + |c| / 2
-    acceleration: float = 2e-7  # fine: joint accelerations squared
-    rate: float = 0.012  # fine: change of the action squared
-    bend: float = 0.008  # fine: second difference of the action squared
-    swing: float = 1.2  # at touchdown: seconds in the air beyond what suits the speed, within -0.25 and 0.1
-    dragging: float = 0.4  # fine for each foot that stays down
-    slip: float = 0.06  # fine, s/m, of each foot on the ground
-    diagonal: float = 0.6  # pay for diagonal pairs alike in contact, once a robot has one of them in the air again and again
-    off_hip: float = (
-        4.0  # fine, 1/m, at lift-off: distance of the middle of a foot's stance from the hip, ahead or behind
-    )
-    sway: float = 10.0  # fine: sideways velocity off its mean over a stride, squared,
-    roll: float = 0.1  # and roll rate squared
-    overspeed: float = 0.1  # fine, s/rad, of joint speeds beyond FAST of their drives' limit
-    slow: float = 5.0  # by how much `power` and `swing` weigh more at rest; falls to 1 at 1 m/s
-    stumble: float = 3.0  # fine, s/m^2: clearance missing in swing times the foot's speed
-    hips: float = 1.0  # fine, 1/rad, of hips away from straight down
-    posture: float = 0.2  # fine in stance, 1/rad, off the nominal posture
-    step: float = 0.1  # fine in stance for each foot in the air
-    fidget: float = 1e-3  # fine in stance: joint speeds squared
+    e is the velocity error, c the command.
+
+    Attributes:
+        linear: exp(-e^2 / (0.25 m^2/s^2 (1 + |c| / 2))), xy.
+        linear_narrow: exp(-e^2 / 0.09 m^2/s^2), xy: as wide as the velocity swings within a slow
+            step.
+        angular: exp(-e^2 / (0.25 rad^2/s^2 (1 + |c| / 4))), yaw.
+        angular_narrow: exp(-e^2 / 0.04 rad^2/s^2), yaw.
+        stride_linear: penalty, s/m, of the error over a stride, xy.
+        stride_angular: penalty, s/rad, of the error over a stride, yaw.
+        lasting_linear: penalty, s/m, of the lasting error, xy.
+        lasting_angular: penalty, s/rad, of the lasting error, yaw.
+        steady: exp(-(e / 0.06)^2) of the lasting error, xy and yaw.
+        bounce: penalty of the vertical speed squared.
+        rocking: penalty of roll and pitch rate squared.
+        tilt: penalty of roll and pitch relative to the ground, squared.
+        height: penalty of the height error squared.
+        power: penalty, 1/W; at speed |c| divided by 1 + |c| / 2.
+        acceleration: penalty of joint accelerations squared.
+        rate: penalty of the change of the action squared.
+        bend: penalty of the second difference of the action squared.
+        swing: at touchdown, per second in the air beyond what suits the speed, within -0.25 and 0.1
+            s.
+        dragging: penalty for each foot that stays down for `MAX_STANCE_S`.
+        slip: penalty, s/m, of the speed of feet in contact.
+        diagonal: reward for diagonal pairs alike in contact, in full once a robot lifts one of them
+            regularly.
+        off_hip: penalty, 1/m, at lift-off: distance of the middle of a foot's stance from the hip.
+        sway: penalty of the sideways velocity relative to its mean over a stride, squared.
+        roll: penalty of the roll rate squared.
+        overspeed: penalty, s/rad, of joint speeds beyond `OVERSPEED_SHARE` of their limit.
+        slow: factor of `power` and `swing` at rest; falls to 1 at 1 m/s.
+        stumble: penalty, s/m^2: clearance missing in swing times the foot's speed.
+        hips: penalty, 1/rad, of `hip_deviation`.
+        posture: penalty in stance, 1/rad, of joints away from the nominal posture.
+        step: penalty in stance for each foot in the air.
+        fidget: penalty in stance of joint speeds squared.
+        alive: constant.
+        fall: penalty of a fall.
+        scale: factor of the sum.
+    """
+
+    linear: float = 1.2
+    linear_narrow: float = 0.5
+    angular: float = 0.6
+    angular_narrow: float = 0.25
+    stride_linear: float = 1.0
+    stride_angular: float = 0.5
+    lasting_linear: float = 1.0
+    lasting_angular: float = 0.5
+    steady: float = 0.3
+    bounce: float = 0.6
+    rocking: float = 0.03
+    tilt: float = 2.0
+    height: float = 30.0
+    power: float = 6e-4
+    acceleration: float = 2e-7
+    rate: float = 0.012
+    bend: float = 0.008
+    swing: float = 1.2
+    dragging: float = 0.4
+    slip: float = 0.06
+    diagonal: float = 0.6
+    off_hip: float = 4.0
+    sway: float = 10.0
+    roll: float = 0.1
+    overspeed: float = 0.1
+    slow: float = 5.0
+    stumble: float = 3.0
+    hips: float = 1.0
+    posture: float = 0.2
+    step: float = 0.1
+    fidget: float = 1e-3
     alive: float = 0.3
-    fall: float = 4.0  # fine, once
-    scale: float = 0.5  # of the sum
+    fall: float = 4.0
+    scale: float = 0.5
 
 
 class WalkingRewards:
-    """The terms of a batch of robots; remembers the joint speeds of the sample before."""
+    """Rewards of a batch of robots, with the joint speeds of the sample before.
+
+    Attributes:
+        env: environments.
+        weights: weights.
+        lifting: `lifting_weight` of all robots, set by the training run.
+    """
 
     def __init__(self, env: VelocityEnv, weights: WalkingWeights) -> None:
+        """Create the rewards without a past.
+
+        Args:
+            env: environments.
+            weights: weights.
+        """
         self.env, self.weights = env, weights
         self._dq = env.dq.copy()
-        self.lifting = 0.0  # of all robots, as the function `lifting` has it
+        self.lifting = 0.0
 
     def reset(self, ids: np.ndarray) -> None:
-        """Forget the past of `ids`."""
+        """Clear the past of some environments.
+
+        Args:
+            ids: their indices.
+        """
         self._dq[ids] = self.env.dq[ids]
 
     def total(self, terms: dict[str, np.ndarray], fell: np.ndarray) -> np.ndarray:
-        """The reward (n,) of these terms, bounded, and of a fall (n,)."""
+        """Sum rewards, bounded, and subtract the penalty of a fall.
+
+        Args:
+            terms: weighted rewards, (n,) each.
+            fell: (n,) bool.
+
+        Returns:
+            (n,).
+        """
         w = self.weights
-        bounded = np.clip(np.sum(list(terms.values()), axis=0), LOWEST, HIGHEST)
+        # R = scale (clip(sum of terms, MIN_REWARD, MAX_REWARD) - fall [fell])
+        bounded = np.clip(np.sum(list(terms.values()), axis=0), MIN_REWARD, MAX_REWARD)
         return np.asarray(w.scale * (bounded - w.fall * fell))
 
     def terms(
         self, command: np.ndarray, past: Past, air: np.ndarray, actions: np.ndarray
     ) -> dict[str, np.ndarray]:
-        """Each term (n,), weighted, after a sample under `command` (n, 4).
+        """Evaluate all weighted rewards after a sample; call it once per sample.
 
-        air (n, 4): s in the air before it; actions (3, n, 12): of this sample and the two before.
+        Args:
+            command: (n, 4), command in force.
+            past: low-passed errors and foot timing of the robots.
+            air: (n, 4), s in the air before the sample.
+            actions: (3, n, 12), of this sample and the two before.
+
+        Returns:
+            Weighted rewards by name, (n,) each.
         """
         walking = command[:, 3] < 0.5
         terms = self._tracking(command, past) | self._body(command, actions)
@@ -172,12 +268,13 @@ class WalkingRewards:
         return terms
 
     def _tracking(self, command: np.ndarray, past: Past) -> dict[str, np.ndarray]:
+        """Rewards of tracking; formulas in `WalkingWeights`."""
         env, w = self.env, self.weights
         xy = np.sum((command[:, :2] - env.velocity[:, :2]) ** 2, axis=1)
         wz = (command[:, 2] - env.angular_velocity[:, 2]) ** 2
         speed, turn = np.hypot(command[:, 0], command[:, 1]), np.abs(command[:, 2])
-        stride_xy, stride_wz = sizes(past.stride)
-        lasting_xy, lasting_wz = sizes(past.lasting)
+        stride_xy, stride_wz = error_magnitudes(past.stride)
+        lasting_xy, lasting_wz = error_magnitudes(past.lasting)
         return {
             "linear": w.linear * np.exp(-xy / (0.25 * (1 + 0.5 * speed)))
             + w.linear_narrow * np.exp(-xy / 0.09),
@@ -189,8 +286,11 @@ class WalkingRewards:
         }
 
     def _body(self, command: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+        """Rewards of trunk motion and smoothness."""
         env, w = self.env, self.weights
         down_forward, down_left = env.ground_slope.T
+        # attitude of a trunk parallel to the ground: roll = atan(-slope_left), pitch =
+        # atan(slope_forward)
         lean = np.arctan(np.stack([-down_left, down_forward], axis=1))
         acceleration = (env.dq - self._dq) / env.config.period
         self._dq = env.dq.copy()
@@ -200,49 +300,54 @@ class WalkingRewards:
             "bounce": -w.bounce * env.velocity[:, 2] ** 2
             - w.rocking * np.sum(env.angular_velocity[:, :2] ** 2, axis=1),
             "tilt": -w.tilt * np.sum((env.roll_pitch - lean) ** 2, axis=1),
-            "height": -w.height * np.minimum((env.height - CARRIED) ** 2, 0.02),
+            "height": -w.height * np.minimum((env.height - TARGET_HEIGHT_M) ** 2, 0.02),
             "power": -w.power * self._slowness(command) * env.power / (1 + 0.5 * speed),
             "acceleration": -w.acceleration * np.sum(acceleration**2, axis=1),
             "smoothness": -w.rate * np.sum((now - before) ** 2, axis=1)
             - w.bend * np.sum((now - 2 * before + earlier) ** 2, axis=1),
-            "hips": -w.hips * hips_astray(env, command),
+            "hips": -w.hips * hip_deviation(env, command),
             "alive": np.full(len(now), w.alive),
         }
 
     def _feet(self, command: np.ndarray, past: Past, air: np.ndarray) -> dict[str, np.ndarray]:
+        """Rewards of swing and stance of the feet."""
         env, w = self.env, self.weights
-        pace = pace_of(command)
-        suited = 0.25 - 0.03 * np.minimum(pace, 3.0)  # s in the air
+        pace = foot_pace(command)
+        # wanted time in the air: 0.25 s at rest, 0.16 s from 3 m/s on
+        suited = 0.25 - 0.03 * np.minimum(pace, 3.0)  # s
         touchdown = env.contact & (air > 0.0)
         speed = np.hypot(env.foot_velocity[..., 0], env.foot_velocity[..., 1])
-        missing = np.maximum(LIFT - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
+        missing = np.maximum(SWING_CLEARANCE_M - env.clearance, 0.0) * np.minimum(speed, 2.0) * ~env.contact
         swing = (np.clip(air - suited[:, None], -0.25, 0.1) * touchdown).sum(axis=1)
         return {
             "swing": w.swing * self._slowness(command) * swing,
-            "dragging": -w.dragging * (past.down > LONG_DOWN).sum(axis=1),
+            "dragging": -w.dragging * (past.down > MAX_STANCE_S).sum(axis=1),
             "slip": -w.slip * (np.minimum(speed, 3.0) * env.contact).sum(axis=1),
             "stumble": -w.stumble * missing.sum(axis=1),
         }
 
     def _slowness(self, command: np.ndarray) -> np.ndarray:
-        """Factor (n,) of the terms that ask for slow steps: 1, and up to `slow` at rest once feet lift."""
-        decay = np.maximum(1.0 - pace_of(command) ** 2, 0.0)
+        """Factor (n,) of the rewards for slow steps: 1, and up to `slow` at rest once feet lift."""
+        decay = np.maximum(1.0 - foot_pace(command) ** 2, 0.0)
+        # 1 + lifting (slow - 1) max(1 - pace^2, 0)
         return np.asarray(1.0 + self.lifting * (self.weights.slow - 1.0) * decay)
 
     def _gait(self, command: np.ndarray, past: Past) -> dict[str, np.ndarray]:
+        """Rewards of the kind of gait."""
         env, w = self.env, self.weights
         sideways = command[:, 1] - env.velocity[:, 1] - past.stride[:, 1]
-        beyond = np.maximum(env.fastest - FAST * robot.VELOCITY_LIMIT, 0.0)
+        beyond = np.maximum(env.fastest - OVERSPEED_SHARE * robot.VELOCITY_LIMIT, 0.0)
         fines = {
             "off_hip": w.off_hip * np.abs(past.off_hip).sum(axis=1),
             "sway": w.sway * np.minimum(sideways**2, 0.1),
             "roll": w.roll * np.minimum(env.angular_velocity[:, 0] ** 2, 10.0),
             "overspeed": w.overspeed * np.minimum(beyond, 5.0).sum(axis=1),
         }
-        paid = w.diagonal * np.minimum(past.paired / PAIRED, 1.0) * alike(env.contact)
+        paid = w.diagonal * np.minimum(past.paired / FULL_PAIRING_SHARE, 1.0) * synchronous_share(env.contact)
         return {"diagonal": paid} | {name: -self.lifting * value for name, value in fines.items()}
 
     def _stance(self) -> dict[str, np.ndarray]:
+        """Rewards of standing still."""
         env, w = self.env, self.weights
         return {
             "posture": -w.posture * np.abs(env.q - robot.NOMINAL_Q).sum(axis=1),

@@ -1,4 +1,4 @@
-"""How the joints answer: the empirical actuator model (EAM) and its parameter file."""
+"""Empirical actuator model (EAM) of the joints and its parameter file."""
 
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect

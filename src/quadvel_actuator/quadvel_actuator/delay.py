@@ -1,6 +1,6 @@
-"""A fractional delay of a signal that is constant over each step.
+"""Fractional delay line for signals that are constant over each step.
 
-With a delay of (n + f) steps, 0 <= f < 1, the time average of the delayed signal over step k is
+For a delay of (n + f) steps, 0 <= f < 1, the time average of the delayed signal over step k is
 (1 - f) x[k - n] + f x[k - n - 1].
 """
 
@@ -11,19 +11,29 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-MAX_DELAY_S = 0.05  # s
+MAX_DELAY_S = 0.05
 
-_ROUND_OFF = 1e-9  # steps; a delay that is a multiple of the step but for rounding is one
+_ROUNDING_STEPS = 1e-9  # steps; a delay this close to a multiple of the step counts as one
 
 
 class DelayLine:
-    """A ring of the last samples of a signal of `shape` (..., C), read back with one delay per leading index.
+    """Ring buffer of the last samples of a signal, read back with one delay per leading index.
 
-    Each step takes one `push()`, whose slot the caller fills, and then any number of `read()`. `head` is the
-    place of the newest sample; setting it back takes pushes back.
+    In each step, call `push()` once, fill the slot that it returns, then call `read()` any number
+    of times. Leading axes are environments: a signal of shape (N, J) has N delays.
+
+    Attributes:
+        length: number of samples in the ring: `MAX_DELAY_S` and two more.
+        head: index of the newest sample. Setting it back undoes pushes.
     """
 
     def __init__(self, shape: tuple[int, ...], dt: float):
+        """Create a line of zeros.
+
+        Args:
+            shape: (..., C), shape of one sample.
+            dt: s, duration of a step.
+        """
         self.length = int(np.ceil(MAX_DELAY_S / dt)) + 2
         self._dt = dt
         self._ring = np.zeros((self.length, *shape))
@@ -34,46 +44,65 @@ class DelayLine:
 
     @property
     def delay(self) -> NDArray[np.float64]:
-        """The delay (s), (..., 1); set it with anything that broadcasts to this shape."""
+        """Delay in s, (..., 1). A copy is returned; assign anything that broadcasts to this shape."""
         return self._delay.copy()
 
     @delay.setter
     def delay(self, seconds: ArrayLike) -> None:
+        """Set the delay and precompute the read positions."""
         lead = self._ring.shape[1:-1]
         delay = np.broadcast_to(np.asarray(seconds, dtype=float), (*lead, 1)).copy()
         if not np.all((delay >= 0.0) & (delay <= MAX_DELAY_S)):
             raise ValueError(f"delay: found {delay.min()} to {delay.max()} s, expected 0 to {MAX_DELAY_S} s")
+        # delay / dt = n + f with an integer n and 0 <= f < 1
         steps = delay / self._dt
-        whole = np.floor(steps + _ROUND_OFF)
+        whole = np.floor(steps + _ROUNDING_STEPS)
         fraction = np.maximum(steps - whole, 0.0)
-        fraction[fraction < _ROUND_OFF] = 0.0
+        fraction[fraction < _ROUNDING_STEPS] = 0.0
         n = whole.astype(int)
         self._delay = delay
+        # With one n for all indices a read is one slice of the ring; otherwise it gathers rows of
+        # the
+        # flattened ring.
         self._common = int(n.flat[0]) if np.all(n == n.flat[0]) else None
         self._back = self._row - n.ravel() * self._row.size
         self._fraction = np.broadcast_to(fraction, self._ring.shape[1:]).copy() if fraction.any() else None
 
     def push(self) -> NDArray[np.float64]:
-        """Begin a step: the slot (..., C) to write its sample into."""
+        """Begin a step.
+
+        Returns:
+            The slot (..., C) to write the sample of this step into, a view of the ring.
+        """
         self.head = (self.head + 1) % self.length
         slot: NDArray[np.float64] = self._ring[self.head]
         return slot
 
-    def hold(self, where: Any) -> None:
-        """Make the newest sample the whole past of the leading indices `where`."""
+    def fill_history(self, where: Any) -> None:
+        """Overwrite the whole past with the newest sample.
+
+        Args:
+            where: index of the leading axes whose past is overwritten, or `...` for all.
+        """
         self._ring[:, where] = self._ring[self.head][where]
 
     def read(self) -> NDArray[np.float64]:
-        """The delayed sample (..., C) of this step, a new array."""
-        sample = self._back_by(0)
+        """Interpolate the delayed sample of this step.
+
+        Returns:
+            (..., C), a new array.
+        """
+        # y[k] = (1 - f) x[k - n] + f x[k - n - 1] = x[k - n] + f (x[k - n - 1] - x[k - n])
+        sample = self._sample_back(0)
         if self._fraction is not None:
-            older = self._back_by(1)
+            older = self._sample_back(1)
             older -= sample
             older *= self._fraction
             sample += older
         return sample
 
-    def _back_by(self, extra: int) -> NDArray[np.float64]:
+    def _sample_back(self, extra: int) -> NDArray[np.float64]:
+        """Return the sample `extra` steps before the whole number n of delayed steps."""
         sample: NDArray[np.float64]
         if self._common is not None:
             sample = self._ring[self.head - self._common - extra].copy()

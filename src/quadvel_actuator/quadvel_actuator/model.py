@@ -1,11 +1,12 @@
-"""The empirical actuator model: what torque the joints give for a PD command (Eq. 1 and 2 of the paper).
+"""Empirical actuator model: joint torque for a PD command (Eq. 1 and 2 of the paper).
 
-    command packet --input delay--> asked torque = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff
-    asked torque --effects, if the parameters hold any--> clipped
-    asked torque --output delay--> + effects at the joint + noise, clipped = torque on the joint
+    command packet -> input delay t_i -> PD law -> effects -> clip -> output delay t_o
+                   -> effects at the joint -> + noise -> clip -> torque on the joint
 
-The law is evaluated every step on the present joint state, with the command held between its updates. One
-model serves the simulator, the batch training and the identification.
+    PD law: tau* = kp_hat (q_des - q) + kd_hat (dq_des - dq) + tau_ff
+
+The command is held between its updates; the PD law is evaluated in every step on the present joint
+state. The simulator, the batched training and the identification share this model.
 """
 
 from __future__ import annotations
@@ -23,11 +24,11 @@ from quadvel_description.robot import JOINT_NAMES
 Array = NDArray[np.float64]
 Values = float | Array
 
-_NOISE_BLOCK = 16384  # samples drawn at once
+_NOISE_BLOCK_SAMPLES = 16384  # drawn at a time
 
 
 def _per_joint(field: str, value: float | tuple[float, ...], joints: int) -> Array:
-    """A number, one for each of hip, thigh and calf, or one for each joint, as an array (joints,)."""
+    """Expand one number, three (hip, thigh, calf) or one per joint to an array (joints,)."""
     values = np.atleast_1d(np.asarray(value, dtype=float))
     if values.size == 3 and joints % 3 == 0:
         values = np.tile(values, joints // 3)
@@ -37,29 +38,46 @@ def _per_joint(field: str, value: float | tuple[float, ...], joints: int) -> Arr
 
 
 def _is_zero(value: Values) -> bool:
+    """Whether a value is the scalar 0, so that its term can be skipped."""
     return isinstance(value, (int, float)) and value == 0
 
 
-def _same(given: Values, held: Array) -> bool:
-    """Equal to the bit; for the joints of one robot much faster than np.array_equal."""
+def _is_identical(given: Values, held: Array) -> bool:
+    """Compare bit by bit; for the joints of one robot this is much faster than np.array_equal."""
     return np.asarray(given, dtype=float).tobytes() == held.tobytes()
 
 
 class ActuatorModel:
-    """The joints of one robot, shape (12,), or of a batch of them, (N, 12); one `step` covers `dt` seconds.
+    """Empirical actuator model of the joints of one robot or of a batch of robots.
 
-    `input_delay`, `output_delay` (s), shape (..., 1), and `kp_scale`, `kd_scale` (1), `noise_std` (N m),
-    shape (..., J), are read as copies and set as wholes with anything that broadcasts to these shapes, so
-    that each environment may differ. Change gain scales together with `reset`: a command under way keeps the
-    old ones.
+    The gain deviation is relative: kp_hat = kp (1 + delta_kp / kp_ref), which is Eq. 2 at the
+    reference gains. Two models with the same parameters, shape, seed and calls give the same
+    torques bit for bit.
 
-    The gain deviation is relative, kp_hat = kp (1 + delta_kp / kp_ref), Eq. 2 at the reference gains. Two
-    models with the same parameters, shape, seed and calls give the same torques bit for bit.
+    `input_delay`, `output_delay`, `kp_scale`, `kd_scale` and `noise_std` return copies. Assign a
+    whole array that broadcasts to their shape, so that each environment may differ. Call `reset`
+    after a change of the gain scales: a command under way keeps the old ones.
+
+    Attributes:
+        parameters: parameters that the model was built from.
+        shape: shape of all joint arrays, (J,) or (N, J).
+        dt: s, duration of a step.
     """
 
     def __init__(
         self, parameters: ActuatorParameters, shape: tuple[int, ...] = (12,), dt: float = 0.001, seed: int = 0
     ) -> None:
+        """Create a model without a past.
+
+        Args:
+            parameters: parameters of the actuators.
+            shape: (J,) for one robot, (N, J) for a batch.
+            dt: s, duration of a step.
+            seed: seed of the torque noise, of random effects, and of `sample` without a generator.
+
+        Raises:
+            ValueError: the parameters are for another number of joints, or an effect cannot run.
+        """
         self.parameters = parameters
         self.shape = shape
         self.dt = dt
@@ -73,7 +91,7 @@ class ActuatorModel:
 
         self._packets = DelayLine(shape, dt)  # kp_hat q_des + kd_hat dq_des + tau_ff
         self._gains = DelayLine((*shape[:-1], 2 * joints), dt)  # kp, kd; used while a change is under way
-        self._torques = DelayLine(shape, dt)  # asked torque
+        self._torques = DelayLine(shape, dt)  # torque of the drive
         self._effects = self._running_effects(seed)
         self._noise = np.zeros((0, *shape), dtype=np.float32)
         self._noise_used = 0
@@ -91,7 +109,7 @@ class ActuatorModel:
         self.reset()
 
     def _running_effects(self, seed: int) -> RunningEffects | None:
-        """None where there are none: a model without effects costs no step more."""
+        """Build the effects of the model; None without effects, to save time per step."""
         parameters = self.parameters
         if not parameters.effects:
             return None
@@ -107,11 +125,12 @@ class ActuatorModel:
 
     @property
     def input_delay(self) -> Array:
-        """Delay of the command on its way to the actuator (s), t_i."""
+        """Delay t_i of the command on its way to the drive, s, (..., 1)."""
         return self._packets.delay
 
     @input_delay.setter
     def input_delay(self, seconds: Values) -> None:
+        """Set the delay of commands, gains and the targets that effects see."""
         self._packets.delay = seconds
         self._gains.delay = seconds
         if self._effects is not None:
@@ -119,49 +138,55 @@ class ActuatorModel:
 
     @property
     def output_delay(self) -> Array:
-        """Delay from the asked torque to the torque on the joint (s), t_o."""
+        """Delay t_o from the drive's torque to the torque on the joint, s, (..., 1)."""
         return self._torques.delay
 
     @output_delay.setter
     def output_delay(self, seconds: Values) -> None:
+        """Set the delay of the torque."""
         self._torques.delay = seconds
 
     @property
     def kp_scale(self) -> Array:
-        """Real over commanded proportional gain."""
+        """Ratio of real to commanded proportional gain, kp_hat / kp, (..., J)."""
         return self._kp_scale.copy()
 
     @kp_scale.setter
     def kp_scale(self, scale: Values) -> None:
+        """Set the ratio and update the gains in force."""
         self._kp_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
     @property
     def kd_scale(self) -> Array:
-        """Real over commanded derivative gain."""
+        """Ratio of real to commanded derivative gain, kd_hat / kd, (..., J)."""
         return self._kd_scale.copy()
 
     @kd_scale.setter
     def kd_scale(self, scale: Values) -> None:
+        """Set the ratio and update the gains in force."""
         self._kd_scale = np.broadcast_to(scale, self.shape).astype(float)
         self._update_gains()
 
     @property
     def noise_std(self) -> Array:
-        """Standard deviation of the torque noise (N m)."""
+        """Standard deviation of the torque noise, N m, (..., J)."""
         return self._noise_std.copy()
 
     @noise_std.setter
     def noise_std(self, std: Values) -> None:
+        """Set the standard deviation of the torque noise."""
         self._noise_std = np.broadcast_to(std, self.shape).astype(float)
         self._noisy = bool(self._noise_std.any())
 
     def sample(self, ids: Any = None, rng: np.random.Generator | None = None) -> None:
-        """Draw delays and gains of the environments `ids` (all by default) as Section 3.1 randomises them.
+        """Draw delays, gains and effects at random, as Section 3.1 of the paper randomises them.
 
-        A probable pair of delays, kp in [kp + 2 delta_kp, kp] and kd in [kd + 2 delta_kd, kd], uniform,
-        independent between environments, the same share of the deviation for all joints of one; the parameters
-        of effects within their intervals. Follow it with `reset(ids)`.
+        Call `reset(ids)` afterwards.
+
+        Args:
+            ids: index of the environments, all by default.
+            rng: source of randomness, the model's own by default.
         """
         where = ... if ids is None else ids
         rng = self._rng if rng is None else rng
@@ -170,6 +195,11 @@ class ActuatorModel:
         input_delay, output_delay = self.input_delay, self.output_delay
         kp_scale, kd_scale = self.kp_scale, self.kd_scale
         count = input_delay[where].shape
+        # Uniform and independent between environments:
+        #     (t_i, t_o) one of the probable pairs
+        #     kp_hat / kp = 1 + 2 u delta_kp / kp_ref, u in [0, 1], so kp_hat in [kp + 2 delta_kp,
+        #     kp]
+        #     kd_hat / kd likewise; all joints of an environment share u
         drawn = pairs[rng.integers(len(pairs), size=count)]
         input_delay[where], output_delay[where] = drawn[..., 0], drawn[..., 1]
         kp_scale[where] = 1.0 + 2.0 * rng.random(count) * self._kp_deviation
@@ -180,10 +210,13 @@ class ActuatorModel:
             self._effects.sample(where, rng, self.shape)
 
     def reset(self, ids: Any = None) -> None:
-        """Forget the past of the environments `ids` (all by default).
+        """Clear the past of some environments.
 
-        Their next command counts as held since ever, and so does the torque that it asks for: no step of
-        torque out of empty buffers. The noise goes on where it is.
+        The next command counts as constant for all earlier times, and so does its torque: empty
+        buffers cause no jump. The noise sequence continues.
+
+        Args:
+            ids: index of the environments, all by default.
         """
         self._new[... if ids is None else ids] = True
         self._any_new = True
@@ -201,20 +234,34 @@ class ActuatorModel:
         dq_des: Values = 0.0,
         tau_ff: Values = 0.0,
     ) -> Array:
-        """The mean torque (N m) of the next `dt`, a new array of `shape`.
+        """Advance by one step and compute the torque.
 
-        `q`, `dq`: the present joint state (rad, rad/s); the rest is the command as sent now: `q_des` (rad),
-        `dq_des` (rad/s), `tau_ff` (N m), `kp` (N m/rad), `kd` (N m s/rad), of `shape` or broadcast to it.
+        Arrays are of `shape` or broadcast to it.
+
+        Args:
+            q: rad, present joint positions.
+            dq: rad/s, present joint velocities.
+            q_des: rad, position target sent now.
+            kp: N m/rad, proportional gain sent now.
+            kd: N m s/rad, derivative gain sent now.
+            dq_des: rad/s, velocity target sent now.
+            tau_ff: N m, feedforward torque sent now.
+
+        Returns:
+            N m, mean torque over the next `dt`, a new array of `shape`.
         """
-        self._take_command(q_des, kp, kd, dq_des, tau_ff)
+        # Eq. 1: tau(t) = tau*(t - t_o) + noise, where tau* uses the command of t - t_i. Effects at
+        # the
+        # joint act after the output delay.
+        self._push_command(q_des, kp, kd, dq_des, tau_ff)
         asked = self._torques.push()
-        self._asked_torque(q, dq, out=asked)
+        self._pd_torque(q, dq, out=asked)
         new = self._new if self._any_new else None
         if new is not None:
-            self._torques.hold(new)
+            self._torques.fill_history(new)
         torque = self._torques.read()
         if self._effects is not None:
-            torque = self._effects.at_joint(torque, new)
+            torque = self._effects.joint_torque(torque, new)
         if new is not None:
             new[...] = False
             self._any_new = False
@@ -233,31 +280,46 @@ class ActuatorModel:
         dq_des: Values = 0.0,
         tau_ff: Values = 0.0,
     ) -> Array:
-        """What `step` would return now, time standing still: memory and noise stay where they are.
+        """Return the torque that `step` would return now, without advancing the model.
 
-        A sample of the torque at the very instant of `q` and `dq`, before the command that answers this
-        sample is there.
+        This samples the torque at the instant of `q` and `dq`, before the controller has answered
+        them.
+
+        Args:
+            q: rad, present joint positions.
+            dq: rad/s, present joint velocities.
+            q_des: rad, position target.
+            kp: N m/rad, proportional gain.
+            kd: N m s/rad, derivative gain.
+            dq_des: rad/s, velocity target.
+            tau_ff: N m, feedforward torque.
+
+        Returns:
+            N m, an array of `shape`.
         """
+        # Take a step, then restore everything that the step changed.
         lines = (self._packets, self._gains, self._torques)
         heads = [line.head for line in lines]
         memory = self._kp, self._kd, self._gain_age, self._any_new
         new = self._new.copy()
-        kept = None if self._effects is None else self._effects.remember()
+        kept = None if self._effects is None else self._effects.save_memory()
         torque = self.step(q, dq, q_des, kp, kd, dq_des, tau_ff)
         for line, head in zip(lines, heads, strict=True):
-            line.head = head  # what lay in the slots written since was too old to be read again
+            line.head = head  # slots written since held samples too old to be read
         self._kp, self._kd, self._gain_age, self._any_new = memory
         self._new[...] = new
         if self._effects is not None:
-            self._effects.recall(kept)
+            self._effects.restore_memory(kept)
         self._update_gains()
         if self._noisy:
             self._noise_used -= 1
         return torque
 
-    def _take_command(self, q_des: Array, kp: Values, kd: Values, dq_des: Values, tau_ff: Values) -> None:
-        """Send the command packet off and, while gains change, the gains."""
-        self._take_gains(kp, kd)
+    def _push_command(self, q_des: Array, kp: Values, kd: Values, dq_des: Values, tau_ff: Values) -> None:
+        """Push the command packet into its delay line and, while gains change, the gains into theirs."""
+        self._note_gains(kp, kd)
+        # Everything in tau* that does not depend on the joint state travels as one number:
+        #     packet = kp_hat q_des + kd_hat dq_des + tau_ff
         packet = self._packets.push()
         np.multiply(self._kp_hat, q_des, out=packet)
         if not _is_zero(dq_des):
@@ -265,62 +327,71 @@ class ActuatorModel:
         if not _is_zero(tau_ff):
             packet += tau_ff
         if self._any_new:
-            self._packets.hold(self._new)
+            self._packets.fill_history(self._new)
         if self._effects is not None:
-            self._effects.send(q_des, dq_des, self._new if self._any_new else None)
+            self._effects.push_targets(q_des, dq_des, self._new if self._any_new else None)
 
-    def _take_gains(self, kp: Values, kd: Values) -> None:
-        """Note the commanded gains; their history is kept until a change has passed the longest delay."""
+    def _note_gains(self, kp: Values, kd: Values) -> None:
+        """Record the commanded gains; keep their history until a change has passed the longest delay."""
         if self._kp is None or self._kd is None:
             self._set_gains(kp, kd)
-        elif not (_same(kp, self._kp) and _same(kd, self._kd)):
-            if self._gain_age >= self._gains.length:  # the history begins with the gains held until now
-                self._write_gains(self._gains.push())
-                self._gains.hold(...)
+        elif not (_is_identical(kp, self._kp) and _is_identical(kd, self._kd)):
+            if self._gain_age >= self._gains.length:  # start the history with the gains in force
+                self._store_gains(self._gains.push())
+                self._gains.fill_history(...)
             self._gain_age = 0
             self._set_gains(kp, kd)
         if self._gain_age < self._gains.length:
             self._gain_age += 1
-            self._write_gains(self._gains.push())
+            self._store_gains(self._gains.push())
             if self._any_new:
-                self._gains.hold(self._new)
+                self._gains.fill_history(self._new)
 
     def _set_gains(self, kp: Values, kd: Values) -> None:
+        """Store new commanded gains and update the gains in force."""
         self._kp, self._kd = np.array(kp, dtype=float), np.array(kd, dtype=float)
         self._update_gains()
 
-    def _write_gains(self, slot: Array) -> None:
+    def _store_gains(self, slot: Array) -> None:
+        """Write kp and kd side by side into a slot (..., 2 J)."""
         joints = self.shape[-1]
         slot[..., :joints] = self._kp
         slot[..., joints:] = self._kd
 
     def _update_gains(self) -> None:
+        """Compute kp_hat and kd_hat of the commanded gains."""
         if self._kp is not None and self._kd is not None:
             self._kp_hat = self._kp_scale * self._kp
             self._kd_hat = self._kd_scale * self._kd
 
-    def _asked_torque(self, q: Array, dq: Array, out: Array) -> None:
-        """Eq. 1 within the brackets, clipped: the law that the actuator computes on the delayed command."""
+    def _pd_torque(self, q: Array, dq: Array, out: Array) -> None:
+        """Compute the torque of the drive, the bracket of Eq. 1, with effects, clipped to the torque
+        limit.
+        """
         kp_hat, kd_hat = self._kp_hat, self._kd_hat
         if self._gain_age < self._gains.length:
             gains = self._gains.read()
             joints = self.shape[-1]
             kp_hat, kd_hat = self._kp_scale * gains[..., :joints], self._kd_scale * gains[..., joints:]
+        # tau* = packet(t - t_i) - kp_hat(t - t_i) q(t) - kd_hat(t - t_i) dq(t)
         torque = self._packets.read()
         torque -= np.multiply(kp_hat, q, out=self._scratch)
         torque -= np.multiply(kd_hat, dq, out=self._scratch)
         if self._effects is not None:
-            torque = self._effects.apply(torque, q, dq, kp_hat, kd_hat, self._new if self._any_new else None)
+            torque = self._effects.drive_torque(
+                torque, q, dq, kp_hat, kd_hat, self._new if self._any_new else None
+            )
         self._clip(torque, out=out)
 
     def _clip(self, torque: Array, out: Array) -> None:
+        """Clip a torque to the limit of each joint."""
         np.minimum(torque, self._limit, out=out)
         np.maximum(out, self._floor, out=out)
 
     def _next_noise(self) -> NDArray[np.float32]:
-        """Standard normal numbers for one step, drawn in blocks: calls cost more than one robot's numbers."""
+        """Return standard normal numbers for one step; blocks save the cost of calls."""
         if self._noise_used == len(self._noise):
-            steps = max(1, _NOISE_BLOCK // int(np.prod(self.shape)))
+            steps = max(1, _NOISE_BLOCK_SAMPLES // int(np.prod(self.shape)))
             self._noise = self._rng.standard_normal((steps, *self.shape), dtype=np.float32)
             self._noise_used = 0
         self._noise_used += 1

@@ -1,7 +1,7 @@
-"""The parameters of the empirical actuator model and their YAML file.
+"""Parameters of the empirical actuator model and their YAML file.
 
-They say how the joints of one robot answer; `quadvel_actuator.model` computes with them. Identification,
-which writes such files from measured logs, lives elsewhere. The shipped default is Table 4 of the paper.
+`quadvel_actuator.model` computes torques from these parameters. `quadvel_sysid` identifies them
+from measured logs. The shipped default is Table 4 of the paper.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import yaml
 from quadvel_description.bounded_yaml import read_yaml
 
 SCHEMA = 1
-JOINTS = 12
-PROBABLE = 1.5  # a pair whose error is below this many times the least one is probable (Section 3.1)
+DEFAULT_JOINT_COUNT = 12
+PROBABLE_ERROR_RATIO = 1.5  # pairs below this multiple of the least error are probable (Section 3.1)
 
 _DEFAULT_FILE = Path(__file__).parent / "data" / "aliengo.yaml"
 
@@ -35,50 +35,60 @@ _COMMENTS = {
 
 
 def _is_number(value: Any) -> bool:
+    """Whether a value is a finite int or float; booleans are not numbers here."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and bool(np.isfinite(value))
 
 
-def _refuse(field: str, value: Any, expected: str) -> None:
+def _raise_invalid(field: str, value: Any, expected: str) -> None:
+    """Raise a ValueError that names the field, the value found and the expected one."""
     raise ValueError(f"{field}: found {value!r}, expected {expected}")
 
 
 def _number(expected: str, at_least: float = -np.inf, above: float = -np.inf) -> Any:
-    """A validator: a finite number, `at_least` or `above` a bound; `expected` says it in words."""
+    """Build a validator for a finite number that is at least `at_least` and above `above`."""
 
     def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         if not _is_number(value) or value < at_least or value <= above:
-            _refuse(attribute.name, value, expected)
+            _raise_invalid(attribute.name, value, expected)
 
     return check
 
 
 def _per_joint(expected: str, above: float = -np.inf) -> Any:
-    """A validator: a number, or a tuple (3: hip, thigh, calf; else every joint), each `above` a bound."""
+    """Build a validator for 1, 3 (hip, thigh, calf) or one number per joint, above a bound."""
 
     def check(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         values = list(value) if isinstance(value, tuple) else [value]
-        joints = len(instance.joints) or JOINTS
+        joints = len(instance.joints) or DEFAULT_JOINT_COUNT
         if isinstance(value, tuple) and len(value) not in (3, joints):
-            _refuse(attribute.name, value, f"a number, 3 numbers or {joints} numbers")
+            _raise_invalid(attribute.name, value, f"a number, 3 numbers or {joints} numbers")
         for one in values:
             if not _is_number(one) or one <= above:
-                _refuse(attribute.name, one, expected)
+                _raise_invalid(attribute.name, one, expected)
 
     return check
 
 
 def _text(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate a string that is not empty."""
     if not isinstance(value, str) or not value:
-        _refuse(attribute.name, value, "a name")
+        _raise_invalid(attribute.name, value, "a name")
 
 
 def _tuple_if_list(value: Any) -> Any:
+    """Convert lists, which YAML gives, to tuples."""
     return tuple(value) if isinstance(value, list) else value
 
 
 @attrs.frozen
 class DelayPair:
-    """Input and output delay (s), and the mean squared torque error (N^2 m^2) of a model with them."""
+    """One pair of delays and the error of the model that has them.
+
+    Attributes:
+        input_delay_s: s, delay of the command on its way to the drive, t_i of Eq. 1.
+        output_delay_s: s, delay from the drive's torque to the torque on the joint, t_o of Eq. 1.
+        mse: N^2 m^2, mean squared torque error of a model with these delays.
+    """
 
     input_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
     output_delay_s: float = attrs.field(validator=_number("a delay of 0 s or more", at_least=0.0))
@@ -86,18 +96,30 @@ class DelayPair:
 
 
 def _mapping(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate a mapping."""
     if not isinstance(value, Mapping):
-        _refuse(attribute.name, value, "a mapping from parameter names")
+        _raise_invalid(attribute.name, value, "a mapping from parameter names")
 
 
 def _names(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate a tuple of joint names that is not empty."""
     if not isinstance(value, tuple) or not value or not all(isinstance(name, str) for name in value):
-        _refuse(attribute.name, value, "a list of joint names")
+        _raise_invalid(attribute.name, value, "a list of joint names")
 
 
 @attrs.frozen
 class Effect:
-    """One torque effect beyond the PD law: the joints it acts on, its parameters, units and intervals."""
+    """One effect beyond the PD law, as an entry of the parameter file.
+
+    Attributes:
+        name: name in the registry (`quadvel_actuator.effects.registry`).
+        joints: names of the joints that the effect acts on.
+        parameters: values by name: one number for all of these joints, or one per joint; and the
+            settings of the effect, which are words.
+        units: unit of each parameter, for readers of the file.
+        intervals: [low, high] by parameter name, or one such pair per joint. Domain randomisation
+            draws from them.
+    """
 
     name: str = attrs.field(validator=_text)
     joints: tuple[str, ...] = attrs.field(converter=_tuple_if_list, validator=_names)
@@ -107,12 +129,13 @@ class Effect:
 
 
 def _names_or_none(instance: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate a tuple of joint names, which may be empty."""
     if value != ():
         _names(instance, attribute, value)
 
 
-def _record(cls: Any, values: Any) -> Any:
-    """`values`, a mapping with exactly the fields of the attrs class `cls`, as an instance of it."""
+def _build_record(cls: Any, values: Any) -> Any:
+    """Build an instance of the attrs class `cls` from a mapping with exactly its fields."""
     if not isinstance(values, Mapping):
         raise ValueError(f"found {values!r}, expected a mapping")
     fields = attrs.fields_dict(cls)
@@ -125,44 +148,61 @@ def _record(cls: Any, values: Any) -> Any:
     return cls(**values)
 
 
-def _records(field: str, cls: Any, values: Any) -> tuple[Any, ...]:
-    """A list of mappings (or of instances) as a tuple of instances of the attrs class `cls`."""
+def _build_records(field: str, cls: Any, values: Any) -> tuple[Any, ...]:
+    """Build a tuple of instances of `cls` from a list of mappings or of instances."""
     if not isinstance(values, (list, tuple)):
         raise ValueError(f"{field}: found {values!r}, expected a list")
     records = []
     for number, value in enumerate(values):
         try:
-            records.append(value if isinstance(value, cls) else _record(cls, value))
+            records.append(value if isinstance(value, cls) else _build_record(cls, value))
         except ValueError as error:
             raise ValueError(f"{field}[{number}].{error}") from None
     return tuple(records)
 
 
 def _pairs(values: Any) -> tuple[DelayPair, ...]:
-    return _records("pairs", DelayPair, values)
+    """Convert the list of delay pairs of a file."""
+    return _build_records("pairs", DelayPair, values)
 
 
 def _effects(values: Any) -> tuple[Effect, ...]:
-    return _records("effects", Effect, values)
+    """Convert the list of effects of a file."""
+    return _build_records("effects", Effect, values)
 
 
 def _not_empty(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate a list with at least one pair."""
     if not value:
-        _refuse(attribute.name, value, "at least one pair")
+        _raise_invalid(attribute.name, value, "at least one pair")
 
 
 def _known_schema(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
+    """Validate the version of the file format."""
     if value != SCHEMA or isinstance(value, bool):
-        _refuse(attribute.name, value, str(SCHEMA))
+        _raise_invalid(attribute.name, value, str(SCHEMA))
 
 
 @attrs.frozen
 class ActuatorParameters:
-    """The empirical actuator model (Eq. 1 and 2) in numbers; SI units, see `data/aliengo.yaml`.
+    """Parameters of the empirical actuator model (Eq. 1 and 2 of the paper), in SI units.
 
-    The deviations `delta_kp`, `delta_kd` and `torque_limit` are one number, three (hip, thigh, calf) or
-    twelve. Building one with a wrong value raises ValueError that names the field, the value found and what
-    was expected.
+    A wrong value raises a ValueError that names the field, the value found and the expected one.
+    `data/aliengo.yaml` is an example of the file.
+
+    Attributes:
+        schema: version of the file format, `SCHEMA`.
+        name: name of the actuators, for people.
+        kp_ref: N m/rad, proportional gain at which the deviations were identified.
+        kd_ref: N m s/rad, derivative gain at which the deviations were identified.
+        delta_kp: N m/rad, deviation of the proportional gain at `kp_ref`: one number, three (hip,
+            thigh, calf) or one per joint.
+        delta_kd: N m s/rad, deviation of the derivative gain at `kd_ref`; shape as `delta_kp`.
+        pairs: delays with their errors, at least one.
+        torque_noise: N^2 m^2, variance of the torque noise.
+        torque_limit: N m, largest torque; shape as `delta_kp`.
+        effects: what the model adds to the PD law.
+        joints: joint names in order; empty for those of the AlienGo.
     """
 
     schema: int = attrs.field(validator=_known_schema)
@@ -185,27 +225,44 @@ class ActuatorParameters:
 
     @property
     def best_pair(self) -> DelayPair:
-        """The pair of delays with the least error, the first of these."""
+        """Pair of delays with the least error; the first of several."""
         return min(self.pairs, key=lambda pair: pair.mse)
 
     @property
     def probable_pairs(self) -> tuple[DelayPair, ...]:
-        """The pairs that randomisation draws from: error under 1.5 times the least one (Section 3.1)."""
+        """Pairs that randomisation draws from: error below 1.5 times the least one (Section 3.1)."""
         least = self.best_pair.mse
-        return tuple(pair for pair in self.pairs if pair.mse < PROBABLE * least or pair.mse == least)
+        return tuple(
+            pair for pair in self.pairs if pair.mse < PROBABLE_ERROR_RATIO * least or pair.mse == least
+        )
 
     @classmethod
     def load(cls, path: str | Path) -> ActuatorParameters:
-        """Read a parameter file; ValueError names file, field, the value found and what was expected."""
+        """Read a parameter file.
+
+        Args:
+            path: YAML file.
+
+        Returns:
+            The parameters.
+
+        Raises:
+            ValueError: the file is no valid parameter file; the message names the file, the field,
+                the value found and the expected one.
+        """
         content = read_yaml(Path(path), "a YAML file of actuator parameters")
         try:
-            parameters: ActuatorParameters = _record(cls, content)
+            parameters: ActuatorParameters = _build_record(cls, content)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         return parameters
 
     def save(self, path: str | Path) -> None:
-        """Write the parameters as YAML, with the units in comments; `load` reads them back unchanged."""
+        """Write the parameters as YAML with the units in comments; `load` reads them back unchanged.
+
+        Args:
+            path: file to write.
+        """
         lines: list[str] = []
         for key, value in attrs.asdict(self).items():
             if key in _COMMENTS:
@@ -217,12 +274,20 @@ class ActuatorParameters:
 
     @classmethod
     def default(cls) -> ActuatorParameters:
-        """The shipped AlienGo actuators, Table 4."""
+        """Return the parameters of the AlienGo that ship with the package.
+
+        Returns:
+            Table 4 of the paper.
+        """
         return cls.load(_DEFAULT_FILE)
 
     @classmethod
     def ideal(cls) -> ActuatorParameters:
-        """A plain PD law: no delay, no deviation, no noise; the torque limit stays."""
+        """Return the parameters of a plain PD law.
+
+        Returns:
+            The default without delay, gain deviation and noise; the torque limit stays.
+        """
         at_once = DelayPair(0.0, 0.0, 0.0)
         return attrs.evolve(
             cls.default(), name="ideal", delta_kp=0.0, delta_kd=0.0, pairs=(at_once,), torque_noise=0.0

@@ -1,6 +1,6 @@
-"""Effects at work in a running `ActuatorModel`, step by step, for one robot or a batch.
+"""Effects of a running `ActuatorModel`, step by step, for one robot or a batch.
 
-Only what the registry's laws need is kept: their memories, the commands under way, and a few past states.
+It keeps only what the effects need: their memories, delayed targets, and a few past states.
 """
 
 from __future__ import annotations
@@ -14,49 +14,66 @@ from numpy.typing import NDArray
 
 from quadvel_actuator.delay import DelayLine
 from quadvel_actuator.effects import DRIVE, JOINT, EffectLaw, MemoryLaw, Stage, registry
-from quadvel_actuator.effects.terms import NAME as TERMS
-from quadvel_actuator.effects.terms import RunningTerms, Term, all_loaded
+from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
+from quadvel_actuator.effects.terms import RunningTerms, Term, load_terms
 from quadvel_actuator.parameters import Effect
 
 Array = NDArray[np.float64]
 
-_PAST = 0.03
-"""s of positions and velocities that are kept"""
+_STATE_HISTORY_S = 0.03
+"""Length of the history of positions and velocities, s"""
 
-_KNOWN = "q", "dq"
+_DELAYABLE_SIGNALS = "q", "dq"
 
-SLOPE = 0.002
-"""s over which the acceleration is taken, all of them past"""
+ACCELERATION_WINDOW_S = 0.002
+"""Window of the past over which the acceleration is computed, s"""
 
 
-class Instant:
-    """What the laws see of one step; see `quadvel_actuator.effects.base.View`."""
+class StepView:
+    """Signals of one step as effects see them; implements `quadvel_actuator.effects.base.View`."""
 
     temperature = 25.0
     voltage = np.inf
     packet = row = sent = None
 
     def __init__(self, shape: tuple[int, ...], dt: float) -> None:
+        """Create a view of a robot at rest.
+
+        Args:
+            shape: (..., J), shape of joint arrays.
+            dt: s, duration of a step.
+        """
         self.dt = self.age = dt
         self.t = np.zeros((*shape[:-1], 1))
         self.q = self.dq = self.ddq = self.q_des = np.zeros(shape)
-        self.past: deque[Array] = deque(maxlen=int(_PAST / dt) + 2)  # (2, ..., J), q and dq
+        self.past: deque[Array] = deque(maxlen=int(_STATE_HISTORY_S / dt) + 2)  # (2, ..., J), q and dq
 
     @property
     def ddq_smooth(self) -> Array:
-        """A running model has only the past to take an acceleration from."""
+        """Acceleration, rad/s^2; a running model cannot smooth over the future, so it is `ddq`."""
         return self.ddq
 
     ddq_sharp = ddq_smooth
 
     def shifted(self, name: str, late: Array) -> Array:
-        """q or dq `late` s ago, (J,) or (..., J); one of the future is not known and stays the present one."""
-        if name not in _KNOWN:
-            raise ValueError(f"shifted: found {name}, expected one of {', '.join(_KNOWN)}")
+        """Interpolate a past position or velocity.
+
+        Args:
+            name: `q` or `dq`.
+            late: s, age of the value, (J,) or (..., J). The present value stands for negative ages.
+
+        Returns:
+            The signal `late` s ago, (..., J).
+
+        Raises:
+            ValueError: another name.
+        """
+        if name not in _DELAYABLE_SIGNALS:
+            raise ValueError(f"shifted: found {name}, expected one of {', '.join(_DELAYABLE_SIGNALS)}")
         last = len(self.past) - 1
         back = np.clip(np.broadcast_to(late, self.dq.shape) / self.dt, 0.0, last)
         first = back.astype(np.intp)
-        past = np.stack([one[_KNOWN.index(name)] for one in self.past])
+        past = np.stack([one[_DELAYABLE_SIGNALS.index(name)] for one in self.past])
         newer, older = (
             np.take_along_axis(past, at[None], 0)[0] for at in (first, np.minimum(first + 1, last))
         )
@@ -64,8 +81,8 @@ class Instant:
         return found
 
 
-class _Running:
-    """One law with its parameters (J,) and its memory."""
+class _RunningEffect:
+    """One effect with its parameters (J,) or (..., J) and its memory."""
 
     def __init__(self, effect: Effect, joints: Sequence[str], rng: np.random.Generator) -> None:
         if effect.name not in registry():
@@ -78,31 +95,36 @@ class _Running:
             )
         where = [joints.index(name) for name in effect.joints]
         given = {
-            name: _everywhere(value, where, len(joints)) if _is_words(value) else value
+            name: _spread_words(value, where, len(joints)) if _is_words(value) else value
             for name, value in effect.parameters.items()
         }
         try:
-            form, numbers = registry()[effect.name].read(given, tuple(joints))
+            form, numbers = registry()[effect.name].parse(given, tuple(joints))
         except ValueError as error:
             raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
-        self.law: EffectLaw = form.running(rng)
+        self.law: EffectLaw = form.runtime_form(rng)
         self.active = np.array([name in effect.joints for name in joints])
         self.everywhere = bool(self.active.all())
         self.values = {
-            parameter.name: _column(effect, parameter.name, numbers, where, len(joints), parameter.scale)
+            parameter.name: _values_per_joint(
+                effect, parameter.name, numbers, where, len(joints), parameter.scale
+            )
             for parameter in form.parameters
         }
         self.ranges = {
-            name: _range(effect, name, interval, where, self.values[name])
+            name: _interval_bounds(effect, name, interval, where, self.values[name])
             for name, interval in effect.intervals.items()
             if name in self.values
         }
         self.memory: tuple[Array, ...] = ()
 
     def sample(self, ids: Any, rng: np.random.Generator, shape: tuple[int, ...]) -> None:
-        """Draw the parameters of the environments `ids` within their intervals, uniform; then they are of `shape`.
+        """Draw parameters of the environments `ids` uniformly within their intervals.
 
-        One number for all joints where the interval is one for all, and one for each joint where it is not.
+        They are of `shape` afterwards.
+
+        An interval for all joints gives one number for all, an interval per joint gives one number
+        per joint.
         """
         for name, (low, high) in self.ranges.items():
             values = np.broadcast_to(self.values[name], shape).copy()
@@ -112,8 +134,8 @@ class _Running:
             self.values[name] = values
         self.values = self.law.canonical(self.values)
 
-    def act(self, x: Any, now: Instant, new: NDArray[np.bool_] | None) -> Any:
-        """The value instead of `x`; environments that are `new` start from rest."""
+    def apply(self, x: Any, now: StepView, new: NDArray[np.bool_] | None) -> Any:
+        """Return the value that the effect makes of `x`; environments that are `new` start from rest."""
         law = self.law
         if isinstance(law, MemoryLaw):
             u = [getattr(now, name) for name in law.inputs]
@@ -142,8 +164,8 @@ class _Running:
         return np.where(self.active, after, x)
 
 
-def _everywhere(values: Sequence[Any], where: Sequence[int], joints: int) -> list[Any]:
-    """A list with a word for each joint of the effect, as one with a word for each joint of the robot."""
+def _spread_words(values: Sequence[Any], where: Sequence[int], joints: int) -> list[Any]:
+    """Expand one word per joint of the effect to one word per joint of the robot."""
     every = [values[0]] * joints
     for joint, one in zip(where, values, strict=True):
         every[joint] = one
@@ -151,13 +173,14 @@ def _everywhere(values: Sequence[Any], where: Sequence[int], joints: int) -> lis
 
 
 def _is_words(value: Any) -> bool:
+    """Whether a value is a list with words."""
     return isinstance(value, (list, tuple)) and any(isinstance(one, str) for one in value)
 
 
-def _column(
+def _values_per_joint(
     effect: Effect, name: str, numbers: dict[str, Any], where: Sequence[int], joints: int, idle: float
 ) -> Array:
-    """A parameter as one number for each joint, (J,)."""
+    """Expand a parameter to the joints of the robot, (J,); `idle` without the effect."""
     if name not in numbers:
         raise ValueError(f"effects/{effect.name}/parameters: {name} is missing")
     given = np.atleast_1d(np.asarray(numbers[name], dtype=float))
@@ -170,10 +193,10 @@ def _column(
     return column
 
 
-def _range(
+def _interval_bounds(
     effect: Effect, name: str, interval: Any, where: Sequence[int], values: Array
 ) -> tuple[Array, Array]:
-    """Lowest and highest value of a parameter: one of each, (), or one for each joint, (J,)."""
+    """Return the lowest and highest value of a parameter, each () or (J,)."""
     given = np.asarray(interval, dtype=float)
     if given.shape not in ((2,), (len(where), 2)) or (given[..., 0] > given[..., 1]).any():
         raise ValueError(
@@ -186,77 +209,131 @@ def _range(
     return low, high
 
 
-def _terms(effect: Effect, joints: Sequence[str]) -> list[Term]:
-    """The terms that an effect of the name `learned_residual` holds."""
+def _load_terms(effect: Effect, joints: Sequence[str]) -> list[Term]:
+    """Load the terms of an effect of the name `learned_residual`."""
     try:
-        return all_loaded(effect.parameters.get("terms"), joints)
+        return load_terms(effect.parameters.get("terms"), joints)
     except ValueError as error:
         raise ValueError(f"effects/{effect.name}/parameters/{error}") from None
 
 
 class RunningEffects:
-    """All effects of a model, in the order in which they act."""
+    """All effects of a running model, in the order of their stages.
+
+    Attributes:
+        targets: delay line (..., 2 J) of `q_des` and `dq_des`, for effects that act on the errors.
+    """
 
     def __init__(
         self, effects: Sequence[Effect], joints: Sequence[str], shape: tuple[int, ...], dt: float, seed: int
     ) -> None:
+        """Prepare the effects of a parameter file.
+
+        Args:
+            effects: entries of the parameter file.
+            joints: J joint names of the robot.
+            shape: (..., J), shape of joint arrays.
+            dt: s, duration of a step.
+            seed: seed of effects that act at random.
+
+        Raises:
+            ValueError: an entry names an unknown effect, joint or parameter, or has a wrong value.
+        """
         rng = np.random.default_rng([seed, 1])
         laws = [one for one in effects if one.name != TERMS]
-        self._all = sorted((_Running(one, joints, rng) for one in laws), key=lambda one: one.law.stage)
+        self._all = sorted((_RunningEffect(one, joints, rng) for one in laws), key=lambda one: one.law.stage)
         self._errors = [one for one in self._all if one.law.stage == Stage.ERRORS]
         self._torques = [one for one in self._all if Stage.ERRORS < one.law.stage < Stage.ADDED]
         added = [one for one in self._all if one.law.stage == Stage.ADDED]
         self._added = [one for one in added if one.law.at == DRIVE]
         self._at_joint = [one for one in added if one.law.at == JOINT]
-        terms = [term for one in effects if one.name == TERMS for term in _terms(one, joints)]
+        terms = [term for one in effects if one.name == TERMS for term in _load_terms(one, joints)]
         self._terms, self._terms_at_joint = (
             RunningTerms([one for one in terms if one.at == at], joints, dt) for at in (DRIVE, JOINT)
         )
-        self._now = Instant(shape, dt)
+        self._now = StepView(shape, dt)
         self.targets = DelayLine((*shape[:-1], 2 * shape[-1]), dt)  # q_des, dq_des
 
     def sample(self, ids: Any, rng: np.random.Generator, shape: tuple[int, ...]) -> None:
-        """Draw what the intervals leave open for the environments `ids`, whose past is of no use then."""
+        """Draw the parameters of some environments within their intervals.
+
+        Args:
+            ids: index of the environments; their memory is invalid afterwards.
+            rng: source of randomness.
+            shape: (..., J), shape of the parameters afterwards.
+        """
         for one in self._all:
             one.sample(ids, rng, shape)
 
-    def send(self, q_des: Any, dq_des: Any, new: NDArray[np.bool_] | None) -> None:
-        """The targets of this step go their way."""
+    def push_targets(self, q_des: Any, dq_des: Any, new: NDArray[np.bool_] | None) -> None:
+        """Push the targets of this step into their delay line.
+
+        Args:
+            q_des: rad, position targets.
+            dq_des: rad/s, velocity targets.
+            new: environments without a past, (...,) bool, or None.
+        """
         slot = self.targets.push()
         joints = slot.shape[-1] // 2
         slot[..., :joints] = q_des
         slot[..., joints:] = dq_des
         if new is not None:
-            self.targets.hold(new)
+            self.targets.fill_history(new)
 
-    def apply(
+    def drive_torque(
         self, torque: Array, q: Array, dq: Array, kp_hat: Array, kd_hat: Array, new: NDArray[np.bool_] | None
     ) -> Array:
-        """What the drive gives where the PD law asks for `torque`."""
-        now = self._observe(q, dq, new)
+        """Apply all effects that act in the drive.
+
+        Args:
+            torque: N m, torque of the PD law, (..., J).
+            q: rad, joint positions.
+            dq: rad/s, joint velocities.
+            kp_hat: N m/rad, proportional gain in force.
+            kd_hat: N m s/rad, derivative gain in force.
+            new: environments without a past, (...,) bool, or None.
+
+        Returns:
+            N m, torque of the drive, (..., J).
+        """
+        now = self._update_view(q, dq, new)
         sent = self.targets.read()
         joints = q.shape[-1]
         now.q_des = sent[..., :joints]
+        # Stage ERRORS: effects change e = (q_des - q, dq_des - dq) to e', so the PD law gives
+        #     tau + kp_hat (e'_q - e_q) + kd_hat (e'_dq - e_dq)
+        # Then the stages LIMIT, DYNAMICS and GAIN act in turn. Stage ADDED sums torques that all
+        # see
+        # the same drive torque.
         if self._errors:
             given = error = (now.q_des - q, sent[..., joints:] - dq)
             for one in self._errors:
-                error = one.act(error, now, new)
+                error = one.apply(error, now, new)
             torque = torque + kp_hat * (error[0] - given[0]) + kd_hat * (error[1] - given[1])
         for one in self._torques:
-            torque = one.act(torque, now, new)
+            torque = one.apply(torque, now, new)
         total = torque
         for one in self._added:
-            total = total + one.act(torque, now, new)
-        return total + self._terms.act(total, now, new)
+            total = total + one.apply(torque, now, new)
+        return total + self._terms.step(total, now, new)
 
-    def at_joint(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
-        """What the joints get, now, of the drives' `torque`, which comes an output delay after it was asked for."""
+    def joint_torque(self, torque: Array, new: NDArray[np.bool_] | None) -> Array:
+        """Add the effects that act at the joint.
+
+        Args:
+            torque: N m, drive torque after the output delay, (..., J).
+            new: environments without a past, (...,) bool, or None.
+
+        Returns:
+            N m, torque on the joints, (..., J).
+        """
         total = torque
         for one in self._at_joint:
-            total = total + one.act(torque, self._now, new)
-        return total + self._terms_at_joint.act(total, self._now, new)
+            total = total + one.apply(torque, self._now, new)
+        return total + self._terms_at_joint.step(total, self._now, new)
 
-    def _observe(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> Instant:
+    def _update_view(self, q: Array, dq: Array, new: NDArray[np.bool_] | None) -> StepView:
+        """Take the state of this step into the view and its history."""
         now = self._now
         now.q, now.dq = np.array(q), np.broadcast_to(dq, q.shape).astype(float)
         seen = np.stack([now.q, now.dq])
@@ -265,16 +342,22 @@ class RunningEffects:
         if new is not None:
             now.t = np.where(new[..., None], 0.0, now.t)
             now.past = deque((np.where(new[..., None], seen, old) for old in now.past), now.past.maxlen)
-        back = min(max(1, round(SLOPE / now.dt)), len(now.past) - 1)
+        # ddq = (dq[k] - dq[k - n]) / (n dt), over ACCELERATION_WINDOW_S of the past
+        back = min(max(1, round(ACCELERATION_WINDOW_S / now.dt)), len(now.past) - 1)
         now.ddq = (now.dq - now.past[back][1]) / (max(back, 1) * now.dt)
         return now
 
     @property
-    def _memories(self) -> list[_Running | RunningTerms]:
+    def _memories(self) -> list[_RunningEffect | RunningTerms]:
+        """Everything with a memory."""
         return [*self._all, self._terms, self._terms_at_joint]
 
-    def remember(self) -> Any:
-        """Everything that a step changes, for `recall`."""
+    def save_memory(self) -> Any:
+        """Copy everything that a step changes.
+
+        Returns:
+            An opaque value for `restore_memory`.
+        """
         now = self._now
         return (
             [one.memory for one in self._memories],
@@ -283,8 +366,12 @@ class RunningEffects:
             self.targets.head,
         )
 
-    def recall(self, kept: Any) -> None:
-        """Take steps since `remember` back."""
+    def restore_memory(self, kept: Any) -> None:
+        """Undo the steps since `save_memory`.
+
+        Args:
+            kept: what `save_memory` returned.
+        """
         memories, self._now.t, self._now.past, self.targets.head = kept
         for one, memory in zip(self._memories, memories, strict=True):
             one.memory = memory

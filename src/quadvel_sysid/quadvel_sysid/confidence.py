@@ -83,9 +83,9 @@ def _half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
 def _shape_error(model: Model, index: int, rows: Bools) -> Array:
     """How far an effect's values (P, J) move where it has another shape that explains the log as well."""
     one, moved = model.effects[index], np.zeros(model.effects[index].values.shape)
-    if one.law.alternatives:
+    if one.law.indistinguishable_forms:
         bound = _EQUIVALENT_ERROR * squared_error(model, rows)
-        for law in one.law.alternatives:
+        for law in one.law.indistinguishable_forms:
             other = fit(model.with_replaced_effect(index, attrs.evolve(one, law=law)), rows)
             if squared_error(other, rows) < bound:
                 moved = np.maximum(moved, np.abs(other.effects[index].values - one.values))

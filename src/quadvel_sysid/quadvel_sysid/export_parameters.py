@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters, DelayPair, Effect
 from quadvel_description.robot import JOINT_NAMES
 
@@ -69,7 +69,7 @@ def _terms(model: Model, rows: Bools) -> list[Effect]:
     terms = [one for one in model.effects if isinstance(one.law, SignalTerm)]
     if not terms:
         return []
-    saved = [one.law.term(one, _largest(model, one, rows)).saved(joints) for one in terms]  # type: ignore[attr-defined]
+    saved = [one.law.term(one, _largest(model, one, rows)).to_entry(joints) for one in terms]  # type: ignore[attr-defined]
     acts = acting_joints(np.any([one.active for one in terms], axis=0), joints)
     return [Effect(TERMS, tuple(acts), {"terms": saved})]
 

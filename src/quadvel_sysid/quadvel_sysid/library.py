@@ -15,8 +15,8 @@ import attrs
 import numpy as np
 
 from quadvel_actuator.effects import DRIVE, JOINT, AddedLaw, EffectLaw, Parameter, registry
-from quadvel_actuator.effects.base import Params, Start, View
-from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.effects.base import InitialGuess, Params, View
+from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.effects.terms import (
     Curve,
     Filter,
@@ -25,11 +25,11 @@ from quadvel_actuator.effects.terms import (
     Shape,
     Term,
     Wave,
-    factor,
-    inputs,
-    read,
+    input_signals,
+    multiplier,
+    read_signal,
 )
-from quadvel_actuator.running import SLOPE
+from quadvel_actuator.running import ACCELERATION_WINDOW_S
 
 from .criterion import DataSplit
 from .lost_commands import lost_commands
@@ -86,7 +86,7 @@ class SignalTerm(AddedLaw):
     @property
     def inputs(self) -> tuple[str, ...]:
         """The signals that it depends on, as reports name them."""
-        return inputs(self.of, self.times, self.shape)
+        return input_signals(self.of, self.times, self.shape)
 
     @property
     def signal(self) -> str:  # type: ignore[override]
@@ -98,7 +98,7 @@ class SignalTerm(AddedLaw):
         return "tau" in (self.of.rpartition("/")[2], self.times)
 
     @property
-    def of_drive(self) -> bool:  # type: ignore[override]
+    def depends_on_drive_torque(self) -> bool:  # type: ignore[override]
         return self.reads_total or self.of in _COMMANDED
 
     @property
@@ -115,7 +115,7 @@ class SignalTerm(AddedLaw):
         """What it says, in parameters."""
         return _SIGNAL_COST * len(self.inputs)
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{}]
 
     def regressors(self, x: Array, s: Signals) -> Array:
@@ -131,12 +131,12 @@ class SignalTerm(AddedLaw):
 
     def _regressors(self, x: Array, s: Signals) -> Array:
         columns = self.shape.columns(self._read(x, s), s.start[:, 0], float(np.median(s.dt)))  # (N, K, C)
-        found = np.moveaxis(columns, 1, 0) * factor(self.times, s, x)
+        found = np.moveaxis(columns, 1, 0) * multiplier(self.times, s, x)
         return np.broadcast_to(found, (len(found), *s.q.shape))
 
     def _read(self, x: Array, s: Signals) -> Array:
         """The signal that it is a shape of, (N, C)."""
-        return read(self.of, _past_only(s) if self.of.endswith("ddq") else s, x, self.joints)
+        return read_signal(self.of, _past_only(s) if self.of.endswith("ddq") else s, x, self.joints)
 
     def torque(self, x: Array, s: Any, p: Params) -> Array:
         each = [p[name] for name in self.names]
@@ -146,7 +146,7 @@ class SignalTerm(AddedLaw):
             x = x[0]
         if x.ndim == 2 and each[0].ndim == 1 and not self.has_memory:
             total, _ = self.shape.advance(self._read(x, s), 0.0, np.array(each), ())
-            return np.broadcast_to(total * factor(self.times, s, x), s.q.shape)
+            return np.broadcast_to(total * multiplier(self.times, s, x), s.q.shape)
         weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
         columns = self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(one, s) for one in x])
         if columns.ndim == 3 and weights.ndim == 2:
@@ -162,7 +162,7 @@ class SignalTerm(AddedLaw):
 def _past_only(s: Signals) -> Signals:
     """The signals with an acceleration that a running model can have, too."""
     dt = float(np.median(s.dt))
-    back = max(1, round(SLOPE / dt))
+    back = max(1, round(ACCELERATION_WINDOW_S / dt))
     n = np.arange(len(s.dq))
     began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
     slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
@@ -275,7 +275,7 @@ class _Maker:
 
     def _read(self, of: str) -> Array:
         s = self._context.signals
-        return read(of, _past_only(s) if of.endswith("ddq") else s, self._context.torque, self.joints)
+        return read_signal(of, _past_only(s) if of.endswith("ddq") else s, self._context.torque, self.joints)
 
     def curve(self, of: str, times: str, pieces: int = _PIECES) -> SignalTerm:
         """A smooth curve over the range that the signal had."""

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_actuator.effects import DRIVE, AddedLaw, EffectLaw, ErrorLaw, MemoryLaw, Stage
-from quadvel_actuator.effects.base import distinct
+from quadvel_actuator.effects.base import distinct_indices
 
 from .signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
 
@@ -205,7 +205,7 @@ def _series(one: AppliedEffect, x: Any, s: Signals, value: Array) -> Any:
     if isinstance(law, ErrorLaw):
         if max(part.ndim for part in x) > 2:
             return law.errors(x, s, p)
-        first, which = distinct(value)
+        first, which = distinct_indices(value)
         after = law.errors(x, s, one.parameters_by_name(value[first]))
         return tuple(part[which] if part.ndim > 2 else part for part in after)
     if isinstance(law, MemoryLaw):
@@ -370,6 +370,6 @@ def _delay_slope(model: Model, which: int) -> Array:
 
 def _depends_on_delay(law: EffectLaw, which: int) -> bool:
     """Does its torque change with the input delay (0), or the output delay (1)? An acceleration is read as commands move it."""
-    if not isinstance(law, AddedLaw) or law.of_drive or law.signal == "ddq":
+    if not isinstance(law, AddedLaw) or law.depends_on_drive_torque or law.signal == "ddq":
         return True
     return which == 1 and law.at == DRIVE

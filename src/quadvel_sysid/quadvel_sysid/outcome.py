@@ -8,7 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 from quadvel_actuator.parameters import ActuatorParameters
 
 from .baselines import explained_share, torque_variance
@@ -287,7 +287,7 @@ def _effect(of_it: SelectedEffect, one: AppliedEffect, half: Array, joints: Sequ
         "indistinguishable": list(of_it.indistinguishable),
         "heldout_gain": of_it.gain,
         "p_value": of_it.p,
-        **one.law.observed(),
+        **one.law.record_statistics(),
     }
     if settings:
         entry["form"] = settings

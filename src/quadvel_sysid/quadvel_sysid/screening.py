@@ -142,7 +142,7 @@ class CandidateScreening:
     def _start_values(self, law: EffectLaw) -> Array | None:
         """The starting values (S, P, J) of a law; None where there are none."""
         context, joints = self.context, len(self.joints)
-        starts = law.starts(context.signals, context.torque, context.residual)
+        starts = law.initial_guesses(context.signals, context.torque, context.residual)
         rows = [
             [np.broadcast_to(one.get(p.name, p.scale), joints).clip(p.low, p.high) for p in law.parameters]
             for one in starts

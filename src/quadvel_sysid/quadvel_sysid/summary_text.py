@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from quadvel_actuator.effects.terms import NAME as TERMS
+from quadvel_actuator.effects.terms import LEARNED_RESIDUAL as TERMS
 
 from .criterion import SIGNIFICANCE_LEVEL
 

@@ -1,6 +1,7 @@
-"""The registry of effects: laws that the EAM lacks, by name.
+"""Registry of actuator effects: deviations from the empirical actuator model (EAM), by name.
 
-Another package adds its own through an entry point of the group `quadvel.effects` that names an `EffectLaw`.
+Another package adds effects through entry points of the group `quadvel.effects`, each naming an
+`EffectLaw`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ __all__ = [
 
 @cache
 def registry() -> dict[str, type[EffectLaw]]:
-    """Every known law by its name; one that comes through an entry point may not take the name of another."""
+    """Return all known effects.
+
+    Returns:
+        Effect classes by name: those of this package and those of entry points.
+
+    Raises:
+        ValueError: an entry point names no `EffectLaw`, or its name is already in use.
+    """
     laws: dict[str, type[EffectLaw]] = {}
     for module in (friction, limits, dynamics, elastic, gains, commands):
         laws |= {law.name: law for law in module.LAWS}

@@ -1,8 +1,8 @@
-"""What an effect is: a law that turns what the EAM asks for into what the joint gives.
+"""Base classes of actuator effects: an effect maps what the EAM predicts to what the joint gives.
 
-A law is written once and runs in two ways: over whole series (identification) and step by step (`ActuatorModel`). Its
-values broadcast, so that the same lines serve (N, J) rows, a batch (B, N, J) of parameter guesses, and one step of
-(J,) or (environments, J). The order in which laws act is that of the drive: `Stage`.
+An effect is written once and runs in two ways: over whole series (identification) and step by step
+(`ActuatorModel`). Values broadcast, so the same lines serve rows (N, J), a batch (B, N, J) of
+parameter guesses, and one step of (J,) or (environments, J). Effects act in the order of `Stage`.
 """
 
 from __future__ import annotations
@@ -20,60 +20,108 @@ Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 Params = Mapping[str, Array]
 Errors = tuple[Array, Array]
-"""q_des - q (rad) and dq_des - dq (rad/s), as the drive sees them"""
+"""Errors that enter the PD law: q_des - q (rad) and dq_des - dq (rad/s)"""
 
 
 class Stage(enum.IntEnum):
-    """Where in the drive a law acts; laws of a lower stage act first."""
+    """Place in the drive where an effect acts; lower stages act first.
+
+    Attributes:
+        ERRORS: on the position and velocity errors that enter the PD law.
+        LIMIT: on the PD torque, as a bound.
+        DYNAMICS: on how fast the torque follows.
+        GAIN: on the torque after bounds and lags, as a gain: motor constant and gear.
+        ADDED: a torque added to it: friction, springs, coupling.
+    """
 
     ERRORS = 0
-    """on the errors of position and velocity that the PD law is given"""
     LIMIT = 1
-    """on the asked torque, as a bound"""
     DYNAMICS = 2
-    """on how fast the torque follows"""
     GAIN = 3
-    """on what the drive's current gives, as a gain: the motor's constant and the gear come after bounds and lags"""
     ADDED = 4
-    """a torque beside it: friction, springs, coupling"""
 
 
 DRIVE, JOINT = "drive", "joint"
 
 
 class View(Protocol):
-    """What a law may look at: `quadvel_sysid.signals.Signals`, or one step of a running model."""
+    """Signals that an effect may use.
+
+    They come from rows of a log (`quadvel_sysid.signals.Signals`) or from one step of a running
+    model.
+    """
 
     @property
-    def t(self) -> Any: ...
+    def t(self) -> Any:
+        """Time since the start, s."""
+
     @property
-    def dt(self) -> Any: ...
+    def dt(self) -> Any:
+        """Time since the row before, s."""
+
     @property
-    def q(self) -> Array: ...
+    def q(self) -> Array:
+        """Joint positions, rad."""
+
     @property
-    def dq(self) -> Array: ...
+    def dq(self) -> Array:
+        """Joint velocities, rad/s."""
+
     @property
-    def ddq(self) -> Array: ...
+    def ddq(self) -> Array:
+        """Joint accelerations, rad/s^2."""
+
     @property
-    def q_des(self) -> Array: ...
+    def q_des(self) -> Array:
+        """Position targets in force, rad."""
+
     @property
-    def temperature(self) -> Any: ...
+    def temperature(self) -> Any:
+        """Drive temperature, degrees Celsius."""
+
     @property
-    def voltage(self) -> Any: ...
+    def voltage(self) -> Any:
+        """Supply voltage, V."""
+
     @property
-    def sent(self) -> Any: ...
+    def sent(self) -> Any:
+        """Position targets of all commands in the order of sending, rad."""
+
     @property
-    def packet(self) -> Any: ...
+    def packet(self) -> Any:
+        """Index into `sent` of the command in force."""
+
     @property
-    def row(self) -> Any: ...
+    def row(self) -> Any:
+        """Index of the row in the log."""
+
     @property
-    def age(self) -> Any: ...
-    def shifted(self, name: str, late: Array) -> Array: ...
+    def age(self) -> Any:
+        """Time since the command in force arrived, s."""
+
+    def shifted(self, name: str, late: Array) -> Array:
+        """Interpolate `q` or `dq` in time.
+
+        Args:
+            name: `q` or `dq`.
+            late: s, age of the value, per joint.
+
+        Returns:
+            The signal `late` s ago.
+        """
 
 
 @attrs.frozen
 class Parameter:
-    """One number of a law. `low` and `high` bound it; `scale` is its usual size, which numerical slopes need."""
+    """One number of an effect.
+
+    Attributes:
+        name: name in files and reports.
+        unit: its unit.
+        low: lower bound.
+        high: upper bound.
+        scale: usual size, which numerical derivatives need.
+    """
 
     name: str
     unit: str
@@ -82,13 +130,28 @@ class Parameter:
     scale: float
 
 
-def staged(field: str, **stages: Stage) -> Any:
-    """The stage of a law that can act at several: the one that stands here for what its `field` says."""
+def stage_from_field(field: str, **stages: Stage) -> Any:
+    """Build a property `stage` for an effect that can act at several stages.
+
+    Args:
+        field: name of the setting that decides.
+        **stages: stage by value of the setting.
+
+    Returns:
+        A property for the class body.
+    """
     return property(lambda law: stages[getattr(law, field)])
 
 
 def one_of(*words: str) -> Any:
-    """A validator: a setting of a law that is one of these words."""
+    """Build a validator for a setting that is one of some words.
+
+    Args:
+        *words: allowed values.
+
+    Returns:
+        A validator for `attrs.field`; it raises ValueError for another value.
+    """
 
     def check(_: Any, attribute: attrs.Attribute[Any], value: Any) -> None:
         if value not in words:
@@ -97,72 +160,106 @@ def one_of(*words: str) -> Any:
     return check
 
 
-_KINDS: Mapping[str, tuple[type | tuple[type, ...], str]] = {
+_SETTING_TYPES: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     "str": (str, "a word"),
     "float": ((int, float), "a number"),
     "tuple[str, ...]": ((list, tuple), "a list with a word for each joint"),
 }
-"""Of the fields of a law, by what they are annotated with, those that a parameter file may set; and what stands there."""
+"""Annotations of settings that a parameter file may give: accepted types, and a description"""
 
 
-Start = Mapping[str, Any]
-"""a guess of every parameter but the `linear` ones: a number, or one for each joint (J,)"""
+InitialGuess = Mapping[str, Any]
+"""Guess of every parameter that is not in `linear`: a number, or one per joint (J,)"""
 
 
 @attrs.frozen(eq=False)
 class EffectLaw(ABC):
-    """An entry of the registry. Subclass `ErrorLaw`, `TorqueLaw`, `AddedLaw` or one with memory, not this one."""
+    """Actuator effect, an entry of the registry.
+
+    Subclass `ErrorLaw`, `TorqueLaw`, `AddedLaw` or `MemoryLaw` instead of this class.
+
+    Attributes:
+        name: name in the registry, in parameter files and reports.
+        stage: where in the drive it acts.
+        parameters: its numbers, in order.
+        signal: signal over which the residual shows the shape of the effect.
+        shifts: whether it resembles a delay.
+        has_memory: whether it depends on other rows than the one it acts on.
+        acts_between_rows: whether it also depends on what happens between the rows of a log.
+        confounded_with_gain: whether the effect on all joints equals a deviation of a gain or of
+            delays. At least one joint has to be free of it.
+        all_joints_together: whether it happens to all joints of a robot at the same time.
+        shared_by_joints: whether it has one cause for all joints, so that they share its values.
+        motion: motion to record in order to distinguish it from other effects.
+        at: where an added torque acts: in the drive, so that it passes the output delay, or at the
+            joint without delay.
+    """
 
     name: ClassVar[str]
     stage: ClassVar[Stage]
     parameters: ClassVar[tuple[Parameter, ...]]
     signal: ClassVar[str] = "tau"
-    """the signal over which its residual shows its shape"""
     shifts: ClassVar[bool] = False
-    """looks like a delay"""
     has_memory: ClassVar[bool] = False
-    """looks at other rows than the one that it acts on"""
     acts_between_rows: ClassVar[bool] = False
-    """has to follow what happens between the rows of a log, too"""
     confounded_with_gain: ClassVar[bool] = False
-    """on all joints together it is a deviation of a gain or of delays: at least one joint is free of it"""
     all_joints_together: ClassVar[bool] = False
-    """happens to all joints of a robot at once"""
     shared_by_joints: ClassVar[bool] = False
-    """has one cause for all joints, so that they share its values"""
     motion: ClassVar[str] = "richer motion"
-    """what to record so that it can be told from others"""
     at: str = attrs.field(default=DRIVE, kw_only=True, validator=one_of(DRIVE, JOINT))
-    """where a torque is added: by the drive, so that it comes an output delay late, or at the joint, at once"""
 
     @classmethod
     def variants(cls, about: Any) -> Sequence[EffectLaw]:
-        """The forms of the law to try on the data `about` (`quadvel_sysid.library.Context`); none where they cannot act."""
+        """List the forms to try on a log.
+
+        Args:
+            about: data of the log, a `quadvel_sysid.library.Context`.
+
+        Returns:
+            Forms of the effect; empty where it cannot act.
+        """
         return (cls(), cls(at=JOINT)) if cls.stage == Stage.ADDED else (cls(),)
 
     @property
-    def alternatives(self) -> tuple[EffectLaw, ...]:
-        """The law in shapes that no log tells from this one; how far its parameters move then adds to their intervals."""
+    def indistinguishable_forms(self) -> tuple[EffectLaw, ...]:
+        """Forms that no log distinguishes from this one; how far the parameters move between forms
+        widens their intervals.
+        """
         return ()
 
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]] | None:
-        """The law with fewer parameters that this one becomes at the end of one of them, and its parameters (J,)."""
+        """Return the effect with fewer parameters that this one becomes in a limit.
+
+        Args:
+            p: parameters, (J,) each.
+
+        Returns:
+            The simpler effect and its parameters (J,), or None.
+        """
         return None
 
     @classmethod
-    def read(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectLaw, dict[str, Any]]:
-        """The form of the law and its parameters, by name, as a parameter file gives both; the robot's `joints`.
+    def parse(cls, given: Mapping[str, Any], joints: Sequence[str]) -> tuple[EffectLaw, dict[str, Any]]:
+        """Read form and parameters from the mapping in a parameter file.
 
-        Raises ValueError, which names the entry, for one that the law does not have or that is of another kind.
+        Args:
+            given: settings and parameters by name.
+            joints: joint names of the robot.
+
+        Returns:
+            The form, and its parameters by name.
+
+        Raises:
+            ValueError: an entry is unknown or of the wrong type; the message names it.
         """
-        schema, settings = cls.schema(), {}
+        schema, settings = cls.setting_types(), {}
         for name, value in given.items():
             if name in schema:
-                kind, expected = _KINDS[schema[name]]
+                kind, expected = _SETTING_TYPES[schema[name]]
                 if not isinstance(value, kind) or isinstance(value, bool):
                     raise ValueError(f"{name}: found {value!r}, expected {expected}")
                 settings[name] = value
-        form = cls.configured(settings, joints)
+        form = cls.from_settings(settings, joints)
         numbers = {name: value for name, value in given.items() if name not in settings}
         for name in numbers:
             if name not in form.names:
@@ -170,120 +267,251 @@ class EffectLaw(ABC):
         return form, numbers
 
     @classmethod
-    def schema(cls) -> dict[str, str]:
-        """What of the law a parameter file may set beside its parameters: the annotation of each."""
-        fields = {field.name: str(field.type) for field in attrs.fields(cls) if str(field.type) in _KINDS}
+    def setting_types(cls) -> dict[str, str]:
+        """List the settings that a parameter file may give in addition to the parameters.
+
+        Returns:
+            Type annotation by setting.
+        """
+        fields = {
+            field.name: str(field.type) for field in attrs.fields(cls) if str(field.type) in _SETTING_TYPES
+        }
         if cls.stage != Stage.ADDED:
             del fields["at"]
         return fields
 
     @classmethod
-    def configured(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
-        """The form with these settings, each of a kind that `schema` names; the robot's `joints`."""
+    def from_settings(cls, settings: Mapping[str, Any], joints: Sequence[str]) -> EffectLaw:
+        """Build the form with some settings.
+
+        Args:
+            settings: values by name, of the types in `setting_types`.
+            joints: joint names of the robot.
+
+        Returns:
+            The form of the effect.
+        """
         return cls(**settings)
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What `configured` needs to make this form again: all that is not as usual."""
+        """Settings that differ from their defaults; `from_settings` builds the same form from them."""
         own = {field.name: (getattr(self, field.name), field.default) for field in attrs.fields(type(self))}
         return {name: value for name, (value, usual) in own.items() if value != usual}
 
     @abstractmethod
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        """Guesses to search from.
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        """List starting points for a search of the parameters.
 
-        `torque` (N, J) is what the model without the effect gives, `residual` what is left of the measured torque,
-        0 where it is not to be explained.
+        Args:
+            s: signals of the log, (N, J).
+            torque: N m, (N, J), prediction without the effect.
+            residual: N m, (N, J), measured torque minus `torque`; 0 in rows that are not to be
+                explained.
+
+        Returns:
+            Guesses; parameters in `linear` are left out.
         """
 
     def restricted_to(self, active: Bools) -> EffectLaw:
-        """The form that is left of it on these joints, (J,)."""
+        """Return the form that remains on some of the joints.
+
+        Args:
+            active: joints that keep the effect, (J,) bool.
+
+        Returns:
+            The form for these joints.
+        """
         return self
 
     def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
-        """Parameters (J,) brought into the order that makes them unique, within the bounds."""
+        """Map parameters to the unique representative with the same torque, within the bounds.
+
+        Args:
+            p: parameters, (J,) each.
+
+        Returns:
+            Equivalent parameters, (J,) each.
+        """
         return p
 
     def excited_joints(self, p: Params, s: View) -> Bools:
-        """Joints (J,) whose motion shows the law with these parameters (J,); on the others it passes for another one."""
+        """Find the joints whose motion shows the effect; on the others it passes for another one.
+
+        Args:
+            p: parameters, (J,) each.
+            s: signals of the log.
+
+        Returns:
+            (J,) bool.
+        """
         return np.ones(s.q.shape[-1], dtype=bool)
 
     def sampling_error(self, p: Params, s: View) -> dict[str, Array]:
-        """Half widths (J,) of the 95 % intervals of parameters that count what happened at random."""
+        """Return half widths of 95 % intervals of parameters that count random events.
+
+        Args:
+            p: parameters, (J,) each.
+            s: signals of the log.
+
+        Returns:
+            Half widths (J,) by parameter; empty for effects without such parameters.
+        """
         return {}
 
     def predictive(self) -> EffectLaw:
-        """The law without what it read off the measured torque: all that it can say before that is known."""
+        """Return the form without anything inferred from the measured torque, for prediction.
+
+        Returns:
+            The predictive form.
+        """
         return self
 
-    def observed(self) -> dict[str, float]:
-        """What it says of this record beside its parameters, by name."""
+    def record_statistics(self) -> dict[str, float]:
+        """Return figures about this log that are no parameters.
+
+        Returns:
+            Figures by name.
+        """
         return {}
 
-    def running(self, rng: np.random.Generator) -> EffectLaw:
-        """The law as a running model has it; what happens at random is drawn from `rng`."""
+    def runtime_form(self, rng: np.random.Generator) -> EffectLaw:
+        """Return the form that a running model uses.
+
+        Args:
+            rng: source of randomness for effects that act at random.
+
+        Returns:
+            The form for step by step use.
+        """
         return self
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The names of the parameters, in order."""
+        """Names of the parameters, in order."""
         return tuple(parameter.name for parameter in self.parameters)
 
 
 class ErrorLaw(EffectLaw):
-    """Changes the errors that the PD law is given."""
+    """Effect on the errors that enter the PD law."""
 
     stage = Stage.ERRORS
 
     @abstractmethod
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
-        """The errors that the drive sees instead of `e`."""
+        """Compute the errors that the drive sees.
+
+        Args:
+            e: (q_des - q, dq_des - dq), rad and rad/s.
+            s: signals.
+            p: parameters.
+
+        Returns:
+            The errors in place of `e`.
+        """
 
 
 class TorqueLaw(EffectLaw):
-    """Changes the asked torque."""
+    """Effect on the torque of the PD law."""
 
     @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        """The torque instead of `x`."""
+        """Compute the changed torque.
+
+        Args:
+            x: N m, torque before the effect.
+            s: signals.
+            p: parameters.
+
+        Returns:
+            N m, the torque in place of `x`.
+        """
 
 
 class AddedLaw(EffectLaw):
-    """Adds a torque; it is the sum of terms in proportion to each of the parameters `linear`."""
+    """Effect that adds a torque, linear in some of its parameters.
+
+    Attributes:
+        stage: always `Stage.ADDED`.
+        linear: names of the parameters that the torque is proportional to, term by term.
+        depends_on_drive_torque: whether it uses the torque of the drive. If not, it is fitted
+            faster.
+    """
 
     stage = Stage.ADDED
     linear: ClassVar[tuple[str, ...]]
-    of_drive: ClassVar[bool] = True
-    """depends on what the drive gives; a law that says that it does not is fitted more quickly"""
+    depends_on_drive_torque: ClassVar[bool] = True
 
     @abstractmethod
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        """The torque to add, `x` being what the drive gives without it."""
+        """Compute the torque to add.
+
+        Args:
+            x: N m, torque of the drive without the effect.
+            s: signals.
+            p: parameters.
+
+        Returns:
+            N m, the torque to add.
+        """
 
 
 Memory = tuple[Array, ...]
 
 
 class MemoryLaw(EffectLaw):
-    """A law with a memory: `advance` is one step of it, and a series is one step after the other.
+    """Effect with a memory: `advance` is one step, a series is one step after the other.
 
-    At stage ERRORS `x` is the pair of errors, and so is what comes back; at ADDED it is the torque to add.
+    At stage ERRORS `x` and the result are the pair of errors. At stage ADDED the result is the
+    torque to add.
+
+    Attributes:
+        has_memory: always True.
+        inputs: names of the signals that `advance` receives.
     """
 
     has_memory = True
     inputs: ClassVar[tuple[str, ...]] = ()
-    """the signals that `advance` is given, by name"""
 
     @abstractmethod
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
-        """The memory of a joint that has rested at `x`, `u` since ever."""
+        """Return the memory of a joint at rest.
+
+        Args:
+            x: value that has been constant for all earlier times.
+            u: `inputs`, constant as well.
+            p: parameters.
+
+        Returns:
+            The memory.
+        """
 
     @abstractmethod
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        """The value instead of `x` after `dt` (s), and the new memory."""
+        """Advance by one step.
+
+        Args:
+            x: value before the effect.
+            u: `inputs` of this step.
+            dt: s, duration of the step.
+            p: parameters.
+            memory: memory after the step before.
+
+        Returns:
+            The value in place of `x`, and the new memory.
+        """
 
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """All rows of a series, one step after the other, memory starting anew with every stretch: give a faster one."""
+        """Apply the effect to all rows of a series; override it with a faster way.
+
+        Args:
+            x: values before the effect, (..., N, J), or the pair of errors.
+            s: signals with `dt` and `start`; the memory is reset to rest where a stretch starts.
+            p: parameters, (J,) or (B, 1, J).
+
+        Returns:
+            The values in place of `x`.
+        """
         pair = isinstance(x, tuple)
         xs = [np.moveaxis(one, -2, 0) for one in (x if pair else (x,))]
         us = [np.moveaxis(getattr(s, name), -2, 0) for name in self.inputs]
@@ -300,30 +528,61 @@ class MemoryLaw(EffectLaw):
 
 
 def smooth_sign(v: Array, width: Array) -> Array:
-    """-1 to 1, through zero at rest; `width` (rad/s) is where it has come to 0.76."""
-    return of_each(lambda each: np.tanh(v / each), width)
+    """Smooth sign function tanh(v / width).
+
+    Args:
+        v: rad/s, velocity.
+        width: rad/s, velocity at which the result is 0.76.
+
+    Returns:
+        Values from -1 to 1, 0 at rest.
+    """
+    return evaluate_distinct(lambda each: np.tanh(v / each), width)
 
 
-def of_each(function: Callable[..., Array], *parameters: Array) -> Array:
-    """The function of `parameters`, (J,) or (B, 1, J), computed but once for those of a batch that are equal.
+def evaluate_distinct(function: Callable[..., Array], *parameters: Array) -> Array:
+    """Evaluate a function once for each distinct parameter set of a batch.
 
-    For functions that take far longer than a copy of what they give. Where slopes are taken one parameter moves at a time.
+    Finite differences move one parameter at a time, so most sets of a batch are equal. Use it for
+    functions that take far longer than a copy of their result.
+
+    Args:
+        function: function of the parameters.
+        *parameters: each (J,) or (B, 1, J).
+
+    Returns:
+        The value of `function`, as if it had been called with the whole batch.
     """
     moved = [one for one in parameters if np.ndim(one) == 3]
     if not moved:
         return function(*parameters)
-    first, which = distinct(np.concatenate(moved, axis=-1))
+    first, which = distinct_indices(np.concatenate(moved, axis=-1))
     return function(*(one[first] if np.ndim(one) == 3 else one for one in parameters))[which]
 
 
-def distinct(batch: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Where the different ones of a batch (B, ...) stand first, and which of them each is (B,)."""
+def distinct_indices(batch: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Find the distinct elements of a batch.
+
+    Args:
+        batch: (B, ...).
+
+    Returns:
+        Index of the first occurrence of each distinct element, and for each element (B,) which
+        distinct one it is.
+    """
     met: dict[bytes, int] = {}
     which = np.array([met.setdefault(one.tobytes(), len(met)) for one in batch])
     return np.unique(which, return_index=True)[1], which
 
 
 def rms(x: Array) -> Array:
-    """Root mean square over the rows, (J,)."""
+    """Root mean square over the rows, plus 1e-9.
+
+    Args:
+        x: (N, J).
+
+    Returns:
+        (J,), above 0.
+    """
     value: Array = np.sqrt(np.mean(x * x, axis=-2)) + 1e-9
     return value

@@ -1,4 +1,4 @@
-"""Laws of time: lags and filters within the drive, inertia, stamps that are off."""
+"""Dynamic effects: lags and filters in the drive, rotor inertia, and time stamps that are off."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 import attrs
 import numpy as np
 from scipy.linalg.blas import dtbsv
+from typing_extensions import override
 
 from .base import (
     DRIVE,
@@ -16,41 +17,62 @@ from .base import (
     Array,
     ErrorLaw,
     Errors,
+    InitialGuess,
     Memory,
     MemoryLaw,
     Parameter,
     Params,
     Stage,
-    Start,
     View,
     one_of,
 )
 
-_FAST = "chirps up to 20 Hz and steps, small enough to stay below every bound"
-_TIME = Parameter("T", "s", 0.0002, 0.1, 0.004)
+_FAST_MOTION = "chirps up to 20 Hz and steps, small enough to stay below every bound"
+_TIME_CONSTANT = Parameter("T", "s", 0.0002, 0.1, 0.004)
 
 
-def lag(before: Array, x: Array, dt: Any, time: Array) -> Array:
-    """One step of a first-order lag: from `before` towards `x`, which is held for `dt`."""
+def lag_step(before: Array, x: Array, dt: Any, time: Array) -> Array:
+    """Advance a first-order lag T dy/dt = x - y by one step with x held.
+
+        y(t + dt) = y + (1 - exp(-dt / T)) (x - y)
+
+    Args:
+        before: y at the start of the step.
+        x: input, constant over the step.
+        dt: s, duration of the step.
+        time: s, time constant T.
+
+    Returns:
+        y at the end of the step.
+    """
     return before - np.expm1(-dt / time) * (x - before)
 
 
-def _evenly(before: Array, x: Array, dt: Any, time: Array) -> Array:
-    """What, held for `dt`, moves a first-order lag as far as a signal that goes evenly from `before` to `x`."""
+def _ramp_equivalent_input(before: Array, x: Array, dt: Any, time: Array) -> Array:
+    """Constant input that moves a first-order lag as far as a ramp from `before` to `x` does."""
+    # Exact solution for u(t) = before + (x - before) t / dt:
+    #     u_eq = x + (x - before) (1 / (exp(dt / T) - 1) - T / dt)
     return x + (x - before) * (1.0 / np.expm1(dt / time) - time / dt)
 
 
-def _row_before(x: Array, s: Any) -> Array:
-    """Of the rows of `x` (..., N, J) each the one before it; the first of a stretch its own."""
+def _previous_row(x: Array, s: Any) -> Array:
+    """Shift rows (..., N, J) by one; the first row of each stretch stays."""
     return np.where(s.start, x, np.concatenate([x[..., :1, :], x[..., :-1, :]], axis=-2))
 
 
-def lagged(x: Array, s: Any, time: Array) -> Array:
-    """First-order lag of the rows of `x` (..., N, J), each value held over its step, beginning at rest.
+def lag_series(x: Array, s: Any, time: Array) -> Array:
+    """Filter rows with a first-order lag, each value held over its step, from rest.
 
-    y[k] = d[k] y[k-1] + (1 - d[k]) x[k], with d = 0 where a stretch begins, is a triangular system of two bands; all
-    joints and the whole batch are solved as one.
+    Args:
+        x: input, (..., N, J).
+        s: signals with `dt` and `start`, (N, 1) each.
+        time: s, time constant, (J,) or (..., 1, J).
+
+    Returns:
+        Filtered rows, (..., N, J).
     """
+    # y[k] - d[k] y[k-1] = (1 - d[k]) x[k], with d[k] = exp(-dt[k] / T), and d = 0 where a stretch
+    # starts. This is a lower bidiagonal system; all joints and guesses are solved as one.
     gone = np.where(s.start, -1.0, np.expm1(-s.dt / time))  # d - 1
     gone[..., 0, :] = -1.0
     gone, x = (one.swapaxes(-1, -2) for one in np.broadcast_arrays(gone, x))  # (..., J, N)
@@ -62,124 +84,153 @@ def lagged(x: Array, s: Any, time: Array) -> Array:
 
 
 class FirstOrderLag(MemoryLaw):
-    """T dtau/dt = tau* - tau"""
+    """First-order lag of the torque: T dtau/dt = tau* - tau."""
 
     name = "first_order_lag"
     stage = Stage.DYNAMICS
-    parameters = (_TIME,)
+    parameters = (_TIME_CONSTANT,)
     signal = "tau@history"
     shifts = True
-    motion = _FAST
+    motion = _FAST_MOTION
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{"T": time} for time in (0.001, 0.002, 0.004, 0.007, 0.012, 0.025)]
 
+    @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return (x,)
 
+    @override
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        given = lag(memory[0], x, dt, p["T"])
+        given = lag_step(memory[0], x, dt, p["T"])
         return given, (given,)
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """A new command may come in the middle of a step: until then the torque before is followed."""
-        before = _row_before(x, s)
+        """Apply the lag to a series, with commands that arrive within a step."""
+        # A new command may arrive within a step, `age` ago; until then the lag follows the torque
+        # before.
+        # Both parts together equal a constant input before + w (x - before), with
+        #     w = (1 - exp(-age / T)) / (1 - exp(-dt / T))
+        before = _previous_row(x, s)
         late = -np.expm1(-np.minimum(s.age, s.dt) / p["T"]) / -np.expm1(-s.dt / p["T"])
-        return lagged(before + late * (x - before), s, p["T"])
+        return lag_series(before + late * (x - before), s, p["T"])
 
 
 class VelocityFilter(MemoryLaw):
-    """The drive damps a velocity that it filters: T d(dq_f)/dt = dq - dq_f"""
+    """Low-pass filtered velocity in the damping term: T d(dq_f)/dt = dq - dq_f."""
 
     name = "velocity_filter"
     stage = Stage.ERRORS
-    parameters = (_TIME,)
+    parameters = (_TIME_CONSTANT,)
     inputs = ("dq",)
     signal = "dq@history"
     shifts = True
-    motion = _FAST
+    motion = _FAST_MOTION
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{"T": time} for time in (0.001, 0.002, 0.004, 0.008, 0.015, 0.03)]
 
+    @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return u[0], u[0]
 
+    @override
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         filtered, before = memory
-        filtered = lag(filtered, _evenly(before, u[0], dt, p["T"]), dt, p["T"])
+        filtered = lag_step(filtered, _ramp_equivalent_input(before, u[0], dt, p["T"]), dt, p["T"])
         return (x[0], x[1] + u[0] - filtered), (filtered, u[0])
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        even = _evenly(_row_before(s.dq, s), s.dq, s.dt, p["T"])
-        return x[0], x[1] + s.dq - lagged(even, s, p["T"])
+        even = _ramp_equivalent_input(_previous_row(s.dq, s), s.dq, s.dt, p["T"])
+        return x[0], x[1] + s.dq - lag_series(even, s, p["T"])
 
 
-_SLOPES = "ddq", "ddq_sharp", "ddq_smooth"
+_ACCELERATION_SIGNALS = "ddq", "ddq_sharp", "ddq_smooth"
 
 
 @attrs.frozen(eq=False)
 class Armature(AddedLaw):
-    """-J ddq; `of` says how the acceleration is taken: a short slope of dq, sharp or not, or a smooth one where dq is noisy"""
+    """Rotor inertia: -J ddq.
+
+    `of` selects the acceleration: `ddq`, a short difference quotient of dq; `ddq_sharp`, a shorter
+    one; `ddq_smooth`, a smooth one for noisy velocities.
+    """
 
     name = "armature"
     parameters = (Parameter("J", "kg m^2", 0.0, 1.0, 0.005),)
     linear = ("J",)
-    of_drive = False
+    depends_on_drive_torque = False
     signal = "ddq"
     shifts = True
-    motion = _FAST
-    of: str = attrs.field(default="ddq", validator=one_of(*_SLOPES))
+    motion = _FAST_MOTION
+    of: str = attrs.field(default="ddq", validator=one_of(*_ACCELERATION_SIGNALS))
 
     @classmethod
+    @override
     def variants(cls, about: Any) -> Sequence[Armature]:
-        return tuple(cls(of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
+        return tuple(cls(of=of, at=at) for of in _ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
 
     @property
-    def alternatives(self) -> tuple[Armature, ...]:
-        every = (attrs.evolve(self, of=of, at=at) for of in _SLOPES for at in (DRIVE, JOINT))
+    @override
+    def indistinguishable_forms(self) -> tuple[Armature, ...]:
+        every = (attrs.evolve(self, of=of, at=at) for of in _ACCELERATION_SIGNALS for at in (DRIVE, JOINT))
         return tuple(one for one in every if (one.of, one.at) != (self.of, self.at))
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{}]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["J"] * getattr(s, self.of)
 
 
 @attrs.frozen(eq=False)
 class TimestampSkew(ErrorLaw):
-    """The drive knew `channel`, q or dq, as its rows have it `late` s before; negative: as they have it only later
+    """Channel `q` or `dq` that reaches the drive `late` s later than its rows say; negative: earlier.
 
-    A position stamped on some joints early is no velocity stamped late there: the command stays where it is. To the
-    model that runs it is a signal that the drive knows late; one known early is a fault of the record alone.
+    The command keeps its time, so a position that is early on some joints is no velocity that is
+    late there. In a running model a late channel is a delay of the measurement. An early one is a
+    fault of the log alone and is ignored.
+
+    Attributes:
+        channel: `dq` or `q`.
     """
 
     name = "timestamp_skew"
     parameters = (Parameter("late", "s", -0.03, 0.03, 0.002),)
     shifts = True
-    motion = _FAST
+    motion = _FAST_MOTION
     channel: str = attrs.field(default="dq", validator=one_of("dq", "q"))
 
     @property
+    @override
     def signal(self) -> str:  # type: ignore[override]
         return f"{self.channel}@history"
 
     @property
+    @override
     def confounded_with_gain(self) -> bool:  # type: ignore[override]
-        """A position that is off on all joints is two other delays."""
+        """Whether skew on all joints equals two other delays, which holds for positions."""
         return self.channel == "q"
 
     @classmethod
+    @override
     def variants(cls, about: Any) -> Sequence[TimestampSkew]:
         return cls("dq"), cls("q")
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [
             {"late": late}
             for late in (-0.012, -0.008, -0.005, -0.003, -0.0015, 0.0015, 0.003, 0.005, 0.008, 0.012)
         ]
 
+    @override
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         shifted = s.shifted(self.channel, p["late"])
         return (e[0] + s.q - shifted, e[1]) if self.channel == "q" else (e[0], e[1] + s.dq - shifted)

@@ -1,4 +1,4 @@
-"""Laws of position: offsets, springs, cogging, deadband, and play and hysteresis with their memory."""
+"""Effects of position: offset, spring, cogging, deadband, backlash and hysteresis."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import attrs
 import numpy as np
+from typing_extensions import override
 
 from . import recurrence
 from .base import (
@@ -16,73 +17,79 @@ from .base import (
     EffectLaw,
     ErrorLaw,
     Errors,
+    InitialGuess,
     Memory,
     MemoryLaw,
     Parameter,
     Params,
     Stage,
-    Start,
     View,
-    of_each,
+    evaluate_distinct,
     one_of,
     rms,
-    staged,
+    stage_from_field,
 )
 
-_STIFFNESSES = (-10.0, -3.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0, 10.0, 30.0)  # N m/rad
-_STILL = "small slow reversals about many postures, each held for a second"
+_STIFFNESS_GUESSES = (-10.0, -3.0, -1.0, -0.4, 0.4, 1.0, 2.0, 4.0, 10.0, 30.0)  # N m/rad
+_SLOW_REVERSALS = "small slow reversals about many postures, each held for a second"
 
 
 class TorqueOffset(AddedLaw):
-    """A constant; an encoder bias looks the same"""
+    """Constant torque; an encoder bias times kp looks the same."""
 
     name = "torque_offset"
     parameters = (Parameter("offset", "N m", -20.0, 20.0, 0.3),)
     linear = ("offset",)
-    of_drive = False
+    depends_on_drive_torque = False
     signal = "q"
     motion = (
         "a constant offset and an encoder bias differ only where kp changes: two recordings with different kp"
     )
 
     @classmethod
+    @override
     def variants(cls, about: Any) -> Sequence[TorqueOffset]:
         return (cls(),)
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{}]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return p["offset"] + 0.0 * s.q
 
 
 class ParallelSpring(AddedLaw):
-    """-k (q - q0)"""
+    """Spring in parallel with the drive: -k (q - q0)."""
 
     name = "parallel_spring"
     parameters = (Parameter("k", "N m/rad", -200.0, 200.0, 1.0), Parameter("q0", "rad", -30.0, 30.0, 0.3))
     linear = ("k",)
-    of_drive = False
+    depends_on_drive_torque = False
     signal = "q"
     motion = "slow sweeps over the whole range of every joint"
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        """Of any stiffness, at rest where it gives the mean of the residual: gains hide the slope of it."""
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        """Try stiffnesses of either sign that give the mean residual; gains hide the slope."""
         weight = (residual != 0.0).astype(float)
         n = weight.sum(axis=0) + 1e-9
         q, r = (s.q * weight).sum(axis=0) / n, residual.sum(axis=0) / n
-        return [{"q0": q}, *({"q0": np.clip(q + r / k, -25.0, 25.0)} for k in _STIFFNESSES)]
+        return [{"q0": q}, *({"q0": np.clip(q + r / k, -25.0, 25.0)} for k in _STIFFNESS_GUESSES)]
 
+    @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
-        """A weak spring that rests far away is a constant."""
+        """Return the constant torque k q0: a weak spring that rests far away."""
         return TorqueOffset(at=self.at), {"offset": p["k"] * p["q0"]}
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["k"] * (s.q - p["q0"])
 
 
 class Cogging(AddedLaw):
-    """a sin(n q + phi)"""
+    """Cogging torque: a sin(n q + phi)."""
 
     name = "cogging"
     parameters = (
@@ -91,12 +98,17 @@ class Cogging(AddedLaw):
         Parameter("phi", "rad", -20.0, 20.0, 0.3),
     )
     linear = ("a",)
-    of_drive = False
+    depends_on_drive_torque = False
     signal = "q"
     motion = "slow sweeps over the whole range of every joint"
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        """The highest lines of the residual's spectrum over the position."""
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        """Take the four highest peaks of the residual's spectrum over the position."""
+        # Fourier sums of the residual r over the position, at wave numbers n:
+        #     line(n) = conj(sum_k r[k] exp(i n (q[k] - centre)))
+        # n in half turns over the range of motion, so that neighbours are one resolution cell
+        # apart.
         spread = np.maximum(np.ptp(s.q, axis=0), 1e-3)
         steps = np.arange(1.0, 60.0, 0.5)
         centre = s.q.mean(axis=0)
@@ -120,37 +132,46 @@ class Cogging(AddedLaw):
             found.append({"n": turns, "phi": np.remainder(phase + np.pi, 2.0 * np.pi) - np.pi})
         return found
 
+    @override
     def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         phi = p["phi"] + np.where(p["a"] < 0.0, np.pi, 0.0)
         return p | {"a": np.abs(p["a"]), "phi": np.remainder(phi + np.pi, 2.0 * np.pi) - np.pi}
 
+    @override
     def excited_joints(self, p: Params, s: View) -> Bools:
-        """Joints that moved through a whole period: a part of one is any curve over the angle."""
+        """Select joints that moved through a whole period: over a part of one, cogging is any curve."""
         whole: Bools = np.ptp(s.q, axis=0) * p["n"] >= 2.0 * np.pi
         return whole
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        return p["a"] * of_each(lambda n, phi: np.sin(n * s.q + phi), p["n"], p["phi"])
+        return p["a"] * evaluate_distinct(lambda n, phi: np.sin(n * s.q + phi), p["n"], p["phi"])
 
 
 @attrs.frozen(eq=False)
 class Deadband(ErrorLaw):
-    """No answer to position errors below `width`; beyond it the whole error (`edge` hard), or what exceeds it (soft)"""
+    """Deadband of the position error: no response below `width`.
+
+    Beyond it the drive sees the whole error (`edge` hard) or what exceeds `width` (soft).
+    """
 
     name = "deadband"
     parameters = (Parameter("width", "rad", 0.0005, 0.5, 0.01),)
     signal = "q_des"
-    motion = _STILL
+    motion = _SLOW_REVERSALS
     edge: str = attrs.field(default="soft", validator=one_of("soft", "hard"))
 
     @classmethod
+    @override
     def variants(cls, about: Any) -> Sequence[Deadband]:
         return cls("soft"), cls("hard")
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         error = np.abs(s.q_des - s.q)
         return [{"width": np.quantile(error, at, axis=0) + 5e-4} for at in np.linspace(0.03, 0.99, 33)]
 
+    @override
     def errors(self, e: Errors, s: View, p: Params) -> Errors:
         beyond = np.abs(e[0]) > p["width"]
         less = p["width"] * np.sign(e[0]) if self.edge == "soft" else 0.0
@@ -159,13 +180,17 @@ class Deadband(ErrorLaw):
 
 @attrs.frozen(eq=False)
 class Backlash(MemoryLaw):
-    """Play: the drive sees `on` (the position q, the error q_des - q, or the torque) through a gap of +-`gap`"""
+    """Backlash: the drive sees a signal through a gap of +-`gap`.
+
+    `on` selects the signal: the position `q`, the error q_des - q, or the torque.
+    """
 
     name = "backlash"
-    stage = staged("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.DYNAMICS)
+    stage = stage_from_field("on", error=Stage.ERRORS, q=Stage.ERRORS, torque=Stage.DYNAMICS)
     on: str = attrs.field(default="error", validator=one_of("error", "q", "torque"))
 
     @property
+    @override
     def parameters(self) -> tuple[Parameter, ...]:  # type: ignore[override]
         if self.on == "torque":
             return (Parameter("gap", "N m", 0.01, 50.0, 0.3),)
@@ -173,40 +198,54 @@ class Backlash(MemoryLaw):
 
     inputs = ("q",)
     signal = "q@history"
-    motion = _STILL
+    motion = _SLOW_REVERSALS
 
     @classmethod
+    @override
     def variants(cls, about: Any) -> Sequence[Backlash]:
         return tuple(cls(on) for on in ("error", "q", "torque"))
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         of = {"error": rms(s.q_des - s.q), "q": rms(s.q_des - s.q), "torque": rms(torque)}[self.on]
         return [{"gap": share * of + 2e-4} for share in (0.05, 0.1, 0.2, 0.4, 0.8)]
 
-    def _seen(self, x: Any, u: Sequence[Array]) -> Array:
+    def _gap_input(self, x: Any, u: Sequence[Array]) -> Array:
+        """Select the signal that enters the gap."""
         if self.on == "q":
             return u[0]
         seen: Array = x if self.on == "torque" else x[0]
         return seen
 
-    def _given(self, x: Any, u: Sequence[Array], follows: Array) -> Any:
+    def _with_gap_output(self, x: Any, u: Sequence[Array], follows: Array) -> Any:
+        """Insert the output of the gap into the errors or the torque."""
         if self.on == "torque":
             return follows
         return (follows if self.on == "error" else x[0] + u[0] - follows), x[1]
 
+    @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
-        return (self._seen(x, u) + 0.0 * p["gap"],)
+        return (self._gap_input(x, u) + 0.0 * p["gap"],)
 
+    @override
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
-        follows = recurrence.backlash_step(memory[0], self._seen(x, u), p["gap"])
-        return self._given(x, u, follows), (follows,)
+        follows = recurrence.backlash_step(memory[0], self._gap_input(x, u), p["gap"])
+        return self._with_gap_output(x, u, follows), (follows,)
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        return self._given(x, (s.q,), recurrence.backlash_series(self._seen(x, (s.q,)), s.start, p["gap"]))
+        return self._with_gap_output(
+            x, (s.q,), recurrence.backlash_series(self._gap_input(x, (s.q,)), s.start, p["gap"])
+        )
 
 
 class Hysteresis(MemoryLaw):
-    """-F z with Bouc-Wen's dz/dq = (1 - (beta + (1 - beta) sign(z dq)) |z|) / reach, -1 <= z <= 1"""
+    """Bouc-Wen hysteresis: -F z, with a state -1 <= z <= 1.
+
+        dz/dq = (1 - (beta + (1 - beta) sign(z dq)) |z|) / reach
+
+    Source: Wen, Journal of the Engineering Mechanics Division 102 (1976).
+    """
 
     name = "hysteresis"
     stage = Stage.ADDED
@@ -218,23 +257,28 @@ class Hysteresis(MemoryLaw):
     )
     inputs = ("q",)
     signal = "q@history"
-    motion = _STILL
+    motion = _SLOW_REVERSALS
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [
             {"reach": share * rms(s.q - s.q.mean(axis=0)), "beta": 0.5} for share in (0.03, 0.1, 0.25, 0.6)
         ]
 
+    @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return 0.0 * (u[0] + p["reach"]), u[0]
 
+    @override
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         z, before = memory
         z = recurrence.bouc_wen_step(z, (u[0] - before) / p["reach"], p["beta"])
         return -p["F"] * z, (z, u[0])
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
-        """In proportion to F: computed once for all guesses with the same curve."""
+        """Apply the effect to a series; z is computed once per distinct curve of a batch."""
+        # The torque is proportional to F: solve for z once per distinct (reach, beta) of the batch.
         reach, beta = np.broadcast_arrays(p["reach"], p["beta"])
         if reach.ndim == 1:
             return -p["F"] * recurrence.bouc_wen_series(s.q, s.start, reach, beta)

@@ -1,6 +1,7 @@
-"""Friction: torques against the velocity. s is a smooth sign, v_0 the velocity at which it turns.
+"""Friction: torques against the velocity.
 
-How a sign turns hardly shows in a log, but what it says about the amplitude of friction hangs on it.
+s(dq) is a smooth sign function and v_0 the velocity at which it saturates. A log hardly shows the
+shape of s, but the estimated amplitude depends on it, so each form has an alternative shape.
 """
 
 from __future__ import annotations
@@ -9,124 +10,164 @@ from collections.abc import Mapping, Sequence
 
 import attrs
 import numpy as np
+from typing_extensions import override
 
-from .base import AddedLaw, Array, EffectLaw, Parameter, Params, Start, View, of_each, one_of, smooth_sign
+from .base import (
+    AddedLaw,
+    Array,
+    EffectLaw,
+    InitialGuess,
+    Parameter,
+    Params,
+    View,
+    evaluate_distinct,
+    one_of,
+    smooth_sign,
+)
 
-_WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
-_WIDTHS = (0.02, 0.06, 0.2)
-_SLOW = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/s"
+_SIGN_WIDTH = Parameter("v_0", "rad/s", 0.003, 0.6, 0.05)
+_SIGN_WIDTH_GUESSES = (0.02, 0.06, 0.2)
+_SLOW_REVERSALS = "slow reversals of every joint in the air, at speeds from 0.05 to 5 rad/s"
 
 
 @attrs.frozen(eq=False)
-class _Rubbing(AddedLaw):
-    """Friction with a sign that turns as the hyperbolic tangent does, or slower, as the arctangent."""
+class _SignFriction(AddedLaw):
+    """Friction with a smooth sign function: hyperbolic tangent, or the slower arctangent."""
 
-    of_drive = False
+    depends_on_drive_torque = False
     turn: str = attrs.field(default="tanh", kw_only=True, validator=one_of("tanh", "arctan"))
 
     @property
-    def alternatives(self) -> tuple[EffectLaw, ...]:
+    @override
+    def indistinguishable_forms(self) -> tuple[EffectLaw, ...]:
         return (attrs.evolve(self, turn="arctan"),)
 
     def sign(self, v: Array, width: Array) -> Array:
-        """-1 to 1, through zero at rest."""
+        """Smooth sign function: tanh(v / v_0), or (2 / pi) arctan(v / v_0).
+
+        Args:
+            v: rad/s, velocity.
+            width: rad/s, v_0.
+
+        Returns:
+            Values from -1 to 1, 0 at rest.
+        """
         if self.turn == "tanh":
             return smooth_sign(v, width)
-        return of_each(lambda each: np.arctan(v / each) * (2.0 / np.pi), width)
+        return evaluate_distinct(lambda each: np.arctan(v / each) * (2.0 / np.pi), width)
 
 
-class CoulombFriction(_Rubbing):
-    """-c s(dq)"""
+class CoulombFriction(_SignFriction):
+    """Coulomb friction: -c s(dq)."""
 
     name = "coulomb_friction"
-    parameters = (Parameter("c", "N m", 0.0, 20.0, 0.3), _WIDTH)
+    parameters = (Parameter("c", "N m", 0.0, 20.0, 0.3), _SIGN_WIDTH)
     linear = ("c",)
     signal = "dq"
-    motion = _SLOW
+    motion = _SLOW_REVERSALS
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        return [{"v_0": width} for width in _WIDTHS]
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        return [{"v_0": width} for width in _SIGN_WIDTH_GUESSES]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["c"] * self.sign(s.dq, p["v_0"])
 
 
 class ViscousFriction(AddedLaw):
-    """-b dq, on some joints only: shared by all it is a deviation of the gain kd"""
+    """Viscous friction: -b dq, on some joints only.
+
+    On all joints it equals a deviation of the gain kd.
+    """
 
     name = "viscous_friction"
     parameters = (Parameter("b", "N m s/rad", 0.0, 10.0, 0.05),)
     linear = ("b",)
-    of_drive = False
+    depends_on_drive_torque = False
     confounded_with_gain = True
     signal = "dq"
-    motion = _SLOW
+    motion = _SLOW_REVERSALS
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{}]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["b"] * s.dq
 
 
-class StribeckFriction(_Rubbing):
-    """-(c + (c_s - c) exp(-(dq / v_s)^2)) s(dq), where c_s > c"""
+class StribeckFriction(_SignFriction):
+    """Stribeck friction: -(c + (c_s - c) exp(-(dq / v_s)^2)) s(dq), with c_s > c.
+
+    Source: Armstrong-Helouvry, Dupont and Canudas de Wit, Automatica 30 (1994).
+    """
 
     name = "stribeck_friction"
     parameters = (
         Parameter("c", "N m", 0.0, 20.0, 0.3),
         Parameter("c_s", "N m", 0.0, 30.0, 0.5),
         Parameter("v_s", "rad/s", 0.02, 5.0, 0.3),
-        _WIDTH,
+        _SIGN_WIDTH,
     )
     linear = ("c", "c_s")
     signal = "dq"
-    motion = _SLOW
+    motion = _SLOW_REVERSALS
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{"v_s": v_s, "v_0": v_0} for v_s in (0.15, 0.4, 1.0, 2.0) for v_0 in (0.02, 0.08)]
 
+    @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
         return CoulombFriction(at=self.at, turn=self.turn), {"c": p["c"], "v_0": p["v_0"]}
 
+    @override
     def canonical(self, p: dict[str, Array]) -> dict[str, Array]:
         return p | {"c_s": np.maximum(p["c_s"], p["c"])}
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
-        sticking = of_each(lambda v_s: np.exp(-np.square(s.dq / v_s)), p["v_s"])
+        # share of the static part: exp(-(dq / v_s)^2)
+        sticking = evaluate_distinct(lambda v_s: np.exp(-np.square(s.dq / v_s)), p["v_s"])
         return -(p["c"] + (p["c_s"] - p["c"]) * sticking) * self.sign(s.dq, p["v_0"])
 
 
 class QuadraticDrag(AddedLaw):
-    """-c dq |dq|"""
+    """Quadratic drag: -c dq |dq|."""
 
     name = "quadratic_drag"
     parameters = (Parameter("c", "N m s^2/rad^2", 0.0, 50.0, 0.02),)
     linear = ("c",)
-    of_drive = False
+    depends_on_drive_torque = False
     signal = "dq"
     motion = "fast sweeps, up to the joint's top speed"
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         return [{}]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["c"] * s.dq * np.abs(s.dq)
 
 
-class LoadDependentFriction(_Rubbing):
-    """-mu |tau*| s(dq)"""
+class LoadDependentFriction(_SignFriction):
+    """Friction proportional to the load, as in gears: -mu |tau*| s(dq)."""
 
     name = "load_dependent_friction"
-    parameters = (Parameter("mu", "1", 0.0, 0.9, 0.05), _WIDTH)
+    parameters = (Parameter("mu", "1", 0.0, 0.9, 0.05), _SIGN_WIDTH)
     linear = ("mu",)
-    of_drive = True
+    depends_on_drive_torque = True
     signal = "dq"
     motion = "slow reversals under different loads: hung in the air, standing, with a payload"
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
-        return [{"v_0": width} for width in _WIDTHS]
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
+        return [{"v_0": width} for width in _SIGN_WIDTH_GUESSES]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return -p["mu"] * np.abs(x) * self.sign(s.dq, p["v_0"])
 

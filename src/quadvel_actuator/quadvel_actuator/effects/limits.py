@@ -1,4 +1,4 @@
-"""Bounds on the torque and on how fast it changes."""
+"""Limits on the torque and on its rate of change."""
 
 from __future__ import annotations
 
@@ -6,33 +6,39 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from typing_extensions import override
 
 from . import recurrence
-from .base import Array, EffectLaw, Memory, MemoryLaw, Parameter, Params, Stage, Start, TorqueLaw, View
+from .base import Array, EffectLaw, InitialGuess, Memory, MemoryLaw, Parameter, Params, Stage, TorqueLaw, View
 
-_HARD = "fast and large steps that ask for more torque than the drive gives"
+_SATURATING_MOTION = "fast and large steps that ask for more torque than the drive gives"
 
 
 class TorqueSaturation(TorqueLaw):
-    """tau* held to -limit..limit"""
+    """Constant torque limit: tau = clip(tau*, -limit, limit)."""
 
     name = "torque_saturation"
     stage = Stage.LIMIT
     parameters = (Parameter("limit", "N m", 0.1, 500.0, 10.0),)
     signal = "tau"
-    motion = _HARD
+    motion = _SATURATING_MOTION
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         shares = (0.75, 0.9, 0.96, 0.99, 0.997)
         seldom = [{"limit": share * np.abs(torque).max(axis=0)} for share in (0.8, 0.9, 0.97)]
         return [*({"limit": np.quantile(np.abs(torque), share, axis=0)} for share in shares), *seldom]
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         return np.clip(x, -p["limit"], p["limit"])
 
 
 class TorqueSpeedLimit(TorqueLaw):
-    """A bound that falls with the speed in the direction of motion: stall (1 - v / no_load), 0 to `stall`"""
+    """Speed-torque curve of a DC motor: the limit falls linearly with speed.
+
+    |tau| <= stall (1 - v / no_load), within 0 and stall, v the speed along the torque
+    """
 
     name = "torque_speed_limit"
     stage = Stage.LIMIT
@@ -41,9 +47,10 @@ class TorqueSpeedLimit(TorqueLaw):
         Parameter("no_load", "rad/s", 0.2, 300.0, 10.0),
     )
     signal = "dq"
-    motion = _HARD
+    motion = _SATURATING_MOTION
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         top = np.quantile(np.abs(s.dq), 0.98, axis=0)
         return [
             {"stall": np.quantile(np.abs(torque), share, axis=0) * over, "no_load": fast * top}
@@ -51,9 +58,11 @@ class TorqueSpeedLimit(TorqueLaw):
             for fast in (0.6, 0.9, 1.3, 2.0, 4.0)
         ]
 
+    @override
     def special_case(self, p: Mapping[str, Array]) -> tuple[EffectLaw, Mapping[str, Array]]:
         return TorqueSaturation(), {"limit": p["stall"]}
 
+    @override
     def torque(self, x: Array, s: View, p: Params) -> Array:
         def bound(speed: Array) -> Array:
             return p["stall"] * np.clip(1.0 - speed / p["no_load"], 0.0, 1.0)
@@ -62,7 +71,10 @@ class TorqueSpeedLimit(TorqueLaw):
 
 
 class SlewLimit(MemoryLaw):
-    """|dtau/dt| held to `rate`; until a new command comes in the middle of a step, the torque goes on as it went before"""
+    """Rate limit: |dtau/dt| <= rate.
+
+    If a new command arrives within a step, the torque keeps its earlier slope until then.
+    """
 
     name = "slew_limit"
     stage = Stage.DYNAMICS
@@ -71,22 +83,26 @@ class SlewLimit(MemoryLaw):
     parameters = (Parameter("rate", "N m/s", 5.0, 50000.0, 300.0),)
     signal = "tau@history"
     shifts = True
-    motion = _HARD
+    motion = _SATURATING_MOTION
 
-    def starts(self, s: View, torque: Array, residual: Array) -> Sequence[Start]:
+    @override
+    def initial_guesses(self, s: View, torque: Array, residual: Array) -> Sequence[InitialGuess]:
         slope = np.abs(np.diff(torque, axis=0)) / s.dt[1:]
-        # The last bounds nothing: not every joint need have it.
+        # The last guess limits nothing, for joints without the effect.
         shares = (0.5, 0.7, 0.85, 0.94, 0.98, 0.992, 0.998, 1.0)
         return [{"rate": np.quantile(slope, share, axis=0) + 5.0} for share in shares]
 
+    @override
     def rest(self, x: Any, u: Sequence[Array], p: Params) -> Memory:
         return x, x, 0.0 * x
 
+    @override
     def advance(self, x: Any, u: Sequence[Array], dt: Any, p: Params, memory: Memory) -> tuple[Any, Memory]:
         given, before, slope = memory
         given, slope = recurrence.rate_limit_step(given, before, slope, x, u[0], dt, p["rate"])
         return given, (given, x, slope)
 
+    @override
     def series(self, x: Any, s: Any, p: Params) -> Any:
         return recurrence.rate_limit_series(x, s.age, s.dt, s.start, p["rate"])
 

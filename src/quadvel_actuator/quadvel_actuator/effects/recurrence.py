@@ -1,7 +1,8 @@
-"""The steps of laws whose next value hangs on the one before in no way that linear algebra solves: play, bristles, chase.
+"""Nonlinear recurrences: backlash, Bouc-Wen hysteresis and rate limit.
 
-A step is written once, of numbers or of arrays. A running model takes one at a time; whole series of rows take them all
-as compiled loops, since as many steps of Python as there are rows are most of an identification's time.
+Each step is written once, for numbers and arrays. A running model takes one step at a time. Series
+of rows run as compiled loops: one Python step per row would take most of the time of an
+identification.
 """
 
 from __future__ import annotations
@@ -14,31 +15,69 @@ import numpy as np
 
 
 def backlash_step(follows: Any, seen: Any, gap: Any) -> Any:
-    """What follows `seen` through a gap of +-`gap`."""
+    """Advance the output of a gap.
+
+        y = clip(y_before, x - gap, x + gap)
+
+    Args:
+        follows: output y of the step before.
+        seen: input x.
+        gap: half width of the gap, in the unit of the input.
+
+    Returns:
+        The output y.
+    """
     return np.minimum(np.maximum(follows, seen - gap), seen + gap)
 
 
 def bouc_wen_step(z: Any, way: Any, beta: Any) -> Any:
-    """The bristles' bending (-1 to 1) after a `way` in units of their reach, by Bouc-Wen's law."""
+    """Advance the state of a Bouc-Wen hysteresis.
+
+        dz = w (1 - (beta + (1 - beta) sign(z w)) |z|)
+
+    Args:
+        z: state, -1 to 1.
+        way: displacement w over the step, in units of the reach.
+        beta: shape, 0 to 1.
+
+    Returns:
+        The new state, -1 to 1.
+    """
+    # beta + (1 - beta) sign(z w) is 1 while loading, and 1 - 2 (1 - beta) while unloading
     back = z * way < 0.0
     z = z + way * (1.0 - (1.0 - 2.0 * (1.0 - beta) * back) * np.abs(z))
     return np.minimum(np.maximum(z, -1.0), 1.0)
 
 
 def rate_limit_step(given: Any, before: Any, slope: Any, now: Any, age: Any, dt: Any, rate: Any) -> Any:
-    """What chases a torque at `rate` at most over `dt`, and that torque's slope; it went from `before` to `now`.
+    """Advance a rate limiter that follows a torque.
 
-    Until a new command came, `age` ago, the torque went on with the slope that it had.
+    Args:
+        given: N m, output of the step before.
+        before: N m, input of the step before.
+        slope: N m/s, slope of the input in the step before.
+        now: N m, input.
+        age: s, time since the command in force arrived; until then the input kept its slope.
+        dt: s, duration of the step.
+        rate: N m/s, limit.
+
+    Returns:
+        The output, and the slope of the input.
     """
+    # Two parts: dt - new with the earlier slope, then `new` that ends at `now`. Without a new
+    # command
+    # within the step, the input is a ramp from `before` to `now`.
     new = np.minimum(age, dt)
     midway = new < dt
     slope = midway * slope + (1 - midway) * ((now - before) / dt)
-    given = _nearer(given, before, slope, dt - new, rate)
-    return _nearer(given, now - slope * new, slope, new, rate), slope
+    given = _chase_target(given, before, slope, dt - new, rate)
+    return _chase_target(given, now - slope * new, slope, new, rate), slope
 
 
-def _nearer(given: Any, target: Any, slope: Any, time: Any, rate: Any) -> Any:
-    """Where `given` comes in `time` at `rate` at most after a target that moves evenly, by `slope`."""
+def _chase_target(given: Any, target: Any, slope: Any, time: Any, rate: Any) -> Any:
+    """Follow a target that moves with `slope` for `time`, at `rate` at most."""
+    # The gap |given - target| closes at rate + side slope. Once it is closed, the output moves with
+    # the target, as far as the limit allows.
     ahead = given - target
     side = np.sign(ahead)
     nearing = np.maximum(rate + side * slope, 1e-12)
@@ -47,22 +86,52 @@ def _nearer(given: Any, target: Any, slope: Any, time: Any, rate: Any) -> Any:
 
 
 def backlash_series(seen: Any, start: Any, gap: Any) -> Any:
-    """`play` along the rows of `seen` (..., N, J), from rest where a stretch starts; `gap` (..., 1, J) or less."""
-    return _along(_compiled()["played"], (seen, start), (gap,))
+    """Apply `backlash_step` along the rows of a series.
+
+    Args:
+        seen: input, (..., N, J).
+        start: where a stretch starts at rest, broadcast to (..., N, J).
+        gap: half width of the gap, (J,) or (..., 1, J).
+
+    Returns:
+        Output, (..., N, J).
+    """
+    return _run_loop(_compiled_loops()["backlash_loop"], (seen, start), (gap,))
 
 
 def bouc_wen_series(q: Any, start: Any, reach: Any, beta: Any) -> Any:
-    """`bend` along the rows of `q` (..., N, J) rad."""
-    return _along(_compiled()["bent"], (q, start), (reach, beta))
+    """Apply `bouc_wen_step` along the rows of a series.
+
+    Args:
+        q: rad, positions, (..., N, J).
+        start: where a stretch starts at rest.
+        reach: rad, (J,) or (..., 1, J).
+        beta: shape, (J,) or (..., 1, J).
+
+    Returns:
+        State z, (..., N, J).
+    """
+    return _run_loop(_compiled_loops()["bouc_wen_loop"], (q, start), (reach, beta))
 
 
 def rate_limit_series(torque: Any, age: Any, dt: Any, start: Any, rate: Any) -> Any:
-    """`chase` along the rows of `torque` (..., N, J)."""
-    return _along(_compiled()["chased"], (torque, age, dt, start), (rate,))
+    """Apply `rate_limit_step` along the rows of a series.
+
+    Args:
+        torque: N m, input, (..., N, J).
+        age: s, time since the command in force arrived.
+        dt: s, duration of each step.
+        start: where a stretch starts at rest.
+        rate: N m/s, limit, (J,) or (..., 1, J).
+
+    Returns:
+        N m, output, (..., N, J).
+    """
+    return _run_loop(_compiled_loops()["rate_limit_loop"], (torque, age, dt, start), (rate,))
 
 
-def _along(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[Any, ...]) -> Any:
-    """A loop over the last axis but one of `rows`; `numbers` have one row, or none of their own."""
+def _run_loop(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[Any, ...]) -> Any:
+    """Broadcast rows and parameters, flatten leading axes, and run a compiled loop over the rows."""
     numbers = tuple(map(np.atleast_2d, numbers))
     shape = np.broadcast_shapes(*map(np.shape, (*rows, *numbers)))
     out = np.empty(shape)
@@ -73,18 +142,20 @@ def _along(loop: Callable[..., Any], rows: tuple[Any, ...], numbers: tuple[Any, 
 
 
 @cache
-def _compiled() -> dict[str, Callable[..., Any]]:
-    """The loops, by name; compiled at the first call after an installation, which takes some seconds, and kept on disk.
+def _compiled_loops() -> dict[str, Callable[..., Any]]:
+    """Compile the loops at the first call after an installation, which takes seconds; Numba caches
+    them on disk.
 
-    Not as universal functions, which Numba keeps in two files that break each other where several processes compile at once.
+    They are no universal functions: Numba keeps those in two files, which several compiling
+    processes corrupt.
     """
     import numba  # takes time and memory that a running model need not spend
     from numba.extending import register_jitable
 
-    for step in (backlash_step, bouc_wen_step, _nearer, rate_limit_step):
+    for step in (backlash_step, bouc_wen_step, _chase_target, rate_limit_step):
         register_jitable(step)
 
-    def played(seen: Any, start: Any, gap: Any, out: Any) -> None:
+    def backlash_loop(seen: Any, start: Any, gap: Any, out: Any) -> None:
         for b, j in np.ndindex(gap.shape):
             follows = seen[b, 0, j]
             for n in range(seen.shape[1]):
@@ -93,7 +164,7 @@ def _compiled() -> dict[str, Callable[..., Any]]:
                 )
                 out[b, n, j] = follows
 
-    def bent(q: Any, start: Any, reach: Any, beta: Any, out: Any) -> None:
+    def bouc_wen_loop(q: Any, start: Any, reach: Any, beta: Any, out: Any) -> None:
         for b, j in np.ndindex(reach.shape):
             z = 0.0
             for n in range(q.shape[1]):
@@ -105,7 +176,7 @@ def _compiled() -> dict[str, Callable[..., Any]]:
                 )
                 out[b, n, j] = z
 
-    def chased(torque: Any, age: Any, dt: Any, start: Any, rate: Any, out: Any) -> None:
+    def rate_limit_loop(torque: Any, age: Any, dt: Any, start: Any, rate: Any, out: Any) -> None:
         for b, j in np.ndindex(rate.shape):
             given, slope = torque[b, 0, j], 0.0
             for n in range(torque.shape[1]):
@@ -122,9 +193,9 @@ def _compiled() -> dict[str, Callable[..., Any]]:
     rows, on = (numba.types.Array(kind, 3, "A", readonly=True) for kind in (numba.float64, numba.boolean))
     number, out = numba.types.Array(numba.float64, 2, "A", readonly=True), numba.float64[:, :, ::1]
     kinds = {
-        played: (rows, on, number, out),
-        bent: (rows, on, number, number, out),
-        chased: (rows, rows, rows, on, number, out),
+        backlash_loop: (rows, on, number, out),
+        bouc_wen_loop: (rows, on, number, number, out),
+        rate_limit_loop: (rows, rows, rows, on, number, out),
     }
     compiled: Any = numba.njit
     return {loop.__name__: compiled(numba.void(*types), cache=True)(loop) for loop, types in kinds.items()}
