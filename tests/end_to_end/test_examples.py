@@ -29,7 +29,7 @@ from quadvel_policy.policy_file import SHIPPED_POLICY
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = ("*.md", "docs/**/*.md", "src/*/README.md", "training/README.md", "ros_ws/README.md")
 PROGRAMS = {"quadvel": [sys.executable, "-m", "quadvel_bringup"], "python": [sys.executable]}
-READY = "ready: a velocity makes it walk"
+READY = "ready; waiting for a velocity command"
 
 
 @attrs.frozen

@@ -97,7 +97,7 @@ class Shown:
 def up(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Robot]:
     robot = Robot(tmp_path_factory.mktemp("up") / "up.log")
     try:
-        robot.says("ready: a velocity makes it walk")
+        robot.says("ready; waiting for a velocity command")
         yield robot
     finally:
         code = robot.end()

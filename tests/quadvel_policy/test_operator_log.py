@@ -43,7 +43,7 @@ def test_each_change_is_told_once_and_a_fault_with_the_way_out_of_it(policy: Any
     run.supervisor.request("stance")
     assert run.tick(STILL, 80) == [
         (False, "stance: was asked for"),
-        (False, "ready: a velocity makes it walk"),
+        (False, "ready; waiting for a velocity command"),
     ]
     assert run.tick(FORWARD, 20) == [(False, "walk: a velocity was commanded")]
     assert not list(run.announcements.waiting())
@@ -61,4 +61,4 @@ def test_why_a_standing_robot_does_not_walk_is_told_once(policy: Any) -> None:
     expected = ["follows no velocity: a zero velocity has to be commanded first"]
     assert list(run.announcements.waiting()) == expected
     assert list(run.announcements.waiting()) == []
-    assert run.tick(STILL) == [(False, "ready: a velocity makes it walk")]
+    assert run.tick(STILL) == [(False, "ready; waiting for a velocity command")]

@@ -91,7 +91,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     parameters["view"]["ros__parameters"]["port"] = 0
     (folder / "params.yaml").write_text(yaml.safe_dump(parameters))
     up = Served(folder / "up.log", "up", "--view", "--params", "params.yaml")
-    up.said("(ready: a velocity makes it walk)")
+    up.said("(ready; waiting for a velocity command)")
     yield up.said(r"open (http://127\.0\.0\.1:\d+/)")
     assert up.end() == 0
 

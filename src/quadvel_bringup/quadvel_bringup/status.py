@@ -122,7 +122,7 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
             yield "finding", finding
         if state.mode_name == "fault":
             yield "way out", f"once the cause is gone: {WAY_OUT}"
-        yield "walking", state.walk_refusal or "ready: a velocity makes it walk"
+        yield "walking", state.walk_refusal or "ready; waiting for a velocity command"
         yield (
             "command",
             f"{velocity_text(planar(state.command))}, from {commands[-1].source if commands else 'nobody'}",

@@ -34,7 +34,7 @@ class OperatorLog:
             self._refusal = None
         elif self._refusal != "" and not self._supervisor.walk_refusal:
             self._refusal = ""
-            yield False, "ready: a velocity makes it walk"
+            yield False, "ready; waiting for a velocity command"
 
     def _way_out(self) -> str:
         if self._supervisor.mode == "fault":
