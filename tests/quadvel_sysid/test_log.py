@@ -198,7 +198,7 @@ def test_of_a_recording_that_was_cut_off_what_is_whole_is_read_and_said(tmp_path
     assert share - 0.2 < rows / len(whole.t) <= share + 0.05
     np.testing.assert_array_equal(log.q, whole.q[:rows])
     assert re.fullmatch(
-        r"recording: it was cut off; the first \d\.\d s, \d+ messages are kept", log.remarks[0]
+        r"recording: it is truncated; the first \d\.\d s, \d+ messages are readable", log.remarks[0]
     )
 
 
@@ -209,9 +209,7 @@ def test_a_recording_that_was_cut_off_before_anything_was_whole_is_refused(
     path = mcap(tmp_path / "cut.mcap", fields(0.2))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(
-        LogError, match=r"cut\.mcap: the recording was cut off before anything of it was whole"
-    ):
+    with pytest.raises(LogError, match=r"cut\.mcap: the recording is truncated and holds no complete chunk"):
         read_log(path)
 
 

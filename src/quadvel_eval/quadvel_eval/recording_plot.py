@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.reading import RecordingError, read_messages
-from quadvel_recordings.stamps import stamp_of, unstamped
+from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXES
 from .output import output_folder, replacing
@@ -115,7 +115,7 @@ def read_run(
         RecordingError: nothing that can be drawn was recorded; the sentence names the topics that are there.
     """
     rows = _read_topics(path, tell)
-    missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
+    missing = missing_stamp_notices({topic: np.array(found.stamps) for topic, found in rows.items()})
     if tell:
         for sentence in missing:
             tell(sentence)
@@ -161,7 +161,7 @@ def _foreign(
 
 def _lines_of(log: JointLog) -> dict[str, tuple[Array, Array]]:
     """Its lines as if they were low_state and low_cmd, of the joints that are measured; NaN for what is not there."""
-    begin, joints = 1e-9 * log.begin, log.state.joints
+    begin, joints = 1e-9 * log.start_ns, log.state.joints
     none = np.full((len(log.state.time), len(joints)), np.nan)
     numbers = np.hstack([log.state.values.get("q", none), log.state.values.get("tau", none)])
     lines = {"/low_state": (log.state.time + begin, numbers)}

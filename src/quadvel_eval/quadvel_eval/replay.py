@@ -22,7 +22,7 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
-from quadvel_recordings.joint_log import JointLog, Series, expect_commands
+from quadvel_recordings.joint_log import JointLog, Series, require_commands
 from quadvel_recordings.reading import read_messages
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
@@ -116,7 +116,7 @@ def joints_of(path: Path, log: JointLog, longest: float, gains: tuple[float, flo
     Raises:
         ValueError: a joint, the torque, the angles or the gains are missing.
     """
-    state, command = log.state, expect_commands(path, log)
+    state, command = log.state, require_commands(path, log)
     for field, meaning in (("q", "angles"), ("tau", "torques")):
         if field not in state.values:
             raise ValueError(
@@ -135,7 +135,7 @@ def joints_of(path: Path, log: JointLog, longest: float, gains: tuple[float, flo
     commands = dict(zip(np.round(1e3 * command.time).astype(int).tolist(), rows, strict=True))
     measured = [each[first] for each in (values["q"], speed, values["tau"])]
     return _every_millisecond(
-        path, ticks, (state.time + 1e-9 * log.begin)[first], measured, commands, longest
+        path, ticks, (state.time + 1e-9 * log.start_ns)[first], measured, commands, longest
     )
 
 
