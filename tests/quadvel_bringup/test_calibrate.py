@@ -84,7 +84,7 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
 ) -> None:
     file = tmp_path / "calibration.yaml"
     for arguments, sentence in (
-        ((), "name a recording with --hung or --standing, or both"),
+        ((), "name one with --hung, with --standing, or both"),
         (("--standing", tmp_path / "none.mcap"), "there is no such file"),
         (("--hung", standing), "hardly moves to and fro; record quadvel excite creep"),
     ):

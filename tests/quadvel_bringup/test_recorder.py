@@ -195,7 +195,7 @@ def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
             break
     _, said = recording.communicate(timeout=60)
     assert recording.returncode == 2
-    assert re.search(r"full\.mcap: the recording ended after .* can be read: File too large", said)
+    assert re.search(r"full\.mcap: the recording ended after .* is unreadable: File too large", said)
     assert "Traceback" not in said
     with pytest.warns(UserWarning, match="it is truncated"):
         assert len(list(read_messages(path, lambda topic, typename: True))) > 50

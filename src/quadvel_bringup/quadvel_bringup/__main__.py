@@ -1,4 +1,4 @@
-"""The program `quadvel`: blocks SIGINT before it loads anything, then runs the commands of `cli`."""
+"""The program `quadvel`: blocks SIGINT first, then loads and runs the commands of `cli`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`quadvel calibrate`: encoder and IMU offsets of a robot, from recordings of it hanging and standing."""
+"""`quadvel calibrate`: encoder and IMU offsets from recordings of the robot hanging and standing."""
 
 from __future__ import annotations
 

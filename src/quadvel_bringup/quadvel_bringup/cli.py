@@ -1,4 +1,4 @@
-"""The command line `quadvel`. Commands import their modules when they run, so that --help is fast."""
+"""Commands of `quadvel`. They import their modules when they run, so that --help is fast."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ ROBOT, SIMULATOR, LOGS, EVALUATION, EXPERIMENTS = PANELS = (
 """Panels of the help, in order."""
 EXAMPLES = """\
 Usage: quadvel COMMAND [ARGS]...   For example:
-  quadvel demo             walk a simulated robot; results in out/demo
-  quadvel up --view        run the simulated robot with the operator page
-  quadvel drive --vx 0.5   drive it, from another terminal"""
+  quadvel demo               walk a simulated robot; results in out/demo
+  quadvel up --view          run the simulated robot with the operator page
+  quadvel drive --vx 0.5     drive it, from another terminal"""
 OPTIONS = "Options: --version, --help, --install-completion, --show-completion"
 
-# In help texts, a line with only \b keeps the lines that follow it as they are, up to the next empty one.
+# In help texts, \b on a line keeps the format of the lines up to the next empty one.
 NODE_LIST = "\n".join(f"  {name:18} {entry.about}" for name, entry in NODES.items())
 RUN_HELP = f"""
 Run one node in this process.
@@ -47,7 +47,7 @@ Further arguments are those of ROS 2:
 
 
 class _PanelGroup(TyperGroup):
-    """Prints the help on one screen of 80 x 40: examples, then a panel per topic with a line per command."""
+    """Prints the help on one screen of 80 x 40: examples, then the commands in panels."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Write the help.
@@ -165,7 +165,10 @@ DELEGATED_COMMANDS = {
 }
 
 RUN_UNTIL_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
-"""Commands that Ctrl-C ends with exit code 0; they unblock SIGINT themselves when they are ready for it."""
+"""Commands that Ctrl-C ends with exit code 0.
+
+They unblock SIGINT themselves when they are ready for it.
+"""
 
 
 def _version(asked: bool) -> None:
@@ -385,10 +388,6 @@ def enable(
     """Permit or forbid walking.
 
     Real robots require the permission; a simulated one does not.
-
-    \b
-    For example:
-      quadvel enable --off
     """
     raise typer.Exit(_with_middleware("operator_commands").enable(on))
 
@@ -509,7 +508,10 @@ def record(
 
 
 def _register(name: str, delegated: DelegatedCommand) -> None:
-    """Register a delegated command: its arguments are passed on, and its module is loaded when it runs."""
+    """Register a delegated command.
+
+    Its arguments are passed on, and its module is loaded when it runs.
+    """
 
     @app.command(
         name,

@@ -71,12 +71,15 @@ class DriveRun:
         if self._signals.received:
             return ""
         self._wait(lambda: self._states[-1].mode_name != "stand_up", MODE_TIMEOUT_S)
-        # After standing up, the controller waits for the zero command that the mux sends continuously.
+        # After standing up, the controller waits for the mux's zero command.
         self._wait(lambda: not self._states[-1].walk_refusal, PUBLISH_PERIOD_S * 4)
         return self.refusal()
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
-        """Spin until the predicate holds or Ctrl-C arrives; returns whether one of them did in time."""
+        """Spin until the predicate holds or Ctrl-C arrives.
+
+        Returns whether one of them did in time.
+        """
         return self._session.spin_until(lambda: self._signals.received or is_so(), seconds)
 
     def refusal(self) -> str:

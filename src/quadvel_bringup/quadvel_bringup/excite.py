@@ -1,8 +1,8 @@
-"""`quadvel excite`: excitation motions for the identification of the joints, with a recording of states and commands.
+"""`quadvel excite`: excitation motions for the identification of the joints.
 
-`quadvel_sysid.excitation` defines the motions; here they are played on any robot that serves
-low_state and low_cmd. The simulated robot runs in lockstep at 1 kHz, so that a busy machine causes
-no gaps.
+States and commands are recorded. `quadvel_sysid.excitation` defines the motions; here they are
+played on any robot that serves low_state and low_cmd. The simulated robot runs in lockstep at 1
+kHz, so that a busy machine causes no gaps.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Check for another robot or simulator on the same ROS domain, where both would send conflicting states and commands."""
+"""Check for another robot or simulator on the same ROS domain.
+
+Two of them would send conflicting states and commands.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,7 @@ def ensure_exclusive(node: Any) -> None:
 
 
 def _describe_servers() -> str:
-    """Name the processes of this machine that serve TOPIC on this domain, or other possible causes."""
+    """Name the processes of this machine and domain that serve TOPIC, or other possible causes."""
     found = robots_on_domain()
     if not found:
         return "a robot, another host or user, or a process that was killed less than 10 s ago"
@@ -51,10 +54,10 @@ def _describe_servers() -> str:
 
 
 def robots_on_domain() -> dict[int, str]:
-    """Find the processes of this machine that serve TOPIC on this ROS domain, as far as this user may see.
+    """Find the processes of this machine and ROS domain that serve TOPIC.
 
     Returns:
-        Names by process id.
+        Names by process id, as far as this user may see.
     """
     return {pid: name for pid, (name, domain) in running_robots().items() if domain == ros_domain()}
 

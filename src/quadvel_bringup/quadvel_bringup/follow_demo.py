@@ -1,7 +1,7 @@
-"""`quadvel demo follow`: the robot follows a person through a simulated world, in real time, one process per node.
+"""`quadvel demo follow`: the robot follows a person through a simulated world.
 
-The tour of some kilometres runs in one process instead, as fast as the machine permits
-(`quadvel_eval.following.tour`).
+It runs in real time with one process per node. The tour of some kilometres runs in one process
+instead, as fast as the machine permits (`quadvel_eval.following.tour`).
 """
 
 from __future__ import annotations

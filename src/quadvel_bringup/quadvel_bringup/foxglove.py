@@ -21,7 +21,7 @@ from .session import Session
 DISCOVERY_PERIOD_S = 0.5
 """Time between two searches for new topics."""
 NICENESS = 5
-"""Nice value: about a third of the CPU time of a robot process under load, since nothing is commanded from here."""
+"""Nice value: about a third of the CPU time of a robot process under load."""
 
 
 def serve(host: str, port: int) -> None:

@@ -224,7 +224,10 @@ def evaluate_models(folders: Mapping[str, Path], console: Console) -> list[dict[
 
 
 def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator[Any]) -> dict[str, Any]:
-    """Return the entry of a plant. `answers`: results of its calls in `evaluate_models`, in order."""
+    """Return the entry of a plant.
+
+    `answers`: results of its calls in `evaluate_models`, in order.
+    """
     report = read_json(folder / "identify" / "report.json")
     walks = [read_walk(folder / f"{walk}.mcap").segments for walk in WALKS]
     plant = _average(walks)

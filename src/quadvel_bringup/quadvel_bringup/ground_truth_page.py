@@ -1,4 +1,7 @@
-"""The report page of `quadvel twin`: what was identified in each plant, and the error of the model before and after."""
+"""The report page of `quadvel twin`.
+
+It shows what was identified in each plant, and the error of the model before and after.
+"""
 
 from __future__ import annotations
 

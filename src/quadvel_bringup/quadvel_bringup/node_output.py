@@ -1,4 +1,7 @@
-"""Output of nodes on the terminal: each line with the name of its node, log lines without their header."""
+"""Output of nodes on the terminal, with the name of the node before each line.
+
+Log lines are shown without their header.
+"""
 
 from __future__ import annotations
 

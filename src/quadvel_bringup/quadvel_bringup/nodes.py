@@ -70,7 +70,9 @@ def node_entry(name: str) -> NodeEntry:
 
 
 def run(name: str, arguments: Sequence[str]) -> None:
-    """Run a node in this process until it ends, as `ros2 run` would; without ROS 2 on the embedded middleware.
+    """Run a node in this process until it ends, as `ros2 run` would.
+
+    Without ROS 2 it runs on the embedded middleware.
 
     Args:
         name: The node.
@@ -90,7 +92,9 @@ def run(name: str, arguments: Sequence[str]) -> None:
 
 
 def enclave(name: str) -> list[str]:
-    """Return the arguments for the SROS 2 enclave of a process (docs/security.md); without SROS 2 they have no effect.
+    """Return the arguments for the SROS 2 enclave of a process (docs/security.md).
+
+    Without SROS 2 they have no effect.
 
     Args:
         name: Name of the enclave.

@@ -1,4 +1,7 @@
-"""Monitoring of a robot's processes. The operator page is optional: the robot continues without it."""
+"""Monitoring of a robot's processes.
+
+The operator page is optional: the robot continues without it.
+"""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""The plant of `quadvel twin`: a simulated robot whose drives have an effect that the stack's model lacks.
+"""The plant of `quadvel twin`: a simulated robot with a hidden effect in its drives.
 
-It runs in its own process, which alone reads its configuration: python -m quadvel_bringup.plant
-FILE --ros-args ... The physics is written from mechanics and circuit theory, separately from the
-effects that identification fits.
+The stack's model lacks that effect. The plant runs in its own process, which alone reads its
+configuration: python -m quadvel_bringup.plant FILE --ros-args ... The physics is written from
+    mechanics
+and circuit theory, separately from the effects that identification fits.
 """
 
 from __future__ import annotations
@@ -79,8 +80,10 @@ class DryGear:
         Returns:
             (12,) N m.
         """
-        # LuGre: g(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2), dz/dt = v - sigma_0 |v| z / g(v), F = sigma_0 z.
-        # The decay term is integrated implicitly, because it is stiff at high speed.
+        # LuGre model with bristle deflection z and friction F = sigma_0 z:
+        #     g(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2),  dz/dt = v - sigma_0 |v| z / g(v)
+        # The decay term is integrated implicitly, because it is stiff at high speed:
+        #     z <- (z + dt v) / (1 + dt sigma_0 |v| / g(v))
         level = self.slip + (self.stick - self.slip) * np.exp(-((dq / self.stribeck_speed) ** 2))
         rate = self.stiffness * np.abs(dq) / np.maximum(level, 1e-9)
         self.memory = (self.memory + dt * dq) / (1.0 + dt * rate)
@@ -113,8 +116,10 @@ class SlowCurrent:
         Returns:
             (12,) N m.
         """
-        # First-order lag: tau(t) = tau_end + (tau_0 - tau_end) exp(-t / T) with tau_end = tau_asked - droop dq;
-        # the result is its mean over the step, tau_end + (tau_0 - tau_end) (1 - exp(-dt / T)) T / dt.
+        # First-order lag towards tau_end = tau_asked - droop dq:
+        #     tau(t) = tau_end + (tau_0 - tau_end) exp(-t / T)
+        # The result is its mean over the step:
+        #     tau_end + (tau_0 - tau_end) (1 - exp(-dt / T)) T / dt
         end = asked - self.droop * dq
         begin = np.where(np.isnan(self.memory), end, self.memory)
         share = np.exp(-dt / np.maximum(self.constant, 1e-6))
@@ -125,7 +130,7 @@ class SlowCurrent:
 
 @attrs.define
 class ChafingCable:
-    """A cable that chafes and pulls tight in a part of a joint's range: friction and a constant pull.
+    """Friction and a constant pull of a cable that chafes in a part of a joint's range.
 
     Attributes:
         rub: Friction, (12,) N m.
@@ -304,7 +309,10 @@ def _value(path: Path, name: str, value: Any) -> Any:
 
 
 def main() -> None:
-    """Run the plant with the arguments FILE and those of ROS 2. The joint log goes to the topic joint_log."""
+    """Run the plant with the arguments FILE and those of ROS 2.
+
+    The joint log goes to the topic joint_log.
+    """
     path, *arguments = sys.argv[1:]
     try:
         physics = read_plant(Path(path))

@@ -1,6 +1,7 @@
-"""Check of a stack's parameters and files before any process starts: one sentence instead of one per node.
+"""Check of a stack's parameters and files before any process starts.
 
-The nodes check again when they start; this module builds the same records from the same values.
+An error is one sentence, instead of one per node. The nodes check again when they start; this
+module builds the same records from the same values.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Groups of child processes that end together, and signals that stop a command. It does not restart processes."""
+"""Groups of child processes that end together, and signals that stop a command.
+
+It does not restart processes.
+"""
 
 from __future__ import annotations
 

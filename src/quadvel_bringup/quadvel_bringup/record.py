@@ -1,4 +1,4 @@
-"""`quadvel record`: record topics to an MCAP file until Ctrl-C, or record the time around each fault."""
+"""`quadvel record`: record topics to an MCAP file, or record the time around each fault."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
 
 
 def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: float | None) -> int:
-    """Keep the latest messages in memory, and write those around each fault to a file named after time and fault.
+    """Record the time around each fault, to a file named after time and fault.
 
     Args:
         folder: Folder for the files.

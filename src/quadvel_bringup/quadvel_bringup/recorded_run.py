@@ -1,4 +1,7 @@
-"""A recorded run of the stack for a demo: every node in its own process, all topics recorded in this one."""
+"""A recorded run of the stack for a demo.
+
+Every node runs in its own process; this process records all topics.
+"""
 
 from __future__ import annotations
 

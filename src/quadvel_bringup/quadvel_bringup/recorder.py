@@ -32,7 +32,9 @@ MAX_OTHER_CALLBACKS = 4
 
 
 class Recorder:
-    """Passes received messages to a sink. Closing it closes the sink. On a full disk OSError passes through the executor.
+    """Passes received messages to a sink.
+
+    Closing it closes the sink. On a full disk OSError passes through the executor.
 
     Args:
         node: The node that subscribes.
@@ -106,7 +108,9 @@ class Recorder:
             self.write_waiting(executor, until)
 
     def write_waiting(self, executor: Executor, until: float = math.inf) -> None:
-        """Write all waiting messages. Other callbacks of the node, such as that of /clock, take turns with them.
+        """Write all waiting messages.
+
+        Other callbacks of the node, such as that of /clock, take turns with them.
 
         Args:
             executor: Executor of the node.

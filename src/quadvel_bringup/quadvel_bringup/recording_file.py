@@ -1,4 +1,7 @@
-"""Storage of recorded messages: in an MCAP file for Foxglove and `ros2 bag`, or in memory until a fault. No ROS."""
+"""Storage of recorded messages, without ROS.
+
+Messages go to an MCAP file for Foxglove and `ros2 bag`, or stay in memory until a fault.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,10 @@ from mcap.writer import CompressionType, Writer
 from quadvel_recordings.definitions import STORE
 
 CHUNK_PERIOD_S = 1.0
-"""Time after which written messages are flushed to disk; a killed recorder loses at most that much."""
+"""Time after which written messages are flushed to disk.
+
+A killed recorder loses at most that much.
+"""
 LATCHED = ("/tf_static", "/robot_description", "/ground")
 """Topics with transient-local durability."""
 
@@ -113,7 +119,7 @@ class RecordingFile:
         return self._schemas[typename]
 
     def settle(self) -> None:
-        """Flush an old chunk and start its synchronisation in another thread, because disks may be slow."""
+        """Flush an old chunk and start its synchronisation in another thread: disks may be slow."""
         if time.monotonic() - self._chunk_began <= CHUNK_PERIOD_S:
             return
         self._chunk_began = time.monotonic()

@@ -23,8 +23,10 @@ from .nodes import enclave
 from .whereabouts import discovery_hint
 
 DISCOVERY_TIMEOUT_S = 4.0
-"""Time to discover a peer: discovery takes a second on a busy machine; if Fast DDS misses the first announcements, the
-next ones come 3 s later.
+"""Time to discover a peer.
+
+Discovery takes a second on a busy machine. If Fast DDS misses the first announcements, the next
+ones come 3 s later.
 """
 SERVICE_TIMEOUT_S = 10.0
 """Time within which an available service answers."""
@@ -111,13 +113,13 @@ class Session:
         self.spin_until(lambda: False, seconds)
 
     def not_running(self, text: str) -> NotRunningError:
-        """Return the error for a missing peer, with likely causes: type conflicts or another ROS domain.
+        """Return the error for a missing peer, with likely causes.
 
         Args:
             text: What is missing.
 
         Returns:
-            The error.
+            The error; it lists type conflicts and other ROS domains.
         """
         return NotRunningError("; ".join([text, *map(str, all_conflicts(self.node)), discovery_hint()]))
 

@@ -17,7 +17,10 @@ VIEW = "view"
 """The node of the operator page; the robot continues after its end."""
 
 BOARD_PORT = 8007
-"""UDP port of the AlienGo's board; simulated boards add the number of the ROS domain, which differs per user."""
+"""UDP port of the AlienGo's board.
+
+Simulated boards add the number of the ROS domain, which differs per user.
+"""
 
 
 @attrs.frozen
@@ -158,7 +161,7 @@ class Stack:
 
 
 def _absolute_world(world: str | None) -> str | None:
-    """Return a file of a world with its absolute path, and the name of a shipped world unchanged."""
+    """Return the absolute path of a world's file, or the name of a shipped world unchanged."""
     return str(Path(world).resolve()) if world and Path(world).suffix else world
 
 

@@ -1,4 +1,4 @@
-"""`quadvel status`: nodes, mode, velocity, battery, temperatures and files of the running robot on one page.
+"""`quadvel status`: health, mode, velocity, rates and files of the running robot.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -102,7 +102,7 @@ def running_nodes() -> dict[str, NodeReport]:
 
 
 def _wait_for_reports(session: Session, heard: deque[Any]) -> None:
-    """Listen until the nodes of the control loop and all other publishers of /diagnostics have reported, or until a timeout."""
+    """Listen until all nodes that publish /diagnostics have reported, or until a timeout."""
     if not session.spin_until(lambda: heard, DISCOVERY_TIMEOUT_S):
         return
 

@@ -235,7 +235,10 @@ def _drive(
     way_out: RecoveryKeys,
     note: Callable[[], str] = lambda: "",
 ) -> None:
-    """Forward velocities until Ctrl-C, and end with zero in any case. `note` precedes the state of the robot."""
+    """Forward velocities until Ctrl-C, and end with zero in any case.
+
+    `note` precedes the state of the robot.
+    """
     console = Console(soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
         teleop = Teleop(session)

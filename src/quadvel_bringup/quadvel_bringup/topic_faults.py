@@ -1,4 +1,4 @@
-"""Fault injection on the topics of a running robot: its processes with the parameters of `quadvel up`, and a relay.
+"""Fault injection on the topics of a running robot, by a relay between its processes.
 
 `quadvel faults` injects faults into the classes from many seeds and measures reaction times. This
 module shows that the same faults arise from messages, and that the operator sees their names:
@@ -84,7 +84,7 @@ class TopicFault:
 
 
 class Relay:
-    """Receives each topic of RELAYED_TYPES instead of the other nodes, and forwards it, modified during a fault.
+    """Receives the topics of RELAYED_TYPES and forwards them, modified during a fault.
 
     Args:
         node: The node that it uses.
@@ -179,6 +179,7 @@ class TopicRobot:
         self._simulator = "board" if stack.low_level == "board" else "sim_node"
 
     def __enter__(self) -> TopicRobot:
+        """Start the processes and wait for the controller."""
         self._session.__enter__()
         self.relay = Relay(self._session.node)
         for name, words in self._stack.commands().items():
@@ -310,14 +311,14 @@ class TopicRobot:
 
 
 def is_named(fault: TopicFault, state: ControllerState) -> bool:
-    """Return whether the operator sees the fault: by its name, or as a finding if the robot continues.
+    """Return whether the operator sees the fault.
 
     Args:
         fault: The fault.
         state: A ControllerState.
 
     Returns:
-        True if the state reports the fault.
+        True if the state reports the fault by its name, or by a finding if the robot continues.
     """
     return (
         any(fault.finding_text in finding for finding in state.findings)
@@ -433,7 +434,10 @@ def _swing(t: float) -> tuple[float, float]:
 
 
 def _prescribed_motion(joints: Sequence[int], path: Path) -> Change:
-    """Move joints along a path in robot time regardless of commands; encoders and drives report it consistently."""
+    """Move joints along a path in robot time regardless of commands.
+
+    Encoders and drives report it consistently.
+    """
     there = np.isin(np.arange(12), joints)
 
     def change(relay: Relay, message: Message) -> Message:

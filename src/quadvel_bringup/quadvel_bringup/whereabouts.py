@@ -1,4 +1,4 @@
-"""Advice for an undiscovered robot: another ROS domain of this machine, or a host outside the discovery range."""
+"""Advice for an undiscovered robot: another ROS domain, or a host outside the discovery range."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import quadvel_dds
 from .exclusivity import ros_domain, running_robots
 
 DDS_PORTS = range(7400, 32651)
-"""UDP ports of ROS domains 0 to 101 by the RTPS standard; higher ones overlap the ephemeral ports of the system."""
+"""UDP ports of ROS domains 0 to 101 by the RTPS standard.
+
+Higher ones overlap the ephemeral ports of the system.
+"""
 PORTS_PER_DOMAIN = 250
 """Ports of one domain."""
 PARTICIPANT_PORT_OFFSETS = range(10, PORTS_PER_DOMAIN, 2)

@@ -18,7 +18,10 @@ from backports import zstd
 MAX_CHUNK_BYTES = 1 << 28
 """Largest decompressed size of a chunk or message; recorders write chunks of a few megabytes."""
 MAX_OVERLAP_BYTES = 1 << 30
-"""Largest decompressed size of all MCAP chunks that cover one instant; a reader holds these together."""
+"""Largest decompressed size of all MCAP chunks that cover one instant.
+
+A reader holds these together.
+"""
 BLOCK_BYTES = 1 << 20
 """Bytes that are decompressed per step while the size is counted."""
 
@@ -90,7 +93,9 @@ def _decompressed_blocks(file: IO[bytes], compression: str) -> Iterator[bytes]:
 
 
 def check_chunks(path: Path) -> None:
-    """Check the decompressed size of all chunks of an MCAP file. Of a damaged file the intact chunks are checked.
+    """Check the decompressed size of all chunks of an MCAP file.
+
+    Of a damaged file the intact chunks are checked.
 
     Args:
         path: The MCAP file.
@@ -117,7 +122,10 @@ def check_chunks(path: Path) -> None:
 
 
 def _check_size(data: bytes, compression: str, max_bytes: int) -> None:
-    """Raise TooLargeError if the data expands beyond the limit. Damaged data is left to the reader to reject."""
+    """Raise TooLargeError if the data expands beyond the limit.
+
+    Damaged data is left to the reader to reject.
+    """
     total = 0
     try:
         for part in _decompressed_blocks(BytesIO(data), compression):
@@ -152,7 +160,7 @@ def _chunks(file: IO[bytes]) -> Iterator[tuple[_Chunk, bytes]]:
 
 def _peak_bytes(chunks: list[_Chunk]) -> int:
     """Return the largest total size of chunks that cover one instant, bytes."""
-    # Sweep over time: each chunk adds its size at its first message and removes it after its last one.
+    # Sweep over time: a chunk adds its size at its first message and removes it after its last.
     changes = [(chunk.first, chunk.size) for chunk in chunks] + [
         (chunk.last + 1, -chunk.size) for chunk in chunks
     ]

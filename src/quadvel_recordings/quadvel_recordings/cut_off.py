@@ -76,7 +76,10 @@ def recover_messages(path: Path) -> Iterator[RecoveredMessage]:
 
 
 def _definition(schema: Schema) -> MessageDefinition:
-    """Convert a schema to a definition of rosbags. IDL definitions are not read, so they become empty."""
+    """Convert a schema to a definition of rosbags.
+
+    IDL definitions are not read, so they become empty.
+    """
     if schema.encoding != "ros2msg":
         return MessageDefinition(MessageDefinitionFormat.NONE, "")
     return MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode(errors="replace"))

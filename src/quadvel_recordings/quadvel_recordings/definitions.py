@@ -1,4 +1,4 @@
-"""Definitions of all messages and services in use: ROS 2 Jazzy's (from `rosbags`), quadvel's, and Unitree's for reading."""
+"""Definitions of all messages and services: ROS 2 Jazzy's, quadvel's and Unitree's."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SERVICE_DEFINITIONS = {
     "rcl_interfaces/srv/SetParameters": "Parameter[] parameters\n---\nSetParametersResult[] results",
     "rcl_interfaces/srv/SetParametersAtomically": "Parameter[] parameters\n---\nSetParametersResult result",
 }
-"""Definitions of the ROS 2 services that the nodes use; rosbags contains definitions of messages only."""
+"""Definitions of the ROS 2 services in use; those of messages are in rosbags."""
 TYPE_DEFAULTS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
 """Default values of primitive fields by type; all other types default to 0."""
 FIELD_DEFAULTS = {
@@ -37,7 +37,7 @@ FIELD_DEFAULTS = {
 
 
 def _own_definitions() -> Path:
-    """Return the folder of the quadvel_msgs definitions: installed by pip, in the source tree, or installed by colcon."""
+    """Return the folder of the quadvel_msgs definitions, installed or in the source tree."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
     folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
@@ -45,7 +45,10 @@ def _own_definitions() -> Path:
 
 
 def _load_store() -> Any:
-    """Register Jazzy's and quadvel's definitions. rosbags has no services, so request and response are parsed as messages."""
+    """Register Jazzy's and quadvel's definitions.
+
+    The type store of rosbags has no services, so request and response are parsed as messages.
+    """
     store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
     for file in sorted(own_files.glob("msg/*.msg")):
         store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
@@ -54,7 +57,7 @@ def _load_store() -> Any:
     own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
     for name, text in {**SERVICE_DEFINITIONS, **own}.items():
         package, _, short = name.split("/")
-        # Add line breaks: if the request or the response is empty, "---" is the first or the last line.
+        # Add line breaks: for an empty request or response "---" is the first or last line.
         request, _, response = f"\n{text}\n".partition("\n---\n")
         for part, definition in {"Request": request, "Response": response}.items():
             (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()

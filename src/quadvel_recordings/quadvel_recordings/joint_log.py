@@ -32,7 +32,10 @@ COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
 OWN_SERVO, UNITREE_SERVO = 10, 1
 """Modes in which a drive tracks position with gains."""
 NO_TARGET_THRESHOLD = 1e4
-"""Smallest value, rad or rad/s, that means "no target": Unitree sends 2.146e9 rad and 16000 rad/s for it."""
+"""Smallest value, rad or rad/s, that means "no target".
+
+Unitree sends 2.146e9 rad and 16000 rad/s for it.
+"""
 COMMAND_TOPIC_PATTERN = re.compile(
     r"cmd|command|desired|target|reference|(^|[/_])(des|ref)($|[/_])|goal|setpoint|action", re.IGNORECASE
 )
@@ -132,12 +135,12 @@ class Series:
 
 @attrs.frozen(eq=False)
 class JointLog:
-    """Joint states and, if recorded, joint commands on one time base that starts with the first state.
+    """Joint states and, if recorded, joint commands on one time base.
 
     Attributes:
         state: The states.
         command: The commands, or None.
-        start_ns: Time of the first state, ns, by stamp or by receipt.
+        start_ns: Time of the first state, ns, by stamp or by receipt; the time base starts there.
         uses_receipt_times: Whether times are times of receipt, because stamps are missing.
     """
 

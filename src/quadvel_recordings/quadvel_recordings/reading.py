@@ -108,7 +108,7 @@ def topics(path: Path) -> dict[str, str]:
 
 
 def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequence[Path]:
-    """Return the recording itself, or its files if metadata.yaml is missing or names no known storage."""
+    """Return the recording, or its files if metadata.yaml is missing or names no known storage."""
     if not path.is_dir():
         return [path]
     files = sorted((one for one in path.iterdir() if one.suffix in STORAGES), key=_file_order)

@@ -77,7 +77,7 @@ def _fields(store: Any, typename: str) -> list[tuple[str, Description]]:
 
 
 def _converter(typename: str, recorded: list[str]) -> Callable[..., Any]:
-    """Return a constructor of the present message from the values of the recorded fields, in their order."""
+    """Return a constructor of the present message from the recorded fields, in their order."""
     make = STORE.types[typename]
     later = [(name, kind) for name, kind in _fields(STORE, typename) if name not in recorded]
     kept = {name for name, _ in _fields(STORE, typename)}

@@ -21,7 +21,9 @@ DEFAULT_PORT = 8765
 
 
 class FoxgloveServer:
-    """Serves topics from construction until `close`, on the loopback interface only, because there is no authentication.
+    """Serves topics from construction until `close`.
+
+    It listens on the loopback interface only, because there is no authentication.
 
     Args:
         host: Address of the loopback interface.
@@ -81,7 +83,9 @@ class FoxgloveServer:
         self._channels[topic].log(data, log_time=time)
 
     def republish(self, topic: str) -> None:
-        """Send the latched message of a topic again, to all clients: the library cannot address one.
+        """Send the latched message of a topic again, to all clients.
+
+        The library cannot address one.
 
         Args:
             topic: The topic.

@@ -31,8 +31,9 @@ DEAD_MAN, STOP, RELEASE = 0x136, 0x131, 0x13B  # BTN_TL, BTN_EAST, BTN_START
 FORWARD, SIDE, YAW, DPAD_Y = 0x01, 0x00, 0x03, 0x11  # ABS_Y, ABS_X, ABS_RX, ABS_HAT0Y
 STICKS = (FORWARD, SIDE, YAW)
 SILENCE_TIMEOUT_S = 5.0
-"""Time without an event after which the dead-man's button counts as released: a held stick always jitters, and the
-kernel reports a lost radio link only after 20 s.
+"""Time without an event after which the dead-man's button counts as released.
+
+A held stick always jitters, and the kernel reports a lost radio link only after 20 s.
 """
 DEAD_ZONE = 0.1
 """Half-width of the stick's neutral range, as a share of its travel."""
@@ -92,7 +93,7 @@ class Gamepad:
 
     @property
     def timed_out(self) -> bool:
-        """Whether the dead-man's button counts as released because the pad was silent for SILENCE_TIMEOUT_S."""
+        """Whether the dead-man's button counts as released because of SILENCE_TIMEOUT_S."""
         return self._timed_out
 
     def handle_event(self, kind: int, code: int, value: int) -> str:

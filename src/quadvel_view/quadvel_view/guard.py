@@ -85,7 +85,10 @@ class AccessControl:
 
     @staticmethod
     def _shown(request: Request) -> list[str]:
-        """Return all cookie values and query tokens. Cookies of other programs on this host may violate the standard."""
+        """Return all cookie values and query tokens.
+
+        Cookies of other programs on this host may violate the standard.
+        """
         cookies = ";".join(request.headers.get_all("Cookie")).split(";")
         return [cookie.partition("=")[2].strip() for cookie in cookies] + parse_qs(
             urlsplit(request.path).query

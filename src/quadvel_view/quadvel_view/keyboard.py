@@ -1,4 +1,4 @@
-"""Velocity commands from the keys of a terminal. A terminal does not report key releases; it repeats a held key.
+"""Velocity commands from the keys of a terminal, which repeats held keys but reports no release.
 
     w s     forward, back           + -    speed, in steps
     a d     turn left, right        space  STOP: damp the joints until r

@@ -48,7 +48,9 @@ class Operator:
         self._late_by = 0.0
 
     def hold(self, holder: object, velocity: Sequence[float], now: float) -> None:
-        """Start or repeat a hold, at least every HOLD_TIMEOUT_S. Other holders are ignored meanwhile.
+        """Start or repeat a hold, at least every HOLD_TIMEOUT_S.
+
+        Other holders are ignored meanwhile.
 
         Args:
             holder: Identity of the page or device.

@@ -43,7 +43,10 @@ TRAIL_LENGTH = 600
 JUMP_M = 1.0
 """Distance between two poses that no walk explains."""
 RESTART_VARIANCE_RATIO = 0.5
-"""Ratio of new to old position variance below which odometry was restarted: the variance of dead reckoning only grows."""
+"""Ratio of new to old position variance below which odometry was restarted.
+
+The variance of dead reckoning only grows.
+"""
 CYLINDER, TRIANGLES = 3, 11
 """Types of visualization_msgs/Marker."""
 LEVELS = ("ok", "warning", "error", "stale")
@@ -118,7 +121,9 @@ class Ground:
 
 @attrs.define
 class RobotPicture:
-    """The newest value of everything that is shown. Joint order FR, FL, RR, RL, each hip, thigh, calf.
+    """The newest value of everything that is shown.
+
+    Joint order FR, FL, RR, RL, each hip, thigh, calf.
 
     Attributes:
         q: (12,) rad.
@@ -159,7 +164,9 @@ class RobotPicture:
     _fixed: dict[str, tuple[str, Array, Array]] = attrs.field(factory=dict)
 
     def update_lazily(self, topic: str, read: Callable[[], Any], now: float) -> None:
-        """Deserialise a message and update the picture; errors go to `rejected`, so that no message ends the page and its STOP.
+        """Deserialise a message and update the picture.
+
+        Errors go to `rejected`, so that no message ends the page and its STOP.
 
         Args:
             topic: The topic.

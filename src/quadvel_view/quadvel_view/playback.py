@@ -17,7 +17,7 @@ from .picture import LOW_STATE, TOPICS, RobotPicture
 PACE_RANGE = (0.25, 4.0)
 """Smallest and largest playback speed."""
 PER_NODE_TOPIC = "/diagnostics"
-"""Topic of which every message is applied, because each node has its own; of other topics only the newest."""
+"""Topic whose messages are all applied, one per node; of other topics only the newest is."""
 TRAIL_DURATION_S = 20.0
 """Duration of the trail before the present time."""
 MAX_TRAIL_MESSAGES = 200

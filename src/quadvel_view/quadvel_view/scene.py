@@ -34,7 +34,10 @@ PERSON_HEIGHT_M, PERSON_RADIUS_M = 1.7, 0.2
 CORNER_RADIUS_M = 0.012
 """Radius of the rounded edges of boxes, which make shading visible."""
 LIFT_SMOOTHING = 0.15
-"""Share of the height error corrected per frame; low, because feet leave the ground in a flight phase."""
+"""Share of the height error corrected per frame.
+
+It is low, because feet leave the ground in a flight phase.
+"""
 LINE_OFFSET_M = 0.006
 """Height of lines above the ground that they lie on."""
 CAMERA_POSITION_M = (1.2, -1.3, 0.6)

@@ -96,7 +96,10 @@ def client_page() -> bytes:
 
 @contextmanager
 def _serving_on(listener: socket.socket) -> Iterator[list[Any]]:
-    """Redirect servers of `websockets` to this socket within the block; yields the list of their handlers."""
+    """Redirect servers of `websockets` to this socket within the block.
+
+    Yields the list of their handlers.
+    """
     serve, handlers = websockets_server.serve, list[Any]()
 
     def serve_on_listener(handler: Any, *address: Any, **options: Any) -> Any:

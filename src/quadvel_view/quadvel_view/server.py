@@ -1,4 +1,4 @@
-"""Web server of the page: its files, its messages in both directions, and viser's scene on the same port.
+"""Web server of the page, its messages in both directions, and viser's scene on the same port.
 
 The scene is one-way: viser's messages are forwarded to the browser, and the browser's messages to
 viser are dropped.
@@ -37,17 +37,30 @@ from .guard import AccessControl, RequestError, Visitor, is_loopback
 from .words import MAX_MESSAGE_BYTES, PageMessage, PageMessageError, parse_message
 
 COOKIE = "quadvel_view"
-"""Prefix of the name of the token's cookie; the port follows, because browsers send cookies to all ports of a host."""
+"""Prefix of the name of the token's cookie.
+
+The port follows, because browsers send cookies to all ports of a host.
+"""
 CONTENT_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 PAGE_FILES = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
 SCENE_PATH, MESSAGES_PATH = "/scene", "/words"
 SCENE_FRAME, WITH_TOKEN = b'<iframe id="scene"', b" data-with-token"
-"""Attribute of the scene's frame that shows the page that a token exists; its script cannot read the cookie."""
+"""Attribute of the scene's frame that shows the page that a token exists.
+
+Its script cannot read the cookie.
+"""
 MAX_FRAGMENTS = 16
-"""Largest number of fragments of a message: browsers send MAX_MESSAGE_BYTES in one, and even empty ones cost memory."""
+"""Largest number of fragments of a message.
+
+Browsers send MAX_MESSAGE_BYTES in one, and even empty ones cost memory.
+"""
 MAX_SOCKETS = 32
-"""Largest number of connections, two per page: each one delays the messages of the others, including STOP."""
-# Hide everything of viser's page but the canvas. viser reconnects only while it has the focus, which our page keeps.
+"""Largest number of connections, two per page.
+
+Each one delays the messages of the others, including STOP.
+"""
+# Hide everything of viser's page but the canvas. viser reconnects only while it has the focus,
+# which our page keeps.
 CANVAS_ONLY = (
     b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
     b"<script>document.hasFocus = () => true;"
@@ -61,7 +74,7 @@ class AddressError(ValueError):
 
 
 def _is_server_error(record: logging.LogRecord) -> bool:
-    """Return whether a log record is more than a failed or abandoned handshake, which any client can cause."""
+    """Return whether a log record is more than a failed handshake, which any client can cause."""
     return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake | ConnectionClosed))
 
 
@@ -227,7 +240,10 @@ class PageServer:
             self._on_disconnect(page)
 
     async def _relay(self, browser: ServerConnection) -> None:
-        """Forward viser's messages to a browser until one side disconnects; drop the browser's messages."""
+        """Forward viser's messages to a browser until one side disconnects.
+
+        Drop the browser's messages.
+        """
         spoken = [Subprotocol(browser.subprotocol)] if browser.subprotocol else None
         path = str(self._scene)
         async with unix_connect(
@@ -250,7 +266,7 @@ async def _forward(scene: ClientConnection, browser: ServerConnection) -> None:
 
 
 async def _discard(browser: ServerConnection) -> None:
-    """Read and drop a browser's messages fragment by fragment, so that pings are answered and its end is noticed."""
+    """Read and drop a browser's messages, so that pings are answered and its end is noticed."""
     try:
         while True:
             async for _ in browser.recv_streaming(decode=False):
@@ -260,7 +276,10 @@ async def _discard(browser: ServerConnection) -> None:
 
 
 async def _next_message(connection: ServerConnection) -> bytes | None:
-    """Return the next message of a page, or None after too many fragments; raises ConnectionClosed at its end."""
+    """Return the next message of a page, or None after too many fragments.
+
+    Raises ConnectionClosed at its end.
+    """
     fragments = []
     async for fragment in connection.recv_streaming(decode=False):
         fragments.append(fragment)

@@ -1,6 +1,7 @@
-"""The node `view`: the operator page of a running robot. `picture` and `scene` define what it shows.
+"""The node `view`: the operator page of a running robot.
 
-Messages are queued as bytes. Only the newest message of each topic is deserialised, once per frame.
+`picture` and `scene` define what it shows. Messages are queued as bytes. Only the newest message of
+each topic is deserialised, once per frame.
 """
 
 from __future__ import annotations
@@ -67,7 +68,7 @@ class ViewParameters:
 
 
 class View(Node):
-    """The operator page, its subscriptions, and the services and topics it commands the robot by."""
+    """The operator page with its subscriptions, publishers and service clients."""
 
     def __init__(self) -> None:
         super().__init__("view")
@@ -166,7 +167,10 @@ class View(Node):
             self.executor.create_task(task)
 
     def _execute(self, page: int, word: PageMessage) -> None:
-        """Execute a message of the page; while STOP is latched only STOP, its release, holds and recording."""
+        """Execute a message of the page.
+
+        While STOP is latched, only STOP, its release, holds and recording are executed.
+        """
         match word:
             case Stop():
                 self._operator.stop()
@@ -199,7 +203,10 @@ class View(Node):
                 self._call(_ready_client(self._pushes), request, "push")
 
     def _reset(self, terrain: str) -> None:
-        """Reset the simulated robot through passive mode: in other modes a jump in position is a fault."""
+        """Reset the simulated robot through passive mode.
+
+        In other modes a jump in position is a fault.
+        """
         slope = SLOPE_RAD if terrain == "slope" else 0.0
         request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
 

@@ -1,4 +1,4 @@
-"""Schema of the messages that a page sends to `/words`: one record per order. No ROS, no sockets."""
+"""Schema of the messages that a page sends to `/words`, one record per order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,10 @@ MAX_REASON_CHARS = 120
 
 
 class PageMessageError(ValueError):
-    """A message does not match the schema; one ASCII sentence of at most MAX_REASON_CHARS characters."""
+    """A message does not match the schema.
+
+    One ASCII sentence of at most MAX_REASON_CHARS characters.
+    """
 
     def __init__(self, error: object) -> None:
         super().__init__(f"not understood: {error}".encode("ascii", "replace").decode()[:MAX_REASON_CHARS])
