@@ -93,8 +93,7 @@ LEFT_OUT = {
     "quadvel following --out out/following": "minutes; tests/quadvel_follow/test_follow_planner.py walks on its stage",
     "quadvel people --scans FOLDER --out out/people": "real scans that are no part of this repository; "
     "tests/quadvel_follow takes them where they are",
-    "quadvel up": "as with --terrain",
-    "quadvel up --world campus": "the same",
+    "quadvel up --world campus": "as with --terrain",
     "quadvel up --view": "tests/quadvel_view/test_page.py opens its page",
     "quadvel view": "the same page, beside a robot that runs",
     "quadvel view out/demo/demo.mcap": "tests/quadvel_view/test_page.py plays one",
