@@ -56,6 +56,6 @@ def test_each_row_comes_about_on_topics() -> None:
 
 
 def test_at_last_a_simulator_that_is_killed_is_a_fault(robot: TopicRobot) -> None:
-    robot.prepare("stance")
-    os.kill(robot.process("sim_node"), signal.SIGKILL)
-    robot.until(lambda state: state.fault == "state_stale", "a dead simulator is not noticed")
+    robot.bring_to("stance")
+    os.kill(robot.process_id("sim_node"), signal.SIGKILL)
+    robot.wait_for(lambda state: state.fault == "state_stale", "a dead simulator is not noticed")

@@ -143,7 +143,7 @@ def test_teleop_without_a_terminal_says_so(up: Robot) -> None:
         [*QUADVEL, "teleop"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60
     )
     assert done.returncode != 0
-    assert "keys come from a terminal" in done.stdout + done.stderr
+    assert "standard input is not a terminal" in done.stdout + done.stderr
 
 
 def test_drive_says_when_a_command_is_cut(up: Robot) -> None:
@@ -161,7 +161,7 @@ def test_drive_refuses_what_is_no_number() -> None:
 def test_drive_says_that_nobody_listens(up: Robot) -> None:
     code, text = quadvel("drive", "--vx", "0.2", "--topic", "cmd_vel_of_nobody")
     assert code == 2
-    assert text.startswith("quadvel: cmd_vel_of_nobody: nobody listens; start the robot first: quadvel up")
+    assert text.startswith("quadvel: cmd_vel_of_nobody: no subscriber; start the robot first: quadvel up")
 
 
 def test_status_shows_nodes_mode_rates_and_files_on_one_page(up: Robot) -> None:
@@ -191,7 +191,7 @@ def test_a_fault_is_told_everywhere_and_there_is_a_way_out_of_it(up: Robot) -> N
     assert "quadvel mode passive, then quadvel mode stand_up" in text
     code, text = quadvel("status")
     assert code == 1
-    assert "way out       once the cause is gone" in text
+    assert "recovery      once the cause is gone" in text
     code, text = quadvel("mode", "stand_up")
     assert code == 1
     assert "request passive first" in text

@@ -12,7 +12,7 @@ import yaml
 
 import quadvel_dds
 from quadvel_bringup.nodes import NODES
-from quadvel_bringup.preflight import rehearse
+from quadvel_bringup.preflight import check_stack
 from quadvel_bringup.stack import PARAMETERS, Stack
 from quadvel_sysid.logs.columns import ColumnMap
 
@@ -46,7 +46,7 @@ def _as_parameters(block: str, folder: Path) -> None:
         file = folder / f"{name}.yaml"
         file.write_text(yaml.safe_dump(values))
         for low_level in ("sim", "aliengo"):
-            rehearse(Stack(low_level=low_level, parameters=file))
+            check_stack(Stack(low_level=low_level, parameters=file))
 
 
 def _as_columns(block: str, folder: Path) -> None:

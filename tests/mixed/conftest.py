@@ -27,7 +27,7 @@ class Graph:
 
     def start(self, name: str, *arguments: str, embedded: bool) -> None:
         """Start one of our nodes; `arguments` are those after --ros-args."""
-        self._begin(nodes.command(name, ["--ros-args", *arguments] if arguments else []), embedded)
+        self._begin(nodes.process_command(name, ["--ros-args", *arguments] if arguments else []), embedded)
 
     def program(self, source: str) -> subprocess.Popen[str]:
         """Start a Python program on the embedded middleware."""

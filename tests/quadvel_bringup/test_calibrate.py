@@ -72,11 +72,11 @@ def test_an_imu_that_leans_by_two_degrees_is_shown_and_written(standing: Path, t
     file = tmp_path / "calibration.yaml"
     code, text = calibrate("--standing", standing, "--out", file)
     assert code == 0, text
-    assert "IMU: leans by +2.0" in text or "IMU: leans by +1.9" in text
+    assert "IMU: tilted by +2.0" in text or "IMU: tilted by +1.9" in text
     np.testing.assert_allclose(
         Calibration.load(file).imu_mounting, LEANING.imu_mounting, atol=np.radians(0.15)
     )
-    assert "not looked for" in text
+    assert "not estimated" in text
 
 
 def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
@@ -84,7 +84,7 @@ def test_what_tells_nothing_is_refused_in_one_sentence_and_writes_nothing(
 ) -> None:
     file = tmp_path / "calibration.yaml"
     for arguments, sentence in (
-        ((), "name a recording with --hung or --standing, or both"),
+        ((), "name one with --hung, with --standing, or both"),
         (("--standing", tmp_path / "none.mcap"), "there is no such file"),
         (("--hung", standing), "hardly moves to and fro; record quadvel excite creep"),
     ):

@@ -9,11 +9,12 @@ import sys
 from pathlib import Path
 
 import pytest
+import typer
 from typer.testing import CliRunner
 
 from quadvel_bringup import cli
 
-COMMANDS = ("doctor", "run", "up", "drive", "record", "demo", "eval", "bench", "excite", "twin")
+COMMANDS = tuple(typer.main.get_group(cli.app).commands)
 
 
 def quadvel(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -21,10 +22,14 @@ def quadvel(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True)
 
 
-def test_help_names_every_command_and_shows_examples() -> None:
+def test_help_shows_examples_and_every_command_in_a_panel_on_one_screen() -> None:
     text = CliRunner().invoke(cli.app, ["--help"]).output
+    lines = text.splitlines()
     assert [command for command in COMMANDS if f"\n  {command} " not in text] == []
-    assert "quadvel eval --grid quick --out" in text
+    assert [line.split()[0] for line in lines[1:4]] == ["quadvel"] * 3
+    assert [line for line in lines if line in cli.PANELS] == list(cli.PANELS)
+    assert len(lines) <= 40
+    assert [line for line in lines if len(line) > 80 or line.endswith("...")] == []
 
 
 @pytest.mark.parametrize(
@@ -74,12 +79,15 @@ def test_help_loads_no_simulator_and_no_middleware() -> None:
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
-        (["run", "pilot"], "quadvel: there is no node 'pilot'; known are sim_node"),
+        (["run", "pilot"], "quadvel: there is no node 'pilot'; known nodes: sim_node"),
         (
             ["run", "sim_node", "terrain:=rough", "--actuator", "mine.yaml"],
-            "quadvel: unexpected argument 'terrain:=rough'; parameters go as --ros-args",
+            "quadvel: unexpected argument 'terrain:=rough'; set parameters by --ros-args",
         ),
-        (["run", "sim_node", "--fast"], "quadvel: unexpected argument '--fast'; parameters go as --ros-args"),
+        (
+            ["run", "sim_node", "--fast"],
+            "quadvel: unexpected argument '--fast'; set parameters by --ros-args",
+        ),
         (["up", "--low-level", "spot"], "'spot' is not one of 'sim', 'board'"),
         (["fly"], "No such command 'fly'"),
     ],

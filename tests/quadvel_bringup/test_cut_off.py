@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from quadvel_bringup.recording_file import Heard, RecordingFile
+from quadvel_bringup.recording_file import RawMessage, RecordingFile
 from quadvel_recordings.definitions import STORE
 
 COMMAND = "quadvel_msgs/msg/VelocityCommand"
@@ -29,7 +29,7 @@ def cut_off(tmp_path_factory: pytest.TempPathFactory) -> Path:
             stamp=time(k // 200, 5_000_000 * (k % 200)), twist=twist, stance=False, source="follow"
         )
         data = bytes(STORE.serialize_cdr(message, COMMAND))
-        file.keep(Heard("/command", COMMAND, 5_000_000 * k, 5_000_000 * k, data))
+        file.keep(RawMessage("/command", COMMAND, 5_000_000 * k, 5_000_000 * k, data))
         if k == 200:
             file._writer.flush()
     file.close()

@@ -9,7 +9,7 @@ import pytest
 from quadvel_bringup import doctor
 from quadvel_bringup.doctor import Finding
 
-GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.NEEDED, "GL", "ffmpeg")]
+GOOD = [Finding(name, True, "1.0") for name in ("Python", *doctor.REQUIRED_PACKAGES, "GL", "ffmpeg")]
 
 
 def test_without_torch_all_but_training_can_run() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from quadvel_bringup.excite import RAMP, MotionError, Player
+from quadvel_bringup.excite import RAMP_S, MotionError, MotionPlayer
 from quadvel_description import robot
 from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand, RobotState
 from quadvel_sysid.excitation import FootLifting
@@ -44,7 +44,7 @@ def state(seconds: float, q: np.ndarray = robot.LIE_Q, tilt: float = 0.0) -> Rob
     )
 
 
-def play(player: Player, begin: float, end: float, q: np.ndarray = robot.LIE_Q) -> JointCommand:
+def play(player: MotionPlayer, begin: float, end: float, q: np.ndarray = robot.LIE_Q) -> JointCommand:
     """The answer at `end`, s, after states of every 20 ms since `begin`."""
     times = np.linspace(begin, end, round((end - begin) / 0.02) + 1)
     return [player.answer(state(float(t), q)) for t in times][-1]
@@ -52,39 +52,39 @@ def play(player: Player, begin: float, end: float, q: np.ndarray = robot.LIE_Q) 
 
 def test_a_motion_begins_where_the_robot_is_and_ends_in_damping() -> None:
     excitation = FootLifting(seconds=1.0)
-    player, targets = Player(excitation), excitation.targets()
+    player, targets = MotionPlayer(excitation), excitation.targets()
     first = player.answer(state(0.0))
     np.testing.assert_allclose(first.q, robot.LIE_Q)
     assert (first.mode, first.tick) == (MODE_SERVO, 5000)
     near = robot.NOMINAL_Q
-    np.testing.assert_allclose(play(player, 0.0, RAMP, near).q, targets[0], atol=1e-9)
-    np.testing.assert_allclose(play(player, RAMP, RAMP + 0.25, near).q, targets[250], atol=1e-9)
-    assert not player.done
-    assert play(player, RAMP + 0.25, RAMP + 1.0, near).mode == MODE_DAMPING
-    assert player.done
+    np.testing.assert_allclose(play(player, 0.0, RAMP_S, near).q, targets[0], atol=1e-9)
+    np.testing.assert_allclose(play(player, RAMP_S, RAMP_S + 0.25, near).q, targets[250], atol=1e-9)
+    assert not player.is_done
+    assert play(player, RAMP_S + 0.25, RAMP_S + 1.0, near).mode == MODE_DAMPING
+    assert player.is_done
 
 
 @pytest.mark.parametrize("then", [1.2, 0.9])
 def test_a_motion_that_would_jump_after_a_silence_or_a_step_of_the_clock_is_ended(then: float) -> None:
-    player = Player(FootLifting(seconds=1.0))
+    player = MotionPlayer(FootLifting(seconds=1.0))
     play(player, 0.0, 1.0)
-    with pytest.raises(MotionError, match=r"time went by (0.200|-0.100) s, expected 0 to 0.05 s"):
+    with pytest.raises(MotionError, match=r"two states is (0.200|-0.100) s, expected 0 to 0.05 s"):
         player.answer(state(then))
 
 
 def test_a_target_is_held_back_where_the_joint_is_far_from_it() -> None:
-    player = Player(FootLifting())
-    asked = robot.KP * (play(player, 0.0, RAMP).q - robot.LIE_Q)
+    player = MotionPlayer(FootLifting())
+    asked = robot.KP * (play(player, 0.0, RAMP_S).q - robot.LIE_Q)
     assert (np.abs(asked) <= robot.TORQUE_LIMIT).all()
 
 
 def test_a_robot_that_tips_over_or_leaves_its_range_ends_the_motion() -> None:
     with pytest.raises(MotionError, match=r"the trunk tilts by 0\.90 rad"):
-        Player(FootLifting()).answer(state(0.0, tilt=0.9))
+        MotionPlayer(FootLifting()).answer(state(0.0, tilt=0.9))
     q = robot.NOMINAL_Q.copy()
     q[5] = robot.UPPER[5] + 0.2
     with pytest.raises(MotionError, match=r"FL_calf_joint is 0\.20 rad beyond its range"):
-        Player(FootLifting()).answer(state(0.0, q))
+        MotionPlayer(FootLifting()).answer(state(0.0, q))
 
 
 def excite(*arguments: object) -> list[str]:
@@ -100,10 +100,10 @@ def test_a_hung_robot_is_moved_and_recorded_at_1_khz_without_gaps(tmp_path: Path
     log = read_log(file)
     np.testing.assert_allclose(np.diff(log.t), 0.001, atol=1e-9)
     np.testing.assert_allclose(np.diff(log.t_cmd), 0.001, atol=1e-9)
-    assert log.t[-1] - log.t[0] >= RAMP + 0.6 - 0.002
+    assert log.t[-1] - log.t[0] >= RAMP_S + 0.6 - 0.002
     assert log.kp is not None
     assert (log.kp == robot.KP).all()
-    swing = np.ptp(log.q[round(1e3 * RAMP) :], axis=0)
+    swing = np.ptp(log.q[round(1e3 * RAMP_S) :], axis=0)
     assert swing.max() > 0.02
     assert sorted(path.name for path in tmp_path.iterdir()) == ["steps.mcap"]
 

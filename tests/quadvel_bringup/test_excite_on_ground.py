@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from quadvel_actuator import ActuatorModel, ActuatorParameters
-from quadvel_bringup.excite import Player
+from quadvel_bringup.excite import MotionPlayer
 from quadvel_description import robot
 from quadvel_description.kinematics import HIPS, foot_positions, roll_pitch
 from quadvel_description.mjcf import Plant, load_model
@@ -27,8 +27,8 @@ def play(
     excitation: Excitation, begin: RobotState, answer: Body
 ) -> tuple[list[RobotState], list[JointCommand]]:
     """The states of the whole motion, and what answered them. MotionError where it does not go through."""
-    player, states, commands = Player(excitation), [begin], []
-    while not player.done:
+    player, states, commands = MotionPlayer(excitation), [begin], []
+    while not player.is_done:
         commands.append(player.answer(states[-1]))
         states.append(answer(commands[-1]))
     return states[:-1], commands
@@ -134,12 +134,15 @@ def test_the_feet_carry_the_robots_weight_and_a_lifted_foot_nothing() -> None:
 
 def test_in_the_air_nothing_is_carried() -> None:
     begin, _ = simulated(0)
-    assert not Player(FootLifting(), hung=True).answer(begin).tau.any()
+    assert not MotionPlayer(FootLifting(), hung=True).answer(begin).tau.any()
 
 
 def test_the_motions_own_gains_are_sent_unless_others_are_asked_for() -> None:
     begin, _ = simulated(0)
-    own, asked = Player(FootLifting()).answer(begin), Player(FootLifting(), 60.0, 2.0).answer(begin)
+    own, asked = (
+        MotionPlayer(FootLifting()).answer(begin),
+        MotionPlayer(FootLifting(), 60.0, 2.0).answer(begin),
+    )
     assert (own.kp[0], own.kd[0]) == (FootLifting.kp, FootLifting.kd)
     assert (asked.kp[0], asked.kd[0]) == (60.0, 2.0)
 

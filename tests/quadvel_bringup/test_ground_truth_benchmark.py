@@ -17,7 +17,7 @@ from rich.console import Console
 from quadvel_actuator import ActuatorParameters
 from quadvel_bringup import plant as plant_module
 from quadvel_bringup.ground_truth_benchmark import PLANTS, SHIPPED, WALKS, _identify, plant_nodes
-from quadvel_bringup.ground_truth_page import decision, twin_page
+from quadvel_bringup.ground_truth_page import summary_sentence, twin_page
 from quadvel_bringup.plant import ChafingCable, DryGear, HiddenDrives, Plant, SlowCurrent, read_plant
 from quadvel_description import robot
 from quadvel_description.state import JointCommand, RobotState
@@ -177,7 +177,7 @@ def entry(name: str, after: float) -> dict[str, Any]:
 
 def test_the_page_says_by_how_much_the_corrected_models_are_nearer() -> None:
     results = [entry("dry_gears", 0.1), entry("slow_current", 0.3)]
-    assert decision(results) == (
+    assert summary_sentence(results) == (
         "With what was identified on 2 plants, the model's torque error falls by 80 %, its open-loop error of q "
         "falls by 80 % and of dq falls by 80 %, the gap of its velocity tracking falls by 80 %."
     )
@@ -196,7 +196,7 @@ def test_the_page_says_by_how_much_the_corrected_models_are_nearer() -> None:
 
 
 def test_the_page_owns_up_to_a_model_that_got_worse() -> None:
-    assert "torque error grows by 25 %" in decision([entry("dry_gears", 1.25)])
+    assert "torque error grows by 25 %" in summary_sentence([entry("dry_gears", 1.25)])
     assert "-25 %" in twin_page([entry("dry_gears", 1.25)])
 
 

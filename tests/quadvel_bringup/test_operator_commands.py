@@ -17,13 +17,13 @@ quadvel_dds.install()
 from std_srvs.srv import SetBool  # noqa: E402
 
 from quadvel_bringup import operator_commands, session  # noqa: E402
-from quadvel_bringup.nodes import command  # noqa: E402
+from quadvel_bringup.nodes import process_command  # noqa: E402
 
 
 @pytest.fixture
 def board() -> Iterator[None]:
     """A simulated robot behind the AlienGo's UDP interface. sim_node is in tests/end_to_end/test_operator.py."""
-    process = subprocess.Popen(command("board", ["--ros-args", "-p", "port:=0"]))
+    process = subprocess.Popen(process_command("board", ["--ros-args", "-p", "port:=0"]))
     yield
     process.send_signal(signal.SIGINT)
     assert process.wait(40.0) == 0
@@ -32,7 +32,7 @@ def board() -> Iterator[None]:
 def test_a_robot_behind_the_board_takes_the_same_orders_as_any_simulated_one(
     board: None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(session, "PATIENCE", 40.0)  # it is only starting
+    monkeypatch.setattr(session, "DISCOVERY_TIMEOUT_S", 40.0)  # it is only starting
     assert operator_commands.pause(True) == 0
     assert operator_commands.step(20) == 0
     assert operator_commands.push((0.0, 60.0, 0.0), 0.2, "trunk") == 0
@@ -42,9 +42,11 @@ def test_a_robot_behind_the_board_takes_the_same_orders_as_any_simulated_one(
 
 
 def test_without_a_simulator_it_is_said_how_to_start_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "PATIENCE", 0.2)
-    text = "sim_node/reset or board/reset: nobody answers; there is no simulator; start one: quadvel up"
-    with pytest.raises(session.NobodyThere, match=re.escape(text)):
+    monkeypatch.setattr(session, "DISCOVERY_TIMEOUT_S", 0.2)
+    text = (
+        "sim_node/reset or board/reset: service not available; there is no simulator; start one: quadvel up"
+    )
+    with pytest.raises(session.NotRunningError, match=re.escape(text)):
         operator_commands.reset("lie")
 
 
@@ -63,14 +65,14 @@ rclpy.shutdown()
 
 
 def test_a_robot_that_nobody_simulates_is_not_pushed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "PATIENCE", 2.0)
+    monkeypatch.setattr(session, "DISCOVERY_TIMEOUT_S", 2.0)
     driver = subprocess.Popen(
         [sys.executable, "-c", DRIVER], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
     assert driver.stdout is not None
     assert driver.stdout.readline() == "ready\n"
     try:
-        with pytest.raises(session.NobodyThere, match="a real one can not be given this order"):
+        with pytest.raises(session.NotRunningError, match="a real one does not support this command"):
             operator_commands.push((0.0, 60.0, 0.0), 0.2, "trunk")
     finally:
         driver.communicate("\n", timeout=40.0)
@@ -101,8 +103,8 @@ class Deaf:
 def test_an_order_without_an_answer_is_given_again_if_that_does_no_harm(
     repeats: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "ANSWER", 0.5)
-    monkeypatch.setattr(session, "AGAIN", 0.1)
+    monkeypatch.setattr(session, "SERVICE_TIMEOUT_S", 0.5)
+    monkeypatch.setattr(session, "SERVICE_RETRY_S", 0.1)
     client = Deaf(2, answer := SetBool.Response(success=True))
     with session.Session("test") as node:
         monkeypatch.setattr(node.node, "create_client", lambda kind, service: client)
@@ -110,6 +112,6 @@ def test_an_order_without_an_answer_is_given_again_if_that_does_no_harm(
             assert node.call(SetBool, ["deaf"], str, data=True) is answer
             assert client.asked == 3
         else:
-            with pytest.raises(session.NobodyThere, match=r"/deaf: no answer within 0\.5 s"):
+            with pytest.raises(session.NotRunningError, match=r"/deaf: no answer within 0\.5 s"):
                 node.call(SetBool, ["deaf"], str, repeats=False, data=True)
             assert client.asked == 1

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from quadvel_bringup import up
-from quadvel_bringup.preflight import PARTS, rehearse
+from quadvel_bringup.preflight import NODE_CHECKS, check_stack
 from quadvel_bringup.stack import LOW_LEVELS, PARAMETERS, Stack
 
 
@@ -23,11 +23,13 @@ def written(path: Path, text: str) -> Path:
 
 
 def test_the_shipped_stack_is_in_order() -> None:
-    rehearse(Stack())
-    rehearse(Stack(use_sim_time=True))
+    check_stack(Stack())
+    check_stack(Stack(use_sim_time=True))
     for low_level in LOW_LEVELS:
-        rehearse(Stack(low_level=low_level))
-    assert set(PARTS) == {name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).overrides()}
+        check_stack(Stack(low_level=low_level))
+    assert set(NODE_CHECKS) == {
+        name for low_level in LOW_LEVELS for name in Stack(low_level=low_level).overrides()
+    }
 
 
 @pytest.mark.parametrize(
@@ -90,10 +92,10 @@ def test_parameters_for_every_node_and_for_one_in_any_namespace_are_understood(t
     text = (
         "/**:\n  ros__parameters: {use_sim_time: true}\n/**/controller:\n  ros__parameters: {max_tilt: 0.9}"
     )
-    rehearse(Stack(parameters=written(tmp_path / "p.yaml", text)))
+    check_stack(Stack(parameters=written(tmp_path / "p.yaml", text)))
 
 
 def test_a_file_that_is_no_text_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "p.yaml").write_bytes(b"\xff\xfe\x00")
     with pytest.raises(ValueError, match=r"p\.yaml' is not text"):
-        rehearse(Stack(parameters=tmp_path / "p.yaml"))
+        check_stack(Stack(parameters=tmp_path / "p.yaml"))

@@ -26,9 +26,9 @@ from geometry_msgs.msg import Twist  # noqa: E402
 from rclpy.node import Node  # noqa: E402
 
 from quadvel_bringup.recorder import Recorder  # noqa: E402
-from quadvel_bringup.recording_file import Heard, RecordingFile, Ring  # noqa: E402
+from quadvel_bringup.recording_file import RawMessage, RecordingFile, RingBuffer  # noqa: E402
 from quadvel_msgs.msg import ControllerState, LowState  # noqa: E402
-from quadvel_recordings.reading import read_messages, unread_messages  # noqa: E402
+from quadvel_recordings.reading import lazy_messages, read_messages  # noqa: E402
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def test_of_a_recorder_that_was_killed_all_but_the_last_second_is_read(node: Nod
     recording.kill()
     recording.communicate(timeout=60)
     with pytest.warns(
-        UserWarning, match=r"walk\.mcap: recording: it was cut off; the first \d\.\d s, \d+ messages"
+        UserWarning, match=r"walk\.mcap: recording: it is truncated; the first \d\.\d s, \d+ messages"
     ):
         found = [message.tick for _, _, message in read_messages(path, lambda topic, typename: True)]
     assert found == sorted(found)
@@ -195,9 +195,9 @@ def test_a_full_disk_ends_a_recording_in_words_and_what_was_written_is_read(
             break
     _, said = recording.communicate(timeout=60)
     assert recording.returncode == 2
-    assert re.search(r"full\.mcap: the recording ended after .* can be read: File too large", said)
+    assert re.search(r"full\.mcap: the recording ended after .* is unreadable: File too large", said)
     assert "Traceback" not in said
-    with pytest.warns(UserWarning, match="it was cut off"):
+    with pytest.warns(UserWarning, match="it is truncated"):
         assert len(list(read_messages(path, lambda topic, typename: True))) > 50
 
 
@@ -205,19 +205,19 @@ def test_a_recording_on_which_nothing_came_leaves_no_file(tmp_path: Path) -> Non
     recording = start_recording("low_state", "--out", str(tmp_path / "walk.mcap"), "--seconds", "0.5")
     _, said = recording.communicate(timeout=60)
     assert recording.returncode == 1
-    assert "nothing came on /low_state on ROS domain" in said
+    assert "no message on /low_state on ROS domain" in said
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_ring_keeps_the_last_seconds_and_what_is_published_once(tmp_path: Path) -> None:
-    ring = Ring(2.0)
+    ring = RingBuffer(2.0)
     blank = bytes(300)
-    ring.keep(Heard("/robot_description", "std_msgs/msg/String", 0, 0, bytes(12)))
+    ring.keep(RawMessage("/robot_description", "std_msgs/msg/String", 0, 0, bytes(12)))
     for tenth in range(100):
-        ring.keep(Heard("/low_state", "quadvel_msgs/msg/LowState", tenth * 10**8, tenth * 10**8, blank))
+        ring.keep(RawMessage("/low_state", "quadvel_msgs/msg/LowState", tenth * 10**8, tenth * 10**8, blank))
     assert ring.save(tmp_path / "fault.mcap") == 22
     found = [
-        (topic, time) for topic, time, _ in unread_messages(tmp_path / "fault.mcap", lambda topic, kind: True)
+        (topic, time) for topic, time, _ in lazy_messages(tmp_path / "fault.mcap", lambda topic, kind: True)
     ]
     assert found == [("/robot_description", 0), *(("/low_state", tenth * 10**8) for tenth in range(79, 100))]
 

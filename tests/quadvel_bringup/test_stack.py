@@ -13,8 +13,8 @@ import yaml
 
 import quadvel_dds
 from quadvel_bringup import nodes
-from quadvel_bringup.follow_demo import FOLLOWED
-from quadvel_bringup.recorded_run import RECORDED
+from quadvel_bringup.follow_demo import FOLLOW_TOPICS
+from quadvel_bringup.recorded_run import RECORDED_TOPICS
 from quadvel_bringup.stack import PARAMETERS, Stack
 from quadvel_dds.arguments import parse
 
@@ -75,8 +75,10 @@ def test_every_node_of_the_stack_is_in_the_table() -> None:
 
 
 def test_an_unknown_node_is_refused_with_the_known_ones() -> None:
-    with pytest.raises(ValueError, match=r"no node 'simnode'; known are sim_node, board, driver, estimator"):
-        nodes.command("simnode")
+    with pytest.raises(
+        ValueError, match=r"no node 'simnode'; known nodes: sim_node, board, driver, estimator"
+    ):
+        nodes.process_command("simnode")
 
 
 def test_arguments_that_ros_would_overlook_are_refused() -> None:
@@ -157,13 +159,9 @@ def test_the_robot_itself_stands_up_and_walks_only_on_an_operators_call() -> Non
 
 
 def test_what_a_robot_cannot_do_is_refused_by_name() -> None:
-    with pytest.raises(
-        ValueError, match="low_level is 'board', expected 'sim' where simulated time sets the pace"
-    ):
+    with pytest.raises(ValueError, match="low_level is 'board', expected 'sim' for simulated time"):
         Stack(low_level="board", use_sim_time=True)
-    with pytest.raises(
-        ValueError, match="low_level is 'sim', expected 'board' for a network that is bad on purpose"
-    ):
+    with pytest.raises(ValueError, match="low_level is 'sim', expected 'board' for a simulated bad network"):
         Stack(network={"network_loss": 0.1})
 
 
@@ -179,7 +177,7 @@ def test_the_page_is_one_more_node_and_none_of_the_robot() -> None:
 
 
 def test_rviz_shows_topics_that_are_recorded_with_the_types_of_its_displays() -> None:
-    known = RECORDED | FOLLOWED
+    known = RECORDED_TOPICS | FOLLOW_TOPICS
     config = yaml.safe_load((PARAMETERS.parent / "robot.rviz").read_text())
     shown = {}
     for display in config["Visualization Manager"]["Displays"]:
@@ -195,6 +193,6 @@ def test_rviz_shows_topics_that_are_recorded_with_the_types_of_its_displays() ->
 
 def test_a_parameter_that_is_given_stands_above_the_file() -> None:
     """The laser of a world, for one, above the file's: a tracker that took the file's saw everybody 0.25 m too near."""
-    words = nodes.arguments("person_tracker", {"laser_x": 0.4}, PARAMETERS)
+    words = nodes.ros_arguments("person_tracker", {"laser_x": 0.4}, PARAMETERS)
     found = parse(words).parameters_for("/person_tracker")
     assert (found["laser_x"], found["select_nearest"]) == (0.4, True)

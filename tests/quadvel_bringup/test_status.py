@@ -18,7 +18,7 @@ from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 
 from quadvel_bringup.demo import _report  # noqa: E402
-from quadvel_bringup.status import HEARD, _lines, look  # noqa: E402
+from quadvel_bringup.status import STATUS_TOPICS, _lines, running_nodes  # noqa: E402
 from quadvel_msgs.msg import ControllerState  # noqa: E402
 
 NAN = float("nan")
@@ -55,7 +55,7 @@ def test_nodes_of_the_control_loop_that_are_found_seconds_after_the_first_are_wa
         assert robot.stdin is not None
         assert robot.stdout is not None
         robot.stdout.readline()
-        nodes = look()
+        nodes = running_nodes()
         robot.stdin.close()
     assert list(nodes) == ["command_mux", "controller", "estimator", "sim_node"]
 
@@ -64,7 +64,7 @@ def test_status_of_a_robot_that_has_not_ticked_yet_shows_dashes() -> None:
     state = ControllerState(mode_name="passive", period_p99_ms=NAN, compute_p50_us=NAN)
     odom, estimate = Odometry(), TwistWithCovarianceStamped()
     odom.pose.pose.position.z = estimate.twist.twist.linear.x = NAN
-    heard: dict[str, deque[Any]] = {topic: deque() for topic in HEARD}
+    heard: dict[str, deque[Any]] = {topic: deque() for topic in STATUS_TOPICS}
     heard["controller/state"].append(state)
     heard["odom"].append(odom)
     heard["velocity_estimate"].append(estimate)

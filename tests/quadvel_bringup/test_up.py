@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from quadvel_bringup import up
-from quadvel_bringup.exclusivity import NotAlone, look_for_others
+from quadvel_bringup.exclusivity import RobotAlreadyRunningError, check_exclusive
 from quadvel_bringup.scripted_walk import ScriptedWalk
 from quadvel_bringup.stack import Stack
 
@@ -36,7 +36,7 @@ def use_programs(monkeypatch: pytest.MonkeyPatch, program: Callable[[str], str])
     def command(name: str, arguments: Sequence[str]) -> list[str]:
         return [sys.executable, "-S", "-c", program(name)]
 
-    monkeypatch.setattr(up, "command", command)
+    monkeypatch.setattr(up, "process_command", command)
 
 
 def interrupt_when_ready(monkeypatch: pytest.MonkeyPatch, times: int) -> None:
@@ -135,12 +135,12 @@ def test_beside_another_simulator_it_does_not_start(
     try:
         until = time.monotonic() + 30.0
         while time.monotonic() < until:
-            with suppress(NotAlone):
-                look_for_others()
+            with suppress(RobotAlreadyRunningError):
+                check_exclusive()
                 continue
             break
-        named = f"low_state: somebody publishes it already on ROS domain .*: sim_node \\(pid {other.pid}\\)"
-        with pytest.raises(NotAlone, match=named):
+        named = f"low_state: already published on ROS domain .* by sim_node \\(pid {other.pid}\\)"
+        with pytest.raises(RobotAlreadyRunningError, match=named):
             up.up(Stack())
     finally:
         other.send_signal(signal.SIGINT)

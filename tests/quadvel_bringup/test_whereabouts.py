@@ -42,7 +42,7 @@ def elsewhere() -> Iterator[subprocess.Popen[str]]:
 
 
 def test_a_robot_on_another_domain_is_named_with_its_domain(elsewhere: subprocess.Popen[str]) -> None:
-    text = whereabouts.whereabouts()
+    text = whereabouts.discovery_hint()
     assert f"on ROS domain {HERE}" in text
     assert f"sim_node (pid {elsewhere.pid}) is on {ELSEWHERE}" in text
 
@@ -69,15 +69,15 @@ def test_domains_are_read_from_pairs_of_ports(ports: tuple[int, ...], domains: s
 
 
 def test_without_another_domain_the_own_and_the_ways_out_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(whereabouts, "robots", dict)
+    monkeypatch.setattr(whereabouts, "running_robots", dict)
     monkeypatch.setattr(whereabouts, "domains_in_use", lambda table: {HERE})
     monkeypatch.delenv("ROS_AUTOMATIC_DISCOVERY_RANGE", raising=False)
-    text = whereabouts.whereabouts()
+    text = whereabouts.discovery_hint()
     assert f"ROS domain {HERE}" in text
     assert "ROS_DOMAIN_ID" in text
     assert "SUBNET" in text
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "SUBNET")
-    assert "SUBNET" not in whereabouts.whereabouts()
+    assert "SUBNET" not in whereabouts.discovery_hint()
 
 
 def test_an_order_that_nobody_answers_says_where_the_robot_is(
@@ -85,6 +85,9 @@ def test_an_order_that_nobody_answers_says_where_the_robot_is(
 ) -> None:
     from std_srvs.srv import SetBool
 
-    monkeypatch.setattr(session, "PATIENCE", 0.2)
-    with session.Session("asking") as asking, pytest.raises(session.NobodyThere, match=f"is on {ELSEWHERE}"):
+    monkeypatch.setattr(session, "DISCOVERY_TIMEOUT_S", 0.2)
+    with (
+        session.Session("asking") as asking,
+        pytest.raises(session.NotRunningError, match=f"is on {ELSEWHERE}"),
+    ):
         asking.call(SetBool, ["nowhere"], lambda: "start it", data=True)

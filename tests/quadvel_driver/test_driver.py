@@ -27,7 +27,7 @@ from sensor_msgs.msg import Imu, JointState  # noqa: E402
 from std_msgs.msg import Bool  # noqa: E402
 from std_srvs.srv import SetBool  # noqa: E402
 
-from quadvel_bringup.nodes import command as node_command  # noqa: E402
+from quadvel_bringup.nodes import process_command as node_command  # noqa: E402
 from quadvel_description.robot import NOMINAL_Q  # noqa: E402
 from quadvel_description.state import JointCommand  # noqa: E402
 from quadvel_driver import wire  # noqa: E402

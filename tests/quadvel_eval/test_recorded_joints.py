@@ -80,7 +80,7 @@ def test_a_replay_is_the_same_of_every_kind_of_recording(tmp_path: Path) -> None
     [
         (joint_states(JOINT_NAMES), "/joint_commands: kp: not in the recording, expected --gains KP KD"),
         (joint_states(("a", "b")), "expected all joints of the model; FR_hip_joint is missing"),
-        (joint_states(JOINT_NAMES)[::2], "expected commands beside the states on /joint_states"),
+        (joint_states(JOINT_NAMES)[::2], "expected commands for the states on /joint_states"),
         ([("/x", "std_msgs/msg/String", T0, STORE.types["std_msgs/msg/String"]("x"))], r"the recording has /x \(std_msgs"),
     ],
 )  # fmt: skip

@@ -24,7 +24,7 @@ def call(tmp_path: Path) -> Iterator[Call]:
     file = tmp_path / "params.yaml"
     file.write_text(KALMAN)
     arguments = ["--ros-args", "--params-file", str(file), "-p", "reset_gap:=0.5"]
-    process = subprocess.Popen(nodes.command("estimator", arguments))
+    process = subprocess.Popen(nodes.process_command("estimator", arguments))
     rclpy.init(args=[])
     node = rclpy.create_node("operator")
 

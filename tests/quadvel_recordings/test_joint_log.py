@@ -17,7 +17,7 @@ from rosbags.rosbag2 import StoragePlugin
 from quadvel_description.robot import JOINT_NAMES
 from quadvel_recordings import bounds
 from quadvel_recordings.definitions import STORE
-from quadvel_recordings.joint_log import LEG_JOINTS, JointLog, expect_commands, read_joint_log
+from quadvel_recordings.joint_log import LEG_JOINTS, JointLog, read_joint_log, require_commands
 from quadvel_recordings.reading import RecordingError, read_messages
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -48,7 +48,7 @@ def test_a_pair_of_joint_states_is_told_apart_by_its_names(tmp_path: Path, topic
     names = ("shoulder", "elbow", "wrist")
     log = read_joint_log(rosbag2(tmp_path / "bag", joint_states(names, topics)))
     check(log, names)
-    assert (log.begin, log.received) == (T0, False)
+    assert (log.start_ns, log.uses_receipt_times) == (T0, False)
     assert log.command is not None
     assert log.command.values.keys() == {"q"}
 
@@ -87,7 +87,7 @@ def test_the_low_level_of_a_go2_is_read(tmp_path: Path, storage: StoragePlugin) 
     slow = [(f"/lf{topic}", *rest) for topic, *rest in go2()[::20] if topic == "/lowstate"]
     log = read_joint_log(rosbag2(tmp_path / "bag", [*go2(off=(7,)), *slow], storage))
     assert log.command is not None
-    assert (log.state.topic, log.received, log.begin) == ("/lowstate", True, T0)
+    assert (log.state.topic, log.uses_receipt_times, log.start_ns) == ("/lowstate", True, T0)
     assert log.command.values["kp"][6].tolist() == [30.0] * 12
     assert all(not log.command.values[name][7].any() for name in ("q", "dq", "kp", "kd"))
     np.testing.assert_allclose(log.state.values["tau"], motion()["tau"], atol=1e-4)
@@ -113,7 +113,7 @@ def test_definitions_of_unitree_go_have_the_bytes_of_the_robot(name: str, size: 
 def test_a_bag_of_ros_1_is_read(tmp_path: Path, packing: Any) -> None:
     log = read_joint_log(ros1(tmp_path / "run.bag", packing))
     check(log)
-    assert log.begin == T0
+    assert log.start_ns == T0
 
 
 @pytest.mark.parametrize(("zeros", "count"), [(range(ROWS), ROWS), (range(20), 20), ([100], 1)])
@@ -121,14 +121,14 @@ def test_where_stamps_are_0_the_times_of_receipt_count(tmp_path: Path, zeros: An
     said: list[str] = []
     log = read_joint_log(rosbag2(tmp_path / "bag", own(zeros)), warn=said.append)
     check(log)
-    assert (log.received, log.begin) == (True, T0)
+    assert (log.uses_receipt_times, log.start_ns) == (True, T0)
     assert [f"{count} of {ROWS} stamps are 0" in text for text in said] == [True, True]
 
 
 def test_a_simulated_clock_may_begin_at_0(tmp_path: Path) -> None:
     messages = [(topic, kind, now, at(message, now - T0)) for topic, kind, now, message in own(())]
     log = read_joint_log(rosbag2(tmp_path / "bag", messages))
-    assert (log.received, log.begin) == (False, 0)
+    assert (log.uses_receipt_times, log.start_ns) == (False, 0)
 
 
 def at(message: Any, nanoseconds: int) -> Any:
@@ -151,7 +151,7 @@ def test_the_kind_of_storage_is_taken_from_the_files(
         metadata.write_text(text.replace(f"storage_identifier: {name}", f"storage_identifier: {fault}"))
         assert metadata.read_text() != text
     said: list[str] = []
-    check(read_joint_log(path, tell=said.append))
+    check(read_joint_log(path, notify=said.append))
     assert "metadata.yaml" in said[0]
 
 
@@ -172,7 +172,7 @@ def test_states_without_commands_are_read_and_the_commands_are_asked_for(tmp_pat
     with pytest.raises(
         RecordingError, match=r"expected commands .*/joint_states.*the recording has /joint_states"
     ):
-        expect_commands(path, log)
+        require_commands(path, log)
 
 
 def mcap_of(path: Path, *chunks: tuple[int, int, bytes, str]) -> Path:
@@ -210,7 +210,7 @@ def zeros(packing: str, megabytes: int) -> bytes:
 def test_a_chunk_that_unpacks_to_too_much_is_refused_within_little_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packing: str, claimed: int, cut: bool
 ) -> None:
-    monkeypatch.setattr(bounds, "LARGEST_CHUNK", 4 << 20)
+    monkeypatch.setattr(bounds, "MAX_CHUNK_BYTES", 4 << 20)
     data = zeros(packing, 64)
     path = mcap_of(tmp_path / "a.mcap", (claimed, 0, data, packing))
     if cut:
@@ -222,7 +222,7 @@ def test_a_chunk_that_unpacks_to_too_much_is_refused_within_little_memory(
 
 
 def test_chunks_of_one_instant_are_bounded_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounds, "LARGEST_AT_ONCE", 8 << 20)
+    monkeypatch.setattr(bounds, "MAX_OVERLAP_BYTES", 8 << 20)
     chunk = (1 << 20, 7, zeros("lz4", 1), "lz4")
     with pytest.raises(
         RecordingError, match=r"a\.mcap: found chunks of 12582912 bytes that hold the same instant"
@@ -232,7 +232,7 @@ def test_chunks_of_one_instant_are_bounded_together(tmp_path: Path, monkeypatch:
 
 @pytest.mark.parametrize("packing", [Ros1Writer.CompressionFormat.BZ2, Ros1Writer.CompressionFormat.LZ4])
 def test_chunks_of_ros_1_are_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packing: Any) -> None:
-    monkeypatch.setattr(bounds.unpacked, "__defaults__", (1000,))
+    monkeypatch.setattr(bounds.decompress, "__defaults__", (1000,))
     path = ros1(tmp_path / "a.bag", packing)
     with pytest.raises(RecordingError, match=r"a\.bag: found a chunk of more than 1000 bytes"):
         list(read_messages(path, lambda *_: True))

@@ -141,7 +141,7 @@ def test_a_folder_that_points_elsewhere_is_refused(
 def test_malicious_metadata_is_refused(tmp_path: Path, text: str) -> None:
     sprung = tmp_path / "sprung"
     (tmp_path / "metadata.yaml").write_text(text.replace("{sprung}", str(sprung)))
-    with pytest.raises(LogError, match=f"{tmp_path}: no whole recording"):
+    with pytest.raises(LogError, match=f"{tmp_path}: not a complete recording"):
         read_log(tmp_path)
     with pytest.raises(ValueError, match=r"metadata\.yaml: "):
         ActuatorParameters.load(tmp_path / "metadata.yaml")
@@ -156,8 +156,8 @@ def test_malicious_metadata_is_refused(tmp_path: Path, text: str) -> None:
 )
 def test_a_recording_of_garbage_is_refused(tmp_path: Path, body: bytes, end: bytes) -> None:
     (tmp_path / "a.mcap").write_bytes(MAGIC + body + end)
-    with pytest.raises(LogError, match=r"a\.mcap: (the recording was cut off|no whole recording)"):
+    with pytest.raises(LogError, match=r"a\.mcap: (the recording is truncated|not a complete recording)"):
         read_log(tmp_path / "a.mcap")
     (tmp_path / "a.db3").write_bytes(b"SQLite format 3\0" + body)
-    with pytest.raises(LogError, match=r"a\.db3: no whole recording"):
+    with pytest.raises(LogError, match=r"a\.db3: not a complete recording"):
         read_log(tmp_path / "a.db3")

@@ -198,7 +198,7 @@ def test_whole_part_of_a_truncated_recording_is_read(tmp_path: Path, share: floa
     assert share - 0.2 < rows / len(whole.t) <= share + 0.05
     np.testing.assert_array_equal(log.q, whole.q[:rows])
     assert re.fullmatch(
-        r"recording: it was cut off; the first \d\.\d s, \d+ messages are kept", log.remarks[0]
+        r"recording: it is truncated; the first \d\.\d s, \d+ messages are readable", log.remarks[0]
     )
 
 
@@ -207,9 +207,7 @@ def test_recording_truncated_before_its_first_chunk_is_refused(tmp_path: Path, s
     path = mcap(tmp_path / "cut.mcap", fields(0.2))
     data = path.read_bytes()
     path.write_bytes(data[: int(share * len(data))])
-    with pytest.raises(
-        LogError, match=r"cut\.mcap: the recording was cut off before anything of it was whole"
-    ):
+    with pytest.raises(LogError, match=r"cut\.mcap: the recording is truncated and holds no complete chunk"):
         read_log(path)
 
 

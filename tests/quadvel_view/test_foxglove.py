@@ -38,7 +38,7 @@ def advertised(client) -> dict:
 def test_a_topic_comes_with_its_definition_and_its_bytes(server, latched: bool) -> None:
     data = bytes(STORE.serialize_cdr(odometry(1.0, 2.0), ODOMETRY))
     server.offer("/odom", ODOMETRY, latched)
-    server.tell("/odom", data, 1)
+    server.publish("/odom", data, 1)
     with connect(server.url, subprotocols=SUBPROTOCOLS) as client:
         channel = advertised(client)
         assert (channel["topic"], channel["encoding"], channel["schemaName"]) == ("/odom", "cdr", ODOMETRY)
@@ -48,7 +48,7 @@ def test_a_topic_comes_with_its_definition_and_its_bytes(server, latched: bool) 
         if not latched:
             with pytest.raises(TimeoutError):
                 client.recv(timeout=0.3)
-            server.tell("/odom", data, 2)
+            server.publish("/odom", data, 2)
         assert client.recv(timeout=10.0)[13:] == data  # behind operation, subscription, and time
 
 
@@ -64,7 +64,7 @@ def test_a_page_of_another_origin_sees_topics_and_publishes_nothing(server) -> N
 
 
 def test_other_hosts_are_refused_as_nobody_shows_a_token_here() -> None:
-    with pytest.raises(AddressError, match=r"this host alone.*ssh -L"):
+    with pytest.raises(AddressError, match=r"this computer only.*ssh -L"):
         foxglove_live.FoxgloveServer("0.0.0.0", 0)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from quadvel_view import recording
-from quadvel_view.recording import Recording
+from quadvel_view.recording import PageRecorder
 
 FINISHES_SLOWLY = (
     "import signal, time; signal.signal(signal.SIGINT, lambda *_: None); print(flush=True); time.sleep(600)"
@@ -31,7 +31,7 @@ def started(monkeypatch: pytest.MonkeyPatch) -> list[subprocess.Popen[bytes]]:
             processes.append(self)
 
     monkeypatch.setattr(recording.subprocess, "Popen", Recorder)
-    monkeypatch.setattr(recording, "PATIENCE", 0.1)
+    monkeypatch.setattr(recording, "FINISH_TIMEOUT_S", 0.1)
     return processes
 
 
@@ -42,7 +42,7 @@ def test_a_recorder_that_cannot_be_started_is_reported(
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(recording.subprocess, "Popen", no_descriptor_left)
-    page = Recording(str(tmp_path))
+    page = PageRecorder(str(tmp_path))
     assert "Too many open files" in page.toggle()
     assert page.file is None
     page.close()
@@ -51,7 +51,7 @@ def test_a_recorder_that_cannot_be_started_is_reported(
 def test_a_page_that_asks_again_and_again_starts_one_recorder(
     started: list[subprocess.Popen[bytes]], tmp_path: Path
 ) -> None:
-    page = Recording(str(tmp_path))
+    page = PageRecorder(str(tmp_path))
     try:
         for _ in range(50):
             page.toggle()

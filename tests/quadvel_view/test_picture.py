@@ -25,18 +25,18 @@ def test_joints_are_taken_by_their_names() -> None:
     names = list(reversed(robot.JOINT_NAMES))
     angles, torques = np.linspace(0.0, 1.1, 12), np.linspace(5.0, -6.0, 12)
     joints = message("sensor_msgs/msg/JointState", name=names, position=angles, effort=torques)
-    picture.take("/joint_states", joints, 0.0)
+    picture.update("/joint_states", joints, 0.0)
     assert picture.q == pytest.approx(angles[::-1])
     assert picture.torque == pytest.approx(torques[::-1])
 
 
 def test_a_scan_lies_where_laser_and_robot_are() -> None:
     picture = RobotPicture()
-    picture.take("/odom", odometry(10.0, 5.0), 0.0)
+    picture.update("/odom", odometry(10.0, 5.0), 0.0)
     laser = message("geometry_msgs/msg/TransformStamped", child_frame_id="laser")
     laser.header.frame_id = "base_link"
     laser.transform.translation.x, laser.transform.translation.z = 0.25, 0.1
-    picture.take("/tf_static", message("tf2_msgs/msg/TFMessage", transforms=[laser]), 0.0)
+    picture.update("/tf_static", message("tf2_msgs/msg/TFMessage", transforms=[laser]), 0.0)
     scan = message(
         "sensor_msgs/msg/LaserScan",
         angle_min=0.0,
@@ -46,14 +46,14 @@ def test_a_scan_lies_where_laser_and_robot_are() -> None:
         ranges=np.array([2.0, 3.0, np.inf], np.float32),
     )
     scan.header.frame_id = "laser"
-    picture.take("/scan", scan, 0.0)
+    picture.update("/scan", scan, 0.0)
     assert picture.scan == pytest.approx(np.array([[12.25, 5.0, 0.5], [10.25, 8.0, 0.5]]))
 
 
 def test_the_way_behind_has_a_point_every_few_centimetres() -> None:
     picture = RobotPicture()
     for x in np.arange(0.0, 1.0, 0.01):
-        picture.take("/odom", odometry(x, 0.0), 0.0)
+        picture.update("/odom", odometry(x, 0.0), 0.0)
     steps = np.diff(np.array(picture.trail)[:, 0])
     assert steps.min() > 0.05
     assert steps.max() < 0.07
@@ -63,11 +63,11 @@ def test_low_state_counts_where_nothing_better_comes() -> None:
     picture = RobotPicture()
     low = message("quadvel_msgs/msg/LowState", q=np.full(12, 0.3, np.float32))
     low.orientation_wxyz = np.array([1.0, 0.0, 0.0, 0.0], np.float32)
-    picture.take("/low_state", low, 0.0)
+    picture.update("/low_state", low, 0.0)
     assert picture.q == pytest.approx(np.full(12, 0.3))
     joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=np.zeros(12))
-    picture.take("/joint_states", joints, 1.0)
-    picture.take("/low_state", low, 1.1)
+    picture.update("/joint_states", joints, 1.0)
+    picture.update("/low_state", low, 1.1)
     assert picture.q == pytest.approx(np.zeros(12))
 
 
@@ -76,9 +76,9 @@ def test_a_fault_is_the_first_lamp_and_a_silent_node_is_told() -> None:
     state = message("quadvel_msgs/msg/ControllerState", mode_name="fault", fault="tilted", reason="it fell")
     status = message("diagnostic_msgs/msg/DiagnosticStatus", name="estimator", message="estimating", level=0)
     other = message("diagnostic_msgs/msg/DiagnosticStatus", name="controller", message="fine", level=0)
-    picture.take("/diagnostics", message("diagnostic_msgs/msg/DiagnosticArray", status=[status]), 0.0)
-    picture.take("/diagnostics", message("diagnostic_msgs/msg/DiagnosticArray", status=[other]), 9.0)
-    picture.take("/controller/state", state, 9.0)
+    picture.update("/diagnostics", message("diagnostic_msgs/msg/DiagnosticArray", status=[status]), 0.0)
+    picture.update("/diagnostics", message("diagnostic_msgs/msg/DiagnosticArray", status=[other]), 9.0)
+    picture.update("/controller/state", state, 9.0)
     lamps = panel(picture, Operator(), 9.1)["lamps"]
     assert lamps[0] == {"name": "tilted", "level": "error", "text": "it fell"}
     assert {"name": "estimator", "level": "stale", "text": "no diagnostics for 3 s"} in lamps
@@ -87,14 +87,16 @@ def test_a_fault_is_the_first_lamp_and_a_silent_node_is_told() -> None:
 
 def test_feet_stand_on_the_ground_that_there_is() -> None:
     picture = RobotPicture()
-    assert picture.floor()[1] == pytest.approx(0.0, abs=1e-3)  # in the nominal posture at the nominal height
+    assert picture.ground_below_feet()[1] == pytest.approx(
+        0.0, abs=1e-3
+    )  # in the nominal posture at the nominal height
     corners = [(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0)]
     points = [message("geometry_msgs/msg/Point", x=x, y=y, z=0.1) for x, y in corners]
-    picture.take("/ground", message("visualization_msgs/msg/Marker", type=11, points=points), 0.0)
-    assert picture.floor()[1] == pytest.approx(-0.1, abs=1e-3)
-    picture.take("/ground", message("visualization_msgs/msg/Marker", type=11, action=2), 1.0)
+    picture.update("/ground", message("visualization_msgs/msg/Marker", type=11, points=points), 0.0)
+    assert picture.ground_below_feet()[1] == pytest.approx(-0.1, abs=1e-3)
+    picture.update("/ground", message("visualization_msgs/msg/Marker", type=11, action=2), 1.0)
     assert picture.ground is None
-    assert picture.floor()[1] == pytest.approx(0.0, abs=1e-3)
+    assert picture.ground_below_feet()[1] == pytest.approx(0.0, abs=1e-3)
 
 
 def test_the_ground_between_its_corners_is_the_plane_through_them() -> None:
@@ -116,8 +118,8 @@ def test_numbers_that_are_not_there_are_none_and_the_rest_is_shown() -> None:
         state.command.linear.x = state.command.linear.y = state.command.angular.z = NAN
         odom = odometry(0.0, 0.0, NAN)
         odom.twist.twist.linear.y = odom.twist.twist.angular.z = NAN
-        picture.take("/controller/state", state, 0.0)
-        picture.take("/odom", odom, 0.0)
+        picture.update("/controller/state", state, 0.0)
+        picture.update("/odom", odom, 0.0)
     assert readings["mode"] == "stand_up"
     assert readings["loop"] == {"rate": None, "period": None, "compute": None, "missed": 0}
 
@@ -126,8 +128,8 @@ def test_readings_of_a_silent_robot_are_not_there() -> None:
     picture = RobotPicture()
     joints = message("sensor_msgs/msg/JointState", name=list(robot.JOINT_NAMES), position=np.zeros(12))
     joints.effort = np.ones(12)
-    picture.take("/joint_states", joints, 0.0)
-    picture.take("/odom", odometry(0.0, 0.0), 0.0)
+    picture.update("/joint_states", joints, 0.0)
+    picture.update("/odom", odometry(0.0, 0.0), 0.0)
     assert None not in panel(picture, Operator(), 0.1)["measured"] + panel(picture, Operator(), 0.1)["torque"]
     late = panel(picture, Operator(), 5.0)
     assert late["measured"] == [None] * 3
@@ -138,7 +140,7 @@ def test_readings_of_a_silent_robot_are_not_there() -> None:
 def _cyclic(picture: RobotPicture) -> None:
     loop = [message("geometry_msgs/msg/TransformStamped", child_frame_id=name) for name in ("a", "b")]
     loop[0].header.frame_id, loop[1].header.frame_id = "b", "a"
-    picture.read("/tf_static", lambda: message("tf2_msgs/msg/TFMessage", transforms=loop), 0.0)
+    picture.update_lazily("/tf_static", lambda: message("tf2_msgs/msg/TFMessage", transforms=loop), 0.0)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +159,7 @@ def _cyclic(picture: RobotPicture) -> None:
 )  # fmt: skip
 def test_a_message_that_makes_no_sense_is_refused_and_told(topic: str, make: Callable[[str], Any]) -> None:
     picture = RobotPicture()
-    picture.read(topic, lambda: make(TOPICS[topic]), 0.0)
+    picture.update_lazily(topic, lambda: make(TOPICS[topic]), 0.0)
     lamps = panel(picture, Operator(), 0.0)["lamps"]
     assert [lamp["name"] for lamp in lamps] == [topic]
     assert np.isfinite(picture.position).all()
@@ -175,7 +177,7 @@ def test_frames_that_go_round_in_circles_do_not_keep_the_page() -> None:
     _cyclic(picture)
     scan = message("sensor_msgs/msg/LaserScan", ranges=np.ones(3, np.float32), range_max=9.0)
     scan.header.frame_id = "a"
-    picture.read("/scan", lambda: scan, 0.0)
+    picture.update_lazily("/scan", lambda: scan, 0.0)
     assert picture.scan.shape == (3, 3)
 
 
@@ -184,36 +186,36 @@ def test_the_way_behind_ends_where_odometry_starts_again() -> None:
     for x in np.arange(0.0, 0.9, 0.06):
         odom = odometry(x, 0.0)
         odom.pose.covariance = np.full(36, (0.1 * x) ** 2)
-        picture.take("/odom", odom, 0.0)
+        picture.update("/odom", odom, 0.0)
     assert len(picture.trail) > 10
-    picture.take("/odom", odometry(0.0, 0.0), 0.1)
+    picture.update("/odom", odometry(0.0, 0.0), 0.1)
     assert len(picture.trail) == 1
-    picture.take("/odom", odometry(5.0, 0.0), 0.2)  # nobody walked there
+    picture.update("/odom", odometry(5.0, 0.0), 0.2)  # nobody walked there
     assert len(picture.trail) == 1
 
 
 def test_commands_that_come_late_and_a_pad_that_is_not_followed_are_told() -> None:
     picture, operator = RobotPicture(), Operator()
-    picture.take("/command", message("quadvel_msgs/msg/VelocityCommand", source="planner"), 0.0)
+    picture.update("/command", message("quadvel_msgs/msg/VelocityCommand", source="planner"), 0.0)
     operator.hold(1, (0.5, 0.0, 0.0), 0.0)
     assert panel(picture, operator, 0.1)["notices"] == []
     operator.hold(1, (0.5, 0.0, 0.0), 0.35)
     late, ignored = panel(picture, operator, 0.6)["notices"]
     assert "0.3 s apart" in late or "0.4 s apart" in late
     assert "'planner'" in ignored
-    operator.let_go(1, 0.65)
+    operator.end_hold(1, 0.65)
     assert panel(picture, operator, 0.9)["notices"] == [late]
     operator.hold(1, (0.5, 0.0, 0.0), 60.0)  # a new press is not late
     assert not any("apart" in notice for notice in panel(picture, operator, 60.1)["notices"])
-    operator.let_go(1, 60.1)
+    operator.end_hold(1, 60.1)
 
 
 def test_a_stopped_robot_says_why_it_does_not_move() -> None:
     picture, operator = RobotPicture(), Operator()
     operator.stop()
     for mode, reason in (
-        ("walk", "STOP was pressed; the robot does not brake yet"),
-        ("passive", "STOP was pressed"),
+        ("walk", "STOP is latched; the joints are not damped yet"),
+        ("passive", "STOP is latched"),
     ):
-        picture.take("/controller/state", message(STATE, mode_name=mode, reason="was asked for"), 0.0)
+        picture.update("/controller/state", message(STATE, mode_name=mode, reason="was asked for"), 0.0)
         assert panel(picture, operator, 0.1)["reason"] == reason

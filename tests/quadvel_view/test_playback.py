@@ -9,7 +9,7 @@ from mcap.writer import Writer
 
 from quadvel_recordings.reading import RecordingError
 from quadvel_view.playback import Playback
-from quadvel_view.replay import heed
+from quadvel_view.replay import execute
 from quadvel_view.words import Pace, Seek, Stop
 
 from .conftest import SECONDS, SPEED
@@ -52,13 +52,13 @@ def test_the_slider_and_the_pace_are_held_to_what_there_is_and_a_robot_is_not_co
     walked: Path,
 ) -> None:
     film = Playback(walked)
-    heed(film, Stop())
+    execute(film, Stop())
     assert (film.time, film.pace, film.playing) == (0.0, 1.0, True)
-    heed(film, Seek(99.0))
+    execute(film, Seek(99.0))
     assert film.time == film.length
-    heed(film, Seek(-1e300))
+    execute(film, Seek(-1e300))
     assert film.time == 0.0
-    heed(film, Pace(1e300))
+    execute(film, Pace(1e300))
     assert film.pace == 4.0
 
 
@@ -68,5 +68,5 @@ def test_a_recording_without_a_robot_is_refused(tmp_path: Path) -> None:
         writer = Writer(file)
         writer.start(profile="ros2")
         writer.finish()
-    with pytest.raises(RecordingError, match="no robot in it"):
+    with pytest.raises(RecordingError, match="not a recording of a robot"):
         Playback(path)

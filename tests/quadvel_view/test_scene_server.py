@@ -19,7 +19,7 @@ from websockets.asyncio.client import unix_connect
 from websockets.typing import Subprotocol
 
 from quadvel_view.guard import is_loopback
-from quadvel_view.scene_server import SceneServer, SceneServerError, page
+from quadvel_view.scene_server import SceneServer, SceneServerError, client_page
 from quadvel_view.server import AddressError
 from quadvel_view.viewer import Viewer
 
@@ -83,7 +83,7 @@ def test_a_viser_that_opens_a_port_of_its_own_draws_nothing(monkeypatch: pytest.
             super().stop()
 
     monkeypatch.setattr(viser.infra, "WebsockServer", Other)
-    with pytest.raises(SceneServerError, match=r"opens a port of its own"):
+    with pytest.raises(SceneServerError, match=r"opens a TCP port"):
         SceneServer()
     assert ports
     assert websockets_server.serve is by_another_way
@@ -101,7 +101,7 @@ def test_a_folder_for_temporary_files_whose_name_is_too_long_for_a_socket_is_nam
 
 
 def test_the_page_of_viser_is_one_file() -> None:
-    assert b"</head>" in page()
+    assert b"</head>" in client_page()
 
 
 def test_what_is_this_host() -> None:

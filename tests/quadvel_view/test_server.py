@@ -17,8 +17,8 @@ from websockets.exceptions import ConnectionClosed, ConnectionClosedError, Inval
 from websockets.frames import CloseCode
 from websockets.sync.client import connect
 
-from quadvel_view.server import LOG, MOST_FRAGMENTS, MOST_SOCKETS, AddressError, PageServer
-from quadvel_view.words import LARGEST_WORD, LetGo, Stop
+from quadvel_view.server import LOG, MAX_FRAGMENTS, MAX_SOCKETS, AddressError, PageServer
+from quadvel_view.words import MAX_MESSAGE_BYTES, LetGo, Stop
 
 NOWHERE = Path("/nowhere")
 TEXT, CONTINUED, END, MASKED = 1, 0, 0x80, 0x80  # of RFC 6455, 5.2
@@ -72,7 +72,7 @@ def test_on_this_host_the_page_comes_without_a_token(here: PageServer) -> None:
 def test_a_name_that_somebody_else_lets_point_here_is_refused(here: PageServer, host: str) -> None:
     status, _, body = get(here, "/", Host=host)
     assert status == 403
-    assert b"for this host alone" in body
+    assert b"this computer only" in body
 
 
 @pytest.mark.parametrize("origin", [None, "https://example.com", "http://127.0.0.1:1"])
@@ -95,7 +95,7 @@ def test_our_own_page_may(here: PageServer, heard: list[Any]) -> None:
 def test_many_pages_are_refused_and_those_that_are_open_go_on(here: PageServer, heard: list[Any]) -> None:
     ours = f"http://127.0.0.1:{urlsplit(here.url).port}"
     with ExitStack() as open_pages:
-        pages = [open_pages.enter_context(socket(here, ours)) for _ in range(MOST_SOCKETS)]
+        pages = [open_pages.enter_context(socket(here, ours)) for _ in range(MAX_SOCKETS)]
         with pytest.raises(InvalidStatus, match="503"):
             socket(here, ours)
         pages[0].send('{"do":"stop"}')
@@ -132,8 +132,8 @@ def frame(opcode: int, data: bytes, length: int | None = None, last: bool = Fals
     "frames",
     [
         frame(TEXT, b"", length=400_000_000, last=True),
-        frame(TEXT, b"x" * 1000) + frame(CONTINUED, b"x" * 1000) * (LARGEST_WORD // 1000),
-        frame(TEXT, b"") + frame(CONTINUED, b"") * MOST_FRAGMENTS,
+        frame(TEXT, b"x" * 1000) + frame(CONTINUED, b"x" * 1000) * (MAX_MESSAGE_BYTES // 1000),
+        frame(TEXT, b"") + frame(CONTINUED, b"") * MAX_FRAGMENTS,
         frame(TEXT, b"x" * 4000) + frame(CONTINUED, b"", length=2**62),
     ],
     ids=["whole", "in fragments", "in empty fragments", "in a huge last fragment"],
@@ -169,7 +169,7 @@ def test_elsewhere_only_the_token_lets_in(everywhere: PageServer) -> None:
 def test_a_port_that_is_taken_is_told_in_one_sentence(here: PageServer) -> None:
     port = urlsplit(here.url).port
     assert port is not None
-    with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: the page can't be served there"):
+    with pytest.raises(AddressError, match=rf"127.0.0.1:{port}: cannot serve the page"):
         PageServer("127.0.0.1", port, NOWHERE, lambda page, word: None, lambda page: None)
 
 

@@ -18,7 +18,15 @@ from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
-from quadvel_view.words import LARGEST_WORD, Hold, ModeRequest, Reset, Seek, WordError, read_word
+from quadvel_view.words import (
+    MAX_MESSAGE_BYTES,
+    Hold,
+    ModeRequest,
+    PageMessageError,
+    Reset,
+    Seek,
+    parse_message,
+)
 
 DIGITS_400 = "1" * 400
 SURROGATE = r"\ud800"
@@ -70,21 +78,21 @@ words = near_words | values.map(json.dumps) | st.text(max_size=40) | st.binary(m
         '"stop"',
         b"\xff\xfe",
         "\ud800",
-        '{"do":"stop"}' + " " * LARGEST_WORD,
+        '{"do":"stop"}' + " " * MAX_MESSAGE_BYTES,
     ],
 )
 def test_what_the_schema_does_not_know_is_refused(text: str | bytes) -> None:
-    with pytest.raises(WordError) as refused:
-        read_word(text)
+    with pytest.raises(PageMessageError) as refused:
+        parse_message(text)
     assert str(refused.value).isascii()
     assert len(str(refused.value)) <= 123  # bytes of a WebSocket's reason
 
 
 def test_what_the_page_says_is_understood() -> None:
-    assert read_word('{"do":"hold","velocity":[1,-0.5,0]}') == Hold((1.0, -0.5, 0.0))
-    assert read_word('{"do":"reset"}') == Reset("")
-    assert read_word('{"do":"seek","time":3}') == Seek(3.0)
-    modes = [read_word(json.dumps({"do": name})) for name in ("passive", "stand_up", "lie_down")]
+    assert parse_message('{"do":"hold","velocity":[1,-0.5,0]}') == Hold((1.0, -0.5, 0.0))
+    assert parse_message('{"do":"reset"}') == Reset("")
+    assert parse_message('{"do":"seek","time":3}') == Seek(3.0)
+    modes = [parse_message(json.dumps({"do": name})) for name in ("passive", "stand_up", "lie_down")]
     assert [word.mode for word in modes if isinstance(word, ModeRequest)] == [
         "passive",
         "stand_up",
@@ -95,8 +103,8 @@ def test_what_the_page_says_is_understood() -> None:
 @given(words)
 def test_any_text_is_a_word_or_refused(text: str | bytes) -> None:
     try:
-        word = read_word(text)
-    except WordError:
+        word = parse_message(text)
+    except PageMessageError:
         return
     if isinstance(word, Hold):
         assert all(abs(value) < float("inf") for value in word.velocity)
@@ -128,8 +136,8 @@ class Node:
         except UnicodeEncodeError:  # no WebSocket can carry it
             return
         try:
-            read_word(word)
-        except WordError:
+            parse_message(word)
+        except PageMessageError:
             with pytest.raises(ConnectionClosed, match="not understood"):
                 _hear_to_the_end(self._page)
             self._page = None

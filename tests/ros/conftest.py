@@ -121,8 +121,8 @@ class Ros:
         """Start one of our nodes; `arguments` are those after --ros-args."""
         ros_arguments = ["--ros-args", *arguments] if arguments else []
         if not embedded:
-            return self.start("ros2", "run", nodes.entry(name).package, name, *ros_arguments)
-        self.processes.append(Process(nodes.command(name, ros_arguments), self._embedded))
+            return self.start("ros2", "run", nodes.node_entry(name).package, name, *ros_arguments)
+        self.processes.append(Process(nodes.process_command(name, ros_arguments), self._embedded))
         return self.processes[-1]
 
     def program(self, package: str, name: str, *arguments: str) -> Process:

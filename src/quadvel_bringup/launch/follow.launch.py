@@ -1,4 +1,4 @@
-"""Beside robot.launch.py: finds persons in the scans of a 2-D laser and follows the one who is meant.
+"""Launch person tracker and follow planner next to robot.launch.py.
 
 ros2 launch quadvel_bringup follow.launch.py params:=my.yaml
 """
@@ -19,12 +19,17 @@ ARGUMENTS = [
         "use_sim_time",
         default_value="false",
         choices=["true", "false"],
-        description="true: by the simulator's clock, as robot.launch.py with it; false: in real time",
+        description="true: simulated time, as robot.launch.py with it; false: real time",
     ),
 ]
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return person tracker and follow planner.
+
+    Returns:
+        The launch description.
+    """
     sim_time = ParameterValue(LaunchConfiguration("use_sim_time"), value_type=bool)
     nodes = [
         Node(

@@ -1,4 +1,4 @@
-"""The whole robot under ROS 2: what serves low_state and low_cmd, estimator, controller, command mux.
+"""Launch a robot under ROS 2: low-level interface, estimator, controller and command mux.
 
 ros2 launch quadvel_bringup robot.launch.py terrain:=rough
 ros2 launch quadvel_bringup robot.launch.py low_level:=aliengo
@@ -31,7 +31,7 @@ ARGUMENTS = [
         "world", default_value="", description="corridor, park, campus or a file; empty: none"
     ),
     DeclareLaunchArgument("params", default_value=str(PARAMETERS), description="YAML file of parameters"),
-    DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="show it"),
+    DeclareLaunchArgument("rviz", default_value="false", choices=["true", "false"], description="start RViz"),
     DeclareLaunchArgument(
         "use_sim_time",
         default_value="false",
@@ -43,6 +43,14 @@ NAMES = [argument.name for argument in ARGUMENTS]
 
 
 def start(context: LaunchContext) -> list[Action]:
+    """Return the nodes for the chosen arguments.
+
+    Args:
+        context: The launch context with the arguments.
+
+    Returns:
+        Nodes of the robot, and RViz if chosen.
+    """
     chosen = {name: LaunchConfiguration(name).perform(context) for name in NAMES}
     stack = Stack(
         low_level=chosen["low_level"],
@@ -71,4 +79,9 @@ def start(context: LaunchContext) -> list[Action]:
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Return the nodes of a robot.
+
+    Returns:
+        The launch description.
+    """
     return LaunchDescription([*ARGUMENTS, OpaqueFunction(function=start)])

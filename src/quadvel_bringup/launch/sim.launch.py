@@ -1,4 +1,4 @@
-"""robot.launch.py under the name that it had before, with the same arguments."""
+"""The former name of robot.launch.py, with the same arguments."""
 
 from pathlib import Path
 
@@ -10,4 +10,9 @@ ROBOT = Path(__file__).with_name("robot.launch.py")
 
 
 def generate_launch_description() -> LaunchDescription:
+    """Include robot.launch.py.
+
+    Returns:
+        The launch description.
+    """
     return LaunchDescription([IncludeLaunchDescription(PythonLaunchDescriptionSource(str(ROBOT)))])

@@ -1,1 +1,1 @@
-"""Start the nodes together: launch files, parameters and the `quadvel` command line."""
+"""Launch files, parameters, and the command line `quadvel`."""

@@ -1,4 +1,4 @@
-"""The command line `quadvel`. A command imports what it needs when it runs: --help answers at once."""
+"""Commands of `quadvel`. They import their modules when they run, so that --help is fast."""
 
 from __future__ import annotations
 
@@ -10,28 +10,27 @@ from typing import Annotated, Any, Literal
 
 import attrs
 import typer
+from typer.core import TyperGroup
 
 from .nodes import NODES
 from .stack import PARAMETERS, Stack
 
-# A line with only \b keeps the lines that follow it as they are, up to the next empty one.
-EXAMPLES = """
-A quadruped that follows velocity commands: in simulation, and as ROS 2 nodes.
+ROBOT, SIMULATOR, LOGS, EVALUATION, EXPERIMENTS = PANELS = (
+    "Robot",
+    "Simulator",
+    "Logs",
+    "Evaluation",
+    "Experiments",
+)
+"""Panels of the help, in order."""
+EXAMPLES = """\
+Usage: quadvel COMMAND [ARGS]...   For example:
+  quadvel demo               walk a simulated robot; results in out/demo
+  quadvel up --view          run the simulated robot with the operator page
+  quadvel drive --vx 0.5     drive it, from another terminal"""
+OPTIONS = "Options: --version, --help, --install-completion, --show-completion"
 
-\b
-Try, one after the other:
-  quadvel doctor              what this machine can run
-  quadvel demo                walk in all directions; results in out/demo
-  quadvel up                  the same robot, waiting for your commands
-  quadvel drive --vx 0.5      one of them, from another terminal
-  quadvel status              how the robot does
-  quadvel eval --grid quick --out out/eval
-
-\b
-Where ROS 2 is sourced, the nodes talk to it:
-  ros2 topic pub -r 20 /cmd_vel geometry_msgs/msg/Twist "{linear: {x: 0.5}}"
-"""
-
+# In help texts, \b on a line keeps the format of the lines up to the next empty one.
 NODE_LIST = "\n".join(f"  {name:18} {entry.about}" for name, entry in NODES.items())
 RUN_HELP = f"""
 Run one node in this process.
@@ -41,82 +40,135 @@ Nodes:
 {NODE_LIST}
 
 \b
-What follows are arguments of ROS 2:
+Further arguments are those of ROS 2:
   quadvel run sim_node --ros-args -p terrain:=rough
   quadvel run controller --ros-args -p policy:=my.onnx -r cmd_vel:=/joy/cmd_vel
 """
 
+
+class _PanelGroup(TyperGroup):
+    """Prints the help on one screen of 80 x 40: examples, then the commands in panels."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Write the help.
+
+        Args:
+            ctx: The context of the command line.
+            formatter: Receives the text.
+        """
+        lines = [EXAMPLES]
+        for panel in PANELS:
+            lines.append(typer.style(panel, bold=True))
+            for name, command in self.commands.items():
+                if getattr(command, "rich_help_panel", None) == panel:
+                    lines.append(f"  {name:11} {command.get_short_help_str(66)}")
+        formatter.write("\n".join([*lines, OPTIONS, ""]))
+
+
 PLAIN: Any = {"add_completion": False, "rich_markup_mode": None, "pretty_exceptions_enable": False}
-app = typer.Typer(no_args_is_help=True, **{**PLAIN, "add_completion": True})
-# Commands whose arguments belong to somebody else: handed on as they are, --help too.
-HANDED_ON = {"allow_extra_args": True, "ignore_unknown_options": True}
+app = typer.Typer(no_args_is_help=True, cls=_PanelGroup, **{**PLAIN, "add_completion": True})
+PASS_THROUGH = {"allow_extra_args": True, "ignore_unknown_options": True}
+"""Settings of commands that pass all arguments on, including --help."""
 
 
 @attrs.frozen
-class Elsewhere:
-    """A command of another module. where: "module:member", a function or a typer application; about: its line in the help."""
+class DelegatedCommand:
+    """A command of another module.
 
-    where: str
+    Attributes:
+        target: "module:member", a function or a typer application.
+        panel: Its panel in the help.
+        about: Its line in the help.
+    """
+
+    target: str
+    panel: str
     about: str
 
 
-ELSEWHERE = {
-    "demo": Elsewhere(
+DELEGATED_COMMANDS = {
+    "demo": DelegatedCommand(
         "quadvel_bringup.demo:demo_command",
-        "Walk a simulated robot through all directions, in real time, through the nodes.",
+        SIMULATOR,
+        "Walk a simulated robot in all directions, or after a person.",
     ),
-    "excite": Elsewhere(
-        "quadvel_bringup.excite:excite_command",
-        "Move the joints so that they show what they are, and record it for `quadvel identify`.",
+    "world": DelegatedCommand(
+        "quadvel_eval.world_map:world_command",
+        SIMULATOR,
+        "Check the file of a world, and draw a map of it.",
     ),
-    "identify": Elsewhere("quadvel_sysid.cli:app", "Find what the actuator model lacks, from measured logs."),
-    "calibrate": Elsewhere(
-        "quadvel_bringup.calibrate:calibrate_command",
-        "Find what the encoders and the IMU of a robot show at zero.",
-    ),
-    "twin": Elsewhere(
-        "quadvel_bringup.ground_truth_benchmark:twin_command",
-        "Close the loop on the stack itself: plants that its model does not know, identified from their walks.",
-    ),
-    "eval": Elsewhere(
-        "quadvel_eval.cli:eval_command",
-        "Measure how well a policy tracks a grid of commands, faster than real time.",
-    ),
-    "compare": Elsewhere("quadvel_eval.cli:compare_command", "Show two evaluations side by side."),
-    "faults": Elsewhere(
-        "quadvel_eval.cli:faults_command",
-        "Let things go wrong in a simulated robot, and measure what it does.",
-    ),
-    "paper": Elsewhere(
-        "quadvel_eval.paper.cli:paper_command",
-        "Measure what the paper's figures show: a page, pictures, tables.",
-    ),
-    "people": Elsewhere(
-        "quadvel_eval.people.cli:people_command",
-        "Measure how well persons are found and tracked in laser scans, real and simulated.",
-    ),
-    "world": Elsewhere(
-        "quadvel_eval.world_map:world_command", "Check a world's file, and draw the world from above."
-    ),
-    "following": Elsewhere(
-        "quadvel_eval.following.cli:following_command",
-        "Measure how well a person is followed, in simulated scenes in the plane.",
-    ),
-    "plot": Elsewhere(
+    "plot": DelegatedCommand(
         "quadvel_eval.recording_plot:plot_command",
-        "Draw what was recorded of a run: velocity, joints, torques, the controller's loop.",
+        LOGS,
+        "Plot velocity, joints, torques and loop timing of a recording.",
     ),
-    "replay": Elsewhere(
+    "replay": DelegatedCommand(
         "quadvel_eval.offline:replay_command",
-        "Ask the actuator model and the estimator offline what they say of a recording.",
+        LOGS,
+        "Run actuator model and estimator offline on a recording.",
     ),
-    "bench": Elsewhere(
-        "quadvel_eval.cli:bench_command", "Measure the speed of simulator, policy and loop on this machine."
+    "excite": DelegatedCommand(
+        "quadvel_bringup.excite:excite_command",
+        LOGS,
+        "Run an excitation motion and record it for identification.",
+    ),
+    "identify": DelegatedCommand(
+        "quadvel_sysid.cli:app",
+        LOGS,
+        "Identify what the actuator model lacks, from measured logs.",
+    ),
+    "calibrate": DelegatedCommand(
+        "quadvel_bringup.calibrate:calibrate_command",
+        LOGS,
+        "Estimate the zero offsets of encoders and IMU.",
+    ),
+    "eval": DelegatedCommand(
+        "quadvel_eval.cli:eval_command",
+        EVALUATION,
+        "Measure velocity tracking of a policy on a command grid.",
+    ),
+    "compare": DelegatedCommand(
+        "quadvel_eval.cli:compare_command",
+        EVALUATION,
+        "Compare two evaluations.",
+    ),
+    "faults": DelegatedCommand(
+        "quadvel_eval.cli:faults_command",
+        EVALUATION,
+        "Inject faults into a simulated robot and measure the reaction.",
+    ),
+    "people": DelegatedCommand(
+        "quadvel_eval.people.cli:people_command",
+        EVALUATION,
+        "Measure detection and tracking of people in laser scans.",
+    ),
+    "following": DelegatedCommand(
+        "quadvel_eval.following.cli:following_command",
+        EVALUATION,
+        "Measure person following in simulated planar scenes.",
+    ),
+    "bench": DelegatedCommand(
+        "quadvel_eval.cli:bench_command",
+        EVALUATION,
+        "Measure the speed of simulator, policy and control loop.",
+    ),
+    "paper": DelegatedCommand(
+        "quadvel_eval.paper.cli:paper_command",
+        EXPERIMENTS,
+        "Reproduce the figures of the paper: page, plots, tables.",
+    ),
+    "twin": DelegatedCommand(
+        "quadvel_bringup.ground_truth_benchmark:twin_command",
+        EXPERIMENTS,
+        "Benchmark the identification on plants with hidden effects.",
     ),
 }
 
-# Commands that Ctrl-C ends as it should, with exit code 0: they allow it themselves, where they are ready for it.
-ENDED_BY_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
+RUN_UNTIL_CTRL_C = ("run", "up", "drive", "record", "view", "teleop")
+"""Commands that Ctrl-C ends with exit code 0.
+
+They unblock SIGINT themselves when they are ready for it.
+"""
 
 
 def _version(asked: bool) -> None:
@@ -127,20 +179,26 @@ def _version(asked: bool) -> None:
         raise typer.Exit
 
 
-@app.callback(help=EXAMPLES)
+@app.callback()
 def begin(
     context: typer.Context,
     version: Annotated[
         bool, typer.Option("--version", help="Show the version and exit.", callback=_version, is_eager=True)
     ] = False,
 ) -> None:
-    if context.invoked_subcommand not in ENDED_BY_CTRL_C:
+    """Learned velocity control of a quadruped: in simulation, on the robot, and as ROS 2 nodes."""
+    if context.invoked_subcommand not in RUN_UNTIL_CTRL_C:
         signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def doctor() -> None:
-    """Say what this machine has and what it can run."""
+    """Check what is installed on this machine and what it can run.
+
+    \b
+    For example:
+      quadvel doctor
+    """
     from .doctor import abilities, examine
 
     findings = []
@@ -151,7 +209,7 @@ def doctor() -> None:
         print(f"{'can' if possible else 'cannot'} run {ability}")
 
 
-@app.command(help=RUN_HELP, context_settings=HANDED_ON)
+@app.command(help=RUN_HELP, context_settings=PASS_THROUGH, rich_help_panel=ROBOT)
 def run(
     context: typer.Context,
     node: Annotated[str, typer.Argument()],
@@ -160,6 +218,7 @@ def run(
         typer.Option(metavar="<file>", help="sim_node: its actuator.yaml.", show_default="the shipped one"),
     ] = None,
 ) -> None:
+    """Run one node in this process; the help is RUN_HELP."""
     from . import nodes
 
     arguments = [*context.args]
@@ -169,12 +228,12 @@ def run(
     nodes.run(node, arguments)
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def up(
     low_level: Annotated[
         Literal["sim", "board", "aliengo", "external"],
         typer.Option(
-            help="The robot: simulated; simulated behind the AlienGo's UDP interface; the AlienGo; or others serve it."
+            help="simulator; simulator behind the AlienGo's UDP interface; the AlienGo; or a robot served elsewhere."
         ),
     ] = "sim",
     policy: Annotated[
@@ -188,7 +247,7 @@ def up(
         str | None,
         typer.Option(
             metavar="<name|file>",
-            help="Simulated robot: what is around it, corridor, park, campus or a file.",
+            help="Simulated robot: its surroundings, corridor, park, campus or a file.",
             show_default="nothing",
         ),
     ] = None,
@@ -205,9 +264,11 @@ def up(
         Path,
         typer.Option(metavar="<file>", help="YAML file with the nodes' parameters.", show_default="shipped"),
     ] = PARAMETERS,
-    view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Serve the operator page in the browser.")] = False,
 ) -> None:
-    """Start robot, estimator, controller and command mux, each as a process; Ctrl-C stops them.
+    """Start a robot: simulated, the AlienGo, or a running one.
+
+    Low-level interface, estimator, controller and command mux run as processes; Ctrl-C stops them.
 
     \b
     Then, from another terminal:
@@ -229,7 +290,7 @@ def up(
     raise typer.Exit(run_up(stack, view))
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def view(
     recording: Annotated[
         Path | None,
@@ -239,7 +300,7 @@ def view(
         str,
         typer.Option(
             metavar="<address>",
-            help="Address to listen on; others than this host's own need the token that is shown.",
+            help="Address to listen on; other than loopback ones require the printed token.",
         ),
     ] = "127.0.0.1",
     port: Annotated[
@@ -249,9 +310,9 @@ def view(
         bool, typer.Option("--foxglove", help="Serve the topics to Foxglove or Lichtblick instead of a page.")
     ] = False,
 ) -> None:
-    """Show the robot in the browser, in 3-D, with all that its operator needs; or play a recording of it.
+    """Serve the operator page in the browser, or play a recording.
 
-    It prints the address to open. What it needs, pip brings with quadvel[view].
+    It prints the address to open. It requires the extra quadvel[view].
 
     \b
     For example:
@@ -263,19 +324,20 @@ def view(
     run_view(recording, host, port, foxglove)
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def drive(
     vx: Annotated[float, typer.Option(help="Forward, m/s.")] = 0.0,
     vy: Annotated[float, typer.Option(help="To the left, m/s.")] = 0.0,
-    wz: Annotated[float, typer.Option(help="Turn to the left, rad/s.")] = 0.0,
-    seconds: Annotated[float, typer.Option(min=0.1, help="For how long.")] = 3.0,
+    wz: Annotated[float, typer.Option(help="Turn rate to the left, rad/s.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="Duration, s.")] = 3.0,
     topic: Annotated[
-        str, typer.Option(metavar="<topic>", help="An input of the command mux.")
+        str, typer.Option(metavar="<topic>", help="Input topic of the command mux.")
     ] = "cmd_vel_teleop",
 ) -> None:
-    """Drive the robot that `quadvel up` started: one velocity for some seconds, then stop; says what came of it.
+    """Command one velocity for some seconds, then stop.
 
-    Exit code 1 where the robot did not follow, 2 where nobody listens.
+    It prints the measured velocity. Exit code 1 if the robot did not follow, 2 if no robot is
+    running.
 
     \b
     For example:
@@ -284,11 +346,13 @@ def drive(
     raise typer.Exit(_with_middleware("drive").drive(vx, vy, wz, seconds, topic))
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def teleop(
-    by: Annotated[Literal["keyboard", "gamepad"], typer.Argument(help="What the hands are on.")] = "keyboard",
+    by: Annotated[Literal["keyboard", "gamepad"], typer.Argument(help="Input device.")] = "keyboard",
 ) -> None:
-    """Drive the robot by the keys of this terminal, or by a gamepad: it goes while something is held, and stands once it is let go.
+    """Drive the robot by keyboard or gamepad.
+
+    The robot moves while a key is held, and stops on release.
 
     \b
     For example:
@@ -296,85 +360,106 @@ def teleop(
       quadvel teleop gamepad
     """
     module = _with_middleware("teleop")
-    raise typer.Exit(module.by_keyboard() if by == "keyboard" else module.by_gamepad())
+    raise typer.Exit(module.drive_by_keyboard() if by == "keyboard" else module.drive_by_gamepad())
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def mode(
     wanted: Annotated[
         Literal["passive", "stand_up", "stance", "walk", "lie_down"], typer.Argument(metavar="mode")
     ],
 ) -> None:
-    """Ask the controller for a mode: passive, stand_up, stance, walk or lie_down.
+    """Request a mode: passive, stand_up, stance, walk or lie_down.
 
-    passive damps the joints, and is the way out of a fault.
+    passive damps the joints and resets a fault.
 
     \b
-    In fault, once its cause is gone:
+    Recover from a fault, once its cause is gone:
       quadvel mode passive
       quadvel mode stand_up
     """
     raise typer.Exit(_with_middleware("operator_commands").mode(wanted))
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def enable(
-    on: Annotated[bool, typer.Option("--on/--off", help="Allow walking, or forbid it.")] = True,
+    on: Annotated[bool, typer.Option("--on/--off", help="Permit or forbid walking.")] = True,
 ) -> None:
-    """Allow a robot that asks for it to walk; a simulated one needs no permission."""
+    """Permit or forbid walking.
+
+    Real robots require the permission; a simulated one does not.
+    """
     raise typer.Exit(_with_middleware("operator_commands").enable(on))
 
 
-@app.command()
+@app.command(rich_help_panel=ROBOT)
 def status() -> None:
-    """Show the robot that runs on one page: nodes, mode, velocity, rates, files, temperatures."""
+    """Show nodes, mode, velocity, rates and files of the robot.
+
+    Exit code 1 if no robot runs, or its controller is in fault.
+
+    \b
+    For example:
+      quadvel status
+    """
     raise typer.Exit(_with_middleware("status").status())
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def reset(
-    keyframe: Annotated[Literal["lie", "stand"], typer.Option(help="Its posture.")] = "lie",
+    keyframe: Annotated[Literal["lie", "stand"], typer.Option(help="Initial posture.")] = "lie",
     terrain: Annotated[
         Literal["flat", "slope", "rough"] | None,
-        typer.Option(help="Ground to start on.", show_default="the ground that is there"),
+        typer.Option(help="New ground.", show_default="the present ground"),
     ] = None,
     slope: Annotated[float, typer.Option(help="With slope or rough: inclination, rad.")] = 0.0,
 ) -> None:
-    """Put the simulated robot back to where it started, or on other ground.
+    """Reset the simulated robot to its start, or onto other ground.
 
     \b
-    After a fall, or from any mode:
+    After a fall, from any mode:
       quadvel reset
       quadvel mode stand_up
-    On a slope of 10 degrees that rises ahead:
+    Onto a slope of 10 degrees that rises ahead:
       quadvel reset --terrain slope --slope 0.175
     """
     raise typer.Exit(_with_middleware("operator_commands").reset(keyframe, terrain or "", slope))
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def pause(
-    on: Annotated[bool, typer.Option("--on/--off", help="Stand still, or go on.")] = True,
+    on: Annotated[bool, typer.Option("--on/--off", help="Pause or resume.")] = True,
 ) -> None:
-    """Let simulated time stand still, or go on with --off."""
+    """Pause simulated time, or resume it with --off.
+
+    \b
+    For example:
+      quadvel pause
+      quadvel pause --off
+    """
     raise typer.Exit(_with_middleware("operator_commands").pause(on))
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def step(milliseconds: Annotated[int, typer.Argument(min=1)] = 5) -> None:
-    """Let a paused simulation run on for some milliseconds."""
+    """Advance a paused simulation by some milliseconds.
+
+    \b
+    For example:
+      quadvel step 20
+    """
     raise typer.Exit(_with_middleware("operator_commands").step(milliseconds))
 
 
-@app.command()
+@app.command(rich_help_panel=SIMULATOR)
 def push(
-    fx: Annotated[float, typer.Option(help="Force to the front of the world, N.")] = 0.0,
-    fy: Annotated[float, typer.Option(help="Force to its left, N.")] = 0.0,
-    fz: Annotated[float, typer.Option(help="Force upwards, N.")] = 0.0,
-    seconds: Annotated[float, typer.Option(min=0.001, help="For how long.")] = 0.2,
-    body: Annotated[str, typer.Option(metavar="<name>", help="Which body of the robot.")] = "trunk",
+    fx: Annotated[float, typer.Option(help="Force along x of the world frame, N.")] = 0.0,
+    fy: Annotated[float, typer.Option(help="Force along y, N.")] = 0.0,
+    fz: Annotated[float, typer.Option(help="Force along z, N.")] = 0.0,
+    seconds: Annotated[float, typer.Option(min=0.001, help="Duration, s.")] = 0.2,
+    body: Annotated[str, typer.Option(metavar="<name>", help="Body of the robot.")] = "trunk",
 ) -> None:
-    """Push the simulated robot.
+    """Apply a force to the simulated robot.
 
     \b
     For example:
@@ -383,27 +468,28 @@ def push(
     raise typer.Exit(_with_middleware("operator_commands").push((fx, fy, fz), seconds, body))
 
 
-@app.command()
+@app.command(rich_help_panel=LOGS)
 def record(
     topics: Annotated[list[str] | None, typer.Argument(help="Topics to record.", show_default="all")] = None,
     out: Annotated[
         Path | None,
         typer.Option(
             metavar="<file>",
-            help="The file to write; with --ring the folder.",
+            help="File to write; with --ring a folder.",
             show_default="out/record.mcap, out/faults",
         ),
     ] = None,
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="Stop after these.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Duration, s.")] = None,
     ring: Annotated[
         float | None,
-        typer.Option(min=1.0, help="Write only faults: each with so many seconds before it."),
+        typer.Option(min=1.0, help="Record faults only, each with the given seconds before it."),
     ] = None,
 ) -> None:
-    """Record running topics to an MCAP file for Foxglove and ros2 bag.
+    """Record topics to an MCAP file for Foxglove and ros2 bag.
 
-    With --ring what came last is kept in memory, and written to a file of its own whenever the robot goes into fault.
-    Exit code 1, and no file, where nothing came. Of a recorder that was killed all but the last second can be read.
+    With --ring the latest messages stay in memory, and each fault of the robot is written to its
+    own file. Exit code 1 and no file if no message arrived. If the recorder is killed, all but the
+    last second is readable.
 
     \b
     For example:
@@ -421,30 +507,39 @@ def record(
         raise typer.Exit(1)
 
 
-def _register(name: str, about: str) -> None:
-    """A command of ELSEWHERE: its arguments are handed on as they are, and its module is loaded when it runs."""
+def _register(name: str, delegated: DelegatedCommand) -> None:
+    """Register a delegated command.
 
-    @app.command(name, help=about, context_settings=HANDED_ON, add_help_option=False)
+    Its arguments are passed on, and its module is loaded when it runs.
+    """
+
+    @app.command(
+        name,
+        help=delegated.about,
+        context_settings=PASS_THROUGH,
+        add_help_option=False,
+        rich_help_panel=delegated.panel,
+    )
     def hand_on(context: typer.Context) -> None:
         command(name).main(context.args, prog_name=context.command_path)
 
 
-for _name, _elsewhere in ELSEWHERE.items():
-    _register(_name, _elsewhere.about)
+for _name, _delegated in DELEGATED_COMMANDS.items():
+    _register(_name, _delegated)
 
 
 def command(name: str) -> Any:
-    """A command with all its arguments and options, as click has it.
+    """Return a command with all its arguments and options.
 
     Args:
-        name: of the command, as after `quadvel`.
+        name: Name of the command after `quadvel`.
 
-    Raises:
-        KeyError: there is no command of this name.
+    Returns:
+        The command as a click object. KeyError is raised if there is none.
     """
-    if name not in ELSEWHERE:
+    if name not in DELEGATED_COMMANDS:
         return typer.main.get_group(app).commands[name]
-    module, _, member = ELSEWHERE[name].where.partition(":")
+    module, _, member = DELEGATED_COMMANDS[name].target.partition(":")
     found = getattr(import_module(module), member)
     if isinstance(found, typer.Typer):
         return typer.main.get_command(found)
@@ -454,7 +549,7 @@ def command(name: str) -> Any:
 
 
 def _with_middleware(module: str) -> Any:
-    """A module of this package that needs rclpy, with whichever rclpy there is."""
+    """Import a module of this package that needs rclpy, after the choice of the middleware."""
     import quadvel_dds
 
     quadvel_dds.install()

@@ -1,6 +1,6 @@
-"""`quadvel demo`: a scripted walk in real time, every node a process of its own, recorded and judged.
+"""`quadvel demo`: a scripted walk in real time, one process per node, recorded and evaluated.
 
-Here the run itself; what is made of the recording is `quadvel_eval`'s matter.
+This module runs the demo; `quadvel_eval` evaluates the recording.
 """
 
 from __future__ import annotations
@@ -25,29 +25,29 @@ from quadvel_sim.world import SHIPPED
 
 from .doctor import GL_PACKAGES, gl_backend, video_encoder
 from .follow_demo import follow
-from .preflight import rehearse
+from .preflight import check_stack
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 
 WALK, FOLLOW, TOUR = "quadvel demo walk", "quadvel demo follow", "quadvel demo follow --tour"
-OPTIONS = {
+OPTION_SCOPES = {
     **dict.fromkeys(("quick", "low_level", "loss", "jitter", "actuator", "lockstep", "video"), (WALK,)),
     **dict.fromkeys(("world", "tour"), (FOLLOW, TOUR)),
     **dict.fromkeys(("metres", "seed"), (TOUR,)),
     "seconds": (FOLLOW,),
     "view": (WALK, FOLLOW),
 }
-"""Options that not every kind of demo has, and those which have them"""
-MADE_OF_IT = ("summary.json", "demo.png", "loop.png", "demo.mp4")
-"""What is made of the recording; what is left of an earlier one goes."""
-TOO_SLOW = "if this machine is slow or busy: with --lockstep simulated time waits for the nodes"
+"""Options that not every kind of demo has, and the kinds that have them."""
+DERIVED_FILES = ("summary.json", "demo.png", "loop.png", "demo.mp4")
+"""Files made from the recording; those of an earlier run are deleted."""
+LOCKSTEP_HINT = "if this machine is slow or busy, use --lockstep: simulated time then waits for the nodes"
 
 
 def demo_command(
     context: typer.Context,
     what: Annotated[
         Literal["walk", "follow"],
-        typer.Argument(help="A walk through all directions, or after a person through a world."),
+        typer.Argument(help="A walk in all directions, or following a person through a world."),
     ] = "walk",
     out: Annotated[
         Path | None,
@@ -56,7 +56,7 @@ def demo_command(
         ),
     ] = None,
     video: Annotated[
-        bool, typer.Option("--video/--no-video", help="With walk: draw a video where GL is there.")
+        bool, typer.Option("--video/--no-video", help="With walk: render a video if GL is available.")
     ] = True,
     quick: Annotated[bool, typer.Option("--quick", help="With walk: a short one, forward and stop.")] = False,
     low_level: Annotated[
@@ -66,35 +66,39 @@ def demo_command(
         ),
     ] = "sim",
     loss: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="With board: share of packets that are lost, each way.")
+        float, typer.Option(min=0.0, max=1.0, help="With board: share of lost packets, each way.")
     ] = 0.0,
     jitter: Annotated[
-        float, typer.Option(min=0.0, max=100.0, help="With board: ms that a packet takes at most, each way.")
+        float, typer.Option(min=0.0, max=100.0, help="With board: largest delay of a packet, ms, each way.")
     ] = 0.0,
     actuator: Annotated[
         Path | None,
         typer.Option(metavar="<file>", help="The robot's actuator.yaml.", show_default="the shipped one"),
     ] = None,
     lockstep: Annotated[
-        bool, typer.Option("--lockstep", help="Not in real time: simulated time waits for the controller.")
+        bool, typer.Option("--lockstep", help="Simulated time waits for the controller: not real time.")
     ] = False,
-    view: Annotated[bool, typer.Option("--view", help="With the operator's page in the browser.")] = False,
+    view: Annotated[bool, typer.Option("--view", help="Serve the operator page in the browser.")] = False,
     world: Annotated[
         str,
-        typer.Option(metavar="<name|file>", help=f"With follow: where; {', '.join(SHIPPED)} or a YAML file."),
+        typer.Option(metavar="<name|file>", help=f"With follow: world, {', '.join(SHIPPED)} or a YAML file."),
     ] = "campus",
-    seconds: Annotated[float, typer.Option(min=5.0, help="With follow: for how long, s.")] = 180.0,
+    seconds: Annotated[float, typer.Option(min=5.0, help="With follow: duration, s.")] = 180.0,
     tour: Annotated[
         bool,
-        typer.Option("--tour", help="With follow: a tour in one process, as fast as the machine allows."),
+        typer.Option("--tour", help="With follow: a tour in one process, faster than real time."),
     ] = False,
-    metres: Annotated[float, typer.Option(min=1.0, help="With --tour: how far, m.")] = 3100.0,
-    seed: Annotated[int, typer.Option(min=0, help="With --tour: of the sensors' noise.")] = 0,
+    metres: Annotated[float, typer.Option(min=1.0, help="With --tour: distance, m.")] = 3100.0,
+    seed: Annotated[int, typer.Option(min=0, help="With --tour: seed of the sensor noise.")] = 0,
 ) -> None:
-    """Walk a simulated robot through all directions, or after a person, in real time, through the nodes.
+    """Run a scripted walk in all directions, or follow a person, in simulation and in real time.
 
-    Simulator, estimator, controller, command mux and a scripted planner run as processes; what they say to
-    each other is recorded. Exit code 0 if the robot went through the whole script without a fall.
+    Simulator, estimator, controller, command mux and a scripted planner run as processes, and their
+    topics are recorded. Exit code 0 if the robot completed the script without a fall.
+
+    \b
+    For example:
+      quadvel demo
     """
     _check_options(context, WALK if what == "walk" else TOUR if tour else FOLLOW)
     console = Console(soft_wrap=True)
@@ -106,18 +110,18 @@ def demo_command(
             good = follow(folder, world, seconds, view, console)
         raise typer.Exit(0 if good else 1)
     stack = _stack(low_level, loss, jitter, lockstep, actuator)
-    rehearse(stack)
+    check_stack(stack)
     folder = output_folder(out or Path("out/demo"))
     recorded = folder / "demo.mcap"
     with replacing(recorded) as draft:
         script = "quick" if quick else "full"
         problem = ScriptedWalk(draft, script, stack.commands(view), lockstep, console).run()
-    for name in MADE_OF_IT:
+    for name in DERIVED_FILES:
         (folder / name).unlink(missing_ok=True)
     if problem:
         console.print(f"[bold red]{problem}")
         if not lockstep:
-            console.print(TOO_SLOW)
+            console.print(LOCKSTEP_HINT)
     try:
         recording = read_recording(recorded)
         summary = demo_summary.summarise_demo(recording)
@@ -127,7 +131,7 @@ def demo_command(
     write_json(folder / "summary.json", summary)
     _report(summary, console)
     _draw(recording, folder, video, console)
-    written = [name for name in ("demo.mcap", *MADE_OF_IT) if (folder / name).exists()]
+    written = [name for name in ("demo.mcap", *DERIVED_FILES) if (folder / name).exists()]
     console.print(f"written to {folder}: {', '.join(written)}")
     if summary["falls"]:
         console.print(f"[bold red]falls: {summary['falls']}")
@@ -135,8 +139,8 @@ def demo_command(
 
 
 def _check_options(context: typer.Context, demo: str) -> None:
-    """Raises ValueError where an option was given that this kind of demo does not have."""
-    for name, demos in OPTIONS.items():
+    """Raise ValueError for an option that this kind of demo does not have."""
+    for name, demos in OPTION_SCOPES.items():
         source = context.get_parameter_source(name)
         if (
             source
@@ -148,12 +152,14 @@ def _check_options(context: typer.Context, demo: str) -> None:
 
 
 def _stack(low_level: str, loss: float, jitter: float, lockstep: bool, actuator: Path | None) -> Stack:
+    """Return the stack of a scripted walk."""
     network = {"network_loss": loss, "network_jitter": 1e-3 * jitter}
     given = {name: value for name, value in network.items() if value}
     return Stack(low_level=low_level, use_sim_time=lockstep, network=given, actuator=actuator)
 
 
 def _report(summary: dict[str, Any], console: Console) -> None:
+    """Print the summary of a walk."""
     console.print(segment_table(summary["segments"]))
     loop, n = summary["loop"], number_text
     rmse = ", ".join(n(x, ".3f") for x in summary["estimator"]["rmse"])
@@ -170,14 +176,14 @@ def _report(summary: dict[str, Any], console: Console) -> None:
 
 
 def _draw(recording: Recording, folder: Path, video: bool, console: Console) -> None:
-    """Plots always; a strip of frames above them and a video where GL is there."""
+    """Draw the plots and, if GL and an encoder are available, a strip of frames and a video."""
     write_figure(folder / "loop.png", demo_figures.loop_figure(recording))
     write_figure(folder / "demo.png", demo_figures.tracking_figure(recording))
     if not video:
         return
     backend, encoder = gl_backend(), video_encoder()
     if backend is None:
-        console.print(f"no video: there is no off-screen GL on this machine; sudo apt install {GL_PACKAGES}")
+        console.print(f"no video: no off-screen GL on this machine; sudo apt install {GL_PACKAGES}")
         return
     if not encoder.good:
         console.print(f"no video: {encoder.text}", markup=False)

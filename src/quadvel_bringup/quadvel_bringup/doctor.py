@@ -1,4 +1,4 @@
-"""What this machine has, and what of quadvel it can run. Looks, and changes nothing."""
+"""Check of this machine: what is installed and what quadvel can run on it. It changes nothing."""
 
 from __future__ import annotations
 
@@ -15,16 +15,22 @@ import numpy as np
 
 import quadvel_dds
 
-NEEDED = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
-FILES = ("actuator", "policy")
-"""Values of /diagnostics that say with which files a node runs"""
+REQUIRED_PACKAGES = ("mujoco", "onnx", "onnxruntime", "cyclonedds", "rosbags", "mcap", "numpy", "scipy")
+FILE_KEYS = ("actuator", "policy")
+"""Keys of /diagnostics with the files of a node."""
 GL_BACKENDS = ("egl", "osmesa")
 GL_PACKAGES = "libegl1 libopengl0"
 
 
 @attrs.frozen
 class Finding:
-    """One line: what was looked at, whether it is as it should be, and what was found."""
+    """One result of the check.
+
+    Attributes:
+        subject: What was checked.
+        good: Whether it is as needed.
+        text: What was found.
+    """
 
     subject: str
     good: bool
@@ -32,11 +38,15 @@ class Finding:
 
 
 def examine() -> Iterator[Finding]:
-    """All findings, one after the other, as they are made."""
+    """Run all checks, each one when it is requested.
+
+    Yields:
+        The findings.
+    """
     yield _python()
     yield _cores()
     yield _middleware()
-    yield from map(_package, NEEDED)
+    yield from map(_package, REQUIRED_PACKAGES)
     yield _clock()
     yield _priority()
     yield _gl()
@@ -46,60 +56,67 @@ def examine() -> Iterator[Finding]:
 
 
 def _robot() -> Finding:
-    """Which robot runs, and on which actuator model."""
+    """Check for a running robot and its actuator model."""
     try:
         quadvel_dds.install()
-        from .status import look
-        from .whereabouts import whereabouts
+        from .status import running_nodes
+        from .whereabouts import discovery_hint
     except ImportError as error:
-        return Finding("robot", True, f"not looked for: {error}")
-    nodes = look()
+        return Finding("robot", True, f"not checked: {error}")
+    nodes = running_nodes()
     if not nodes:
         return Finding(
             "robot",
             True,
-            f"none runs; `quadvel up` takes the shipped actuator model (Table 4); {whereabouts()}",
+            f"none runs; `quadvel up` uses the shipped actuator model (Table 4); {discovery_hint()}",
         )
-    told = [f"{key} {node.values[key]}" for node in nodes.values() for key in FILES if key in node.values]
+    files = [
+        f"{key} {node.values[key]}" for node in nodes.values() for key in FILE_KEYS if key in node.values
+    ]
     return Finding(
-        "robot", True, f"{', '.join(nodes)} run; {', '.join(told) or 'with files that none tells'}"
+        "robot", True, f"running: {', '.join(nodes)}; {', '.join(files) or 'no node reports its files'}"
     )
 
 
 def _python() -> Finding:
+    """Check the version of Python."""
     good = (3, 11) <= sys.version_info[:2] <= (3, 13)
     text = f"{platform.python_version()}" if good else f"{platform.python_version()}, expected 3.11 to 3.13"
     return Finding("Python", good, text)
 
 
 def _cores() -> Finding:
+    """Check the number of cores."""
     number = len(os.sched_getaffinity(0))
-    return Finding("cores", number >= 2, f"{number}" if number >= 2 else f"{number}; real time wants two")
+    return Finding("cores", number >= 2, f"{number}" if number >= 2 else f"{number}; real time needs two")
 
 
 def _middleware() -> Finding:
+    """Check which middleware the nodes use."""
     distro = os.environ.get("ROS_DISTRO", "an unnamed distribution")
     if util.find_spec("rclpy") is None:
         return Finding("ROS 2", True, "not found in this shell: the nodes run on the embedded Cyclone DDS")
     if os.environ.get("QUADVEL_MIDDLEWARE") == "embedded":
-        return Finding("ROS 2", True, f"{distro}, left aside: QUADVEL_MIDDLEWARE is 'embedded'")
+        return Finding("ROS 2", True, f"{distro}, ignored because QUADVEL_MIDDLEWARE is 'embedded'")
     if fault := quadvel_dds.ros2_fault():
         return Finding("ROS 2", True, fault)
     rmw = os.environ.get("RMW_IMPLEMENTATION", "its default middleware")
     text = f"{distro} with {rmw}: the nodes run on its rclpy"
     if not _has_executor_of_events():
-        text += "; real time on two cores wants its executor of events, of rclpy 7.1.4 or newer"
+        text += "; real time on two cores needs the events executor of rclpy 7.1.4 or newer"
     return Finding("ROS 2", True, text)
 
 
 def _has_executor_of_events() -> bool:
+    """Return whether rclpy has the events executor."""
     try:
         return util.find_spec("rclpy.experimental") is not None
-    except ImportError:  # the embedded middleware's answer for what it does not offer
+    except ImportError:  # the embedded middleware raises this for missing features
         return False
 
 
 def _package(name: str) -> Finding:
+    """Check whether a Python package is installed."""
     try:
         return Finding(name, True, metadata.version(name))
     except metadata.PackageNotFoundError:
@@ -107,7 +124,7 @@ def _package(name: str) -> Finding:
 
 
 def _clock(period: float = 0.005, ticks: int = 100) -> Finding:
-    """How late a sleep to a deadline ends, at the controller's rate."""
+    """Measure the lateness of sleeps at the rate of the controller."""
     late = np.empty(ticks)
     deadline = time.monotonic()
     for i in range(ticks):
@@ -117,11 +134,17 @@ def _clock(period: float = 0.005, ticks: int = 100) -> Finding:
     median, p99 = 1e3 * np.quantile(late, (0.5, 0.99))
     text = f"at 200 Hz, wakes {median:.2f} ms late (median), {p99:.2f} ms (99 %)"
     good = bool(p99 < 2.0)
-    return Finding("clock", good, text if good else f"{text}; the machine is busy, loops will overrun")
+    return Finding(
+        "clock", good, text if good else f"{text}; the machine is busy, control loops will overrun"
+    )
 
 
 def gl_backend() -> str | None:
-    """The first of MuJoCo's off-screen backends that draws here, or None. Tried in processes of their own."""
+    """Find an off-screen rendering backend of MuJoCo, by trials in separate processes.
+
+    Returns:
+        The first working backend, or None.
+    """
     chosen = os.environ.get("MUJOCO_GL")
     program = "import mujoco; mujoco.GLContext(64, 64).make_current()"
     for backend in (chosen,) if chosen else GL_BACKENDS:
@@ -134,22 +157,29 @@ def gl_backend() -> str | None:
 
 
 def _priority() -> Finding:
-    """Real-time priority, tried in a process of its own, which ends at once."""
+    """Check whether real-time priority is permitted, in a separate process."""
     code = "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))"
     permitted = subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
-    refused = "real time not permitted, so all programs share the cores alike; see rtprio in limits.conf(5)"
-    return Finding("priority", True, "real time is permitted" if permitted else refused)
+    refused = (
+        "real-time priority not permitted, so all programs share the cores; see rtprio in limits.conf(5)"
+    )
+    return Finding("priority", True, "real-time priority is permitted" if permitted else refused)
 
 
 def _gl() -> Finding:
+    """Check off-screen rendering."""
     backend = gl_backend()
     if backend is None:
         return Finding("GL", False, f"no off-screen GL, so no video; sudo apt install {GL_PACKAGES}")
-    return Finding("GL", True, f"{backend}: draws off screen")
+    return Finding("GL", True, f"{backend}: renders off screen")
 
 
 def video_encoder() -> Finding:
-    """The program that makes a video of pictures, tried: the package may be there without it."""
+    """Check the video encoder by running it; the package may lack its program.
+
+    Returns:
+        The finding.
+    """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
 
@@ -158,11 +188,12 @@ def video_encoder() -> Finding:
         return Finding("ffmpeg", False, "imageio-ffmpeg is missing, so no video; pip install -e '.[video]'")
     except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
         reason = " ".join(str(error).split())
-        return Finding("ffmpeg", False, f"imageio-ffmpeg has no program that runs, so no video: {reason}")
+        return Finding("ffmpeg", False, f"imageio-ffmpeg has no working program, so no video: {reason}")
     return Finding("ffmpeg", True, f"imageio-ffmpeg {metadata.version('imageio-ffmpeg')}: encodes the video")
 
 
 def _torch() -> Finding:
+    """Check whether PyTorch is installed."""
     try:
         version = metadata.version("torch")
     except metadata.PackageNotFoundError:
@@ -171,9 +202,16 @@ def _torch() -> Finding:
 
 
 def abilities(findings: list[Finding]) -> Iterator[tuple[str, bool]]:
-    """What can be run with that, in the order in which one would try it."""
+    """Derive what can run from the findings.
+
+    Args:
+        findings: All findings of `examine`.
+
+    Yields:
+        Name and possibility of each task, in the order of a first use.
+    """
     good = {finding.subject: finding.good for finding in findings}
-    runs = good["Python"] and all(good[name] for name in NEEDED)
+    runs = good["Python"] and all(good[name] for name in REQUIRED_PACKAGES)
     torch = any(finding.subject == "torch" and "training can run" in finding.text for finding in findings)
     yield "quadvel demo, up, run, record", runs
     yield "quadvel eval, bench", runs

@@ -1,4 +1,4 @@
-"""`quadvel drive`: one velocity for a while, then zero, and what came of it.
+"""`quadvel drive`: command one velocity for a while, then zero, and report the response.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -18,20 +18,31 @@ from numpy.typing import ArrayLike, NDArray
 from quadvel_msgs.msg import ControllerState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 
-from .operator_commands import CONTROLLER, LONGEST, WAY_OUT
+from .operator_commands import MODE_TIMEOUT_S, RECOVERY_HINT, START_HINT
 from .processes import StopSignals
-from .session import PATIENCE, Session
+from .session import DISCOVERY_TIMEOUT_S, Session
 
-PERIOD = 0.05  # s, between two messages; the command mux forgets a source after 0.5 s
-SETTLING = 0.5  # s after the command is in full effect until the measured velocity counts
-SAME = 1e-3  # m/s, rad/s, within which two commands are the same
-ESTIMATES = 10_000  # kept for the mean: 50 s of them
+PUBLISH_PERIOD_S = 0.05
+"""Time between two messages; the command mux drops a source after 0.5 s."""
+SETTLING_TIME_S = 0.5
+"""Time after the command is in full effect before the measured velocity is averaged."""
+SAME_TOLERANCE = 1e-3
+"""Largest difference of equal commands, m/s or rad/s."""
+MAX_ESTIMATES = 10_000
+"""Number of estimates for the mean, 50 s."""
 
 Array = NDArray[np.float64]
 
 
-class Drive:
-    """What the robot says while it is driven. asked: vx, vy (m/s), wz (rad/s)."""
+class DriveRun:
+    """Drives the robot and records its response.
+
+    Args:
+        session: The node that it uses.
+        signals: Ends the waits on Ctrl-C.
+        asked: Commanded vx, vy (m/s), wz (rad/s), body frame.
+        topic: Input topic of the command mux.
+    """
 
     def __init__(self, session: Session, signals: StopSignals, asked: ArrayLike, topic: str) -> None:
         self._session, self._signals = session, signals
@@ -40,58 +51,76 @@ class Drive:
         self._publisher = session.node.create_publisher(Twist, topic, 10)
         self._states = session.listen(ControllerState, "controller/state")
         self._commands = session.listen(VelocityCommand, "command")
-        self._estimates = session.listen(TwistWithCovarianceStamped, "velocity_estimate", ESTIMATES)
-        self._full_effect: float | None = None  # since when the whole command is in effect, s
+        self._estimates = session.listen(TwistWithCovarianceStamped, "velocity_estimate", MAX_ESTIMATES)
+        self._full_effect: float | None = None  # time since which the command is in full effect, s
         self._in_effect = np.zeros(3)
 
     def wait_for_robot(self) -> str:
-        """Until somebody hears us and the robot stands: why it would not follow, or "". Raises NobodyThere."""
-        if not self._wait(self._publisher.get_subscription_count, PATIENCE):
-            raise self._session.nobody(f"{self._topic}: nobody listens; {CONTROLLER}")
-        if not self._wait(lambda: self._states, PATIENCE):
-            raise self._session.nobody(f"controller/state: nothing came; {CONTROLLER}")
+        """Wait until the command mux listens and the robot stands.
+
+        Returns:
+            Why the robot would not follow a velocity, or "".
+
+        Raises:
+            NotRunningError: There is no command mux or no controller.
+        """
+        if not self._wait(self._publisher.get_subscription_count, DISCOVERY_TIMEOUT_S):
+            raise self._session.not_running(f"{self._topic}: no subscriber; {START_HINT}")
+        if not self._wait(lambda: self._states, DISCOVERY_TIMEOUT_S):
+            raise self._session.not_running(f"controller/state: no message; {START_HINT}")
         if self._signals.received:
             return ""
-        self._wait(lambda: self._states[-1].mode_name != "stand_up", LONGEST)
-        # The mux commands zero all the time, which a robot that has just stood up waits for.
-        self._wait(lambda: not self._states[-1].walk_refusal, PERIOD * 4)
+        self._wait(lambda: self._states[-1].mode_name != "stand_up", MODE_TIMEOUT_S)
+        # After standing up, the controller waits for the mux's zero command.
+        self._wait(lambda: not self._states[-1].walk_refusal, PUBLISH_PERIOD_S * 4)
         return self.refusal()
 
     def _wait(self, is_so: Callable[[], Any], seconds: float) -> bool:
-        """Serve until the predicate holds, or Ctrl-C comes; whether one of them does in time."""
+        """Spin until the predicate holds or Ctrl-C arrives.
+
+        Returns whether one of them did in time.
+        """
         return self._session.spin_until(lambda: self._signals.received or is_so(), seconds)
 
     def refusal(self) -> str:
-        """Why the robot does not follow velocities now; empty where it does."""
+        """Explain why the robot does not follow velocities now.
+
+        Returns:
+            The reason, or "" if it follows.
+        """
         state = self._states[-1]
         if state.mode_name == "fault":
-            return f"the robot is in fault: {state.reason}\nonce the cause is gone: {WAY_OUT}"
+            return f"the robot is in fault: {state.reason}\nonce the cause is gone: {RECOVERY_HINT}"
         if not state.rate_hz:  # over the last second
-            return "the controller hears no robot: is the simulator paused?"
+            return "the controller receives no states: is the simulator paused?"
         return str(state.walk_refusal)
 
     def send(self) -> None:
-        """The velocity once more, and note whether all of it is in effect by now."""
+        """Publish the velocity, and check whether it is in full effect."""
         self._publisher.publish(_twist(self._asked))
-        before, self._in_effect = self._in_effect, planar(self._states[-1].command)
-        steady = np.abs(self._in_effect - before).max() < SAME
+        before, self._in_effect = self._in_effect, twist_to_array(self._states[-1].command)
+        steady = np.abs(self._in_effect - before).max() < SAME_TOLERANCE
         followed = self._in_effect.any() == self._asked.any()
         if self._full_effect is None and steady and followed:
             self._full_effect = time.monotonic()
             self._estimates.clear()
-        if self._full_effect and time.monotonic() - self._full_effect < SETTLING:
+        if self._full_effect and time.monotonic() - self._full_effect < SETTLING_TIME_S:
             self._estimates.clear()
 
     def stop(self) -> None:
-        """Zero."""
+        """Publish zero velocity."""
         self._publisher.publish(_twist(np.zeros(3)))
 
     def report(self) -> int:
-        """Print what was commanded, what was in effect, what was measured; the exit code."""
+        """Print the commanded, the effective and the measured velocity.
+
+        Returns:
+            The exit code: 1 if the robot followed another source.
+        """
         print(f"commanded  {velocity_text(self._asked)}")
-        if np.abs(self._in_effect - self._asked).max() > SAME:
-            on_its_way = "still on its way: it changes no faster than the mux lets it"
-            why = "cut to the limits of mux and policy" if self._full_effect else on_its_way
+        if np.abs(self._in_effect - self._asked).max() > SAME_TOLERANCE:
+            ramping = "still ramping: the mux limits the acceleration"
+            why = "clipped to the limits of mux and policy" if self._full_effect else ramping
             print(f"in effect  {velocity_text(self._in_effect)}, {why}")
         if source := self._other_source():
             print(f"not followed: {source} commands the robot")
@@ -100,33 +129,44 @@ class Drive:
             velocity = _mean(self._estimates)
             print(f"measured   {velocity_text(velocity)}, mean of {len(self._estimates)} estimates")
         else:
-            print("measured   nothing: too short for the robot to settle; drive for some seconds more")
+            print("measured   nothing: too short to settle; drive for some seconds more")
         return 0
 
     def _other_source(self) -> str:
-        """Who commands the robot instead of us, or ""."""
+        """Return the source that commands the robot instead of this one, or ""."""
         if not self._commands or not self._asked.any() or self._in_effect.any():
             return ""
         return f"'{self._commands[-1].source}'"
 
 
 def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> int:
-    """Publish a Twist (m/s, m/s, rad/s, body frame) for some seconds or until Ctrl-C, then one of zeros.
+    """Publish a velocity for some seconds or until Ctrl-C, then zero.
 
-    Returns the exit code: 1 where the robot did not follow. Raises ValueError for what is no number, NobodyThere.
+    Args:
+        vx: m/s, body frame.
+        vy: m/s, body frame.
+        wz: rad/s.
+        seconds: Duration, s.
+        topic: Input topic of the command mux.
+
+    Returns:
+        The exit code: 1 if the robot did not follow.
+
+    Raises:
+        ValueError: An argument is not finite.
     """
     for name, value in {"--vx": vx, "--vy": vy, "--wz": wz, "--seconds": seconds}.items():
         if not math.isfinite(value):
             raise ValueError(f"{name} is {value}, expected a finite number")
     with StopSignals() as signals, Session("drive") as session:
-        robot = Drive(session, signals, (vx, vy, wz), topic)
+        robot = DriveRun(session, signals, (vx, vy, wz), topic)
         refusal = robot.wait_for_robot()
         if signals.received:
             return 0
         until = time.monotonic() + seconds
         while not refusal and not signals.received and time.monotonic() < until:
             robot.send()
-            session.spin(PERIOD)
+            session.spin(PUBLISH_PERIOD_S)
             refusal = robot.refusal()
         robot.stop()
         if refusal:
@@ -136,21 +176,37 @@ def drive(vx: float, vy: float, wz: float, seconds: float, topic: str) -> int:
 
 
 def _twist(velocity: Array) -> Any:
+    """Convert a velocity (3,) to a Twist."""
     message = Twist()
     message.linear.x, message.linear.y, message.angular.z = velocity.tolist()
     return message
 
 
-def planar(twist: Any) -> Array:
-    """vx, vy (m/s) and wz (rad/s) of a geometry_msgs/Twist, (3,)."""
+def twist_to_array(twist: Any) -> Array:
+    """Convert a geometry_msgs/Twist to an array.
+
+    Args:
+        twist: The message.
+
+    Returns:
+        (3,) vx, vy (m/s), wz (rad/s).
+    """
     return np.array([twist.linear.x, twist.linear.y, twist.angular.z])
 
 
 def velocity_text(velocity: Array) -> str:
-    """Such a velocity for people."""
+    """Format a planar velocity for people.
+
+    Args:
+        velocity: (3,) vx, vy (m/s), wz (rad/s).
+
+    Returns:
+        One line with units.
+    """
     return "vx {} m/s, vy {} m/s, wz {} rad/s".format(*(number_text(value, "+.2f") for value in velocity))
 
 
 def _mean(estimates: deque[Any]) -> Array:
-    mean: Array = np.mean([planar(estimate.twist.twist) for estimate in estimates], axis=0)
+    """Return the mean velocity (3,) of estimates."""
+    mean: Array = np.mean([twist_to_array(estimate.twist.twist) for estimate in estimates], axis=0)
     return mean

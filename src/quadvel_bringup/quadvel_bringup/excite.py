@@ -1,7 +1,8 @@
-"""`quadvel excite`: moves the joints so that they show what they are, and records state and command.
+"""`quadvel excite`: excitation motions for the identification of the joints.
 
-The motions are `quadvel_sysid.excitation`'s; here they are played on a robot that serves low_state and
-low_cmd. The simulated one runs in lockstep at 1 kHz, so that a busy machine leaves no gaps.
+States and commands are recorded. `quadvel_sysid.excitation` defines the motions; here they are
+played on any robot that serves low_state and low_cmd. The simulated robot runs in lockstep at 1
+kHz, so that a busy machine causes no gaps.
 """
 
 from __future__ import annotations
@@ -26,31 +27,51 @@ from quadvel_eval.report import read_json
 from quadvel_nodes.messages import MessageError, read_low_state, write_low_cmd
 from quadvel_sysid.excitation import EXCITATIONS, PERIOD_S, Excitation, limit_torque, propose
 
-from .exclusivity import ensure_alone
+from .exclusivity import ensure_exclusive
 from .node_output import PrefixedOutput
-from .nodes import Parameters, arguments, command, enclave
-from .preflight import rehearse_node
+from .nodes import Parameters, enclave, process_command, ros_arguments
+from .preflight import check_node
 from .processes import ProcessGroup, StopSignals
 from .stack import PARAMETERS
 
-RAMP = 1.5  # s, from where the robot is to where the motion begins
-REST = 0.5  # s of damping at the end
-LOOK = 0.05  # s, from one look at recorder and processes to the next
-MAX_TILT = 0.8  # rad
-JOINT_MARGIN = 0.1  # rad, that a joint may pass its mechanical range by
-PATIENCE = 20.0  # s, for the first state
-MAX_SILENCE = 5.0  # s, without a state
-MAX_GAP = 0.05  # s, between two states: after a longer one the motion would jump
-ANSWER_TIMEOUT = 2.0  # s, after which the simulator asks again
-RECORDED = {"/low_state": "quadvel_msgs/msg/LowState", "/low_cmd": "quadvel_msgs/msg/LowCmd"}
+RAMP_S = 1.5
+"""Time from the initial posture to the start of the motion."""
+REST_S = 0.5
+"""Time of damping at the end."""
+POLL_PERIOD_S = 0.05
+"""Time between two checks of recorder and processes."""
+MAX_TILT_RAD = 0.8
+"""Largest tilt of the trunk."""
+JOINT_MARGIN_RAD = 0.1
+"""Largest angle beyond the mechanical range of a joint."""
+FIRST_STATE_TIMEOUT_S = 20.0
+"""Time to wait for the first state."""
+STATE_TIMEOUT_S = 5.0
+"""Longest time without a state."""
+MAX_STATE_GAP_S = 0.05
+"""Longest time between two states; after a longer one the motion would jump."""
+ANSWER_TIMEOUT_S = 2.0
+"""Time after which the simulator repeats a state."""
+RECORDED_TOPICS = {"/low_state": "quadvel_msgs/msg/LowState", "/low_cmd": "quadvel_msgs/msg/LowCmd"}
 
 
 class MotionError(RuntimeError):
-    """Why a motion was ended, in one sentence."""
+    """A motion was aborted; one sentence with the reason."""
 
 
-class Player:
-    """Answers states with the commands of one motion; time is the states' own."""
+class MotionPlayer:
+    """Answers states with the commands of a motion. Time is that of the states.
+
+    Args:
+        excitation: The motion.
+        kp: Position gain, N m/rad; None for that of the motion.
+        kd: Velocity gain, N m s/rad; None for that of the motion.
+        hung: Whether the feet are in the air; None for the choice of the motion.
+
+    Attributes:
+        total: Duration of ramp and motion, s.
+        elapsed: Time since the first state, s.
+    """
 
     def __init__(
         self,
@@ -59,7 +80,7 @@ class Player:
         kd: float | None = None,
         hung: bool | None = None,
     ) -> None:
-        """kp (N m/rad), kd (N m s/rad), hung: whether the feet are in the air; the motion's own where None."""
+
         self._targets = excitation.targets()
         self._kp = excitation.kp if kp is None else kp
         self._kd = excitation.kd if kd is None else kd
@@ -67,52 +88,62 @@ class Player:
         self._support = np.zeros_like(self._targets) if in_the_air else excitation.support_torque()
         self._begin: RobotState | None = None
         self._last = 0.0
-        self.total = RAMP + excitation.seconds
-        """s, of ramp and motion"""
+        self.total = RAMP_S + excitation.seconds
+
         self.elapsed = 0.0
-        """s, of these"""
 
     @property
-    def done(self) -> bool:
-        """Whether the motion is at its end."""
+    def is_done(self) -> bool:
+        """Whether the motion is complete."""
         return self.elapsed >= self.total
 
     def answer(self, state: RobotState) -> JointCommand:
-        """The command at `state`; damping once the motion is done. Raises MotionError."""
+        """Return the command for a state; damping after the end of the motion.
+
+        Args:
+            state: The state.
+
+        Returns:
+            The command.
+
+        Raises:
+            MotionError: The robot left the range of the motion, or states are missing.
+        """
         _check(state)
         if self._begin is None:
             self._begin, self._last = state, state.time
         gap, self._last = state.time - self._last, state.time
-        if not 0.0 <= gap <= MAX_GAP:
+        if not 0.0 <= gap <= MAX_STATE_GAP_S:
             raise MotionError(
-                f"from one state to the next time went by {gap:.3f} s, expected 0 to {MAX_GAP} s"
+                f"the time between two states is {gap:.3f} s, expected 0 to {MAX_STATE_GAP_S} s"
             )
         self.elapsed = state.time - self._begin.time
-        if self.done:
+        if self.is_done:
             return JointCommand.damping(tick=state.tick)
-        target, tau = self._wanted(self._begin.q)
+        target, tau = self._current_targets(self._begin.q)
         target = limit_torque(target, state.q, state.dq, self._kp, self._kd, tau)
         return JointCommand(
             q=target, tau=tau, kp=np.full(12, self._kp), kd=np.full(12, self._kd), tick=state.tick
         )
 
-    def _wanted(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Joint targets (12,) rad and feed-forward torque (12,) N m of this instant."""
-        if self.elapsed < RAMP:
-            s = self.elapsed / RAMP
+    def _current_targets(self, start: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return joint targets (12,) rad and feed-forward torque (12,) N m at the present time."""
+        if self.elapsed < RAMP_S:
+            # Smoothstep from the initial posture: 3 s^2 - 2 s^3.
+            s = self.elapsed / RAMP_S
             share = s * s * (3.0 - 2.0 * s)
             return start + share * (self._targets[0] - start), share * self._support[0]
-        row = min(int((self.elapsed - RAMP) / PERIOD_S + 0.5), len(self._targets) - 1)
+        row = min(int((self.elapsed - RAMP_S) / PERIOD_S + 0.5), len(self._targets) - 1)
         return self._targets[row], self._support[row]
 
 
 def _check(state: RobotState) -> None:
-    """Raises MotionError where the robot is no longer where these motions are made for."""
+    """Raise MotionError if tilt or joint angles leave the range of the motions."""
     tilt = np.abs(roll_pitch(state.quaternion)).max()
-    if tilt > MAX_TILT:
-        raise MotionError(f"the trunk tilts by {tilt:.2f} rad, expected at most {MAX_TILT}")
+    if tilt > MAX_TILT_RAD:
+        raise MotionError(f"the trunk tilts by {tilt:.2f} rad, expected at most {MAX_TILT_RAD}")
     beyond = np.maximum(robot.LOWER - state.q, state.q - robot.UPPER)
-    if beyond.max() > JOINT_MARGIN:
+    if beyond.max() > JOINT_MARGIN_RAD:
         joint = robot.JOINT_NAMES[int(beyond.argmax())]
         raise MotionError(f"{joint} is {beyond.max():.2f} rad beyond its range")
 
@@ -122,7 +153,7 @@ def excite_command(
         str | None, typer.Argument(help=f"One of {', '.join(EXCITATIONS)}.", show_default=False)
     ] = None,
     seconds: Annotated[
-        float | None, typer.Option(min=0.5, help="For how long.", show_default="the motion's own")
+        float | None, typer.Option(min=0.5, help="Duration, s.", show_default="by the motion")
     ] = None,
     out: Annotated[
         Path | None,
@@ -130,23 +161,23 @@ def excite_command(
     ] = None,
     low_level: Annotated[
         Literal["sim", "external"],
-        typer.Option(help="What serves low_state and low_cmd; external: a robot that is there."),
+        typer.Option(help="What serves low_state and low_cmd; external: a running robot."),
     ] = "sim",
     hung: Annotated[
         bool | None,
-        typer.Option("--hung/--ground", help="Are the feet in the air?", show_default="as the motion wants"),
+        typer.Option(
+            "--hung/--ground", help="Feet in the air, or on the ground.", show_default="by the motion"
+        ),
     ] = None,
     kp: Annotated[
         float | None,
         typer.Option(
-            min=1.0, max=500.0, help="Gain of the joints' angles, N m/rad.", show_default="the motion's own"
+            min=1.0, max=500.0, help="Position gain of the joints, N m/rad.", show_default="by the motion"
         ),
     ] = None,
     kd: Annotated[
         float | None,
-        typer.Option(
-            min=0.0, max=20.0, help="Gain of their speeds, N m s/rad.", show_default="the motion's own"
-        ),
+        typer.Option(min=0.0, max=20.0, help="Velocity gain, N m s/rad.", show_default="by the motion"),
     ] = None,
     actuator: Annotated[
         Path | None,
@@ -154,35 +185,34 @@ def excite_command(
             metavar="<file>", help="Simulated robot: its actuator.yaml.", show_default="the shipped one"
         ),
     ] = None,
-    seed: Annotated[int, typer.Option(help="Simulated robot: of its noise.")] = 0,
+    seed: Annotated[int, typer.Option(help="Simulated robot: seed of its noise.")] = 0,
     after: Annotated[
         Path | None,
-        typer.Option(
-            metavar="<file>", help="A report.json: say which motions would settle what it left open."
-        ),
+        typer.Option(metavar="<file>", help="A report.json: propose motions that resolve its ambiguities."),
     ] = None,
 ) -> None:
-    """Move the joints so that they show what they are; record state and command for `quadvel identify`.
+    """Run an excitation motion; record states and commands for `quadvel identify`.
 
     \b
     foot-lifting  the paper's motion, Eq. 9      sweep  foot lifting, rate and height vary
     chirp         fast swings in the air         steps  steps of all sizes in the air
     creep         slow motion in the air         solo   one joint at a time in the air
 
-    On the ground the legs are as stiff as this robot stands up with (--kp 150 --kd 4) and carry its weight by
-    feed-forward torque: with the policy's gains (--kp 30 --kd 0.5), which the motions in the air take, it tips over.
-    Gains and torque are in the recording.
+    On the ground the gains are those of standing up (--kp 150 --kd 4), with feed-forward torque for
+    the weight: with the policy's gains (--kp 30 --kd 0.5), which the motions in the air use, the
+    robot tips over. The recording contains gains and torque.
 
     \b
     For example:
       quadvel excite foot-lifting --out lift.mcap
       quadvel excite --after out/identify/report.json
 
-    On a robot (--low-level external) let nothing else send low_cmd, and hang it for the motions in the air.
+    On a real robot (--low-level external) let nothing else send low_cmd. For the motions in the
+    air, suspend it.
     """
     console = Console(soft_wrap=True)
     if after is not None:
-        _propose(after, console)
+        _print_proposals(after, console)
         return
     if motion not in EXCITATIONS:
         raise ValueError(f"motion is {motion!r}, expected one of {', '.join(EXCITATIONS)}")
@@ -197,42 +227,57 @@ def excite_command(
         parameters["actuator_file"] = str(actuator.resolve())
     nodes = {}
     if low_level == "sim":
-        rehearse_node("sim_node", sim_arguments(**parameters))
-        nodes["sim_node"] = command("sim_node", sim_arguments(**parameters))
+        check_node("sim_node", sim_arguments(**parameters))
+        nodes["sim_node"] = process_command("sim_node", sim_arguments(**parameters))
     try:
-        record_motion(Player(excitation, kp, kd, in_the_air), path, nodes, console)
+        record_motion(MotionPlayer(excitation, kp, kd, in_the_air), path, nodes, console)
     except MotionError as error:
         console.print(f"[bold red]{error}")
         raise typer.Exit(1) from None
 
 
-def _propose(report: Path, console: Console) -> None:
+def _print_proposals(report: Path, console: Console) -> None:
+    """Print the motions that would resolve the ambiguities of a report."""
     try:
         proposals = propose(read_json(report))
     except (KeyError, TypeError) as error:
-        raise ValueError(f"{report}: no report of `quadvel identify`: {error!r}") from None
+        raise ValueError(f"{report}: not a report of `quadvel identify`: {error!r}") from None
     if not proposals:
-        console.print("The report leaves nothing open that another motion would settle.")
+        console.print("The report has no ambiguity that another motion would resolve.")
     for one in proposals:
         console.print(f"{one.command}\n  for {', '.join(one.separates)}: {one.reason}", highlight=False)
 
 
 def sim_arguments(**parameters: Any) -> list[str]:
-    """Arguments of a simulator that stands, in lockstep, at 1 kHz."""
+    """Return the arguments of a simulator in lockstep at 1 kHz with a standing robot.
+
+    Args:
+        parameters: Further parameters of the node.
+
+    Returns:
+        Arguments of ROS 2.
+    """
     lockstep: Parameters = {
         "mode": "lockstep",
         "state_rate": 1000,
         "keyframe": "stand",
-        "answer_timeout": ANSWER_TIMEOUT,
+        "answer_timeout": ANSWER_TIMEOUT_S,
     }
-    return arguments("sim_node", {**lockstep, **parameters}, PARAMETERS)
+    return ros_arguments("sim_node", {**lockstep, **parameters}, PARAMETERS)
 
 
-def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]], console: Console) -> None:
-    """Play the motion on the robot that `nodes` (name: command line) make, or that is there where they are none.
+def record_motion(
+    player: MotionPlayer, path: Path, nodes: Mapping[str, Sequence[str]], console: Console
+) -> None:
+    """Play and record a motion. The file is written only if the motion is completed.
 
-    Writes state and command to `path`, which comes to be only where the motion went through. Raises MotionError
-    where it did not; Ctrl-C ends it with a typer.Exit.
+    Args:
+        player: The motion.
+        path: The MCAP file to write.
+        nodes: Command lines by name of the nodes to start; empty for a running robot.
+        console: Console for output and bar.
+
+        Errors pass through: MotionError for an aborted motion, typer.Exit after a signal.
     """
     quadvel_dds.install()
     import rclpy
@@ -247,7 +292,7 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
     node, recorder = (rclpy.create_node(name, parameter_overrides=clock) for name in ("excite", "recorder"))
     try:
         if nodes:
-            ensure_alone(node)
+            ensure_exclusive(node)
         with (
             StopSignals() as signals,
             bar,
@@ -266,15 +311,16 @@ def record_motion(player: Player, path: Path, nodes: Mapping[str, Sequence[str]]
 
 
 def _spin(executor: Any, seconds: float) -> None:
+    """Spin an executor for a duration, s."""
     until = time.monotonic() + seconds
     while (left := until - time.monotonic()) > 0.0:
         executor.spin_once(timeout_sec=left)
 
 
 class _Session:
-    """A player on the topics of a robot, and a recorder beside it."""
+    """A motion player on the topics of a robot, with a recorder."""
 
-    def __init__(self, node: Any, recorder_node: Any, player: Player, simulated: bool) -> None:
+    def __init__(self, node: Any, recorder_node: Any, player: MotionPlayer, simulated: bool) -> None:
         from rclpy.qos import QoSProfile, ReliabilityPolicy
 
         from quadvel_msgs.msg import LowCmd, LowState
@@ -283,37 +329,47 @@ class _Session:
         self._player, self._simulated = player, simulated
         self._message = LowCmd
         self._started = time.monotonic()
-        self._heard: float | None = None  # when the last state came, s
+        self._heard: float | None = None  # time of the last state, s
         self._counts: Counter[str] = Counter()
         self._failure: MotionError | None = None
         self._resting, self._tick = False, 0
         self._publisher = node.create_publisher(LowCmd, "low_cmd", 1)
-        # In lockstep no state may be lost; a robot's driver may send them as best it can.
+        # Lockstep must not lose a state; drivers may send states best-effort.
         reliability = ReliabilityPolicy.RELIABLE if simulated else ReliabilityPolicy.BEST_EFFORT
         newest = QoSProfile(depth=1, reliability=reliability)
         node.create_subscription(LowState, "low_state", self._on_state, newest)
 
     def run(self, draft: Path, group: ProcessGroup, signals: StopSignals, bar: Progress) -> None:
-        """Play to the end and record it in `draft`; then, whatever ended it, let a real robot sink to rest."""
+        """Play and record the motion; in any case end with damping on a real robot.
+
+        Args:
+            draft: The file to write.
+            group: Processes to monitor.
+            signals: Ends the motion on Ctrl-C.
+            bar: Progress bar.
+        """
         from rclpy.executors import SingleThreadedExecutor
 
         from .recorder import Recorder
         from .recording_file import RecordingFile
 
         task = bar.add_task("", total=self._player.total)
-        playing, recording = SingleThreadedExecutor(), SingleThreadedExecutor()  # neither waits for the other
+        playing, recording = (
+            SingleThreadedExecutor(),
+            SingleThreadedExecutor(),
+        )  # so that neither blocks the other
         playing.add_node(self._node)
         recording.add_node(self._recorder_node)
         try:
             with Recorder(self._recorder_node, RecordingFile(draft)) as recorder:
-                for topic, kind in RECORDED.items():
+                for topic, kind in RECORDED_TOPICS.items():
                     recorder.record(topic, kind)
-                while not self._player.done:
-                    _spin(playing, LOOK)
+                while not self._player.is_done:
+                    _spin(playing, POLL_PERIOD_S)
                     recorder.write_waiting(recording)
                     bar.update(task, completed=min(self._player.elapsed, self._player.total))
-                    self._look(group, signals)
-                time.sleep(LOOK)  # what was sent last is under way
+                    self._check_running(group, signals)
+                time.sleep(POLL_PERIOD_S)  # the last messages are in transit
                 recorder.write_waiting(recording)
             self._counts = recorder.counts
         finally:
@@ -321,18 +377,22 @@ class _Session:
                 self._rest(playing)
 
     def _rest(self, playing: Any) -> None:
-        """Damping, at once and as the answer to all that comes."""
+        """Damp the joints, at once and as the answer to all further states."""
         self._resting = True
         if self._heard is not None:
             self._send(JointCommand.damping(tick=self._tick), self._node.get_clock().now().to_msg())
-        _spin(playing, REST)
+        _spin(playing, REST_S)
 
     def summary(self) -> str:
-        """What was recorded."""
+        """Summarise the recorded messages.
+
+        Returns:
+            Counts by topic.
+        """
         return ", ".join(f"{count} on {topic}" for topic, count in self._counts.items())
 
-    def _look(self, group: ProcessGroup, signals: StopSignals) -> None:
-        """Raises what ends the motion early."""
+    def _check_running(self, group: ProcessGroup, signals: StopSignals) -> None:
+        """Raise the error or the exit that ends the motion early."""
         if signals.received:
             raise typer.Exit(128 + signals.received)
         if self._failure:
@@ -341,30 +401,32 @@ class _Session:
             raise MotionError(
                 ", ".join(f"{name} ended with exit code {code}" for name, code in ended.items())
             )
-        patience = PATIENCE if self._heard is None else MAX_SILENCE
+        patience = FIRST_STATE_TIMEOUT_S if self._heard is None else STATE_TIMEOUT_S
         since = self._started if self._heard is None else self._heard
         if time.monotonic() - since > patience:
-            raise MotionError(f"nothing came on low_state for {patience:g} s")
+            raise MotionError(f"no message on low_state for {patience:g} s")
 
     def _on_state(self, message: Any) -> None:
+        """Answer a state."""
         self._heard, self._tick = time.monotonic(), message.tick
         answer = self._answer(message)
-        if self._simulated and (self._failure or self._player.done):
+        if self._simulated and (self._failure or self._player.is_done):
             return
         self._send(answer, message.stamp if self._simulated else self._node.get_clock().now().to_msg())
 
     def _answer(self, message: Any) -> JointCommand:
-        """The player's answer; damping once something went wrong, or the end has come."""
+        """Return the player's command, or damping after a failure or the end."""
         if not (self._failure or self._resting):
             try:
                 if self._player.elapsed == 0.0 and self._node.count_publishers("low_cmd") > 1:
-                    raise MotionError("somebody else sends low_cmd too; stop the controller first")
+                    raise MotionError("another node sends low_cmd; stop the controller first")
                 return self._player.answer(read_low_state(message))
             except (MessageError, MotionError) as error:
                 self._failure = MotionError(str(error))
         return JointCommand.damping(tick=message.tick)
 
     def _send(self, answer: JointCommand, stamp: Any) -> None:
+        """Publish a command."""
         command = self._message(stamp=stamp)
         write_low_cmd(answer, command)
         self._publisher.publish(command)

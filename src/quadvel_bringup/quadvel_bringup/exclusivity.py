@@ -1,4 +1,7 @@
-"""Whether another robot or simulator is there already: two on one domain would wreck each other."""
+"""Check for another robot or simulator on the same ROS domain.
+
+Two of them would send conflicting states and commands.
+"""
 
 from __future__ import annotations
 
@@ -12,42 +15,59 @@ import quadvel_dds
 
 TOPIC = "low_state"
 SERVERS = ("sim_node", "board", "driver", "quadvel_bringup.plant")
-"""Words of a command line whose process serves TOPIC"""
-LOOK = 0.5  # s; who is there answers a newcomer at once
-LONG_LOOK = 4.0  # s, where a process of this machine looks like it: a busy one answers late
+"""Words on the command lines of processes that serve TOPIC."""
+DISCOVERY_TIME_S = 0.5
+"""Time to discover other publishers."""
+LOADED_DISCOVERY_TIME_S = 4.0
+"""The same if such a process runs on this machine: a busy one answers late."""
 
 
-class NotAlone(ConnectionError):
-    """Somebody else serves the robot's topics."""
+class RobotAlreadyRunningError(ConnectionError):
+    """Another process serves the robot's topics."""
 
 
-def ensure_alone(node: Any) -> None:
-    """Raises NotAlone where somebody publishes low_state beside what this command is about to start."""
-    until = time.monotonic() + (LONG_LOOK if servers() else LOOK)
+def ensure_exclusive(node: Any) -> None:
+    """Check that no other node publishes low_state.
+
+    Args:
+        node: A node for the discovery.
+
+    Raises:
+        RobotAlreadyRunningError: There is a publisher; the sentence names its process.
+    """
+    until = time.monotonic() + (LOADED_DISCOVERY_TIME_S if robots_on_domain() else DISCOVERY_TIME_S)
     while time.monotonic() < until:
         if node.count_publishers(TOPIC):
-            raise NotAlone(
-                f"{TOPIC}: somebody publishes it already on ROS domain {ros_domain()}: {_who()}. Stop it, or set "
+            raise RobotAlreadyRunningError(
+                f"{TOPIC}: already published on ROS domain {ros_domain()} by {_describe_servers()}. Stop it, or set "
                 "ROS_DOMAIN_ID to another number"
             )
         time.sleep(0.02)
 
 
-def _who() -> str:
-    """The processes of this machine that serve TOPIC on our domain, or what else it may be."""
-    found = servers()
+def _describe_servers() -> str:
+    """Name the processes of this machine and domain that serve TOPIC, or other possible causes."""
+    found = robots_on_domain()
     if not found:
-        return "no process of yours on this machine, so a robot, another host or user, or one that was killed less than 10 s ago"
+        return "a robot, another host or user, or a process that was killed less than 10 s ago"
     return ", ".join(f"{name} (pid {pid}{_starter(pid)})" for pid, name in found.items())
 
 
-def servers() -> dict[int, str]:
-    """Names, by process id, of what serves TOPIC on our ROS domain, as far as this user may look."""
-    return {pid: name for pid, (name, domain) in robots().items() if domain == ros_domain()}
+def robots_on_domain() -> dict[int, str]:
+    """Find the processes of this machine and ROS domain that serve TOPIC.
+
+    Returns:
+        Names by process id, as far as this user may see.
+    """
+    return {pid: name for pid, (name, domain) in running_robots().items() if domain == ros_domain()}
 
 
-def robots() -> dict[int, tuple[str, str]]:
-    """Name and ROS domain, by process id, of what serves TOPIC on this machine, as far as this user may look."""
+def running_robots() -> dict[int, tuple[str, str]]:
+    """Find the processes of this machine that serve TOPIC, as far as this user may see.
+
+    Returns:
+        Name and ROS domain by process id.
+    """
     found = {}
     for folder in Path("/proc").glob("[0-9]*"):
         name = next((word for word in SERVERS if word in _words(folder)), None)
@@ -58,30 +78,38 @@ def robots() -> dict[int, tuple[str, str]]:
 
 
 def _words(folder: Path) -> list[str]:
-    """The command line of a process, without the folders of its words."""
+    """Return the command line of a process without folders."""
     try:
         return [
             word.rpartition("/")[2] for word in (folder / "cmdline").read_text(errors="replace").split("\0")
         ]
-    except OSError:  # it has ended meanwhile
+    except OSError:  # the process has ended
         return []
 
 
 def _environment(folder: Path) -> dict[str, str] | None:
+    """Return the environment of a process, or None if it belongs to another user."""
     try:
         pairs = (folder / "environ").read_text(errors="replace").split("\0")
-    except OSError:  # another user's
+    except OSError:  # not permitted
         return None
     return dict(pair.partition("=")[::2] for pair in pairs)
 
 
 def ros_domain(environment: Mapping[str, str] = os.environ) -> str:
-    """The number of the ROS domain that a process with this environment is on."""
+    """Return the ROS domain of a process.
+
+    Args:
+        environment: Its environment.
+
+    Returns:
+        The number of the domain.
+    """
     return environment.get("ROS_DOMAIN_ID") or "0"
 
 
 def _starter(pid: int) -> str:
-    """The `quadvel` command that started a process, if one did."""
+    """Name the `quadvel` command that started a process, if any."""
     try:
         parent = Path("/proc") / Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[1]
     except OSError:
@@ -93,10 +121,10 @@ def _starter(pid: int) -> str:
     return ""
 
 
-def look_for_others() -> None:
-    """The same for a command that has no node of its own."""
+def check_exclusive() -> None:
+    """Run `ensure_exclusive` with a temporary node."""
     quadvel_dds.install()
     from .session import Session
 
     with Session("look_for_others") as session:
-        ensure_alone(session.node)
+        ensure_exclusive(session.node)

@@ -1,5 +1,7 @@
-"""`quadvel demo follow`: the robot follows a person through a simulated world, in real time and every node a process of its own,
-or, as a tour of some kilometres, in one process and as fast as the machine allows.
+"""`quadvel demo follow`: the robot follows a person through a simulated world.
+
+It runs in real time with one process per node. The tour of some kilometres runs in one process
+instead, as fast as the machine permits (`quadvel_eval.following.tour`).
 """
 
 from __future__ import annotations
@@ -16,12 +18,12 @@ from quadvel_eval.following.tour_report import tour_table, write_tour
 from quadvel_eval.output import replacing
 from quadvel_sim.world import World
 
-from .nodes import arguments, command
-from .preflight import rehearse
+from .nodes import process_command, ros_arguments
+from .preflight import check_stack
 from .recorded_run import RecordedRun
 from .stack import Stack
 
-FOLLOWED = {
+FOLLOW_TOPICS = {
     "/cmd_vel_follow": "geometry_msgs/msg/Twist",
     "/follow_planner/path": "nav_msgs/msg/Path",
     "/follow_planner/state": "std_msgs/msg/String",
@@ -31,10 +33,20 @@ FOLLOWED = {
     "/person_tracker/markers": "visualization_msgs/msg/MarkerArray",
     "/scan": "sensor_msgs/msg/LaserScan",
 }
+"""Topics and types that a following run records in addition."""
 
 
 class FollowedWalk(RecordedRun):
-    """Over `seconds` after the robot began to follow."""
+    """A run that ends a given time after the robot started to follow.
+
+    Args:
+        recording: The MCAP file to write.
+        stack: The nodes and their parameters.
+        laser: Position x, y of the laser on the robot, m.
+        seconds: Duration, s.
+        view: Whether to add the operator page.
+        console: Console for output and bar.
+    """
 
     def __init__(
         self,
@@ -45,22 +57,40 @@ class FollowedWalk(RecordedRun):
         view: bool,
         console: Console,
     ) -> None:
-        """laser: where it is on the robot, x and y, m. view: with the operator's page."""
+
         place = dict(zip(("laser_x", "laser_y"), laser, strict=True))
         names = ("person_tracker", "follow_planner")
-        followers = {name: command(name, arguments(name, place, stack.parameters)) for name in names}
-        super().__init__(recording, {**stack.commands(view), **followers}, FOLLOWED, False, console, seconds)
+        followers = {
+            name: process_command(name, ros_arguments(name, place, stack.parameters)) for name in names
+        }
+        super().__init__(
+            recording, {**stack.commands(view), **followers}, FOLLOW_TOPICS, False, console, seconds
+        )
         self._seconds, self._began = seconds, float("inf")
 
     def listen(self, node: Any) -> None:
+        """Subscribe to the state of the follower.
+
+        Args:
+            node: The recorder's node.
+        """
         from std_msgs.msg import String
 
         node.create_subscription(String, "follow_planner/state", self._on_state, 10)
 
     def is_over(self, ended: Mapping[str, int]) -> bool:
+        """Return whether the time has passed and all nodes run.
+
+        Args:
+            ended: Exit codes of ended processes by name.
+
+        Returns:
+            True at the end.
+        """
         return not ended and time.monotonic() - self._began > self._seconds
 
     def _on_state(self, message: Any) -> None:
+        """Update the bar."""
         state, words = message.data.split(": ", maxsplit=1)
         if state == "following" and self._began == float("inf"):
             self._began = time.monotonic()
@@ -69,9 +99,20 @@ class FollowedWalk(RecordedRun):
 
 
 def follow(folder: Path, world: str, seconds: float, view: bool, console: Console) -> bool:
-    """Run, judge, write; whether the robot neither fell nor touched anything. view: with the operator's page."""
+    """Run, evaluate and write the results.
+
+    Args:
+        folder: Folder for the results.
+        world: Name or file of the world.
+        seconds: Duration, s.
+        view: Whether to add the operator page.
+        console: Console for the report.
+
+    Returns:
+        Whether the robot neither fell nor touched anything.
+    """
     stack, loaded = Stack(world=world), World.load(world)
-    rehearse(stack)
+    check_stack(stack)
     recorded = folder / "follow.mcap"
     x, y, _ = loaded.laser.position.tolist()
     with replacing(recorded) as draft:
@@ -81,5 +122,5 @@ def follow(folder: Path, world: str, seconds: float, view: bool, console: Consol
     outcome, moments = read_following(recorded, loaded)
     console.print(tour_table(write_tour(folder, loaded, outcome, moments)))
     console.print(f"written to {folder}: follow.mcap, tour.json, tour.png")
-    console.print(f"no video is drawn of it; to watch it: quadvel view {recorded}", highlight=False)
+    console.print(f"to watch the run: quadvel view {recorded}", highlight=False)
     return not (problem or outcome.fell or outcome.touched)

@@ -1,4 +1,4 @@
-"""`quadvel view --foxglove`: every topic that is there, live for Foxglove and Lichtblick.
+"""`quadvel view --foxglove`: all topics live for Foxglove and Lichtblick.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -18,13 +18,19 @@ from .recorder import ANY_QOS, HIDDEN, LATCHED_QOS
 from .recording_file import LATCHED
 from .session import Session
 
-LOOK = 0.5  # s, between two looks for new topics
+DISCOVERY_PERIOD_S = 0.5
+"""Time between two searches for new topics."""
 NICENESS = 5
-"""a third of the processor time of each of the robot's processes where it is short: nothing is commanded from here"""
+"""Nice value: about a third of the CPU time of a robot process under load."""
 
 
 def serve(host: str, port: int) -> None:
-    """Hand on what comes, until Ctrl-C. Raises AddressError."""
+    """Forward all topics until Ctrl-C. AddressError passes through.
+
+    Args:
+        host: Address of the loopback interface.
+        port: TCP port.
+    """
     run_after_others(NICENESS)
     with StopSignals() as signals, Session("foxglove", rights="foxglove") as session:
         server = FoxgloveServer(host, port)
@@ -33,12 +39,13 @@ def serve(host: str, port: int) -> None:
             offered: set[str] = set()
             while not signals.received:
                 _offer_new(session, server, offered)
-                session.spin_until(lambda: signals.received, LOOK)
+                session.spin_until(lambda: signals.received, DISCOVERY_PERIOD_S)
         finally:
             server.close()
 
 
 def _offer_new(session: Session, server: FoxgloveServer, offered: set[str]) -> None:
+    """Subscribe to new topics and offer them."""
     for topic, (typename, *_) in session.node.get_topic_names_and_types():
         if topic in offered or topic in HIDDEN or typename not in STORE.fielddefs:
             continue
@@ -48,11 +55,12 @@ def _offer_new(session: Session, server: FoxgloveServer, offered: set[str]) -> N
         session.node.create_subscription(
             getattr(import_module(f"{package}.{kind}"), name),
             topic,
-            _hands_on(server, topic),
+            _forwarder(server, topic),
             LATCHED_QOS if topic in LATCHED else ANY_QOS,
             raw=True,
         )
 
 
-def _hands_on(server: FoxgloveServer, topic: str) -> Callable[[bytes, dict[str, int]], Any]:
-    return lambda data, info: server.tell(topic, data, info["source_timestamp"])
+def _forwarder(server: FoxgloveServer, topic: str) -> Callable[[bytes, dict[str, int]], Any]:
+    """Return a callback that forwards the messages of a topic."""
+    return lambda data, info: server.publish(topic, data, info["source_timestamp"])

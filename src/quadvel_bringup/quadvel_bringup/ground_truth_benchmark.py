@@ -1,8 +1,9 @@
-"""`quadvel twin`: closes the loop on the stack itself.
+"""`quadvel twin`: benchmark of the identification against plants with known hidden effects.
 
-A plant whose drives hold something that the stack's model lacks walks with the shipped policy, as processes over DDS;
-`quadvel identify` sees the recording alone; the corrected model goes into the stack's simulator, and what that
-predicts is held against what the plant did. The plant's file is read by the plant's process alone.
+A plant with an effect that the stack's model lacks walks with the shipped policy, as processes over
+DDS. `quadvel identify` gets the recording only. The corrected model replaces the stack's own in
+simulation, and its predictions are compared with the plant. Only the plant's process reads the
+plant's file.
 """
 
 from __future__ import annotations
@@ -29,10 +30,10 @@ from quadvel_eval.report import read_json, write_json
 from quadvel_eval.script import SCRIPTS, Drive
 from quadvel_eval.segments import Segment, rounded
 
-from .ground_truth_page import ROWS, decision, twin_page
+from .ground_truth_page import ROWS, summary_sentence, twin_page
 from .plant import read_plant
 from .processes import ProcessGroup, StopSignals
-from .recorded_run import LOOK
+from .recorded_run import POLL_PERIOD_S
 from .scripted_walk import ScriptedWalk
 from .stack import Stack
 
@@ -40,8 +41,9 @@ PLANTS = Path(__file__).parent / "config" / "plants"
 SHIPPED = ("dry_gears", "slow_current", "chafing_cable")
 SCRIPT = "circuit"
 WALKS = ("walk_1", "walk_2")
-"""The first is fitted, the second is held out; they differ in the seed of the noise."""
-SEEDS = (0, 1)  # of the model's walks
+"""The first walk is fitted, the second one is held out; they differ in the seed of the noise."""
+MODEL_SEEDS = (0, 1)
+"""Seeds of the model's walks."""
 SCHEMA = 1
 
 
@@ -51,14 +53,13 @@ def twin_command(
         typer.Argument(help=f"Shipped plants ({', '.join(SHIPPED)}) or YAML files.", show_default="all"),
     ] = None,
     out: Annotated[Path, typer.Option(metavar="<folder>", help="Folder for the results.")] = Path("out/twin"),
-    reuse: Annotated[
-        bool, typer.Option("--reuse", help="Take up the recordings and reports that are there.")
-    ] = False,
+    reuse: Annotated[bool, typer.Option("--reuse", help="Reuse existing recordings and reports.")] = False,
 ) -> None:
-    """Walk plants that the model does not know, identify what it lacks, and hold the corrected model against them.
+    """Benchmark the identification on plants with hidden effects.
 
-    A plant walks a circuit twice, as processes over DDS; `quadvel identify` sees the recordings alone. OUT/twin.html
-    says what was found in each plant, and how far the model was from it before and after.
+    Each plant walks a circuit twice, as processes over DDS; `quadvel identify` gets the recordings
+    only. OUT/twin.html shows what was identified in each plant, and the error of the model before
+    and after.
 
     \b
     For example:
@@ -77,27 +78,35 @@ def twin_command(
     new = {name: here for name, here in folders.items() if not (reuse and _identified(here))}
     if new:
         _identify(new, console)
-    results = judge(folders, console)
+    results = evaluate_models(folders, console)
     for result in results:
         console.print(_table(result))
     write_json(folder / "twin.json", {"schema": SCHEMA, "plants": results})
     with replacing(folder / "twin.html") as draft:
         draft.write_text(twin_page(results), encoding="utf-8")
-    console.print(f"{decision(results)}\nwritten to {folder}: twin.html, twin.json", highlight=False)
+    console.print(f"{summary_sentence(results)}\nwritten to {folder}: twin.html, twin.json", highlight=False)
 
 
 def _plant_file(plant: str) -> Path:
+    """Return the file of a plant after a check of its content."""
     file = PLANTS / f"{plant}.yaml" if plant in SHIPPED else Path(plant)
     if not file.is_file():
         raise FileNotFoundError(f"{plant}: no such plant; expected {', '.join(SHIPPED)} or a YAML file")
-    read_plant(file)  # what is wrong with it shows here, before any walk
+    read_plant(file)  # report errors before any walk
     return file
 
 
 def plant_nodes(file: Path, seed: int) -> dict[str, list[str]]:
-    """Command lines of the stack in lockstep, its simulator replaced by the plant.
+    """Return the command lines of the stack in lockstep, with the plant as its simulator.
 
-    The nodes follow the states on `board/low_state`, 200 a second; `low_state` is the plant's log of each ms.
+    The nodes use the states on `board/low_state` (200 Hz); `low_state` is the plant's log (1 kHz).
+
+    Args:
+        file: The plant's file.
+        seed: Seed of its noise.
+
+    Returns:
+        Command lines by name of the node.
     """
     commands = Stack(use_sim_time=True).commands()
     arguments = Stack(use_sim_time=True).arguments()["sim_node"]
@@ -109,7 +118,7 @@ def plant_nodes(file: Path, seed: int) -> dict[str, list[str]]:
 
 
 def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
-    """Record the plant's walk. Ends with exit code 1 where the script did not go through."""
+    """Record a walk of the plant; exit code 1 if it did not complete the script."""
     with replacing(recording) as draft:
         problem = ScriptedWalk(draft, SCRIPT, plant_nodes(file, seed), True, console).run()
         if problem:
@@ -118,16 +127,16 @@ def _walk(file: Path, recording: Path, seed: int, console: Console) -> None:
 
 
 def _identified(folder: Path) -> bool:
-    """Whether there is a report that is newer than the recordings."""
+    """Return whether the report is newer than the recordings."""
     report = folder / "identify" / "report.json"
     written = [(folder / f"{walk}.mcap").stat().st_mtime for walk in WALKS]
     return report.exists() and report.stat().st_mtime >= max(written)
 
 
 def _identify(folders: Mapping[str, Path], console: Console) -> None:
-    """`quadvel identify` on the recordings of every plant, as processes that see nothing else.
+    """Run `quadvel identify` on each plant's recordings, in processes with access to nothing else.
 
-    Ends with an exit code where one of them fails or a signal comes; reports that are there stay as they were.
+    If one fails or a signal arrives, it ends with an exit code; existing reports stay unchanged.
     """
     lines: dict[str, list[str]] = {name: [] for name in folders}
     columns = (TextColumn("identifying"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
@@ -137,10 +146,10 @@ def _identify(folders: Mapping[str, Path], console: Console) -> None:
         for name, folder in folders.items():
             fitted, held_out = (str(folder / f"{walk}.mcap") for walk in WALKS)
             line = ["identify", fitted, "--holdout", held_out, "--out", str(folder / "identify")]
-            one_thread = {"OMP_NUM_THREADS": "1"}  # they share the cores among them
+            one_thread = {"OMP_NUM_THREADS": "1"}  # the processes share the cores
             group.start(name, [sys.executable, "-m", "quadvel_bringup", *line], one_thread)
         ended: dict[str, int] = {}
-        while len(ended) < len(folders) and not any(ended.values()) and not signals.wait(LOOK):
+        while len(ended) < len(folders) and not any(ended.values()) and not signals.wait(POLL_PERIOD_S):
             ended = group.ended()
             bar.update(task, completed=len(ended))
     if signals.received:
@@ -153,17 +162,34 @@ def _identify(folders: Mapping[str, Path], console: Console) -> None:
 
 
 @attrs.frozen(eq=False)
-class Walked:
-    """A recorded walk of the plant, and its part that is judged."""
+class RecordedWalk:
+    """A recorded walk of the plant.
+
+    Attributes:
+        recording: The recording.
+        joints: Its joint states and commands.
+        stretches: Start (s), end (s) and command (3,) of the evaluated part.
+        segments: Mean velocities by command.
+    """
 
     recording: Recording
     joints: replay.JointRecord
-    stretches: list[tuple[float, float, np.ndarray]]  # start, end (s), commanded vx, vy, wz
+    stretches: list[tuple[float, float, np.ndarray]]
     segments: list[Segment]
 
 
-def read_walk(path: Path) -> Walked:
-    """Raises ValueError where the walk cannot be judged."""
+def read_walk(path: Path) -> RecordedWalk:
+    """Read a recorded walk.
+
+    Args:
+        path: The recording.
+
+    Returns:
+        The walk.
+
+    Raises:
+        ValueError: It has no long constant command.
+    """
     recording = read_recording(path)
     moving = [
         c
@@ -173,28 +199,39 @@ def read_walk(path: Path) -> Walked:
     segments = [segment for segment in demo_summary.recorded_segments(recording) if segment.command.any()]
     if not moving:
         raise ValueError(
-            f"{path}: cmd_vel: found no velocity that was commanded for long enough to be judged"
+            f"{path}: cmd_vel: found no velocity command that lasts long enough for an evaluation"
         )
-    return Walked(recording, replay.read_joints(path), moving, segments)
+    return RecordedWalk(recording, replay.read_joints(path), moving, segments)
 
 
-def judge(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]:
-    """What the stack's model and the corrected one make of the plants' walks: the entries of `twin.json`."""
+def evaluate_models(folders: Mapping[str, Path], console: Console) -> list[dict[str, Any]]:
+    """Compare the stack's model and the corrected model with the plants' walks.
+
+    Args:
+        folders: Folders with walks and reports by plant.
+        console: Console for the bar.
+
+    Returns:
+        The entries of `twin.json`.
+    """
     own = ActuatorParameters.default()
     drives = [step for step in SCRIPTS[SCRIPT] if isinstance(step, Drive) and any(step.velocity)]
     commands = [(np.array(step.velocity), step.duration) for step in drives]
-    calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in SEEDS]
+    calls: list[Call] = [(replay.predicted_tracking, own, commands, seed) for seed in MODEL_SEEDS]
     for folder in folders.values():
         corrected = ActuatorParameters.load(folder / "identify" / "actuator.yaml")
-        calls += [(replay.predicted_tracking, corrected, commands, seed) for seed in SEEDS]
-        calls += [(_replayed, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
+        calls += [(replay.predicted_tracking, corrected, commands, seed) for seed in MODEL_SEEDS]
+        calls += [(_replay_errors, model, folder / f"{WALKS[1]}.mcap") for model in (own, corrected)]
     answers = iter(_answers(calls, console))
-    before = _average([next(answers) for _ in SEEDS])
+    before = _average([next(answers) for _ in MODEL_SEEDS])
     return [_entry(name, folder, before, answers) for name, folder in folders.items()]
 
 
 def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator[Any]) -> dict[str, Any]:
-    """A plant's entry. answers: of the calls that `judge` made for it, in their order."""
+    """Return the entry of a plant.
+
+    `answers`: results of its calls in `evaluate_models`, in order.
+    """
     report = read_json(folder / "identify" / "report.json")
     walks = [read_walk(folder / f"{walk}.mcap").segments for walk in WALKS]
     plant = _average(walks)
@@ -208,7 +245,7 @@ def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator
         "segments": [{"command": rounded(s.command), "plant": rounded(s.mean)} for s in plant],
         "repeat": _gap(*walks),
     }
-    for when, predicted in (("before", before), ("after", _average([next(answers) for _ in SEEDS]))):
+    for when, predicted in (("before", before), ("after", _average([next(answers) for _ in MODEL_SEEDS]))):
         entry[when] = {"tracking": _gap(plant, predicted)}
         for segment, model_segment in zip(entry["segments"], predicted, strict=True):
             segment[when] = rounded(model_segment.mean)
@@ -222,8 +259,8 @@ def _entry(name: str, folder: Path, before: Sequence[Segment], answers: Iterator
     return entry
 
 
-def _replayed(model: ActuatorParameters, recording: Path) -> tuple[float, replay.ReplayError]:
-    """Torque error (N^2 m^2) and open-loop error of a model against the walk recorded there."""
+def _replay_errors(model: ActuatorParameters, recording: Path) -> tuple[float, replay.ReplayError]:
+    """Return the torque error (N^2 m^2) and the open-loop error of a model on a recorded walk."""
     walk = read_walk(recording)
     begin, end = walk.stretches[0][0], walk.stretches[-1][1]
     torque = replay.torque_error(model, walk.joints, begin, end)
@@ -233,7 +270,7 @@ def _replayed(model: ActuatorParameters, recording: Path) -> tuple[float, replay
 
 
 def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
-    """What the calls return, in their order; they run on all cores, under a bar."""
+    """Run the calls on all cores under a bar; returns their results in order."""
     answers: list[Any] = [None] * len(calls)
     columns = (TextColumn("before and after"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
     with Progress(*columns, console=console) as bar:
@@ -245,18 +282,20 @@ def _answers(calls: Sequence[Call], console: Console) -> list[Any]:
 
 
 def _average(runs: Sequence[Sequence[Segment]]) -> list[Segment]:
-    """The mean of several runs of the same commands, segment by segment."""
+    """Return the mean of several runs of the same commands, by segment."""
     return [
         Segment(same[0].command, np.mean([s.mean for s in same], axis=0)) for same in zip(*runs, strict=True)
     ]
 
 
 def _gap(plant: Sequence[Segment], model: Sequence[Segment]) -> dict[str, float]:
+    """Return the velocity tracking gap between plant and model."""
     xy, wz = replay.tracking_gap(plant, model)
     return {"xy": rounded(xy), "wz": rounded(wz)}
 
 
 def _table(result: dict[str, Any]) -> Table:
+    """Return a table of the errors before and after."""
     table = Table(
         "error of the model against the plant",
         "before",

@@ -1,4 +1,7 @@
-"""The one page of `quadvel twin`: for each plant what was found, and how far the model is from it, before and after."""
+"""The report page of `quadvel twin`.
+
+It shows what was identified in each plant, and the error of the model before and after.
+"""
 
 from __future__ import annotations
 
@@ -19,14 +22,20 @@ Entry = Mapping[str, Any]
 
 @attrs.frozen
 class Row:
-    """A quantity in which model and plant are compared."""
+    """A compared quantity.
+
+    Attributes:
+        name: Its name.
+        unit: Its unit.
+        error: Error of the "before" or "after" part of an entry.
+        noise: Error due to noise alone, if known, of an entry.
+    """
 
     name: str
     unit: str
     error: Callable[[Entry], float]
-    """of an entry's "before" or "after\""""
+
     noise: Callable[[Entry], float | None] = lambda entry: None
-    """of an entry: an error that says nothing, where that is known"""
 
     @property
     def title(self) -> str:
@@ -46,24 +55,39 @@ YAW = Row("predicted yaw rate", "rad/s", lambda m: m["tracking"]["wz"], lambda e
 ROWS = (TORQUE, Q, DQ, VELOCITY, YAW)
 
 NOTE = (
-    "Before: the stack's own model. After: the model that `quadvel identify` made of one recorded walk. All errors are "
-    "on a second walk that was not fitted. Torque: mean square, on the recorded motion; its noise is that of the "
-    "drives. Open loop: the recorded commands are replayed over stretches of 0.2 s, each from the recorded state; root "
-    "mean square over all joints. Velocity: the shipped policy walks the same commands in the model; mean distance to "
-    "the plant's mean velocities, of two walks each; its noise is what the two walks of the plant differ by."
+    "Before: the stack's own model. After: the model that `quadvel identify` fitted to one recorded walk. All errors are "
+    "on a second, held-out walk. Torque: mean square error on the recorded motion; its noise is that of the "
+    "drives. Open loop: replay of the recorded commands over stretches of 0.2 s, each from the recorded state; root "
+    "mean square error over all joints. Velocity: the shipped policy walks the same commands in the model; mean distance "
+    "to the plant's mean velocities, of two walks each; its noise is the difference between the plant's two walks."
 )
 
 
 def twin_page(results: Sequence[Entry]) -> str:
-    """The page as HTML. results: the plants' entries of `twin.json`."""
+    """Return the page as HTML.
+
+    Args:
+        results: The plants' entries of `twin.json`.
+
+    Returns:
+        The HTML document.
+    """
     body = _overview(results) + f'<p class="note">{escape(NOTE)}</p>' + "".join(map(_plant, results))
-    return document("Closing the loop on the stack itself", decision(results), body)
+    return document("Closing the loop on the stack itself", summary_sentence(results), body)
 
 
-def decision(results: Sequence[Entry]) -> str:
-    """One sentence: how much nearer the corrected models are to their plants."""
+def summary_sentence(results: Sequence[Entry]) -> str:
+    """Summarise the error reduction of the corrected models.
+
+    Args:
+        results: The plants' entries of `twin.json`.
+
+    Returns:
+        One sentence.
+    """
 
     def cut(row: Row) -> str:
+        """Describe the mean relative change of an error."""
         share = float(np.mean([row.error(one["after"]) / row.error(one["before"]) for one in results]))
         return f"falls by {100 * (1 - share):.0f} %" if share < 1.0 else f"grows by {100 * (share - 1):.0f} %"
 
@@ -75,6 +99,7 @@ def decision(results: Sequence[Entry]) -> str:
 
 
 def _overview(results: Sequence[Entry]) -> str:
+    """Return figure and table of all plants."""
     rows = [
         (
             f'<a href="#{escape(one["name"])}">{escape(one["name"])}</a>',
@@ -88,11 +113,17 @@ def _overview(results: Sequence[Entry]) -> str:
 
 
 def _before_after(entry: Entry, row: Row) -> str:
+    """Return both errors of an entry as HTML."""
     return f"{number(row.error(entry['before']))} → <b>{number(row.error(entry['after']))}</b>"
 
 
 def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
-    """A panel for each quantity: error before beside after, plant by plant, and the noise."""
+    """Draw a panel for each quantity: errors before and after by plant, and the noise.
+
+    Args:
+        figure: An empty figure.
+        results: The plants' entries of `twin.json`.
+    """
     places = np.arange(len(results))
     for panel, row in zip(figure.subplots(1, len(ROWS)), ROWS, strict=True):
         for shift, colour, when in ((-0.19, BEFORE, "before"), (0.19, AFTER, "after")):
@@ -111,7 +142,12 @@ def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
 
 
 def draw_plant(figure: Figure, entry: Entry) -> None:
-    """How the open-loop error of q grows, and how far the predicted velocities are off, command by command."""
+    """Draw the growth of the open-loop error of q, and the velocity errors by command.
+
+    Args:
+        figure: An empty figure.
+        entry: A plant's entry of `twin.json`.
+    """
     growth, velocity = figure.subplots(1, 2, width_ratios=(2, 3))
     commands = [f"{x:g}, {y:g}, {w:g}" for x, y, w in (s["command"] for s in entry["segments"])]
     places = np.arange(len(commands))
@@ -132,11 +168,12 @@ def draw_plant(figure: Figure, entry: Entry) -> None:
 
 
 def _plant(entry: Entry) -> str:
+    """Return the section of a plant as HTML."""
     rows = []
     for row in ROWS:
         before, after = row.error(entry["before"]), row.error(entry["after"])
         noise = number(row.noise(entry))
-        rows.append((escape(row.title), number(before), number(after), _cut(before, after), noise))
+        rows.append((escape(row.title), number(before), number(after), _reduction(before, after), noise))
     name = escape(entry["name"])
     text = (
         f'<section id="{name}"><h2>{name}</h2><p><b>{escape(entry["decision"])}</b> '
@@ -157,9 +194,11 @@ def _plant(entry: Entry) -> str:
     return f"{text}<details><summary>mean velocities, m/s and rad/s</summary>{velocities}</details></section>"
 
 
-def _cut(before: float, after: float) -> str:
+def _reduction(before: float, after: float) -> str:
+    """Return the relative error reduction as text."""
     return f"{100 * (1 - after / before):.0f} %" if before else "–"
 
 
 def _velocity(values: Sequence[float]) -> str:
+    """Return a velocity as text."""
     return ", ".join(f"{value:+.3f}" for value in values)

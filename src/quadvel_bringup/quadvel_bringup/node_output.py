@@ -1,4 +1,7 @@
-"""What the nodes write, shown to people: line by line behind the name of the node, of its log what it says."""
+"""Output of nodes on the terminal, with the name of the node before each line.
+
+Log lines are shown without their header.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +15,34 @@ from rich.text import Text
 
 COLOURS = ("cyan", "green", "magenta", "yellow", "blue")
 LOGGED = re.compile(r"\[(DEBUG|INFO|WARN|ERROR|FATAL)\] \[[\d.]+\] \[[^\]]+\]: (.*)")
-"""A line of a node's log: its level and what it says"""
+"""A line of a node's log: its level and its text."""
 STYLES = {"WARN": "yellow", "ERROR": "bold red", "FATAL": "bold red"}
 
 
 class PrefixedOutput:
-    """Prints each line behind the name of the process that wrote it, a colour each; of a log what it says."""
+    """Prints lines of processes with a coloured prefix; call it with name and line.
+
+    Args:
+        names: Names of the processes.
+        console: Console with `soft_wrap`, so that lines stay whole.
+    """
 
     def __init__(self, names: Iterable[str], console: Console) -> None:
-        """console: one with `soft_wrap`, so that lines stay whole."""
+
         self._console = console
         self._colours = dict(zip(names, itertools.cycle(COLOURS), strict=False))
         self._width = max(map(len, self._colours), default=0)
         self._lock = threading.Lock()
 
     def __call__(self, name: str, line: str) -> None:
+        """Print a line.
+
+        Args:
+            name: Name of the process.
+            line: Its line.
+        """
         label = Text(f"{name:>{self._width}} | ", style=self._colours[name])
         logged = LOGGED.fullmatch(line)
-        said = Text(logged[2], style=STYLES.get(logged[1], "")) if logged else Text.from_ansi(line)
+        text = Text(logged[2], style=STYLES.get(logged[1], "")) if logged else Text.from_ansi(line)
         with self._lock:
-            self._console.print(label + said, highlight=False)
+            self._console.print(label + text, highlight=False)

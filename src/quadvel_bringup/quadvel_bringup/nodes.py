@@ -1,6 +1,6 @@
-"""Which nodes there are, and how to start one: in this process, or as a process of its own.
+"""The table of all nodes, and how to start one in this process or in its own.
 
-The one table of nodes; the entry points in the packages' setup.cfg files name the same modules.
+The entry points in the packages' setup.cfg files name the same modules.
 """
 
 from __future__ import annotations
@@ -19,50 +19,71 @@ Parameters = Mapping[str, bool | str | int | float]
 
 @attrs.frozen
 class NodeEntry:
-    """The module with the node's `main`, and what the node does, in a few words."""
+    """A node.
+
+    Attributes:
+        module: Module with its `main`.
+        about: What it does, in a few words.
+    """
 
     module: str
     about: str
 
     @property
     def package(self) -> str:
-        """The ROS 2 package that the node belongs to."""
+        """ROS 2 package of the node."""
         return self.module.partition(".")[0]
 
 
 NODES = {
-    "sim_node": NodeEntry("quadvel_sim.sim_node", "the stand-in robot: MuJoCo behind low_state and low_cmd"),
+    "sim_node": NodeEntry("quadvel_sim.sim_node", "the simulated robot: MuJoCo behind low_state and low_cmd"),
     "board": NodeEntry("quadvel_sim.board_node", "the same robot behind the UDP interface of the AlienGo"),
-    "driver": NodeEntry("quadvel_driver.driver", "the AlienGo itself: its UDP interface and its remote"),
-    "estimator": NodeEntry("quadvel_estimator.estimator", "linear velocity from IMU and encoders"),
-    "controller": NodeEntry("quadvel_policy.controller", "the policy at 200 Hz, its modes and its safety"),
-    "command_mux": NodeEntry("quadvel_policy.command_mux_node", "which of several cmd_vel counts"),
-    "person_tracker": NodeEntry("quadvel_follow.person_tracker_node", "persons in the scans of a 2-D laser"),
-    "follow_planner": NodeEntry("quadvel_follow.follow_planner_node", "follows a person, at a set distance"),
-    "trajectory_planner": NodeEntry("quadvel_follow.trajectory_planner", "walks a way from a file"),
-    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
-    "planner": NodeEntry(
-        "quadvel_eval.scripted_planner", "walks the robot through a script, as the demo does"
+    "driver": NodeEntry("quadvel_driver.driver", "the real AlienGo: its UDP interface and its remote"),
+    "estimator": NodeEntry("quadvel_estimator.estimator", "estimates linear velocity from IMU and encoders"),
+    "controller": NodeEntry("quadvel_policy.controller", "runs the policy at 200 Hz, its modes and guards"),
+    "command_mux": NodeEntry("quadvel_policy.command_mux_node", "selects a velocity source by priority"),
+    "person_tracker": NodeEntry(
+        "quadvel_follow.person_tracker_node", "detects and tracks people in 2-D laser scans"
     ),
+    "follow_planner": NodeEntry("quadvel_follow.follow_planner_node", "follows a person, at a set distance"),
+    "trajectory_planner": NodeEntry("quadvel_follow.trajectory_planner", "walks a path from a file"),
+    "view": NodeEntry("quadvel_view.view_node", "the operator's page in the browser"),
+    "planner": NodeEntry("quadvel_eval.scripted_planner", "commands a scripted walk, as the demo does"),
 }
 
 
-def entry(name: str) -> NodeEntry:
-    """The node's entry. Raises ValueError that lists the known ones."""
+def node_entry(name: str) -> NodeEntry:
+    """Return the entry of a node.
+
+    Args:
+        name: The node.
+
+    Returns:
+        Its entry.
+
+    Raises:
+        ValueError: There is no such node; the sentence lists all.
+    """
     if name not in NODES:
-        raise ValueError(f"there is no node '{name}'; known are {', '.join(NODES)}")
+        raise ValueError(f"there is no node '{name}'; known nodes: {', '.join(NODES)}")
     return NODES[name]
 
 
 def run(name: str, arguments: Sequence[str]) -> None:
     """Run a node in this process until it ends, as `ros2 run` would.
 
-    `arguments` are those of ROS 2 ("--ros-args", "-p", "terrain:=rough", ...). Without ROS 2 it runs on the
-    embedded middleware. Raises ValueError on an unknown node, or an argument that is not one of ROS 2.
+    Without ROS 2 it runs on the embedded middleware.
+
+    Args:
+        name: The node.
+        arguments: Arguments of ROS 2 ("--ros-args", "-p", "terrain:=rough", ...).
+
+    Raises:
+        ValueError: The node is unknown, or an argument is not one of ROS 2.
     """
-    module = entry(name).module
+    module = node_entry(name).module
     if arguments and arguments[0] != "--ros-args":
-        raise ValueError(f"unexpected argument '{arguments[0]}'; parameters go as --ros-args -p NAME:=VALUE")
+        raise ValueError(f"unexpected argument '{arguments[0]}'; set parameters by --ros-args -p NAME:=VALUE")
     import quadvel_dds
 
     quadvel_dds.install()
@@ -71,32 +92,65 @@ def run(name: str, arguments: Sequence[str]) -> None:
 
 
 def enclave(name: str) -> list[str]:
-    """The arguments of ROS 2 that name a process's rights under SROS 2 (docs/security.md); without it they change nothing."""
+    """Return the arguments for the SROS 2 enclave of a process (docs/security.md).
+
+    Without SROS 2 they have no effect.
+
+    Args:
+        name: Name of the enclave.
+
+    Returns:
+        Arguments of ROS 2.
+    """
     return ["--enclave", f"/quadvel/{name}"]
 
 
 def launch_arguments(name: str) -> dict[str, Any]:
-    """What `launch_ros.actions.Node` wants to know of a node, but for its parameters."""
-    package = entry(name).package
+    """Return the keyword arguments of `launch_ros.actions.Node` for a node, without its parameters.
+
+    Args:
+        name: The node.
+
+    Returns:
+        Keyword arguments.
+    """
+    package = node_entry(name).package
     return {
         "package": package, "executable": name, "name": name, "output": "screen", "ros_arguments": enclave(name)
     }  # fmt: skip
 
 
-def arguments(name: str, parameters: Parameters, file: Path | None = None) -> list[str]:
-    """A node's arguments of ROS 2: its enclave and its parameters, which stand above those of the parameter file."""
+def ros_arguments(name: str, parameters: Parameters, file: Path | None = None) -> list[str]:
+    """Return the arguments of ROS 2 for a node.
+
+    Args:
+        name: The node.
+        parameters: Parameters, which override those of the file.
+        file: Parameter file, or None.
+
+    Returns:
+        Enclave, parameter file and parameters.
+    """
     words = ["--ros-args", *enclave(name)]
     if file is not None:
-        words += ["--params-file", str(file.resolve())]  # before the parameters: what comes later counts
+        words += ["--params-file", str(file.resolve())]  # before the parameters: later values override
     for parameter, value in parameters.items():
-        # JSON is YAML with quotes, and without them a file named "1" would be a number.
+        # JSON is quoted YAML; without quotes a file named "1" would be read as a number.
         words += ["-p", f"{parameter}:={json.dumps(value)}"]
     return words
 
 
-def command(name: str, arguments: Sequence[str] = ()) -> list[str]:
-    """The command line that runs a node as a process of its own."""
-    entry(name)
+def process_command(name: str, arguments: Sequence[str] = ()) -> list[str]:
+    """Return the command line that runs a node in its own process.
+
+    Args:
+        name: The node.
+        arguments: Arguments of ROS 2.
+
+    Returns:
+        The command line.
+    """
+    node_entry(name)
     return [sys.executable, "-m", "quadvel_bringup.nodes", name, *arguments]
 
 

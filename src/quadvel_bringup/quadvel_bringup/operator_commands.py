@@ -1,7 +1,7 @@
-"""Orders of the operator that need no ROS 2: modes of the controller, and what can be done to a simulated robot.
+"""Operator commands without ROS 2: modes of the controller and services of the simulator.
 
-Each prints what came of it and returns the exit code: 1 where it was refused or failed. Needs `rclpy`: ROS 2's own, or
-the embedded one after `quadvel_dds.install()`.
+Each function prints the response and returns the exit code, 1 if the command was refused or failed.
+Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
 
 from __future__ import annotations
@@ -15,106 +15,160 @@ from std_srvs.srv import SetBool, Trigger
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import Push, ResetSim, SetMode, StepSim
 
-from .session import NobodyThere, Session
+from .session import NotRunningError, Session
 from .stack import LOW_LEVELS
 
-CONTROLLER = "start the robot first: quadvel up"
-SIMULATIONS = tuple(dict.fromkeys(level.simulation for level in LOW_LEVELS.values() if level.simulation))
-"""The nodes of which one simulates the robot; they offer the same services"""
-WAY_OUT = "quadvel mode passive, then quadvel mode stand_up"
-PASSING = {"stand_up": "stance", "lie_down": "passive"}
-"""Modes that end by themselves, and the one that follows"""
-LOOK = 2.0
-"""s to find the controller and the estimator next to a simulator; it may run without them"""
-LONGEST = 10.0
-"""s that standing up or lying down may take"""
+START_HINT = "start the robot first: quadvel up"
+"""Advice if no controller runs."""
+SIMULATOR_NODES = tuple(dict.fromkeys(level.simulation for level in LOW_LEVELS.values() if level.simulation))
+"""Nodes that can simulate the robot; they offer the same services."""
+RECOVERY_HINT = "quadvel mode passive, then quadvel mode stand_up"
+"""Advice after a fault."""
+TRANSIENT_MODES = {"stand_up": "stance", "lie_down": "passive"}
+"""Modes that end by themselves, and their successors."""
+DISCOVERY_TIME_S = 2.0
+"""Time to discover controller and estimator, which a simulator may lack."""
+MODE_TIMEOUT_S = 10.0
+"""Longest duration of standing up or lying down."""
 
 
 def mode(wanted: str) -> int:
-    """Ask the controller for a mode; where that takes a while, wait until it is done."""
+    """Request a mode of the controller and wait until a transient mode is over.
+
+    Args:
+        wanted: The mode.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        NotRunningError: The controller stopped reporting.
+    """
     with Session("mode") as session:
         states = session.listen(ControllerState, "controller/state")
-        response = session.call(SetMode, ["controller/set_mode"], lambda: CONTROLLER, mode=wanted)
+        response = session.call(SetMode, ["controller/set_mode"], lambda: START_HINT, mode=wanted)
         print(response.message)
         if not response.success:
             if session.spin_until(lambda: states, 1.0) and states[-1].mode_name == "fault":
-                print(f"once its cause is gone: {WAY_OUT}")
+                print(f"once its cause is gone: {RECOVERY_HINT}")
             return 1
-        if wanted not in PASSING:
+        if wanted not in TRANSIENT_MODES:
             return 0
         asked = time.monotonic()
         session.spin_until(lambda: states and states[-1].mode_name == wanted, 1.0)
-        session.spin_until(lambda: states and states[-1].mode_name != wanted, LONGEST)
+        session.spin_until(lambda: states and states[-1].mode_name != wanted, MODE_TIMEOUT_S)
         if not states:
-            raise NobodyThere(f"controller/state: nothing came for {LONGEST:g} s")
+            raise NotRunningError(f"controller/state: no message for {MODE_TIMEOUT_S:g} s")
         state = states[-1]
         print(f"{state.mode_name}: {state.reason} ({time.monotonic() - asked:.1f} s)")
-        return 0 if state.mode_name == PASSING[wanted] else 1
+        return 0 if state.mode_name == TRANSIENT_MODES[wanted] else 1
 
 
 def enable(enabled: bool) -> int:
-    """Allow walking, as a robot wants it from its operator, or forbid it."""
+    """Permit or forbid walking.
+
+    Args:
+        enabled: Whether walking is permitted.
+
+    Returns:
+        The exit code.
+    """
     with Session("enable") as session:
-        return _told(session.call(SetBool, ["controller/enable_walking"], lambda: CONTROLLER, data=enabled))
+        return _print_response(
+            session.call(SetBool, ["controller/enable_walking"], lambda: START_HINT, data=enabled)
+        )
 
 
 def reset(keyframe: str, terrain: str = "", slope: float = 0.0) -> int:
-    """Put the simulated robot back, on other ground where `terrain` names one.
+    """Reset the simulated robot and its odometry.
 
-    It goes through passive, as a jump to another place is a fault of a robot that is not; odometry starts again there.
+    It requests passive mode first: in other modes a jump in position is a fault.
+
+    Args:
+        keyframe: Initial posture, "lie" or "stand".
+        terrain: New terrain, or "" for the present one.
+        slope: Inclination of the terrain, rad.
+
+    Returns:
+        The exit code.
     """
     with Session("reset") as session:
         passive = session.node.create_client(SetMode, "controller/set_mode")
         odometry = session.node.create_client(Trigger, "estimator/reset_odometry")
-        session.spin_until(lambda: passive.service_is_ready() and odometry.service_is_ready(), LOOK)
+        session.spin_until(
+            lambda: passive.service_is_ready() and odometry.service_is_ready(), DISCOVERY_TIME_S
+        )
         if passive.service_is_ready():
-            session.call(SetMode, [passive.service_name], lambda: CONTROLLER, mode="passive")
-        put_back = _call_simulation(
+            session.call(SetMode, [passive.service_name], lambda: START_HINT, mode="passive")
+        put_back = _call_simulator(
             session, "reset", ResetSim, keyframe=keyframe, terrain=terrain, slope=slope
         )
-        code = _told(put_back)
+        code = _print_response(put_back)
         if code == 0 and odometry.service_is_ready():
-            session.call(Trigger, [odometry.service_name], lambda: CONTROLLER)
+            session.call(Trigger, [odometry.service_name], lambda: START_HINT)
         return code
 
 
 def pause(paused: bool) -> int:
-    """Let simulated time stand still, or go on."""
-    return _to_simulation("pause", SetBool, data=paused)
+    """Pause or resume the simulation.
+
+    Args:
+        paused: Whether to pause.
+
+    Returns:
+        The exit code.
+    """
+    return _order_simulator("pause", SetBool, data=paused)
 
 
 def step(milliseconds: int) -> int:
-    """Let a paused simulation run on for a while."""
-    return _to_simulation("step", StepSim, repeats=False, steps=milliseconds)
+    """Advance a paused simulation.
+
+    Args:
+        milliseconds: Simulated time, ms.
+
+    Returns:
+        The exit code.
+    """
+    return _order_simulator("step", StepSim, repeats=False, steps=milliseconds)
 
 
 def push(force: tuple[float, float, float], seconds: float, body: str) -> int:
-    """Push the simulated robot with a force (N, world frame)."""
+    """Apply a force to the simulated robot.
+
+    Args:
+        force: x, y, z, N, world frame.
+        seconds: Duration, s.
+        body: Name of the body.
+
+    Returns:
+        The exit code.
+    """
     x, y, z = force
     wrench = Wrench(force=Vector3(x=x, y=y, z=z))
-    return _to_simulation("push", Push, repeats=False, body=body, wrench=wrench, duration=seconds)
+    return _order_simulator("push", Push, repeats=False, body=body, wrench=wrench, duration=seconds)
 
 
-def _to_simulation(order: str, kind: Any, repeats: bool = True, **fields: Any) -> int:
-    """Whichever node simulates the robot carries it out. repeats: whether twice is as good as once."""
+def _order_simulator(order: str, kind: Any, repeats: bool = True, **fields: Any) -> int:
+    """Call a service of the simulator. `repeats`: whether a repeated call does no harm."""
     with Session(order) as session:
-        return _told(_call_simulation(session, order, kind, repeats, **fields))
+        return _print_response(_call_simulator(session, order, kind, repeats, **fields))
 
 
-def _call_simulation(session: Session, order: str, kind: Any, repeats: bool = True, **fields: Any) -> Any:
-    services = [f"{node}/{order}" for node in SIMULATIONS]
-    return session.call(kind, services, lambda: _no_simulation(session), repeats, **fields)
+def _call_simulator(session: Session, order: str, kind: Any, repeats: bool = True, **fields: Any) -> Any:
+    """Call a service of the node that simulates the robot; returns the response."""
+    services = [f"{node}/{order}" for node in SIMULATOR_NODES]
+    return session.call(kind, services, lambda: _missing_simulator(session), repeats, **fields)
 
 
-def _no_simulation(session: Session) -> str:
+def _missing_simulator(session: Session) -> str:
+    """Explain why no simulator answers."""
     if session.node.count_publishers("low_state"):
-        return (
-            "the robot that is there is not simulated by quadvel, and a real one can not be given this order"
-        )
+        return "the running robot is not simulated by quadvel, and a real one does not support this command"
     return "there is no simulator; start one: quadvel up"
 
 
-def _told(response: Any) -> int:
-    """Print what came of an order; the exit code."""
+def _print_response(response: Any) -> int:
+    """Print the message of a response and return the exit code."""
     print(response.message)
     return 0 if response.success else 1

@@ -1,8 +1,9 @@
-"""The plant of `quadvel twin`: a simulated robot whose drives do something that the stack's model does not know.
+"""The plant of `quadvel twin`: a simulated robot with a hidden effect in its drives.
 
-A process of its own, which alone reads its configuration: python -m quadvel_bringup.plant FILE --ros-args ... The
-physics here is written from the mechanics and the circuit, apart from the laws that identification fits; the other
-processes see what it does to the joints, and nothing else.
+The stack's model lacks that effect. The plant runs in its own process, which alone reads its
+configuration: python -m quadvel_bringup.plant FILE --ros-args ... The physics is written from
+    mechanics
+and circuit theory, separately from the effects that identification fits.
 """
 
 from __future__ import annotations
@@ -26,41 +27,99 @@ from quadvel_sim.simulator import DT, Simulator
 Array = NDArray[np.float64]
 
 
-class Physics(Protocol):
-    """What a drive does to the torque it was asked for; `memory` is all that it remembers."""
+class HiddenPhysics(Protocol):
+    """An effect on the torque of a drive.
+
+    Attributes:
+        memory: Its complete state.
+    """
 
     memory: Array
 
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
-        """The torque (12,) N m of the next `dt` (s)."""
+        """Compute the joint torque.
+
+        Args:
+            asked: Torque of the modelled drive, (12,) N m.
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            dt: Time step, s.
+
+        Returns:
+            Torque (12,) N m during the next step.
+        """
 
 
 @attrs.define
 class DryGear:
-    """Friction of a gear that runs dry: bristles that bend and slip (the LuGre model). Numbers a joint, (12,)."""
+    """Friction of a dry gear: the LuGre bristle model (Canudas de Wit et al., 1995).
 
-    slip: Array  # N m, sliding
-    stick: Array  # N m, breaking away
-    stribeck_speed: float = 0.25  # rad/s
-    stiffness: float = 250.0  # N m/rad, of the bristles
-    memory: Array = attrs.Factory(lambda: np.zeros(12))  # rad, their bending
+    Attributes:
+        slip: Coulomb friction F_c, (12,) N m.
+        stick: Static friction F_s, (12,) N m.
+        stribeck_speed: Stribeck speed v_s, rad/s.
+        stiffness: Stiffness sigma_0 of the bristles, N m/rad.
+        memory: Deflection z of the bristles, (12,) rad.
+    """
+
+    slip: Array
+    stick: Array
+    stribeck_speed: float = 0.25
+    stiffness: float = 250.0
+    memory: Array = attrs.Factory(lambda: np.zeros(12))
 
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
+        """Subtract the friction; see HiddenPhysics.torque.
+
+        Args:
+            asked: (12,) N m.
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            dt: s.
+
+        Returns:
+            (12,) N m.
+        """
+        # LuGre model with bristle deflection z and friction F = sigma_0 z:
+        #     g(v) = F_c + (F_s - F_c) exp(-(v / v_s)^2),  dz/dt = v - sigma_0 |v| z / g(v)
+        # The decay term is integrated implicitly, because it is stiff at high speed:
+        #     z <- (z + dt v) / (1 + dt sigma_0 |v| / g(v))
         level = self.slip + (self.stick - self.slip) * np.exp(-((dq / self.stribeck_speed) ** 2))
         rate = self.stiffness * np.abs(dq) / np.maximum(level, 1e-9)
-        self.memory = (self.memory + dt * dq) / (1.0 + dt * rate)  # implicit: stiff where the joint runs fast
+        self.memory = (self.memory + dt * dq) / (1.0 + dt * rate)
         return np.where(level > 0.0, asked - self.stiffness * self.memory, asked)
 
 
 @attrs.define
 class SlowCurrent:
-    """A weak current loop: proportional control of the current through a winding, with its back-EMF left over."""
+    """A slow current loop: proportional current control of a winding, with uncompensated back-EMF.
 
-    constant: Array  # s, winding over loop gain, (12,)
-    droop: Array  # N m s/rad, what the back-EMF takes off the torque, (12,)
-    memory: Array = attrs.Factory(lambda: np.full(12, np.nan))  # N m, current times torque constant
+    Attributes:
+        constant: Time constant of the loop, (12,) s: inductance over loop gain.
+        droop: Torque lost to the back-EMF, (12,) N m s/rad.
+        memory: Current times torque constant, (12,) N m; NaN before the first step.
+    """
+
+    constant: Array
+    droop: Array
+    memory: Array = attrs.Factory(lambda: np.full(12, np.nan))
 
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
+        """Return the mean torque of a first-order lag; see HiddenPhysics.torque.
+
+        Args:
+            asked: (12,) N m.
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            dt: s.
+
+        Returns:
+            (12,) N m.
+        """
+        # First-order lag towards tau_end = tau_asked - droop dq:
+        #     tau(t) = tau_end + (tau_0 - tau_end) exp(-t / T)
+        # The result is its mean over the step:
+        #     tau_end + (tau_0 - tau_end) (1 - exp(-dt / T)) T / dt
         end = asked - self.droop * dq
         begin = np.where(np.isnan(self.memory), end, self.memory)
         share = np.exp(-dt / np.maximum(self.constant, 1e-6))
@@ -71,19 +130,38 @@ class SlowCurrent:
 
 @attrs.define
 class ChafingCable:
-    """A cable that rubs in a part of a joint's range and is drawn tight there: friction and a pull, (12,) each."""
+    """Friction and a constant pull of a cable that chafes in a part of a joint's range.
 
-    rub: Array  # N m
-    begin: Array  # rad, from where on, towards larger angles
-    width: float = 0.08  # rad, over which it comes to lie on
+    Attributes:
+        rub: Friction, (12,) N m.
+        begin: Angle where the contact starts, towards larger angles, (12,) rad.
+        width: Range over which the contact builds up, rad.
+        memory: Empty; the effect has no state.
+    """
+
+    rub: Array
+    begin: Array
+    width: float = 0.08
     memory: Array = attrs.Factory(lambda: np.zeros(0))
 
     def torque(self, asked: Array, q: Array, dq: Array, dt: float) -> Array:
+        """Subtract friction and pull in the contact range; see HiddenPhysics.torque.
+
+        Args:
+            asked: (12,) N m.
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            dt: s.
+
+        Returns:
+            (12,) N m.
+        """
+        # Contact share c(q) = (1 + tanh((q - q_0) / w)) / 2; tau = tau_asked - r c (0.4 + tanh(dq / 0.2)).
         touching = 0.5 * (1.0 + np.tanh((q - self.begin) / self.width))
         return asked - self.rub * touching * (0.4 + np.tanh(dq / 0.2))
 
 
-KINDS: dict[str, Callable[..., Physics]] = {
+PLANT_KINDS: dict[str, Callable[..., HiddenPhysics]] = {
     "dry_gear": DryGear,
     "slow_current": SlowCurrent,
     "chafing_cable": ChafingCable,
@@ -91,9 +169,16 @@ KINDS: dict[str, Callable[..., Physics]] = {
 
 
 class HiddenDrives(ActuatorModel):
-    """The stack's actuator model with `physics` behind it; torque noise and limit come last."""
+    """The stack's actuator model followed by a hidden effect, torque noise and the torque limit.
 
-    def __init__(self, parameters: ActuatorParameters, physics: Physics, dt: float, seed: int) -> None:
+    Args:
+        parameters: The stack's actuator parameters.
+        physics: The hidden effect.
+        dt: Time step, s.
+        seed: Seed of the noise.
+    """
+
+    def __init__(self, parameters: ActuatorParameters, physics: HiddenPhysics, dt: float, seed: int) -> None:
         super().__init__(attrs.evolve(parameters, torque_noise=0.0), dt=dt, seed=seed)
         self._physics = physics
         self._deviation = np.sqrt(parameters.torque_noise)
@@ -101,34 +186,58 @@ class HiddenDrives(ActuatorModel):
         self._next_draw = self._draws.standard_normal(12)
 
     def step(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
-        """As `ActuatorModel.step`."""
+        """Advance one step, as `ActuatorModel.step`.
+
+        Args:
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            law: Further arguments of `ActuatorModel.step`.
+            named: Further arguments of `ActuatorModel.step`.
+
+        Returns:
+            Torque (12,) N m.
+        """
         torque = self._answer(q, dq, *law, **named)
         self._next_draw = self._draws.standard_normal(12)
         return torque
 
     def peek(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
-        """As `ActuatorModel.peek`."""
+        """Return the torque of the next step without a change of state, as `ActuatorModel.peek`.
+
+        Args:
+            q: (12,) rad.
+            dq: (12,) rad/s.
+            law: Further arguments of `ActuatorModel.peek`.
+            named: Further arguments of `ActuatorModel.peek`.
+
+        Returns:
+            Torque (12,) N m.
+        """
         memory, draw, draws = self._physics.memory, self._next_draw, self._draws.bit_generator.state
         torque = super().peek(q, dq, *law, **named)
         self._physics.memory, self._next_draw, self._draws.bit_generator.state = memory, draw, draws
         return torque
 
     def _answer(self, q: Array, dq: Array, *law: Any, **named: Any) -> Array:
+        """Return the torque of one step with the present noise."""
         asked = super().step(q, dq, *law, **named)
         torque = self._physics.torque(asked, q, dq, self.dt) + self._deviation * self._next_draw
         return np.clip(torque, -robot.TORQUE_LIMIT, robot.TORQUE_LIMIT)
 
 
 class Plant(Simulator):
-    """A simulated robot with hidden drives, made from a plant's file.
+    """A simulated robot with hidden drives.
 
-    `log` is given its state every ms, as the board of a robot logs its joints faster than it reports them.
+    Args:
+        config: Configuration of the simulator.
+        physics: Makes the hidden effect.
+        log: Receives the state every ms: robot boards log joints faster than they report them.
     """
 
     def __init__(
         self,
         config: SimulatorConfig,
-        physics: Callable[[], Physics],
+        physics: Callable[[], HiddenPhysics],
         log: Callable[[RobotState], None] = lambda state: None,
     ) -> None:
         self._make_physics = physics
@@ -136,38 +245,57 @@ class Plant(Simulator):
         super().__init__(config)
 
     def step(self, n: int = 1) -> None:
-        """As `Simulator.step`."""
+        """Advance and log each ms, as `Simulator.step`.
+
+        Args:
+            n: Number of steps of 1 ms.
+        """
         super().step()
         for _ in range(n - 1):
             self.state()
             super().step()
 
     def state(self) -> RobotState:
-        """As `Simulator.state`; logged, as every reading is."""
+        """Read and log the state, as `Simulator.state`.
+
+        Returns:
+            The state with sensor noise.
+        """
         state = super().state()
         self._log(state)
         return state
 
     def _make_actuator(self, seed: int) -> ActuatorModel:
+        """Make the hidden drives."""
         return HiddenDrives(self.config.actuator, self._make_physics(), DT, seed)
 
 
-def read_plant(path: Path) -> Callable[[], Physics]:
-    """What makes the physics that the file describes. ValueError names file, field and what was expected."""
+def read_plant(path: Path) -> Callable[[], HiddenPhysics]:
+    """Read the file of a plant.
+
+    Args:
+        path: YAML file with `kind` and the parameters of that class.
+
+    Returns:
+        A function that makes the hidden effect.
+
+    Raises:
+        ValueError: The content is wrong; the sentence names file, field and expectation.
+    """
     content = read_yaml(path, "a YAML file of a plant")
-    if not isinstance(content, Mapping) or content.get("kind") not in KINDS:
+    if not isinstance(content, Mapping) or content.get("kind") not in PLANT_KINDS:
         found = content.get("kind") if isinstance(content, Mapping) else content
-        raise ValueError(f"{path}: kind: found {found!r}, expected one of {', '.join(KINDS)}")
+        raise ValueError(f"{path}: kind: found {found!r}, expected one of {', '.join(PLANT_KINDS)}")
     values = {name: _value(path, name, value) for name, value in content.items() if name != "kind"}
     try:
-        KINDS[content["kind"]](**values)
+        PLANT_KINDS[content["kind"]](**values)
     except TypeError as error:
         raise ValueError(f"{path}: {error}") from None
-    return lambda: KINDS[content["kind"]](**values)
+    return lambda: PLANT_KINDS[content["kind"]](**values)
 
 
 def _value(path: Path, name: str, value: Any) -> Any:
-    """A number, or numbers by joint (joints that are not named have 0), as (12,)."""
+    """Convert a number, or numbers by joint (0 for missing joints) to (12,)."""
     if isinstance(value, Mapping):
         numbers = np.zeros(12)
         try:
@@ -181,7 +309,10 @@ def _value(path: Path, name: str, value: Any) -> Any:
 
 
 def main() -> None:
-    """FILE, and then what ROS 2 wants. The log of the joints goes to the topic joint_log."""
+    """Run the plant with the arguments FILE and those of ROS 2.
+
+    The joint log goes to the topic joint_log.
+    """
     path, *arguments = sys.argv[1:]
     try:
         physics = read_plant(Path(path))
@@ -197,7 +328,7 @@ def main() -> None:
     from quadvel_sim.sim_node import SimNode
 
     class PlantNode(SimNode):
-        def __init__(self, physics: Callable[[], Physics]) -> None:
+        def __init__(self, physics: Callable[[], HiddenPhysics]) -> None:
             super().__init__(lambda config: Plant(config, physics, self._log_joints()))
 
         def _log_joints(self) -> Callable[[RobotState], None]:

@@ -1,6 +1,7 @@
-"""What is wrong with a stack's parameters and files, found before a process starts: one sentence instead of four.
+"""Check of a stack's parameters and files before any process starts.
 
-The nodes look for themselves once more when they start; here the same records are made of the same values.
+An error is one sentence, instead of one per node. The nodes check again when they start; this
+module builds the same records from the same values.
 """
 
 from __future__ import annotations
@@ -20,57 +21,72 @@ from .stack import Stack
 
 
 @attrs.frozen
-class Part:
-    """The record of a node's parameters, and what the node makes of it that may fail."""
+class NodeCheck:
+    """A node's parameter record and the construction that may fail.
+
+    Attributes:
+        record: "module:class" of the record.
+        make: Makes from the record what the node would make.
+    """
 
     record: str
     make: Callable[[Any], object]
 
 
 def _policy(settings: Any) -> object:
+    """Load the policy, if one is given."""
     from quadvel_policy.policy_file import PolicyFile
 
     return PolicyFile(Path(settings.policy)) if settings.policy else None
 
 
-# The shipped networks are as they were shipped; loading them would only take time.
-PARTS = {
-    "sim_node": Part("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
-    "board": Part(
+# Skip the shipped networks: they are tested and slow to load.
+NODE_CHECKS = {
+    "sim_node": NodeCheck("quadvel_sim.parameters:SimParameters", lambda settings: settings.config()),
+    "board": NodeCheck(
         "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
     ),
-    "driver": Part(
-        "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()
-    ),
-    "estimator": Part(
+    "driver": NodeCheck("quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()),
+    "estimator": NodeCheck(
         "quadvel_estimator.estimator:EstimatorParameters",
         lambda settings: settings.make_estimator() if settings.model else None,
     ),
-    "controller": Part("quadvel_policy.controller:ControllerParameters", _policy),
-    "command_mux": Part("quadvel_policy.command_mux_node:MuxParameters", lambda settings: settings.inputs()),
+    "controller": NodeCheck("quadvel_policy.controller:ControllerParameters", _policy),
+    "command_mux": NodeCheck(
+        "quadvel_policy.command_mux_node:MuxParameters", lambda settings: settings.inputs()
+    ),
 }
 
 
-def rehearse(stack: Stack) -> None:
-    """Raises ValueError, which names the node and the parameter, or OSError where the stack could not start."""
+def check_stack(stack: Stack) -> None:
+    """Check a stack. Errors pass through: ValueError names node and parameter, OSError the file.
+
+    Args:
+        stack: The nodes and their parameters.
+    """
     quadvel_dds.install()
     _check_names(stack.parameters)
     for name, arguments in stack.arguments().items():
-        if name in PARTS:
-            rehearse_node(name, arguments)
+        if name in NODE_CHECKS:
+            check_node(name, arguments)
 
 
-def rehearse_node(name: str, arguments: Sequence[str]) -> None:
-    """The same for one node of PARTS with these arguments of ROS 2."""
-    _check(name, PARTS[name], parse(arguments).parameters_for(f"/{name}"))
+def check_node(name: str, arguments: Sequence[str]) -> None:
+    """Check one node of NODE_CHECKS.
+
+    Args:
+        name: The node.
+        arguments: Its arguments of ROS 2.
+    """
+    _check(name, NODE_CHECKS[name], parse(arguments).parameters_for(f"/{name}"))
 
 
 def _check_names(file: Path) -> None:
-    """That each section of the parameter file is meant for one of our nodes."""
+    """Check that each section of a parameter file belongs to a node."""
     try:
         overrides = read_parameter_file(file)
     except ValueError as error:
-        raise ValueError(" ".join(str(error).split())) from None  # YAML tells its errors in several lines
+        raise ValueError(" ".join(str(error).split())) from None  # errors of YAML have several lines
     if not overrides:
         raise ValueError(f"{file}: found no section with parameters, expected one of {', '.join(NODES)}")
     for pattern in dict.fromkeys(override.pattern for override in overrides):
@@ -79,7 +95,8 @@ def _check_names(file: Path) -> None:
             raise ValueError(f"{file}: found a section for '{pattern}', expected one of {', '.join(NODES)}")
 
 
-def _check(name: str, part: Part, values: Mapping[str, Any]) -> None:
+def _check(name: str, part: NodeCheck, values: Mapping[str, Any]) -> None:
+    """Check names, types and values of the parameters of a node."""
     module, _, record = part.record.partition(":")
     kind = getattr(import_module(module), record)
     defaults = {field.name: field.default for field in attrs.fields(kind)}

@@ -1,4 +1,7 @@
-"""Processes that live and die together. Not for restarting them, and not for what they say to each other."""
+"""Groups of child processes that end together, and signals that stop a command.
+
+It does not restart processes.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,7 @@ from types import FrameType, TracebackType
 from typing import Any
 
 Output = Callable[[str, str], None]
-"""Takes a process's name and one line that it wrote."""
+"""Receives name of a process and one line of its output."""
 
 LIBC = ctypes.CDLL(None)
 PR_SET_PDEATHSIG = 1
@@ -21,11 +24,14 @@ INTERRUPT = {signal.SIGINT}
 
 
 class ProcessGroup:
-    """Starts processes, hands on what they write, and leaves none behind.
+    """Starts processes, forwards their output, and leaves none running.
 
-    Each runs in a session of its own, so that Ctrl-C reaches it through `stop` alone and once. SIGINT is blocked
-    where it starts: it waits until the process allows it, as a node does once it is ready to end cleanly. If
-    this process is killed, the kernel tells them to end.
+    Each process runs in its own session, so that Ctrl-C reaches it once, through `stop`. It starts
+    with SIGINT blocked until it is ready to end cleanly, as nodes are after their start. If this
+    process is killed, the kernel sends them SIGTERM.
+
+    Args:
+        output: Receives name and line.
     """
 
     def __init__(self, output: Output) -> None:
@@ -34,7 +40,16 @@ class ProcessGroup:
         self._readers: list[threading.Thread] = []
 
     def start(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
-        """Start a process under a name that is not taken; `environment` comes on top of our own."""
+        """Start a process.
+
+        Args:
+            name: A new name.
+            command: The command line.
+            environment: Variables in addition to those of this process.
+
+        Raises:
+            ValueError: A process of this name exists.
+        """
         if name in self._processes:
             raise ValueError(f"a process named '{name}' runs already")
         process = subprocess.Popen(
@@ -52,16 +67,34 @@ class ProcessGroup:
         self._readers.append(reader)
 
     def process_id(self, name: str) -> int:
-        """Of a process that was started."""
+        """Return the process id of a started process.
+
+        Args:
+            name: Its name.
+
+        Returns:
+            The process id.
+        """
         return self._processes[name].pid
 
     def ended(self) -> dict[str, int]:
-        """Exit codes of the processes that have ended, by name; that of one ended by signal n is -n."""
+        """Return the ended processes.
+
+        Returns:
+            Exit codes by name; -n for a process ended by signal n.
+        """
         codes = {name: process.poll() for name, process in self._processes.items()}
         return {name: code for name, code in codes.items() if code is not None}
 
     def stop(self, patience: float = 10.0) -> dict[str, int]:
-        """End all: SIGINT, after `patience` s SIGTERM, then SIGKILL. Returns the exit codes."""
+        """Stop all processes: SIGINT, then SIGTERM, then SIGKILL.
+
+        Args:
+            patience: Time to wait after each signal, s.
+
+        Returns:
+            Exit codes by name.
+        """
         for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
             for process in self._processes.values():
                 _send(process, number)
@@ -80,6 +113,7 @@ class ProcessGroup:
         self.stop()
 
     def _read(self, name: str, process: subprocess.Popen[bytes]) -> None:
+        """Forward the output of a process."""
         assert process.stdout is not None
         with process.stdout as lines:
             for line in lines:
@@ -87,11 +121,15 @@ class ProcessGroup:
 
 
 class StopSignals:
-    """While entered, SIGINT, SIGTERM and SIGHUP are noted instead of raised, however often they come.
+    """Catches SIGINT, SIGTERM and SIGHUP within the block and notes them instead of raising.
 
-    To be entered in the main thread, outside of a `ProcessGroup`, so that a second Ctrl-C does not cut its
-    clean-up short. A SIGINT that was held back before comes now. If it was, and in any case once one came, it is
-    held back again after the block and ignored, also by threads that began in it: what follows is the end.
+    Enter it in the main thread, outside of a `ProcessGroup`, so that a second Ctrl-C does not abort
+    its clean-up. A SIGINT that was blocked before arrives inside the block. After the block SIGINT
+    is blocked and ignored if it was before, or if a signal arrived, also in threads started inside:
+    the process is about to end.
+
+    Attributes:
+        received: Number of the first signal, or None.
     """
 
     NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -102,13 +140,21 @@ class StopSignals:
         self._mask: set[int] = set()
 
     def wait(self, seconds: float) -> bool:
-        """Whether one came; returns early if it comes now."""
+        """Wait for a signal.
+
+        Args:
+            seconds: Timeout, s.
+
+        Returns:
+            Whether a signal has arrived.
+        """
         until = time.monotonic() + seconds
         while self.received is None and (left := until - time.monotonic()) > 0.0:
             time.sleep(min(left, 0.05))
         return self.received is not None
 
     def _note(self, number: int, frame: FrameType | None) -> None:
+        """Note the first signal."""
         self.received = self.received or number
 
     def __enter__(self) -> StopSignals:
@@ -128,21 +174,23 @@ class StopSignals:
 
 
 def _before_exec() -> None:
-    """Runs in the child: hold SIGINT back, and have the kernel send SIGTERM when the parent is gone."""
+    """In the child: block SIGINT, and let the kernel send SIGTERM when the parent is gone."""
     signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)
     LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
 
 
 def _send(process: subprocess.Popen[bytes], number: int) -> None:
+    """Send a signal to a running process; SIGKILL to its whole process group."""
     if process.poll() is not None:
         return
     if number == signal.SIGKILL:
-        os.killpg(process.pid, number)  # with all that it started
+        os.killpg(process.pid, number)  # includes its children
     else:
         process.send_signal(number)
 
 
 def _all_end(processes: Iterable[subprocess.Popen[bytes]], seconds: float) -> bool:
+    """Return whether all processes end within a time, s."""
     until = time.monotonic() + seconds
     for process in processes:
         try:

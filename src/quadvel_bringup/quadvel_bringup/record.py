@@ -1,4 +1,4 @@
-"""`quadvel record`: the topics that are there, into an MCAP file until Ctrl-C, or what led to a fault whenever there is one."""
+"""`quadvel record`: record topics to an MCAP file, or record the time around each fault."""
 
 from __future__ import annotations
 
@@ -17,14 +17,26 @@ from quadvel_eval.output import output_file, output_folder
 from .exclusivity import ros_domain
 from .processes import StopSignals
 
-LOOK = 0.5  # s, between two looks for new topics
-AFTER = 3.0  # s, that a recording of a fault goes on behind it
+DISCOVERY_PERIOD_S = 0.5
+"""Time between two searches for new topics."""
+AFTER_FAULT_S = 3.0
+"""Time that a recording of a fault continues after it."""
 
 
 def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
-    """Record the topics named, or all, until Ctrl-C or for some seconds; returns the number of messages.
+    """Record topics until Ctrl-C or for a duration. Without any message no file is written.
 
-    Where nothing came there is no file. Raises FileExistsError if the file is there already.
+    Args:
+        path: The file to write.
+        topics: Topics to record; empty for all.
+        seconds: Duration, s, or None.
+
+    Returns:
+        Number of recorded messages.
+
+    Raises:
+        FileExistsError: The file exists already.
+        OSError: The disk is full.
     """
     if path.exists():
         raise FileExistsError(f"{path} exists already; name another file")
@@ -46,58 +58,65 @@ def record(path: Path, topics: Sequence[str], seconds: float | None) -> int:
         try:
             while not signals.received and (left := ends - time.monotonic()) > 0.0:
                 recorder.record_all(wanted)
-                recorder.serve(session.executor, min(LOOK, left))
+                recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
                 status.update(f"{_summary(recorder.counts)}; Ctrl-C stops")
         except OSError as error:
-            written = f"after {_summary(recorder.counts)}, of which all but the last second or so can be read"
+            written = f"after {_summary(recorder.counts)}; about the last second of them is unreadable"
             raise OSError(f"{path}: the recording ended {written}: {error.strerror}") from error
     if not recorder.counts:
         path.unlink()
         sought = ", ".join(wanted) or "any topic"
         console.print(
-            f"nothing came on {sought} on ROS domain {ros_domain()}, so there is no {path}; is a robot up?"
+            f"no message on {sought} on ROS domain {ros_domain()}; {path} was not written; is a robot running?"
         )
         return 0
     for topic in wanted:
         if topic not in recorder.counts:
-            console.print(f"nothing came on {topic}")
+            console.print(f"no message on {topic}")
     console.print(f"{path}: {_summary(recorder.counts)}")
     return recorder.counts.total()
 
 
 def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: float | None) -> int:
-    """Keep what came last in memory; when the robot goes into fault, write the `before` s that led to it and AFTER s behind it.
+    """Record the time around each fault, to a file named after time and fault.
 
-    Until Ctrl-C or for some seconds; returns the number of files, each named after the time and the fault.
+    Args:
+        folder: Folder for the files.
+        topics: Topics to record; empty for all.
+        before: Time to keep before a fault, s.
+        seconds: Duration, s, or None for until Ctrl-C.
+
+    Returns:
+        Number of recorded faults.
     """
     output_folder(folder)
     quadvel_dds.install()
     from quadvel_msgs.msg import ControllerState
 
     from .recorder import Recorder
-    from .recording_file import Ring
+    from .recording_file import RingBuffer
     from .session import Session
 
-    console, ring = Console(stderr=True, soft_wrap=True), Ring(before + AFTER)
+    console, ring = Console(stderr=True, soft_wrap=True), RingBuffer(before + AFTER_FAULT_S)
     wanted = _absolute(topics)
     ends = _end(seconds)
-    faults = Faults(ControllerState.FAULT)
+    faults = FaultTrigger(ControllerState.FAULT)
 
     def save() -> None:
         path = folder / faults.file_name(datetime.now())
         console.print(f"{path}: {ring.save(path)} messages; {faults.reason}")
-        faults.saved()
+        faults.mark_saved()
 
     with (
         StopSignals() as signals,
-        console.status(f"keeps the last {before:g} s for a fault; Ctrl-C stops"),
+        console.status(f"keeping the last {before:g} s for a fault; Ctrl-C stops"),
         Session("recorder", rights="recorder") as session,
         Recorder(session.node, ring) as recorder,
     ):
-        session.node.create_subscription(ControllerState, "controller/state", faults.hear, 10)
+        session.node.create_subscription(ControllerState, "controller/state", faults.on_state, 10)
         while not signals.received and (left := ends - time.monotonic()) > 0.0:
             recorder.record_all(wanted)
-            recorder.serve(session.executor, min(LOOK, left))
+            recorder.serve(session.executor, min(DISCOVERY_PERIOD_S, left))
             if faults.is_due:
                 save()
         if faults.is_open:
@@ -106,53 +125,73 @@ def record_faults(folder: Path, topics: Sequence[str], before: float, seconds: f
     return faults.count
 
 
-class Faults:
-    """Hears what the controller says of itself, and knows when a fault is to be written."""
+class FaultTrigger:
+    """Detects faults in the controller's state, and determines when to save them.
+
+    Args:
+        mode: Number of the fault mode.
+
+    Attributes:
+        reason: Reason of the last fault.
+        count: Number of saved faults.
+    """
 
     def __init__(self, mode: int) -> None:
-        """mode: the one that is a fault."""
+
         self._mode, self._was = mode, False
         self._due = float("inf")
         self._name = self.reason = ""
         self.count = 0
 
-    def hear(self, state: Any) -> None:
-        """A ControllerState."""
+    def on_state(self, state: Any) -> None:
+        """Process a state of the controller.
+
+        Args:
+            state: A ControllerState.
+        """
         is_fault = state.mode == self._mode
         if is_fault and not self._was and not self.is_open:
             self._name, self.reason = state.fault, state.reason
-            self._due = time.monotonic() + AFTER
+            self._due = time.monotonic() + AFTER_FAULT_S
         self._was = is_fault
 
     @property
     def is_open(self) -> bool:
-        """Whether there was one that is not written yet."""
+        """Whether there is an unsaved fault."""
         return self._due < float("inf")
 
     @property
     def is_due(self) -> bool:
-        """Whether it is time to write it."""
+        """Whether it is time to save the fault."""
         return time.monotonic() >= self._due
 
     def file_name(self, now: datetime) -> str:
-        """After the time and the fault."""
+        """Return the name of the file for the fault.
+
+        Args:
+            now: Local time.
+
+        Returns:
+            Name with time and fault.
+        """
         return f"{now:%Y-%m-%d_%H-%M-%S}_{self._name or 'fault'}.mcap"
 
-    def saved(self) -> None:
-        """It is written."""
+    def mark_saved(self) -> None:
+        """Mark the fault as saved."""
         self._due = float("inf")
         self.count += 1
 
 
 def _absolute(topics: Sequence[str]) -> list[str]:
-    """Topics of the root namespace, as the graph names them."""
+    """Return topics with a leading slash, as the graph names them."""
     return [topic if topic.startswith("/") else f"/{topic}" for topic in topics]
 
 
 def _end(seconds: float | None) -> float:
-    """When so many seconds have passed, on the monotonic clock; never, for None."""
+    """Return the end of a duration on the monotonic clock, s; infinity for None."""
     return float("inf") if seconds is None else time.monotonic() + seconds
 
 
 def _summary(counts: Counter[str]) -> str:
+    """Summarise counts of messages."""
     return f"{counts.total()} messages on {len(counts)} topics"

@@ -1,4 +1,7 @@
-"""A run of the stack for a demo: every node a process of its own, and all that they say to each other recorded in this one."""
+"""A recorded run of the stack for a demo.
+
+Every node runs in its own process; this process records all topics.
+"""
 
 from __future__ import annotations
 
@@ -13,13 +16,13 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import quadvel_dds
 
-from .exclusivity import ensure_alone
+from .exclusivity import ensure_exclusive
 from .node_output import PrefixedOutput
 from .nodes import enclave
 from .page_watch import PageWatch
 from .processes import ProcessGroup, StopSignals
 
-RECORDED = {
+RECORDED_TOPICS = {
     "/command": "quadvel_msgs/msg/VelocityCommand",
     "/controller/state": "quadvel_msgs/msg/ControllerState",
     "/diagnostics": "diagnostic_msgs/msg/DiagnosticArray",
@@ -35,12 +38,22 @@ RECORDED = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/velocity_estimate": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
-"""What every run records; each adds its planner's."""
-LOOK = 0.2  # s, between two looks whether all nodes still run
+"""Topics and types that every run records; each run adds those of its planner."""
+POLL_PERIOD_S = 0.2
+"""Time between two checks of the nodes."""
 
 
 class RecordedRun(ABC):
-    """The nodes, the recorder in this process, and a bar that shows how far it is."""
+    """Runs nodes, recorder and progress bar.
+
+    Args:
+        recording: The MCAP file to write.
+        nodes: Command lines by name, in the order of their start.
+        topics: Types of topics to record besides RECORDED_TOPICS.
+        lockstep: Whether the nodes use simulated time.
+        console: Console for output and bar.
+        total: Value of the completed bar.
+    """
 
     def __init__(
         self,
@@ -51,27 +64,39 @@ class RecordedRun(ABC):
         console: Console,
         total: float,
     ) -> None:
-        """nodes: command line of each, by name, in the order of their start. topics: what is recorded besides RECORDED, with types.
-        lockstep: they keep simulated time. total: of the bar.
-        """
         self._recording, self._nodes, self._topics, self._lockstep = recording, nodes, topics, lockstep
         columns = (TextColumn("{task.description:24}"), BarColumn(), TimeElapsedColumn())
         self._bar = Progress(*columns, console=console)
-        self._say = PrefixedOutput(list(nodes), console)
+        self._output = PrefixedOutput(list(nodes), console)
         self._task = self._bar.add_task("start", total=total)
 
     @abstractmethod
     def listen(self, node: Any) -> None:
-        """Subscribe, in the recorder's node, to what tells how far it is."""
+        """Subscribe to the topics that show the progress.
+
+        Args:
+            node: The recorder's node.
+        """
 
     @abstractmethod
     def is_over(self, ended: Mapping[str, int]) -> bool:
-        """Whether it ends in good order, though the processes `ended` (names, exit codes) are gone."""
+        """Return whether the run is complete.
+
+        Args:
+            ended: Exit codes of ended processes by name.
+
+        Returns:
+            True if it ends in good order.
+        """
 
     def run(self) -> str:
-        """Run to the end; what went wrong, or "". Ctrl-C ends it with a typer.Exit.
+        """Run to the end. RobotAlreadyRunningError passes through.
 
-        Raises NotAlone where a robot is there already.
+        Returns:
+            What went wrong, or "".
+
+        Raises:
+            typer.Exit: A signal ended the run.
         """
         quadvel_dds.install()
         import rclpy
@@ -88,19 +113,19 @@ class RecordedRun(ABC):
         executor = SingleThreadedExecutor()
         executor.add_node(node)
         try:
-            ensure_alone(node)
+            ensure_exclusive(node)
             self.listen(node)
             with (
                 StopSignals() as signals,
                 Recorder(node, RecordingFile(self._recording)) as recorder,
                 self._bar,
             ):
-                for topic, kind in {**RECORDED, **self._topics}.items():
+                for topic, kind in {**RECORDED_TOPICS, **self._topics}.items():
                     recorder.record(topic, kind)
-                with ProcessGroup(self._say) as group:
+                with ProcessGroup(self._output) as group:
                     for name, line in self._nodes.items():
                         group.start(name, line)
-                    problem = self._wait(group, signals, lambda: recorder.serve(executor, LOOK))
+                    problem = self._wait(group, signals, lambda: recorder.serve(executor, POLL_PERIOD_S))
         finally:
             node.destroy_node()
             rclpy.try_shutdown()
@@ -109,8 +134,8 @@ class RecordedRun(ABC):
         return problem
 
     def _wait(self, group: ProcessGroup, signals: StopSignals, record: Callable[[], None]) -> str:
-        """Record until it is over, or a node ended that should not have."""
-        watch, ended = PageWatch(group, self._say), dict[str, int]()
+        """Record until the run is complete, or a node ended unexpectedly."""
+        watch, ended = PageWatch(group, self._output), dict[str, int]()
         while not self.is_over(ended) and not ended and not signals.received:
             record()
             ended = watch.ended()

@@ -1,4 +1,4 @@
-"""Hear topics, and hand each message on as it came, in CDR, to what keeps it: `recording_file`.
+"""Recorder of topics: passes serialised messages to a `MessageSink` of `recording_file`.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -19,46 +19,66 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from quadvel_recordings.definitions import STORE
 
-from .recording_file import LATCHED, Heard, Keeper
+from .recording_file import LATCHED, MessageSink, RawMessage
 
 ANY_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Hears every publisher, a reliable one too; of the fastest topic it holds seconds, for where other work keeps us from writing."""
+"""Compatible with all publishers; the depth bridges seconds of the fastest topic."""
 LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 HIDDEN = ("/parameter_events", "/rosout")
-BATCH = 0.05  # s
-OTHERS = 4  # callbacks that may come between two of ours although messages wait
+BATCH_PERIOD_S = 0.05
+"""Time between two batches of messages."""
+MAX_OTHER_CALLBACKS = 4
+"""Number of other callbacks that may precede a waiting message."""
 
 
 class Recorder:
-    """Hands what the given node receives on some topics to `keeper`, until it is closed, which closes the keeper.
+    """Passes received messages to a sink.
 
-    Whatever serves the node raises OSError where the disk is full.
+    Closing it closes the sink. On a full disk OSError passes through the executor.
+
+    Args:
+        node: The node that subscribes.
+        keeper: The sink.
+
+    Attributes:
+        counts: Number of messages by topic.
     """
 
-    def __init__(self, node: Node, keeper: Keeper) -> None:
+    def __init__(self, node: Node, keeper: MessageSink) -> None:
         self._node, self._keeper = node, keeper
         self._subscriptions: dict[str, Any] = {}
         self._unknown: set[str] = set()
         self.counts: Counter[str] = Counter()
-        """Messages kept so far, by topic."""
 
     def record(self, topic: str, typename: str) -> None:
-        """Record a topic of a type such as "geometry_msgs/msg/Twist". Raises ValueError if it is unknown."""
+        """Record a topic.
+
+        Args:
+            topic: The topic.
+            typename: Its type, such as "geometry_msgs/msg/Twist".
+
+        Raises:
+            ValueError: The type is unknown.
+        """
         if topic in self._subscriptions:
             return
         if typename not in STORE.fielddefs:
-            raise ValueError(f"topic {topic} has the type '{typename}', whose definition is not known")
+            raise ValueError(f"topic {topic} has the type '{typename}', whose definition is unknown")
         package, kind, name = typename.split("/")
         self._subscriptions[topic] = self._node.create_subscription(
             getattr(import_module(f"{package}.{kind}"), name),
             topic,
-            self._keeps(topic, typename),
+            self._callback(topic, typename),
             LATCHED_QOS if topic in LATCHED else ANY_QOS,
             raw=True,
         )
 
     def record_all(self, only: Iterable[str] = ()) -> None:
-        """Record every topic that is there now, or those of `only`; to be called again as topics come."""
+        """Record all present topics; call it again to include new ones.
+
+        Args:
+            only: Restricts it to these topics, if not empty.
+        """
         wanted = set(only)
         for topic, typenames in self._node.get_topic_names_and_types():
             if topic in self._unknown or (topic not in wanted if wanted else topic in HIDDEN):
@@ -70,13 +90,17 @@ class Recorder:
                 self._node.get_logger().warning(f"not recorded: {error}")
 
     def serve(self, executor: Executor, seconds: float) -> None:
-        """Let the executor of our node write for so long what comes.
+        """Spin the executor of the node and write messages for a duration.
 
-        In real time it looks once in BATCH, for all that waits: waking for each message would take from the
-        processes that are recorded several times what writing does. On simulated time, whose pace is not known,
-        messages are written as they come, since they are filed under the time of writing.
+        In real time it wakes once per BATCH_PERIOD_S: waking for each message would take several
+        times more CPU time from the recorded processes than writing. In simulated time it writes at
+        once, because messages are stamped when they are written.
+
+        Args:
+            executor: Executor of the node.
+            seconds: Duration, s.
         """
-        pause = 0.0 if self._node.get_parameter("use_sim_time").value else BATCH
+        pause = 0.0 if self._node.get_parameter("use_sim_time").value else BATCH_PERIOD_S
         until = time.monotonic() + seconds
         while (left := until - time.monotonic()) > 0.0:
             time.sleep(min(left, pause))
@@ -84,19 +108,27 @@ class Recorder:
             self.write_waiting(executor, until)
 
     def write_waiting(self, executor: Executor, until: float = math.inf) -> None:
-        """Write all that waits now. Other callbacks of our node, such as that of /clock, take turns with ours.
+        """Write all waiting messages.
 
-        until: s on the monotonic clock, when to leave the rest for the next time: more may come than one can write.
+        Other callbacks of the node, such as that of /clock, take turns with them.
+
+        Args:
+            executor: Executor of the node.
+            until: Latest end on the monotonic clock, s; the rest stays for the next call.
         """
         in_vain = 0
-        while in_vain < OTHERS and time.monotonic() < until:
+        while in_vain < MAX_OTHER_CALLBACKS and time.monotonic() < until:
             written = self.counts.total()
             executor.spin_once(timeout_sec=0.0)
             in_vain = 0 if self.counts.total() > written else in_vain + 1
         self._keeper.settle()
 
     def close(self, finish: bool = True) -> None:
-        """Hear nothing any more, and close what keeps; finish: false where nothing can be written any more."""
+        """Unsubscribe and close the sink.
+
+        Args:
+            finish: False if nothing can be written any more.
+        """
         for subscription in self._subscriptions.values():
             self._node.destroy_subscription(subscription)
         self._subscriptions.clear()
@@ -110,11 +142,14 @@ class Recorder:
     ) -> None:
         self.close(finish=not isinstance(error, OSError))
 
-    def _keeps(self, topic: str, typename: str) -> Callable[[bytes, dict[str, int]], None]:
+    def _callback(self, topic: str, typename: str) -> Callable[[bytes, dict[str, int]], None]:
+        """Return the callback of a topic."""
         clock = self._node.get_clock()
 
         def keep(data: bytes, info: dict[str, int]) -> None:
-            self._keeper.keep(Heard(topic, typename, clock.now().nanoseconds, info["source_timestamp"], data))
+            self._keeper.keep(
+                RawMessage(topic, typename, clock.now().nanoseconds, info["source_timestamp"], data)
+            )
             self.counts[topic] += 1
 
         return keep

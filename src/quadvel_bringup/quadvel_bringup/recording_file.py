@@ -1,4 +1,7 @@
-"""What a recorder hears, kept: in an MCAP file that Foxglove and `ros2 bag` read, or in memory until a fault. No ROS."""
+"""Storage of recorded messages, without ROS.
+
+Messages go to an MCAP file for Foxglove and `ros2 bag`, or stay in memory until a fault.
+"""
 
 from __future__ import annotations
 
@@ -15,15 +18,26 @@ from mcap.writer import CompressionType, Writer
 
 from quadvel_recordings.definitions import STORE
 
-CHUNK = 1.0
-"""s, after which what was written so far goes to the disk: a recorder that is killed loses no more"""
+CHUNK_PERIOD_S = 1.0
+"""Time after which written messages are flushed to disk.
+
+A killed recorder loses at most that much.
+"""
 LATCHED = ("/tf_static", "/robot_description", "/ground")
-"""Topics that are published once and kept for those who come later."""
+"""Topics with transient-local durability."""
 
 
 @attrs.frozen
-class Heard:
-    """A message in CDR as it came: its topic and type, ns when it was taken up and when it was sent."""
+class RawMessage:
+    """A serialised message.
+
+    Attributes:
+        topic: Its topic.
+        typename: Its type.
+        time: When it was received, ns.
+        sent: When it was sent, ns.
+        data: The message in CDR.
+    """
 
     topic: str
     typename: str
@@ -32,22 +46,36 @@ class Heard:
     data: bytes
 
 
-class Keeper(Protocol):
-    """Takes what a recorder hears."""
+class MessageSink(Protocol):
+    """Stores the messages of a recorder."""
 
-    def keep(self, message: Heard) -> None:
-        """Keep a message, of a type that `STORE` defines. Raises OSError where the disk is full."""
+    def keep(self, message: RawMessage) -> None:
+        """Store a message.
+
+        Args:
+            message: A message of a type that `STORE` defines. OSError is raised if the disk is
+                full.
+        """
 
     def settle(self) -> None:
-        """Called between messages: time for what takes longer."""
+        """Do slow work; called between messages."""
 
     def close(self, finish: bool = True) -> None:
-        """Finish, or leave all as it is where nothing can be written any more. A second call does nothing."""
+        """Finish; further calls have no effect.
+
+        Args:
+            finish: False if nothing can be written any more.
+        """
 
 
 class RecordingFile:
-    """An MCAP file under way. It has its index only when it is closed; where it never comes to that,
-    `quadvel_recordings.reading` reads all but the last CHUNK.
+    """An MCAP file being written.
+
+    The index is written by `close`. Without it `quadvel_recordings.reading` reads all but the last
+    CHUNK_PERIOD_S.
+
+    Args:
+        path: The file to write.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,10 +91,14 @@ class RecordingFile:
         self._channels: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
 
-    def keep(self, message: Heard) -> None:
-        """Write a message."""
+    def keep(self, message: RawMessage) -> None:
+        """Write a message.
+
+        Args:
+            message: The message.
+        """
         if message.topic not in self._channels:
-            # An empty list: rosbag2 wants the key, and its versions disagree about what stands in it.
+            # An empty list: rosbag2 needs the key, but its versions disagree about its content.
             self._channels[message.topic] = self._writer.register_channel(
                 message.topic, "cdr", self._schema(message.typename), {"offered_qos_profiles": "[]"}
             )
@@ -80,14 +112,15 @@ class RecordingFile:
         self._counts[message.topic] += 1
 
     def _schema(self, typename: str) -> int:
+        """Register a type and return its id."""
         if typename not in self._schemas:
             text, _ = STORE.generate_msgdef(typename, ros_version=2)
             self._schemas[typename] = self._writer.register_schema(typename, "ros2msg", text.encode())
         return self._schemas[typename]
 
     def settle(self) -> None:
-        """Hand the chunk to the system once it is old, and have it brought to the disk beside us, as a disk may take its time."""
-        if time.monotonic() - self._chunk_began <= CHUNK:
+        """Flush an old chunk and start its synchronisation in another thread: disks may be slow."""
+        if time.monotonic() - self._chunk_began <= CHUNK_PERIOD_S:
             return
         self._chunk_began = time.monotonic()
         self._writer.flush()  # type: ignore[no-untyped-call]
@@ -95,7 +128,11 @@ class RecordingFile:
             self._synced = self._disk.submit(os.fdatasync, self._file.fileno())
 
     def close(self, finish: bool = True) -> None:
-        """Finish the file."""
+        """Write the index and close the file.
+
+        Args:
+            finish: False if nothing can be written any more.
+        """
         if not self._open:
             return
         self._open = False
@@ -108,16 +145,24 @@ class RecordingFile:
                 self._file.close()
 
 
-class Ring:
-    """The messages of the last `seconds`, in memory, and the newest of what is published only once."""
+class RingBuffer:
+    """Keeps the messages of the last seconds in memory, and the newest message of latched topics.
+
+    Args:
+        seconds: Duration, s.
+    """
 
     def __init__(self, seconds: float) -> None:
         self._nanoseconds = round(1e9 * seconds)
-        self._messages: deque[Heard] = deque()
-        self._latched: dict[str, Heard] = {}
+        self._messages: deque[RawMessage] = deque()
+        self._latched: dict[str, RawMessage] = {}
 
-    def keep(self, message: Heard) -> None:
-        """Keep a message, and forget those that are too old."""
+    def keep(self, message: RawMessage) -> None:
+        """Store a message and drop expired ones.
+
+        Args:
+            message: The message.
+        """
         if message.topic in LATCHED:
             self._latched[message.topic] = message
             return
@@ -126,13 +171,24 @@ class Ring:
             self._messages.popleft()
 
     def settle(self) -> None:
-        """Nothing takes longer."""
+        """Do nothing: there is no slow work."""
 
     def close(self, finish: bool = True) -> None:
-        """Nothing is left open."""
+        """Do nothing: there is no open file.
+
+        Args:
+            finish: Ignored.
+        """
 
     def save(self, path: Path) -> int:
-        """Write all that is kept, as a recording; how many messages it is. Raises OSError."""
+        """Write all stored messages to an MCAP file. OSError passes through.
+
+        Args:
+            path: The file to write.
+
+        Returns:
+            Number of messages.
+        """
         kept = [*self._latched.values(), *self._messages]
         file = RecordingFile(path)
         try:

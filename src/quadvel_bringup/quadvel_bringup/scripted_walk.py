@@ -1,4 +1,4 @@
-"""A scripted walk: the stack, driven by the planner of a script, and all that they say recorded."""
+"""A recorded scripted walk: the stack and the planner of a script."""
 
 from __future__ import annotations
 
@@ -10,14 +10,22 @@ from rich.console import Console
 
 from quadvel_eval.script import SCRIPTS
 
-from .nodes import command, enclave
+from .nodes import enclave, process_command
 from .recorded_run import RecordedRun
 
 PLANNED = {"/cmd_vel": "geometry_msgs/msg/Twist", "/planner/step": "std_msgs/msg/String"}
 
 
 class ScriptedWalk(RecordedRun):
-    """Over once the planner has walked its script to the end."""
+    """A run that ends when the planner has completed its script.
+
+    Args:
+        recording: The MCAP file to write.
+        script: Name of the script.
+        nodes: Command lines by name; the planner is added.
+        lockstep: Whether the nodes use simulated time.
+        console: Console for output and bar.
+    """
 
     def __init__(
         self,
@@ -27,20 +35,34 @@ class ScriptedWalk(RecordedRun):
         lockstep: bool,
         console: Console,
     ) -> None:
-        """nodes: command line of each, by name; the planner comes on top. lockstep: they keep simulated time."""
+
         self._steps = [step.name for step in SCRIPTS[script]]
         parameters = {"script": script, "use_sim_time": str(lockstep).lower()}
         arguments = [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
-        planner = {"planner": command("planner", ["--ros-args", *enclave("planner"), *arguments])}
+        planner = {"planner": process_command("planner", ["--ros-args", *enclave("planner"), *arguments])}
         super().__init__(recording, {**nodes, **planner}, PLANNED, lockstep, console, len(self._steps))
 
     def listen(self, node: Any) -> None:
+        """Subscribe to the steps of the planner.
+
+        Args:
+            node: The recorder's node.
+        """
         from std_msgs.msg import String
 
         node.create_subscription(String, "planner/step", self._on_step, 10)
 
     def is_over(self, ended: Mapping[str, int]) -> bool:
+        """Return whether the planner ended in good order.
+
+        Args:
+            ended: Exit codes of ended processes by name.
+
+        Returns:
+            True at the end.
+        """
         return dict(ended) == {"planner": 0}
 
     def _on_step(self, message: Any) -> None:
+        """Update the bar."""
         self._bar.update(self._task, completed=self._steps.index(message.data), description=message.data)

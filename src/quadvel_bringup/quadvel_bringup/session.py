@@ -1,4 +1,4 @@
-"""The node that a command of the operator has while it runs: it listens, calls services, and is gone.
+"""A temporary node for an operator command: it subscribes and calls services.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -20,26 +20,38 @@ from rclpy.signals import SignalHandlerOptions
 from quadvel_nodes.topic_types import all_conflicts
 
 from .nodes import enclave
-from .whereabouts import whereabouts
+from .whereabouts import discovery_hint
 
-PATIENCE = 4.0
-"""s to find out whether somebody is there: on a busy machine discovery takes a second, and where Fast DDS has missed the first
-announcements the next ones come 3 s later"""
-ANSWER = 10.0
-"""s within which a service answers that is there"""
-AGAIN = 1.0
-"""s after which an order without an answer is given again"""
+DISCOVERY_TIMEOUT_S = 4.0
+"""Time to discover a peer.
+
+Discovery takes a second on a busy machine. If Fast DDS misses the first announcements, the next
+ones come 3 s later.
+"""
+SERVICE_TIMEOUT_S = 10.0
+"""Time within which an available service answers."""
+SERVICE_RETRY_S = 1.0
+"""Time after which an unanswered request is repeated."""
 
 
-class NobodyThere(ConnectionError):
-    """Who should listen or answer is not running; the text says what to start."""
+class NotRunningError(ConnectionError):
+    """A required node does not run; the sentence names the command that starts it."""
 
 
 class Session:
-    """A node and the executor that serves it. To be entered: outside of that they do not exist."""
+    """A node with an executor; both exist inside the `with` block only.
+
+    Args:
+        name: Name of the node.
+        rights: Name of its SROS 2 enclave.
+
+    Attributes:
+        node: The node.
+        executor: Its executor.
+    """
 
     def __init__(self, name: str, rights: str = "operator") -> None:
-        """rights: the SROS 2 enclave of the node `name`."""
+
         self._name, self._rights = name, rights
 
     def __enter__(self) -> Session:
@@ -59,14 +71,31 @@ class Session:
         rclpy.try_shutdown()
 
     def listen(self, kind: Any, topic: str, keep: int = 1) -> deque[Any]:
-        """The last `keep` messages of a topic, as they come while this session spins."""
+        """Subscribe to a topic.
+
+        Args:
+            kind: Message class.
+            topic: The topic.
+            keep: Number of messages to keep.
+
+        Returns:
+            The last `keep` messages, updated while the session spins.
+        """
         heard: deque[Any] = deque(maxlen=keep)
         quality = QoSProfile(depth=min(keep, 100), reliability=ReliabilityPolicy.BEST_EFFORT)
         self.node.create_subscription(kind, topic, lambda message: heard.append(message), quality)
         return heard
 
     def spin_until(self, is_so: Callable[[], Any], seconds: float) -> bool:
-        """Serve until the predicate holds; whether it does before the time (s) is up."""
+        """Spin until a predicate holds.
+
+        Args:
+            is_so: The predicate.
+            seconds: Timeout, s.
+
+        Returns:
+            Whether it held before the timeout.
+        """
         until = time.monotonic() + seconds
         while not is_so():
             left = until - time.monotonic()
@@ -76,12 +105,23 @@ class Session:
         return True
 
     def spin(self, seconds: float) -> None:
-        """Serve for so long (s)."""
+        """Spin for a duration.
+
+        Args:
+            seconds: s.
+        """
         self.spin_until(lambda: False, seconds)
 
-    def nobody(self, text: str) -> NobodyThere:
-        """The error that says so, and why that may be: messages of another type, another ROS domain."""
-        return NobodyThere("; ".join([text, *map(str, all_conflicts(self.node)), whereabouts()]))
+    def not_running(self, text: str) -> NotRunningError:
+        """Return the error for a missing peer, with likely causes.
+
+        Args:
+            text: What is missing.
+
+        Returns:
+            The error; it lists type conflicts and other ROS domains.
+        """
+        return NotRunningError("; ".join([text, *map(str, all_conflicts(self.node)), discovery_hint()]))
 
     def call(
         self,
@@ -91,18 +131,37 @@ class Session:
         repeats: bool = True,
         **fields: Any,
     ) -> Any:
-        """The response of the first of these services that is there.
+        """Call the first available one of several services.
 
-        repeats: whether the order may be given again, which it is where no answer comes: one is lost where the server has not
-        found us yet, although we have found it. Raises NobodyThere, with what `absent` says where no service is there.
+        Args:
+            kind: Service class.
+            services: Names of services.
+            absent: Returns advice if no service is available.
+            repeats: Whether the request may be repeated without an answer: the first one is lost if
+                the server has not discovered this client yet.
+            fields: Fields of the request.
+
+        Returns:
+            The response.
+
+        Raises:
+            NotRunningError: No service is available, or it does not answer.
         """
         clients = [self.node.create_client(kind, service) for service in services]
-        if not self.spin_until(lambda: any(client.service_is_ready() for client in clients), PATIENCE):
-            raise self.nobody(f"{' or '.join(services)}: nobody answers; {absent()}")
+        if not self.spin_until(
+            lambda: any(client.service_is_ready() for client in clients), DISCOVERY_TIMEOUT_S
+        ):
+            raise self.not_running(f"{' or '.join(services)}: service not available; {absent()}")
         client = next(client for client in clients if client.service_is_ready())
         asked: list[Any] = []
-        for wait in repeat(AGAIN, round(ANSWER / AGAIN)) if repeats else (ANSWER,):
+        for wait in (
+            repeat(SERVICE_RETRY_S, round(SERVICE_TIMEOUT_S / SERVICE_RETRY_S))
+            if repeats
+            else (SERVICE_TIMEOUT_S,)
+        ):
             asked.append(client.call_async(kind.Request(**fields)))
             if self.spin_until(lambda: any(future.done() for future in asked), wait):
                 return next(future.result() for future in asked if future.done())
-        raise NobodyThere(f"{client.service_name}: no answer within {ANSWER:g} s, though somebody offers it")
+        raise NotRunningError(
+            f"{client.service_name}: no answer within {SERVICE_TIMEOUT_S:g} s from its server"
+        )

@@ -1,4 +1,4 @@
-"""The nodes that make a walking robot, and the parameters that each of them gets."""
+"""The nodes of a walking robot, and the parameters of each."""
 
 from __future__ import annotations
 
@@ -8,24 +8,31 @@ from pathlib import Path
 
 import attrs
 
-from .nodes import Parameters, arguments, command
+from .nodes import Parameters, process_command, ros_arguments
 
 PARAMETERS = Path(__file__).parent / "config" / "params.yaml"
-"""The shipped values of all nodes' parameters."""
+"""Parameter file with the default values of all nodes."""
 
 VIEW = "view"
-"""The node that serves the operator's page: where it ends, the robot goes on"""
+"""The node of the operator page; the robot continues after its end."""
 
 BOARD_PORT = 8007
-"""UDP port of the AlienGo's board; the simulated one adds the number of the ROS domain, as nobody shares one"""
+"""UDP port of the AlienGo's board.
+
+Simulated boards add the number of the ROS domain, which differs per user.
+"""
 
 
 @attrs.frozen
 class LowLevel:
-    """What serves low_state and low_cmd: its nodes with their parameters, and what it wants of the controller.
+    """A source of low_state and sink of low_cmd.
 
-    simulation: the one of these nodes that simulates, if one does. urgent: whether real time is a matter of safety, so that
-    the threads of the control loop run before all others.
+    Attributes:
+        nodes: Its nodes with their parameters.
+        controller: Parameters that it needs of the controller.
+        simulation: Its simulating node, or "".
+        urgent: Whether missed deadlines are unsafe, so that the control loop needs real-time
+            priority.
     """
 
     nodes: Mapping[str, Parameters]
@@ -35,7 +42,7 @@ class LowLevel:
 
 
 def _on_loopback() -> dict[str, Parameters]:
-    """The simulated board and the driver that finds it."""
+    """Return the simulated board, and the driver connected to it."""
     domain = os.environ.get("ROS_DOMAIN_ID", "")
     port = BOARD_PORT + (int(domain) if domain.isdecimal() else 0)
     return {
@@ -45,22 +52,31 @@ def _on_loopback() -> dict[str, Parameters]:
 
 
 URGENT: Parameters = {"realtime_priority": 50}
-# It stands up and walks only on an operator's call, with the policy loaded but inactive until then.
+# Stand up and walk only on request of an operator; until then the policy is loaded but inactive.
 _BY_OPERATOR: Parameters = {"auto_stand": False, "require_operator": True}
 LOW_LEVELS = {
     "sim": LowLevel({"sim_node": {}}, {"auto_stand": True, "robot_waits": True}, simulation="sim_node"),
     "board": LowLevel(_on_loopback(), {"auto_stand": True}, simulation="board"),
     "aliengo": LowLevel({"driver": URGENT}, _BY_OPERATOR, urgent=True),
-    "external": LowLevel({}, _BY_OPERATOR),  # started by somebody else, and perhaps a real robot
+    "external": LowLevel({}, _BY_OPERATOR),  # started elsewhere, possibly a real robot
 }
 
 
 @attrs.frozen(kw_only=True)
 class Stack:
-    """What may be chosen; None leaves what the parameter file says.
+    """The options of a robot; None keeps the value of the parameter file.
 
-    use_sim_time: the simulator sets the pace, waiting for the answer to each of its states; all others follow
-    its clock. Only "sim" can: a board waits for nobody. network: parameters of "board", how bad its network is.
+    Attributes:
+        low_level: Key of LOW_LEVELS.
+        parameters: Parameter file.
+        policy: ONNX file of the policy.
+        terrain: "flat", "slope" or "rough".
+        world: Name or file of a world.
+        actuator: YAML file of the actuator model.
+        estimator: "learned" or "kalman".
+        use_sim_time: Whether the simulator waits for the answer to each state and the other nodes
+            use its clock; requires the low level "sim", because a board does not wait.
+        network: Parameters of "board" for a bad network.
     """
 
     low_level: str = attrs.field(default="sim", validator=attrs.validators.in_(LOW_LEVELS))
@@ -75,25 +91,30 @@ class Stack:
 
     @use_sim_time.validator
     def _can_wait(self, attribute: object, value: bool) -> None:
+        """Require the low level "sim" for simulated time."""
         if value and self.low_level != "sim":
-            raise ValueError(
-                f"low_level is '{self.low_level}', expected 'sim' where simulated time sets the pace"
-            )
+            raise ValueError(f"low_level is '{self.low_level}', expected 'sim' for simulated time")
 
     @network.validator
     def _has_network(self, attribute: object, value: Parameters) -> None:
+        """Require the low level "board" for a bad network."""
         if value and self.low_level != "board":
-            raise ValueError(
-                f"low_level is '{self.low_level}', expected 'board' for a network that is bad on purpose"
-            )
+            raise ValueError(f"low_level is '{self.low_level}', expected 'board' for a simulated bad network")
 
     @property
     def brings_robot(self) -> bool:
-        """Whether one of its nodes serves the robot's topics."""
+        """Whether one of the nodes serves the robot's topics."""
         return bool(LOW_LEVELS[self.low_level].nodes)
 
     def overrides(self) -> dict[str, Parameters]:
-        """For each node to start, by name, the parameters that stand above those of the file."""
+        """Return the parameters that override those of the file.
+
+        Returns:
+            Parameters by name of the nodes to start.
+
+        Raises:
+            ValueError: An option needs a simulated robot.
+        """
         low_level = LOW_LEVELS[self.low_level]
         policy = None if self.policy is None else str(self.policy.resolve())
         urgent: Parameters = URGENT if low_level.urgent else {}
@@ -103,7 +124,7 @@ class Stack:
             "command_mux": _given(),
         }
         actuator = None if self.actuator is None else str(self.actuator.resolve())
-        simulated = _given(terrain=self.terrain, world=_found(self.world), actuator_file=actuator)
+        simulated = _given(terrain=self.terrain, world=_absolute_world(self.world), actuator_file=actuator)
         if simulated and not low_level.simulation:
             raise ValueError(f"{', '.join(simulated)}: only a simulated robot has this, not {self.low_level}")
         serving = dict(low_level.nodes)
@@ -116,22 +137,34 @@ class Stack:
         return serving | followers
 
     def arguments(self, view: bool = False) -> dict[str, list[str]]:
-        """The same as arguments of ROS 2.
+        """Return the arguments of ROS 2 of each node.
 
-        view: with the node `view`, which is no part of the robot and stays in the time of who looks at it.
+        Args:
+            view: Whether to add the node `view`, which keeps real time.
+
+        Returns:
+            Arguments by name of the node.
         """
         nodes = self.overrides() | ({VIEW: {}} if view else {})
-        return {name: arguments(name, values, self.parameters) for name, values in nodes.items()}
+        return {name: ros_arguments(name, values, self.parameters) for name, values in nodes.items()}
 
     def commands(self, view: bool = False) -> dict[str, list[str]]:
-        """The same as command lines, which run each node as a process of its own."""
-        return {name: command(name, words) for name, words in self.arguments(view).items()}
+        """Return the command lines that run each node in its own process.
+
+        Args:
+            view: Whether to add the node `view`.
+
+        Returns:
+            Command lines by name of the node.
+        """
+        return {name: process_command(name, words) for name, words in self.arguments(view).items()}
 
 
-def _found(world: str | None) -> str | None:
-    """A shipped world's name as it is, a file, which has a suffix, for whatever folder a node runs in."""
+def _absolute_world(world: str | None) -> str | None:
+    """Return the absolute path of a world's file, or the name of a shipped world unchanged."""
     return str(Path(world).resolve()) if world and Path(world).suffix else world
 
 
 def _given(**values: str | None) -> Parameters:
+    """Return the given values without None."""
     return {name: value for name, value in values.items() if value is not None}

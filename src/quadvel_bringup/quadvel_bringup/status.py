@@ -1,4 +1,4 @@
-"""`quadvel status`: one page on the robot that runs: nodes, mode, velocity, battery, temperatures, files.
+"""`quadvel status`: health, mode, velocity, rates and files of the running robot.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -19,18 +19,18 @@ from quadvel_msgs.msg import ControllerState, LowState, VelocityCommand
 from quadvel_nodes.number_text import number_text
 from quadvel_nodes.topic_types import all_conflicts
 
-from .doctor import FILES
-from .drive import planar, velocity_text
+from .doctor import FILE_KEYS
+from .drive import twist_to_array, velocity_text
 from .exclusivity import ros_domain
-from .operator_commands import WAY_OUT
-from .session import PATIENCE, Session
-from .whereabouts import whereabouts
+from .operator_commands import RECOVERY_HINT
+from .session import DISCOVERY_TIMEOUT_S, Session
+from .whereabouts import discovery_hint
 
-LISTEN = 2.2
-"""s at least: each node reports once a second"""
-LOOP = {"command_mux", "controller", "estimator"}
-"""The nodes without which no robot walks; they are waited for, as a middleware may find some of them seconds after others"""
-HEARD = {
+LISTEN_TIME_S = 2.2
+"""Minimum time to listen; each node reports once a second."""
+LOOP_NODES = {"command_mux", "controller", "estimator"}
+"""Nodes that every walking robot has; status waits for them because discovery may take seconds."""
+STATUS_TOPICS = {
     "/diagnostics": DiagnosticArray,
     "controller/state": ControllerState,
     "command": VelocityCommand,
@@ -49,8 +49,14 @@ Heard = Mapping[str, deque[Any]]
 
 
 @attrs.frozen
-class Node:
-    """What a node said last on /diagnostics."""
+class NodeReport:
+    """The last diagnostics of a node.
+
+    Attributes:
+        level: Level of DiagnosticStatus.
+        summary: Its message.
+        values: Its keys and values.
+    """
 
     level: bytes
     summary: str
@@ -58,14 +64,18 @@ class Node:
 
 
 def status() -> int:
-    """Print the page; the exit code is 1 where no robot runs, or its controller is in fault."""
+    """Print the status of the running robot.
+
+    Returns:
+        The exit code: 1 if no robot runs, or its controller is missing or in fault.
+    """
     with Session("status") as session:
-        heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in HEARD.items()}
-        _hear_all(session, heard["/diagnostics"])
+        heard = {topic: session.listen(kind, topic, keep=1000) for topic, kind in STATUS_TOPICS.items()}
+        _wait_for_reports(session, heard["/diagnostics"])
         conflicts = all_conflicts(session.node)
-    nodes = reported(heard["/diagnostics"])
+    nodes = nodes_from_diagnostics(heard["/diagnostics"])
     if not nodes:
-        print(f"no robot runs on ROS domain {ros_domain()}; start one: quadvel up; {whereabouts()}")
+        print(f"no robot runs on ROS domain {ros_domain()}; start one: quadvel up; {discovery_hint()}")
         return 1
     console = Console(soft_wrap=True, highlight=False)
     for name, text in [
@@ -79,41 +89,54 @@ def status() -> int:
     return 1 if not states or states[-1].mode_name == "fault" else 0
 
 
-def look() -> dict[str, Node]:
-    """The nodes of the robot that runs, by name; none where there is none."""
+def running_nodes() -> dict[str, NodeReport]:
+    """List the nodes of the running robot.
+
+    Returns:
+        Diagnostics by name of the node; empty without a robot.
+    """
     with Session("look") as session:
         heard = session.listen(DiagnosticArray, "/diagnostics", keep=100)
-        _hear_all(session, heard)
-    return reported(heard)
+        _wait_for_reports(session, heard)
+    return nodes_from_diagnostics(heard)
 
 
-def _hear_all(session: Session, heard: deque[Any]) -> None:
-    """Listen until the control loop's nodes and all others that publish /diagnostics have reported, or are waited for in vain."""
-    if not session.spin_until(lambda: heard, PATIENCE):
+def _wait_for_reports(session: Session, heard: deque[Any]) -> None:
+    """Listen until all nodes that publish /diagnostics have reported, or until a timeout."""
+    if not session.spin_until(lambda: heard, DISCOVERY_TIMEOUT_S):
         return
 
     def complete() -> bool:
-        nodes = reported(heard)
-        return nodes.keys() >= LOOP and len(nodes) >= session.node.count_publishers("/diagnostics")
+        nodes = nodes_from_diagnostics(heard)
+        return nodes.keys() >= LOOP_NODES and len(nodes) >= session.node.count_publishers("/diagnostics")
 
-    session.spin(LISTEN)
-    session.spin_until(complete, PATIENCE)
+    session.spin(LISTEN_TIME_S)
+    session.spin_until(complete, DISCOVERY_TIMEOUT_S)
 
 
-def reported(arrays: deque[Any]) -> dict[str, Node]:
-    """The nodes by name, out of their /diagnostics."""
+def nodes_from_diagnostics(arrays: deque[Any]) -> dict[str, NodeReport]:
+    """Extract the last report of each node.
+
+    Args:
+        arrays: Messages of /diagnostics.
+
+    Returns:
+        Reports by name of the node, sorted.
+    """
     nodes = {}
     for one in (one for array in arrays for one in array.status):
-        nodes[one.name] = Node(one.level, one.message, {pair.key: pair.value for pair in one.values})
+        nodes[one.name] = NodeReport(one.level, one.message, {pair.key: pair.value for pair in one.values})
     return dict(sorted(nodes.items()))
 
 
-def _nodes(nodes: Mapping[str, Node]) -> Iterator[tuple[str, str]]:
+def _nodes(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
+    """Yield name and health of each node."""
     for name, node in nodes.items():
         yield name, f"{LEVELS[node.level]}[/] {node.summary}"
 
 
 def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
+    """Yield name and text of each line on mode, velocity and rates."""
     states, commands, estimates = heard["controller/state"], heard["command"], heard["velocity_estimate"]
     if states:
         state = states[-1]
@@ -121,19 +144,19 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
         for finding in state.findings:
             yield "finding", finding
         if state.mode_name == "fault":
-            yield "way out", f"once the cause is gone: {WAY_OUT}"
-        yield "walking", state.walk_refusal or "ready: a velocity makes it walk"
+            yield "recovery", f"once the cause is gone: {RECOVERY_HINT}"
+        yield "walking", state.walk_refusal or "ready; waiting for a velocity command"
         yield (
             "command",
-            f"{velocity_text(planar(state.command))}, from {commands[-1].source if commands else 'nobody'}",
+            f"{velocity_text(twist_to_array(state.command))}, source {commands[-1].source if commands else 'none'}",
         )
         period, compute = number_text(state.period_p99_ms, ".2f"), number_text(state.compute_p50_us, ".0f")
         loop = f"p99 of its period {period} ms, {compute} us from state to command"
         yield "loop", f"{state.rate_hz:.0f} Hz, {loop}, {state.overruns} deadlines missed"
     else:
-        yield "mode", "[red]no controller runs"
+        yield "mode", "[red]no controller is running"
     if estimates:
-        yield "estimate", velocity_text(planar(estimates[-1].twist.twist))
+        yield "estimate", velocity_text(twist_to_array(estimates[-1].twist.twist))
     if heard["odom"]:
         position = heard["odom"][-1].pose.pose.position
         x, y = (number_text(value, ".2f") for value in (position.x, position.y))
@@ -141,17 +164,18 @@ def _lines(heard: Heard) -> Iterator[tuple[str, str]]:
     yield "rates", ", ".join(f"{topic} {_rate(heard[topic]):.0f}" for topic in RATES) + " Hz"
 
 
-def _equipment(nodes: Mapping[str, Node]) -> Iterator[tuple[str, str]]:
+def _equipment(nodes: Mapping[str, NodeReport]) -> Iterator[tuple[str, str]]:
+    """Yield name and text of each line on files, battery and temperatures."""
     values = {key: value for node in nodes.values() for key, value in node.values.items()}
-    for key in FILES:
-        yield key, values.get(key, "not told by any node")
-    yield "battery", values.get("battery", "not told by this robot's low-level interface")
+    for key in FILE_KEYS:
+        yield key, values.get(key, "not reported by any node")
+    yield "battery", values.get("battery", "not reported by the low-level interface")
     temperatures = [f"{key} {value}" for key, value in sorted(values.items()) if "temperature" in key]
-    yield "temperatures", ", ".join(temperatures) or "none told: a simulated robot has none"
+    yield "temperatures", ", ".join(temperatures) or "not reported: a simulated robot has none"
 
 
 def _rate(messages: deque[Any]) -> float:
-    """Messages a second by their stamps, Hz."""
+    """Return the rate of messages by their stamps, Hz."""
     stamps = [message.stamp if hasattr(message, "stamp") else message.header.stamp for message in messages]
     times = [stamp.sec + 1e-9 * stamp.nanosec for stamp in stamps]
     return (len(times) - 1) / (times[-1] - times[0]) if len(times) > 1 and times[-1] > times[0] else 0.0

@@ -1,4 +1,4 @@
-"""`quadvel teleop`: drive the robot by the keys of a terminal, or by a gamepad.
+"""`quadvel teleop`: drive the robot by the keys of a terminal or by a gamepad.
 
 Needs `rclpy`: ROS 2's own, or the embedded one after `quadvel_dds.install()`.
 """
@@ -24,49 +24,61 @@ from rich.markup import escape
 from quadvel_msgs.msg import ControllerState
 from quadvel_msgs.srv import SetMode
 from quadvel_view import gamepad, keyboard
-from quadvel_view.gamepad import Gamepad, Span
-from quadvel_view.keyboard import Keyboard, strokes
-from quadvel_view.operator import PERIOD, Operator
+from quadvel_view.gamepad import AxisRange, Gamepad
+from quadvel_view.keyboard import Keyboard, split_keys
+from quadvel_view.operator import PUBLISH_PERIOD_S, Operator
 
-from .drive import planar, velocity_text
-from .operator_commands import CONTROLLER
+from .drive import twist_to_array, velocity_text
+from .operator_commands import START_HINT
 from .processes import StopSignals
-from .session import PATIENCE, Session
+from .session import DISCOVERY_TIMEOUT_S, Session
 
-ORDERS = {"u": "stand_up", "x": "lie_down"}
-HAND = "hand"
-SILENT = f"gamepad silent for {gamepad.SILENCE:g} s: press the dead-man's button again   "
+MODE_KEYS = {"u": "stand_up", "x": "lie_down"}
+HOLDER_ID = "hand"
+SILENCE_NOTE = f"gamepad silent for {gamepad.SILENCE_TIMEOUT_S:g} s: press the dead-man's button again   "
 
 
 @attrs.frozen
-class WayOut:
-    """What a hand presses: release, to release the STOP; recover, to stand up again after a fault."""
+class RecoveryKeys:
+    """Inputs of a device for recovery.
+
+    Attributes:
+        release: Releases the STOP.
+        recover: Stands up again after a fault.
+    """
 
     release: str
     recover: str
 
 
-KEYS = WayOut(release="r", recover="space, r, then u")
-BUTTONS = WayOut(release="start", recover="B, start, then `quadvel mode stand_up`")
+KEYS = RecoveryKeys(release="r", recover="space, r, then u")
+BUTTONS = RecoveryKeys(release="start", recover="B, start, then `quadvel mode stand_up`")
 
 
-def state_line(state: Any, stopped: bool, speed: float, way_out: WayOut) -> str:
-    """The robot in one line.
+def state_line(state: Any, stopped: bool, speed: float, way_out: RecoveryKeys) -> str:
+    """Describe the robot in one line.
 
     Args:
-        state: the last ControllerState.
-        stopped: whether STOP is pressed.
-        speed: m/s, straight on, of what is held.
-        way_out: of the hand that drives.
+        state: The last ControllerState.
+        stopped: Whether STOP is latched.
+        speed: Selected forward speed, m/s.
+        way_out: Inputs of the device for recovery.
+
+    Returns:
+        Mode, speed and command, or the fault and the way out of it.
     """
     stop = f"STOPPED, {way_out.release} releases   " if stopped else ""
     if state.mode_name == "fault":
         return f"{stop}fault: {state.reason}   once the cause is gone: {way_out.recover}"
-    return f"{stop}{state.mode_name}   speed {speed:.1f} m/s   {velocity_text(planar(state.command))}"
+    return f"{stop}{state.mode_name}   speed {speed:.1f} m/s   {velocity_text(twist_to_array(state.command))}"
 
 
 class Teleop:
-    """What is said to the robot, and what it says."""
+    """Publishes the operator's commands and receives the controller's state.
+
+    Args:
+        session: The node that it uses.
+    """
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -77,12 +89,22 @@ class Teleop:
         self._asked = 0.0
 
     def wait_for_robot(self) -> None:
-        """Raises NobodyThere where no robot is heard."""
-        if not self._session.spin_until(lambda: self._states and self._set_mode.service_is_ready(), PATIENCE):
-            raise self._session.nobody(f"controller/state: nothing came; {CONTROLLER}")
+        """Wait for the controller.
 
-    def order(self, order: str) -> None:
-        """ "stop", "release", or a mode, of which none counts while STOP is pressed."""
+        Raises:
+            NotRunningError: There is no controller.
+        """
+        if not self._session.spin_until(
+            lambda: self._states and self._set_mode.service_is_ready(), DISCOVERY_TIMEOUT_S
+        ):
+            raise self._session.not_running(f"controller/state: no message; {START_HINT}")
+
+    def execute(self, order: str) -> None:
+        """Execute an order.
+
+        Args:
+            order: "stop", "release", or a mode, which STOP blocks; "" does nothing.
+        """
         if order == "stop":
             self._operator.stop()
             self._ask("passive")
@@ -91,83 +113,118 @@ class Teleop:
         elif order and not self._operator.stopped:
             self._ask(order)
 
-    def serve(self, velocity: Any) -> None:
-        """One period: the velocity that is held, or None."""
+    def serve_period(self, velocity: Any) -> None:
+        """Publish the velocity of one period.
+
+        Args:
+            velocity: The held velocity (3,), or None.
+        """
         now = time.monotonic()
         if velocity is None:
-            self._operator.let_go(HAND, now)
+            self._operator.end_hold(HOLDER_ID, now)
         else:
-            self._operator.hold(HAND, velocity, now)
+            self._operator.hold(HOLDER_ID, velocity, now)
         self._publish(self._operator.velocity(now))
         mode = self._states[-1].mode_name if self._states else ""
-        if self._operator.is_unheeded(mode, now - self._asked):
+        if self._operator.should_resend_stop(mode, now - self._asked):
             self._ask("passive")
-        self._session.spin(PERIOD)
+        self._session.spin(PUBLISH_PERIOD_S)
 
-    def line(self, speed: float, way_out: WayOut) -> str:
-        """`state_line` of the robot as it is now."""
+    def status_line(self, speed: float, way_out: RecoveryKeys) -> str:
+        """Describe the robot as `state_line` does.
+
+        Args:
+            speed: Selected forward speed, m/s.
+            way_out: Inputs of the device for recovery.
+
+        Returns:
+            One line.
+        """
         return state_line(self._states[-1], self._operator.stopped, speed, way_out)
 
-    def end(self) -> None:
-        """Zero, as the last word."""
+    def send_zero(self) -> None:
+        """Publish a final zero velocity."""
         self._publish(np.zeros(3))
 
     def _publish(self, velocity: Any) -> None:
+        """Publish a velocity, if there is one."""
         if velocity is not None:
             twist = Twist()
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
             self._publisher.publish(twist)
 
     def _ask(self, mode: str) -> None:
+        """Request a mode without waiting for the answer."""
         self._asked = time.monotonic()
         self._set_mode.call_async(SetMode.Request(mode=mode))
 
 
-def by_keyboard() -> int:
-    """Until Ctrl-C. Raises ValueError where standard input is no terminal, NobodyThere where no robot is heard."""
+def drive_by_keyboard() -> int:
+    """Drive by the terminal's keys until Ctrl-C.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ValueError: Standard input is not a terminal.
+    """
     if not sys.stdin.isatty():
-        raise ValueError("keys come from a terminal, and standard input is none")
+        raise ValueError("standard input is not a terminal: quadvel teleop reads keys from one")
     keys = Keyboard()
 
     def hear(teleop: Teleop) -> Any:
-        for key in strokes(_typed()):
+        """Process the pressed keys and return the velocity."""
+        for key in split_keys(_pending_input()):
             if key in (" ", "r"):
-                keys.let_go()
-                teleop.order("stop" if key == " " else "release")
-            elif key in ORDERS:
-                teleop.order(ORDERS[key])
-            keys.stroke(key, time.monotonic())
+                keys.release()
+                teleop.execute("stop" if key == " " else "release")
+            elif key in MODE_KEYS:
+                teleop.execute(MODE_KEYS[key])
+            keys.press(key, time.monotonic())
         return keys.velocity(time.monotonic())
 
     print("".join(str(keyboard.__doc__).partition("\n\n")[1:]).strip("\n"))
-    with _keys_as_they_come():
+    with _cbreak_terminal():
         _drive(hear, lambda: keys.speed, KEYS)
     return 0
 
 
-def by_gamepad() -> int:
-    """Until Ctrl-C. Raises ValueError where there is none, or it is pulled out; NobodyThere where no robot is heard."""
+def drive_by_gamepad() -> int:
+    """Drive by a gamepad until Ctrl-C. Raises ValueError if there is none.
+
+    Returns:
+        The exit code.
+    """
     device = _find_gamepad()
-    spans = {code: Span(info.min, info.max) for code, info in device.capabilities()[gamepad.ABSOLUTE]}
+    spans = {code: AxisRange(info.min, info.max) for code, info in device.capabilities()[gamepad.ABSOLUTE]}
     pad = Gamepad(spans)
 
     def hear(teleop: Teleop) -> Any:
+        """Process the events of the gamepad and return the velocity."""
         try:
             while (event := device.read_one()) is not None:
-                order = pad.follow(event.type, event.code, event.value)
-                teleop.order(restore(pad, device) if order == "restore" else order)
+                order = pad.handle_event(event.type, event.code, event.value)
+                teleop.execute(restore_gamepad(pad, device) if order == "restore" else order)
         except OSError:
-            raise ValueError(f"{device.name}: the gamepad is gone") from None
+            raise ValueError(f"{device.name}: the gamepad was disconnected") from None
         return pad.velocity()
 
     print("".join(str(gamepad.__doc__).partition("\n\n")[1:]).strip("\n"))
     print(f"by {device.name}")
-    _drive(hear, lambda: pad.speed, BUTTONS, lambda: SILENT if pad.fell_silent else "")
+    _drive(hear, lambda: pad.speed, BUTTONS, lambda: SILENCE_NOTE if pad.timed_out else "")
     return 0
 
 
-def restore(pad: Gamepad, device: Any) -> str:
-    """Ask an evdev device what is held, after the kernel has lost events of it; "stop" where STOP is."""
+def restore_gamepad(pad: Gamepad, device: Any) -> str:
+    """Read the state of an evdev device after the kernel lost events.
+
+    Args:
+        pad: The gamepad to update.
+        device: The evdev device.
+
+    Returns:
+        "stop" if the STOP button is pressed, else "".
+    """
     axes = {code: device.absinfo(code).value for code in gamepad.STICKS}
     return pad.restore(device.active_keys(), axes)
 
@@ -175,10 +232,13 @@ def restore(pad: Gamepad, device: Any) -> str:
 def _drive(
     hear: Callable[[Teleop], Any],
     speed: Callable[[], float],
-    way_out: WayOut,
+    way_out: RecoveryKeys,
     note: Callable[[], str] = lambda: "",
 ) -> None:
-    """Hand on what is heard until Ctrl-C; the last word is zero, whatever happens. note: shown before the robot's state."""
+    """Forward velocities until Ctrl-C, and end with zero in any case.
+
+    `note` precedes the state of the robot.
+    """
     console = Console(soft_wrap=True)
     with StopSignals() as signals, Session("teleop") as session:
         teleop = Teleop(session)
@@ -186,21 +246,21 @@ def _drive(
         try:
             with console.status("") as status:
                 while not signals.received:
-                    teleop.serve(hear(teleop))
-                    status.update(escape(note() + teleop.line(speed(), way_out)))
+                    teleop.serve_period(hear(teleop))
+                    status.update(escape(note() + teleop.status_line(speed(), way_out)))
         finally:
-            teleop.end()
+            teleop.send_zero()
 
 
-def _typed() -> str:
-    """What waits at the terminal."""
+def _pending_input() -> str:
+    """Return the unread input of the terminal."""
     ready, _, _ = select.select([sys.stdin], [], [], 0.0)
     return os.read(sys.stdin.fileno(), 1024).decode(errors="replace") if ready else ""
 
 
 @contextmanager
-def _keys_as_they_come() -> Iterator[None]:
-    """While entered, the terminal sends each key at once and does not show it; Ctrl-C stays what it is."""
+def _cbreak_terminal() -> Iterator[None]:
+    """Switch the terminal to single keys without echo; Ctrl-C keeps its meaning."""
     terminal = sys.stdin.fileno()
     before = termios.tcgetattr(terminal)
     tty.setcbreak(terminal)
@@ -211,7 +271,7 @@ def _keys_as_they_come() -> Iterator[None]:
 
 
 def _find_gamepad() -> Any:
-    """The first device with a dead-man's button and sticks. Raises ValueError."""
+    """Return the first device with a dead-man's button and sticks, or raise ValueError."""
     import evdev
 
     for path in evdev.list_devices():
@@ -219,5 +279,5 @@ def _find_gamepad() -> Any:
         if gamepad.DEAD_MAN in device.capabilities().get(gamepad.KEY, ()):
             return device
     raise ValueError(
-        "no gamepad was found in /dev/input; is it plugged in, and may you read it (group input)?"
+        "no gamepad found in /dev/input: check that it is connected and that you are in the group input"
     )

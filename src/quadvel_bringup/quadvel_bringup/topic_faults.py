@@ -1,7 +1,8 @@
-"""Faults on the topics of a running robot: its processes with the parameters of `quadvel up`, and a relay in the middle.
+"""Fault injection on the topics of a running robot, by a relay between its processes.
 
-`quadvel faults` lets the classes fail from many seeds and measures how soon they react; this shows that what they find arises from
-messages, too, and that its name reaches the operator: `python -m quadvel_bringup.topic_faults`. Needs `rclpy`.
+`quadvel faults` injects faults into the classes from many seeds and measures reaction times. This
+module shows that the same faults arise from messages, and that the operator sees their names:
+`python -m quadvel_bringup.topic_faults`. Needs `rclpy`.
 """
 
 from __future__ import annotations
@@ -38,9 +39,9 @@ from .stack import Stack
 
 Message = Any
 Change = Callable[["Relay", Message], Message | None]
-"""What becomes of a message on its way; None: it is lost"""
+"""Modifies a message in the relay; returns None to drop it."""
 
-KINDS = {
+RELAYED_TYPES = {
     "low_state": LowState,
     "velocity_estimate": TwistWithCovarianceStamped,
     "command": VelocityCommand,
@@ -52,18 +53,26 @@ SENDERS = {
     "command": ("command_mux",),
     "motor_status": ("driver",),
 }
-"""Who publishes the topics that go through the relay"""
-WALKS = 0.4  # m/s, forward, where a fault needs a robot that walks
-PATIENCE = 60.0  # s, for what a robot does in a few seconds on an idle machine
-JOINT = 5  # whose encoder or drive is at fault: FL_calf
+"""Publishers of the relayed topics."""
+WALK_SPEED_M_S = 0.4
+"""Forward speed for faults of a walking robot."""
+TIMEOUT_S = 60.0
+"""Timeout for what takes a robot a few seconds on an idle machine."""
+FAULTY_JOINT = 5
+"""Joint with the faulty encoder or drive: FL_calf."""
 
 
 @attrs.frozen
 class TopicFault:
-    """One row of docs/faults.md, and how it comes about.
+    """A fault of docs/faults.md and its injection.
 
-    name: in the table. topic, change: what happens to the messages there. begin: what happens besides. mode: "stance", "walk" or
-    "stand_up". says: what `findings` holds where the robot goes on.
+    Attributes:
+        name: Name in the table.
+        topic: Relayed topic that is modified.
+        change: Modifies its messages.
+        begin: Further action at the start of the fault.
+        mode: Mode of the robot at the start: "stance", "walk" or "stand_up".
+        finding_text: Part of the expected finding, if the robot continues.
     """
 
     name: str
@@ -71,22 +80,35 @@ class TopicFault:
     change: Change | None = None
     begin: Callable[[TopicRobot], None] = lambda robot: None
     mode: str = "stance"
-    says: str = ""
+    finding_text: str = ""
 
 
 class Relay:
-    """Receives each of KINDS in place of the other nodes and sends it on, changed while a fault lasts."""
+    """Receives the topics of RELAYED_TYPES and forwards them, modified during a fault.
+
+    Args:
+        node: The node that it uses.
+
+    Attributes:
+        velocity: Commanded forward velocity, m/s.
+        states: Messages of controller/state.
+        last_command: The last LowCmd, or None.
+        memory: State of the present fault.
+        limits: Counts of each command limit in /diagnostics.
+    """
 
     def __init__(self, node: Any) -> None:
         self.node = node
         self.velocity = 0.0
         self.states: list[Message] = []
-        self.asked: Message | None = None
-        self.memory: dict[str, Any] = {}  # of the fault that there is
-        self.limits: dict[str, str] = {}  # what /diagnostics shows of each limit of commands
+        self.last_command: Message | None = None
+        self.memory: dict[str, Any] = {}
+        self.limits: dict[str, str] = {}
         self._fault: TopicFault | None = None
-        self._senders = {topic: node.create_publisher(kind, topic, 10) for topic, kind in KINDS.items()}
-        for topic, kind in KINDS.items():
+        self._senders = {
+            topic: node.create_publisher(kind, topic, 10) for topic, kind in RELAYED_TYPES.items()
+        }
+        for topic, kind in RELAYED_TYPES.items():
             node.create_subscription(
                 kind, f"before/{topic}", partial(self._pass_on, topic), QoSProfile(depth=10)
             )
@@ -97,31 +119,44 @@ class Relay:
         node.create_timer(0.05, self._command)
 
     def begin(self, fault: TopicFault) -> None:
-        """From now on the fault is there."""
+        """Start a fault.
+
+        Args:
+            fault: The fault.
+        """
         self.memory.clear()
         self._fault = fault
 
     def end(self) -> None:
-        """All is well again."""
+        """End the fault."""
         self._fault = None
 
     def send(self, topic: str, message: Message) -> None:
-        """Send a message as it is."""
+        """Publish a message unmodified.
+
+        Args:
+            topic: A relayed topic.
+            message: The message.
+        """
         self._senders[topic].publish(message)
 
     def _hear(self, message: Message) -> None:
-        self.asked = message
+        """Store the last LowCmd."""
+        self.last_command = message
 
     def _read_limits(self, message: Message) -> None:
+        """Store the counts of the command limits."""
         values = {pair.key: pair.value for status in message.status for pair in status.values}
         self.limits |= {name: values[f"limit {name}"] for name in LIMITS if f"limit {name}" in values}
 
     def _command(self) -> None:
+        """Publish the commanded velocity."""
         twist = Twist()
         twist.linear.x = self.velocity
         self._drive.publish(twist)
 
     def _pass_on(self, topic: str, message: Message | None) -> None:
+        """Forward a message through the present fault."""
         fault = self._fault
         if fault is not None and fault.topic == topic and fault.change is not None:
             message = fault.change(self, message)
@@ -130,7 +165,12 @@ class Relay:
 
 
 class TopicRobot:
-    """The processes of a robot, and the relay between them. To be entered."""
+    """The processes of a robot with a relay between them; use it as a context manager.
+
+    Args:
+        stack: The nodes and their parameters.
+        output: Receives name and line of what the processes print.
+    """
 
     def __init__(self, stack: Stack, output: Callable[[str, str], None] = lambda name, line: None) -> None:
         self._stack = stack
@@ -139,6 +179,7 @@ class TopicRobot:
         self._simulator = "board" if stack.low_level == "board" else "sim_node"
 
     def __enter__(self) -> TopicRobot:
+        """Start the processes and wait for the controller."""
         self._session.__enter__()
         self.relay = Relay(self._session.node)
         for name, words in self._stack.commands().items():
@@ -146,7 +187,7 @@ class TopicRobot:
             renamed = [word for topic in topics for word in ("-r", f"{topic}:=before/{topic}")]
             self._group.start(name, [*words, *renamed])
         try:
-            self.until(lambda state: state.mode_name != "passive", "it does not report")
+            self.wait_for(lambda state: state.mode_name != "passive", "it does not report")
         except BaseException:
             self.__exit__()
             raise
@@ -157,102 +198,157 @@ class TopicRobot:
         self._group.stop()
 
     def provoke(self, fault: TopicFault) -> ControllerState:
-        """Bring the fault about in a healthy robot; what the controller said when it was named.
+        """Inject a fault into a healthy robot and wait until it is reported.
 
-        AssertionError, with what it said instead, where it is not within PATIENCE.
+        Args:
+            fault: The fault.
+
+        Returns:
+            The ControllerState that reported it. AssertionError with the last state if none does
+            within TIMEOUT_S.
         """
-        self.prepare(fault.mode)
+        self.bring_to(fault.mode)
         before = self.relay.limits.get(fault.name)
         self.relay.begin(fault)
         fault.begin(self)
         try:
             if fault.name in LIMITS:
-                return self.until(
+                return self.wait_for(
                     lambda state: self.relay.limits.get(fault.name) != before,
                     f"{fault.name} is not counted: {self.relay.limits}",
                 )
-            return self.until(lambda state: is_named(fault, state), f"{fault.name} is not named")
+            return self.wait_for(lambda state: is_named(fault, state), f"{fault.name} is not named")
         finally:
             self.relay.end()
             self.relay.velocity = 0.0
 
-    def prepare(self, mode: str) -> None:
-        """A robot that stands, walks, or begins to stand up."""
+    def bring_to(self, mode: str) -> None:
+        """Bring the robot to a mode.
+
+        Args:
+            mode: "stance", "walk", or "stand_up" for its beginning.
+        """
         self.relay.velocity = 0.0
         self._ask_for("passive")
         self._call(ResetSim, f"{self._simulator}/reset", keyframe="lie")
-        self.spin(1.5)  # until what the guards remember of the fault before has faded
+        self.spin(1.5)  # until the memory of the guards has faded
         self._ask_for("stand_up")
         if mode != "stand_up":
-            self.until(lambda state: state.mode_name == "stance", "it does not stand up")
+            self.wait_for(lambda state: state.mode_name == "stance", "it does not stand up")
             self.spin(0.5)
         if mode == "walk":
-            self.until(lambda state: state.walk_allowed, "it is not ready")
-            self.relay.velocity = WALKS
-            self.until(lambda state: state.mode_name == "walk", "it does not walk")
+            self.wait_for(lambda state: state.walk_allowed, "it is not ready")
+            self.relay.velocity = WALK_SPEED_M_S
+            self.wait_for(lambda state: state.mode_name == "walk", "it does not walk")
             self.spin(1.0)
 
-    def until(self, is_so: Callable[[Any], bool], otherwise: str) -> ControllerState:
-        """Serve until the controller says so from now on; returns what it said."""
+    def wait_for(self, is_so: Callable[[Any], bool], otherwise: str) -> ControllerState:
+        """Wait for a state of the controller.
+
+        Args:
+            is_so: Predicate of a ControllerState.
+            otherwise: Start of the error sentence.
+
+        Returns:
+            The first new state for which the predicate holds.
+
+        Raises:
+            AssertionError: There is none within TIMEOUT_S.
+        """
         states = self.relay.states
         states.clear()
         found: list[Any] = []
 
         def look() -> bool:
+            """Collect matching states."""
             found.extend(state for state in states if is_so(state))
             return bool(found)
 
-        if not self._session.spin_until(look, PATIENCE):
+        if not self._session.spin_until(look, TIMEOUT_S):
             raise AssertionError(f"{otherwise}: {_summary(states)}")
         return found[0]
 
     def spin(self, seconds: float) -> None:
-        """Serve for so long (s)."""
+        """Spin for a duration.
+
+        Args:
+            seconds: s.
+        """
         self._session.spin(seconds)
 
-    def process(self, name: str) -> int:
-        """The process id of a node."""
+    def process_id(self, name: str) -> int:
+        """Return the process id of a node.
+
+        Args:
+            name: The node.
+
+        Returns:
+            The process id.
+        """
         return self._group.process_id(name)
 
-    def stop(self, name: str, seconds: float) -> None:
-        """Stop the process of a node for so long (s), and let it go on."""
-        os.kill(self.process(name), signal.SIGSTOP)
+    def suspend(self, name: str, seconds: float) -> None:
+        """Suspend the process of a node for a duration.
+
+        Args:
+            name: The node.
+            seconds: s.
+        """
+        os.kill(self.process_id(name), signal.SIGSTOP)
         self.spin(seconds)
-        os.kill(self.process(name), signal.SIGCONT)
+        os.kill(self.process_id(name), signal.SIGCONT)
 
     def _ask_for(self, mode: str) -> None:
-        until = time.monotonic() + PATIENCE
+        """Request a mode until it is accepted."""
+        until = time.monotonic() + TIMEOUT_S
         while not (answer := self._call(SetMode, "controller/set_mode", mode=mode)).success:
             assert time.monotonic() < until, f"mode {mode}: {answer.message}"
             self.spin(0.2)
 
     def _call(self, kind: Any, service: str, **fields: Any) -> Any:
+        """Call a service."""
         return self._session.call(kind, [service], lambda: f"{service} is not there", **fields)
 
 
 def is_named(fault: TopicFault, state: ControllerState) -> bool:
-    """Whether the operator reads of this fault: by its name, or in words where the robot goes on."""
+    """Return whether the operator sees the fault.
+
+    Args:
+        fault: The fault.
+        state: A ControllerState.
+
+    Returns:
+        True if the state reports the fault by its name, or by a finding if the robot continues.
+    """
     return (
-        any(fault.says in finding for finding in state.findings) if fault.says else state.fault == fault.name
+        any(fault.finding_text in finding for finding in state.findings)
+        if fault.finding_text
+        else state.fault == fault.name
     )
 
 
-def _told(fault: TopicFault, state: ControllerState) -> str:
-    return next((f for f in state.findings if fault.says in f), "") if fault.says else state.reason
+def _report_text(fault: TopicFault, state: ControllerState) -> str:
+    """Return the text that reports the fault."""
+    return (
+        next((f for f in state.findings if fault.finding_text in f), "")
+        if fault.finding_text
+        else state.reason
+    )
 
 
 def _summary(states: list[Any]) -> str:
+    """Summarise the last state for an error sentence."""
     if not states:
-        return "controller/state: nothing came"
+        return "controller/state: no message"
     last = states[-1]
     return f"{last.mode_name}, fault '{last.fault}', {last.reason}; findings {list(last.findings)}"
 
 
-# What becomes of messages.
+# Modifications of messages.
 
 
 def _set(**values: Any) -> Change:
-    """Fields whose numbers are replaced, by others or by what a function makes of them."""
+    """Replace fields by values, or by functions of the old values."""
 
     def change(relay: Relay, message: Message) -> Message:
         for field, value in values.items():
@@ -265,23 +361,27 @@ def _set(**values: Any) -> Change:
 
 
 def _at(joint: int, value: float) -> Callable[[Any], Any]:
+    """Return a function that replaces the value of one joint."""
     return lambda before: np.where(np.arange(12) == joint, value, before)
 
 
 def _plus(joint: int, value: float) -> Callable[[Any], Any]:
+    """Return a function that adds to the value of one joint."""
     return lambda before: before + value * (np.arange(12) == joint)
 
 
-def _lost(relay: Relay, message: Message) -> None:
+def _drop(relay: Relay, message: Message) -> None:
+    """Drop every message."""
     return None
 
 
-def _kept(relay: Relay, message: Message) -> None:
+def _keep_first(relay: Relay, message: Message) -> None:
+    """Keep the first message and drop all."""
     relay.memory.setdefault("state", message)
 
 
 def _repeat(robot: TopicRobot) -> None:
-    """A simulator that hangs sends one state again and again, as if it was new."""
+    """Repeat one state with new stamps, as a hanging simulator does."""
     relay = robot.relay
 
     def send() -> None:
@@ -290,12 +390,12 @@ def _repeat(robot: TopicRobot) -> None:
             relay.send("low_state", state)
 
     timer = relay.node.create_timer(0.005, send)
-    robot.until(lambda state: bool(state.fault), "a simulator that hangs is not noticed")
+    robot.wait_for(lambda state: bool(state.fault), "a simulator that hangs is not noticed")
     relay.node.destroy_timer(timer)
 
 
 def _stuck(*fields: str, joint: int | None = None) -> Change:
-    """Fields, or one joint of them, that repeat what they held first."""
+    """Repeat the first value of fields, or of one joint of them."""
 
     def change(relay: Relay, message: Message) -> Message:
         for field in fields:
@@ -309,6 +409,8 @@ def _stuck(*fields: str, joint: int | None = None) -> Change:
 
 
 def _earlier(seconds: float) -> Change:
+    """Shift stamps back by a duration, s."""
+
     def change(relay: Relay, message: Message) -> Message:
         nanoseconds = message.stamp.sec * 10**9 + message.stamp.nanosec - round(1e9 * seconds)
         message.stamp.sec, message.stamp.nanosec = divmod(nanoseconds, 10**9)
@@ -318,20 +420,24 @@ def _earlier(seconds: float) -> Change:
 
 
 Path = Callable[[float], tuple[float, float]]
-"""How far a joint has moved (rad), and how fast it moves (rad/s), at a time (s)"""
+"""Displacement (rad) and speed (rad/s) of a joint as a function of time (s)."""
 
 
 def _ramp(by: float, within: float) -> Path:
+    """Return a ramp of `by` rad within a duration, s."""
     return lambda t: (by * min(t / within, 1.0), by / within if t < within else 0.0)
 
 
 def _swing(t: float) -> tuple[float, float]:
-    """Bent by 0.8 rad in 0.4 s, and back faster than a drive can."""
+    """Bend by 0.8 rad in 0.4 s, then return faster than a drive can."""
     return (-2.0 * t, -2.0) if t < 0.4 else (min(17.0 * (t - 0.4) - 0.8, 0.0), 17.0 if t < 0.447 else 0.0)
 
 
-def _led(joints: Sequence[int], path: Path) -> Change:
-    """Joints that move along a path in the robot's time, whatever they are asked for; encoders and drives agree about it."""
+def _prescribed_motion(joints: Sequence[int], path: Path) -> Change:
+    """Move joints along a path in robot time regardless of commands.
+
+    Encoders and drives report it consistently.
+    """
     there = np.isin(np.arange(12), joints)
 
     def change(relay: Relay, message: Message) -> Message:
@@ -340,7 +446,8 @@ def _led(joints: Sequence[int], path: Path) -> Change:
         q = np.where(there, first + moved, np.array(message.q))
         dq = np.where(there, speed, np.array(message.dq))
         tau = np.array(message.tau)
-        if (command := relay.asked) is not None:
+        # The drive law tau = tau_ff + kp (q_des - q) + kd (dq_des - dq), clipped to the torque limit.
+        if (command := relay.last_command) is not None:
             asked = np.array(command.tau) + np.array(command.kp) * (np.array(command.q) - q)
             asked += np.array(command.kd) * (np.array(command.dq) - dq)
             tau = np.where(there, np.clip(asked, -TORQUE_LIMIT, TORQUE_LIMIT), tau)
@@ -351,11 +458,14 @@ def _led(joints: Sequence[int], path: Path) -> Change:
 
 
 def _not_a_velocity(relay: Relay, message: Message) -> Message:
+    """Set the commanded velocity to NaN."""
     message.twist.linear.x = float("nan")
     return message
 
 
 def _faster(by: float) -> Change:
+    """Add to the estimated forward velocity, m/s."""
+
     def change(relay: Relay, message: Message) -> Message:
         message.twist.twist.linear.x += by
         return message
@@ -364,6 +474,8 @@ def _faster(by: float) -> Change:
 
 
 def _late(seconds: float) -> Change:
+    """Delay every message by a duration, s."""
+
     def change(relay: Relay, message: Message) -> Message:
         time.sleep(seconds)
         return message
@@ -372,23 +484,27 @@ def _late(seconds: float) -> Change:
 
 
 def _hot(relay: Relay, message: Message) -> Message:
+    """Report overheated motors."""
     message.temperature = np.full(12, 95.0, np.float32)
     return message
 
 
 def _dropped_out(relay: Relay, message: Message) -> Message:
-    message.dropped_out = [joint == JOINT for joint in range(12)]
+    """Report a motor that dropped out."""
+    message.dropped_out = [joint == FAULTY_JOINT for joint in range(12)]
     return message
 
 
 def _second_publisher(robot: TopicRobot) -> None:
+    """Publish low_state from a second node."""
     node = robot.relay.node
     other = node.create_publisher(LowState, "low_state", 1)
-    robot.until(lambda state: state.fault == "duplicate_publisher", "a second robot is not noticed")
+    robot.wait_for(lambda state: state.fault == "duplicate_publisher", "a second robot is not noticed")
     node.destroy_publisher(other)
 
 
 def _too_fast(robot: TopicRobot) -> None:
+    """Command a velocity beyond the limits of the policy."""
     robot.relay.velocity = 4.4
 
 
@@ -399,61 +515,77 @@ FAULTS = (
     TopicFault("state_not_finite", change=_set(q=np.nan)),
     TopicFault("attitude_not_unit", change=_set(orientation_wxyz=lambda before: 1.2 * before)),
     TopicFault("state_back_in_time", change=_earlier(0.1)),
-    TopicFault("state_stale", change=_lost),
-    TopicFault("controller_stopped", begin=lambda robot: robot.stop("controller", 2.0)),
-    TopicFault("state_frozen", change=_kept, begin=_repeat),
+    TopicFault("state_stale", change=_drop),
+    TopicFault("controller_stopped", begin=lambda robot: robot.suspend("controller", 2.0)),
+    TopicFault("state_frozen", change=_keep_first, begin=_repeat),
     TopicFault("tilted", change=_set(orientation_wxyz=TILTED)),
-    TopicFault("joint_out_of_range", change=_set(q=_at(JOINT, float(UPPER[JOINT]) + 0.5))),
-    TopicFault("joint_too_fast", change=_set(dq=_at(JOINT, 50.0))),
-    TopicFault("encoder_inconsistent", change=_set(q=_plus(JOINT, 0.4))),
+    TopicFault("joint_out_of_range", change=_set(q=_at(FAULTY_JOINT, float(UPPER[FAULTY_JOINT]) + 0.5))),
+    TopicFault("joint_too_fast", change=_set(dq=_at(FAULTY_JOINT, 50.0))),
+    TopicFault("encoder_inconsistent", change=_set(q=_plus(FAULTY_JOINT, 0.4))),
     TopicFault("encoder_frozen", change=_stuck("q", "dq", joint=2), mode="stand_up"),
     TopicFault(
         "imu_inconsistent", change=_set(angular_velocity=lambda before: before + np.array([0.0, 0.0, 1.5]))
     ),
-    TopicFault("drive_does_not_answer", change=_set(tau=_plus(JOINT, 25.0))),
-    TopicFault("joint_stuck", change=_led([JOINT], _ramp(-0.29, within=0.3))),
-    TopicFault("stand_up_failed", change=_led([JOINT], _ramp(0.4, within=2.0)), mode="stand_up"),
+    TopicFault("drive_does_not_answer", change=_set(tau=_plus(FAULTY_JOINT, 25.0))),
+    TopicFault("joint_stuck", change=_prescribed_motion([FAULTY_JOINT], _ramp(-0.29, within=0.3))),
+    TopicFault(
+        "stand_up_failed", change=_prescribed_motion([FAULTY_JOINT], _ramp(0.4, within=2.0)), mode="stand_up"
+    ),
     TopicFault("imu_frozen", change=_stuck("orientation_wxyz", "angular_velocity"), mode="walk"),
     TopicFault("accelerometer_implausible", change=_set(linear_acceleration=lambda before: before + 15.0)),
-    TopicFault("estimate_stale", "velocity_estimate", _lost, mode="walk", says="no fresh velocity estimate"),
     TopicFault(
-        "estimate_wrong", "velocity_estimate", _faster(1.5), mode="walk", says="off the Kalman filter's"
+        "estimate_stale", "velocity_estimate", _drop, mode="walk", finding_text="no fresh velocity estimate"
     ),
-    TopicFault("command_stale", "command", _lost, mode="walk", says="There is no fresh command"),
-    TopicFault("command_not_finite", "command", _not_a_velocity, mode="walk", says="expected finite numbers"),
     TopicFault(
-        "command_out_of_range", begin=_too_fast, mode="walk", says="beyond what the policy can follow"
+        "estimate_wrong",
+        "velocity_estimate",
+        _faster(1.5),
+        mode="walk",
+        finding_text="off the Kalman filter's",
     ),
-    TopicFault("foot_force_frozen", change=_stuck("foot_force"), mode="walk", says="the force of foot"),
+    TopicFault("command_stale", "command", _drop, mode="walk", finding_text="There is no fresh command"),
+    TopicFault(
+        "command_not_finite", "command", _not_a_velocity, mode="walk", finding_text="expected finite numbers"
+    ),
+    TopicFault(
+        "command_out_of_range", begin=_too_fast, mode="walk", finding_text="beyond what the policy can follow"
+    ),
+    TopicFault(
+        "foot_force_frozen", change=_stuck("foot_force"), mode="walk", finding_text="the force of foot"
+    ),
     TopicFault("target_out_of_range", begin=_too_fast, mode="walk"),
     *(
-        TopicFault(name, change=_led(CALVES, _swing))
+        TopicFault(name, change=_prescribed_motion(CALVES, _swing))
         for name in ("torque_jumps", "torque_too_large", "joint_at_speed_limit", "power_too_large")
     ),
 )
-"""Of a simulated robot"""
+"""Faults of a simulated robot."""
 BOARD_FAULTS = (
     TopicFault("motor_hot", "motor_status", _hot),
     TopicFault("motor_dropped_out", "motor_status", _dropped_out),
     TopicFault("overruns", change=_late(0.008)),
 )
-"""What a board alone can report, or that a simulated robot waits for"""
+"""Faults that only a board reports, or whose lateness a simulated robot waits for."""
 
 
 def _known(names: list[str]) -> list[str]:
+    """Check names of faults."""
     known = [fault.name for fault in (*FAULTS, *BOARD_FAULTS)]
     for name in names:
         if name not in known:
-            raise typer.BadParameter(f"'{name}', expected names out of: {', '.join(known)}")
+            raise typer.BadParameter(f"'{name}', expected one of: {', '.join(known)}")
     return names
 
 
 def main(
     names: Annotated[
-        list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (none: all of them).")
+        list[str], typer.Argument(callback=_known, help="Rows of docs/faults.md (default: all).")
     ] = [],  # noqa: B006 typer copies it
 ) -> None:
-    """Provoke faults on the topics of a running robot, and print how each was named. Exit code 1 where one was not."""
+    """Inject faults on the topics of a running robot, and print how each is reported.
+
+    Exit code 1 if a fault was not reported.
+    """
     wanted, missed = set(names), 0
     for low_level, faults in (("sim", FAULTS), ("board", BOARD_FAULTS)):
         chosen = [fault for fault in faults if not wanted or fault.name in wanted]
@@ -463,10 +595,10 @@ def main(
             for fault in chosen:
                 try:
                     state = robot.provoke(fault)
-                    told = robot.relay.limits.get(fault.name) or _told(fault, state)
+                    text = robot.relay.limits.get(fault.name) or _report_text(fault, state)
                 except AssertionError as error:
-                    told, missed = f"MISSED: {error}", missed + 1
-                print(f"{fault.name}: {told}", flush=True)
+                    text, missed = f"MISSED: {error}", missed + 1
+                print(f"{fault.name}: {text}", flush=True)
     sys.exit(1 if missed else 0)
 
 

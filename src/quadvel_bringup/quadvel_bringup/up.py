@@ -1,37 +1,43 @@
-"""`quadvel up`: the whole robot as processes that start together and end together."""
+"""`quadvel up`: all processes of a robot, started and stopped together."""
 
 from __future__ import annotations
 
 from rich.console import Console
 
-from .exclusivity import look_for_others
+from .exclusivity import check_exclusive
 from .node_output import PrefixedOutput
-from .nodes import command
+from .nodes import process_command
 from .page_watch import PageWatch
-from .preflight import rehearse
+from .preflight import check_stack
 from .processes import ProcessGroup, StopSignals
 from .stack import VIEW, Stack
 
 
 def up(stack: Stack, view: bool = False) -> int:
-    """Run the stack until Ctrl-C or until one of its nodes ends; returns the exit code of the command. view: with a page.
+    """Run the processes of a robot until Ctrl-C or until one of its nodes ends.
 
-    It is 0 after Ctrl-C if every node then ended with 0. A node that ends by itself is a fault: the others
-    are stopped, and its exit code is ours (1 if that was 0). Without the page alone they go on.
+    After Ctrl-C the exit code is 0 if every node ended with 0. A node that ends by itself is a
+    fault: the others are stopped, and its exit code is returned, or 1 if that was 0. Only the end
+    of the page does not stop the robot. Errors pass through: ValueError or OSError for a wrong
+    parameter or file, RobotAlreadyRunningError for a second robot.
 
-    Raises ValueError or OSError where a parameter or a file is wrong, and NotAlone where a robot is there already that nobody
-    asked for.
+    Args:
+        stack: The nodes and their parameters.
+        view: Whether to add the operator page.
+
+    Returns:
+        The exit code.
     """
-    rehearse(stack)
+    check_stack(stack)
     if stack.brings_robot:
-        look_for_others()
+        check_exclusive()
     nodes = stack.arguments(view)
     say = PrefixedOutput(["quadvel", *nodes], Console(soft_wrap=True))
     with StopSignals() as signals, ProcessGroup(say) as group:
-        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows how they do")
+        say("quadvel", f"starting {', '.join(nodes)}; Ctrl-C stops them, `quadvel status` shows their health")
         for name, arguments in nodes.items():
             if not signals.received:
-                group.start(name, command(name, arguments))
+                group.start(name, process_command(name, arguments))
         watch, ended = PageWatch(group, say), dict[str, int]()
         while not ended and not signals.wait(0.1):
             ended = watch.ended()
@@ -47,5 +53,5 @@ def up(stack: Stack, view: bool = False) -> int:
 
 
 def _positive(code: int) -> int:
-    """As a shell reports it: 128 + n for a process that signal n ended."""
+    """Convert an exit code to the shell's convention: 128 + n for a process ended by signal n."""
     return code if code > 0 else 128 - code

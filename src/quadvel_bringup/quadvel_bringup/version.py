@@ -1,4 +1,4 @@
-"""Which quadvel this is."""
+"""Version and commit of this quadvel."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ from pathlib import Path
 
 
 def version() -> str:
-    """Number and, in a source tree, commit: "0.1.0 (commit 873baba)"; with changes on top: "873baba, changed"."""
+    """Return the version and, in a source tree, the commit.
+
+    Returns:
+        Such as "0.1.0 (commit 873baba)"; with local changes "0.1.0 (commit 873baba, changed)".
+    """
     try:
         number = metadata.version("quadvel")
     except metadata.PackageNotFoundError:  # built by colcon, package by package
@@ -18,10 +22,10 @@ def version() -> str:
 
 
 def _git(*arguments: str) -> str:
-    """What git answers about the tree that this file belongs to, or "" where it belongs to none."""
+    """Return the output of git for the source tree of this file, or "" outside of one."""
     here = Path(__file__).parent
     if (here.parents[2] / "src" / "quadvel_bringup" / "quadvel_bringup") != here:
-        return ""  # installed; a repository around it would be somebody else's
+        return ""  # installed; an enclosing repository is not that of quadvel
     try:
         answer = subprocess.run(["git", "-C", here, *arguments], capture_output=True, text=True)
     except OSError:

@@ -1,4 +1,4 @@
-"""`quadvel view`: the operator's page, on the robot that runs or on a recording of one."""
+"""`quadvel view`: the operator page for a running robot or a recording."""
 
 from __future__ import annotations
 
@@ -11,29 +11,37 @@ from .processes import StopSignals
 
 
 def view(recording: Path | None, host: str, port: int | None, for_foxglove: bool) -> None:
-    """Serve the page until Ctrl-C, or the topics for Foxglove. host: the address to listen on. port: None for the usual one.
+    """Serve the page, or the topics for Foxglove, until Ctrl-C.
 
-    Raises ValueError or OSError, of which AddressError and RecordingError are kinds, where that can't be.
+    Args:
+        recording: A recording to play, or None for the running robot.
+        host: Address to listen on.
+        port: TCP port, or None for the default one.
+        for_foxglove: Whether to serve Foxglove instead of the page.
+
+    Raises:
+        ValueError: The arguments contradict each other. AddressError, RecordingError and OSError
+            pass through.
     """
     if for_foxglove:
         if recording is not None:
             raise ValueError(
-                f"{recording}: Foxglove opens recordings itself; --foxglove serves a robot that runs"
+                f"{recording}: Foxglove opens recordings itself; --foxglove serves a running robot"
             )
         quadvel_dds.install()
         from quadvel_view import foxglove_live
 
         from .foxglove import serve
 
-        serve(host, foxglove_live.PORT if port is None else port)
+        serve(host, foxglove_live.DEFAULT_PORT if port is None else port)
         return
     if recording is None:
         given = {"host": host} | ({} if port is None else {"port": port})
-        nodes.run("view", nodes.arguments("view", given))
+        nodes.run("view", nodes.ros_arguments("view", given))
         return
     from quadvel_view.replay import replay
-    from quadvel_view.viewer import PORT
+    from quadvel_view.viewer import DEFAULT_PORT
 
     with StopSignals() as signals:
-        chosen = PORT if port is None else port
+        chosen = DEFAULT_PORT if port is None else port
         replay(recording, host, chosen, signals.wait, lambda url: print(f"open {url}", flush=True))

@@ -222,8 +222,8 @@ def _default(typename: str, field: str, description: Description) -> Callable[[]
     if kind == Nodetype.NAME:
         return message_class(detail)
     if kind == Nodetype.BASE:
-        zero = Octet(1) if detail[0] == "byte" else definitions.ZEROS.get(detail[0], 0)
-        value = definitions.DEFAULTS.get((typename, field), zero)
+        zero = Octet(1) if detail[0] == "byte" else definitions.TYPE_DEFAULTS.get(detail[0], 0)
+        value = definitions.FIELD_DEFAULTS.get((typename, field), zero)
         return lambda: value
     item, count = _default(typename, field, detail[0]), detail[1] if kind == Nodetype.ARRAY else 0
     convert = _converter(description) or list

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from quadvel_description.robot import JOINT_NAMES, TORQUE_LIMIT
 from quadvel_recordings.joint_log import JointLog, read_joint_log
 from quadvel_recordings.reading import RecordingError, read_messages
-from quadvel_recordings.stamps import stamp_of, unstamped
+from quadvel_recordings.stamps import missing_stamp_notices, stamp_of
 
 from .demo_figures import AXIS_LABELS
 from .output import output_folder, replacing
@@ -137,7 +137,7 @@ def read_recorded_run(
         RecordingError: The recording holds nothing to plot; the message names its topics.
     """
     rows = _read_topics(path, warn)
-    missing = unstamped({topic: np.array(found.stamps) for topic, found in rows.items()})
+    missing = missing_stamp_notices({topic: np.array(found.stamps) for topic, found in rows.items()})
     if warn:
         for sentence in missing:
             warn(sentence)
@@ -184,7 +184,7 @@ def _read_foreign_log(
 
 def _series_of_log(log: JointLog) -> dict[str, tuple[Array, Array]]:
     """Series of a joint log under the names low_state and low_cmd, with NaN for missing values."""
-    begin, joints = 1e-9 * log.begin, log.state.joints
+    begin, joints = 1e-9 * log.start_ns, log.state.joints
     none = np.full((len(log.state.time), len(joints)), np.nan)
     numbers = np.hstack([log.state.values.get("q", none), log.state.values.get("tau", none)])
     lines = {"/low_state": (log.state.time + begin, numbers)}

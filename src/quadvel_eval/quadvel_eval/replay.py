@@ -22,7 +22,7 @@ from quadvel_description.state import MODE_DAMPING, MODE_SERVO, JointCommand
 from quadvel_nodes.messages import seconds
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
-from quadvel_recordings.joint_log import JointLog, Series, expect_commands
+from quadvel_recordings.joint_log import JointLog, Series, require_commands
 from quadvel_recordings.reading import read_messages
 from quadvel_sim.config import SensorNoise, SimulatorConfig
 from quadvel_sim.simulator import DT, Simulator, Truth
@@ -146,7 +146,7 @@ def joints_from_log(
     Raises:
         ValueError: A joint, the torque, the angles or the gains are missing.
     """
-    state, command = log.state, expect_commands(path, log)
+    state, command = log.state, require_commands(path, log)
     for field, meaning in (("q", "angles"), ("tau", "torques")):
         if field not in state.values:
             raise ValueError(f"{path}: {state.topic}: found no {meaning}, expected them next to the commands")
@@ -165,7 +165,7 @@ def joints_from_log(
     commands = dict(zip(np.round(1e3 * command.time).astype(int).tolist(), rows, strict=True))
     measured = [each[first] for each in (values["q"], speed, values["tau"])]
     return _resample_to_milliseconds(
-        path, ticks, (state.time + 1e-9 * log.begin)[first], measured, commands, max_period
+        path, ticks, (state.time + 1e-9 * log.start_ns)[first], measured, commands, max_period
     )
 
 

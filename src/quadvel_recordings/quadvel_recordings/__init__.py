@@ -1,5 +1,6 @@
-"""Recordings read without ROS and without a middleware, with `rosbags` alone.
+"""Reading of ROS recordings without ROS and without a middleware, with `rosbags` alone.
 
-`reading` takes messages out of an MCAP file or a rosbag2, by the definitions that it carries (`recorded`); `definitions` knows the
-messages of ROS 2 Jazzy and ours. Not for writing recordings, which is `quadvel_bringup.recorder`'s, nor for what is in them.
+`reading` reads messages from MCAP files and rosbag2 folders by the definitions in the file
+(`recorded`). `definitions` holds the messages of ROS 2 Jazzy and of quadvel. Recordings are written
+by `quadvel_bringup.recorder`.
 """

@@ -1,4 +1,4 @@
-"""How much a packed recording may unpack to: a small file can promise more than memory or disk holds."""
+"""Limits on the decompressed size of recordings: a small file can expand beyond memory or disk."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ import attrs
 import lz4.frame
 from backports import zstd
 
-LARGEST_CHUNK = 1 << 28
-"""Bytes of a chunk or message once unpacked: recorders write chunks of some MB."""
-LARGEST_AT_ONCE = 1 << 30
-"""Bytes of all chunks of an MCAP file that hold the same instant, which a reader keeps at once."""
-STEP = 1 << 20
-"""Bytes that are unpacked at once while they are counted."""
+MAX_CHUNK_BYTES = 1 << 28
+"""Largest decompressed size of a chunk or message; recorders write chunks of a few megabytes."""
+MAX_OVERLAP_BYTES = 1 << 30
+"""Largest decompressed size of all MCAP chunks that cover one instant.
 
-CHUNK, RECORD = 0x06, struct.Struct("<BQ")
-CHUNK_HEAD, LENGTH = struct.Struct("<QQQL"), struct.Struct("<L")
+A reader holds these together.
+"""
+BLOCK_BYTES = 1 << 20
+"""Bytes that are decompressed per step while the size is counted."""
+
+CHUNK_OPCODE, RECORD_HEADER = 0x06, struct.Struct("<BQ")
+CHUNK_HEADER, LENGTH = struct.Struct("<QQQL"), struct.Struct("<L")
 MAGIC = b"\x89MCAP0\r\n"
 _UNPACKERS: dict[str, Callable[[], Any]] = {
     "lz4": lz4.frame.LZ4FrameDecompressor,
@@ -33,12 +36,19 @@ _UNPACKERS: dict[str, Callable[[], Any]] = {
 
 
 class TooLargeError(ValueError):
-    """More is packed in a recording than may be unpacked; the sentence lacks the file's name."""
+    """Decompressed data exceeds a limit; the message does not name the file."""
 
 
 @attrs.frozen
 class _Chunk:
-    """A chunk of an MCAP file: the times (ns) that it holds, what it says that it unpacks to, and how it is packed."""
+    """The header of an MCAP chunk.
+
+    Attributes:
+        first: Time of its first message, ns.
+        last: Time of its last message, ns.
+        size: Decompressed size as the header states it, bytes.
+        compression: Name of the compression.
+    """
 
     first: int
     last: int
@@ -46,54 +56,82 @@ class _Chunk:
     compression: str
 
 
-def unpacked(data: bytes, compression: str, largest: int = LARGEST_CHUNK) -> bytes:
-    """The data unpacked. Raises TooLargeError before more than `largest` bytes are, and what the packers raise."""
+def decompress(data: bytes, compression: str, max_bytes: int = MAX_CHUNK_BYTES) -> bytes:
+    """Decompress data up to a size limit.
+
+    Args:
+        data: Compressed bytes of one or several frames.
+        compression: "lz4", "zstd" or "bz2".
+        max_bytes: Largest size of the result.
+
+    Returns:
+        The decompressed bytes.
+
+    Raises:
+        TooLargeError: The result would exceed `max_bytes`. Errors of the decompressors pass
+            through.
+    """
     out = bytearray()
-    for part in _parts(BytesIO(data), compression):
+    for part in _decompressed_blocks(BytesIO(data), compression):
         out += part
-        if len(out) > largest:
-            raise TooLargeError(f"found a chunk of more than {largest} bytes, expected fewer")
+        if len(out) > max_bytes:
+            raise TooLargeError(f"found a chunk of more than {max_bytes} bytes, expected fewer")
     return bytes(out)
 
 
-def _parts(file: IO[bytes], compression: str) -> Iterator[bytes]:
-    """What is packed in one or several frames, in steps."""
-    rest = file.read(STEP)
+def _decompressed_blocks(file: IO[bytes], compression: str) -> Iterator[bytes]:
+    """Yield the decompressed content of one or several frames, block by block."""
+    rest = file.read(BLOCK_BYTES)
     while rest:
         unpacker = _UNPACKERS[compression]()
         while not unpacker.eof:
-            yield unpacker.decompress(rest, STEP)
-            rest = file.read(STEP) if unpacker.needs_input else b""
+            yield unpacker.decompress(rest, BLOCK_BYTES)
+            rest = file.read(BLOCK_BYTES) if unpacker.needs_input else b""
             if unpacker.needs_input and not rest and not unpacker.eof:
                 return
-        rest = (unpacker.unused_data or b"") + file.read(STEP)
+        rest = (unpacker.unused_data or b"") + file.read(BLOCK_BYTES)
 
 
 def check_chunks(path: Path) -> None:
-    """Raises TooLargeError where chunks of an MCAP file unpack to more than they may; of a broken file what is whole counts."""
+    """Check the decompressed size of all chunks of an MCAP file.
+
+    Of a damaged file the intact chunks are checked.
+
+    Args:
+        path: The MCAP file.
+
+    Raises:
+        TooLargeError: A chunk exceeds `MAX_CHUNK_BYTES`, or overlapping chunks exceed
+            `MAX_OVERLAP_BYTES`.
+    """
     chunks = []
     with path.open("rb") as file:
         for chunk, data in _chunks(file):
-            if chunk.size > LARGEST_CHUNK:
-                raise TooLargeError(f"found a chunk of {chunk.size} bytes, expected {LARGEST_CHUNK} at most")
+            if chunk.size > MAX_CHUNK_BYTES:
+                raise TooLargeError(
+                    f"found a chunk of {chunk.size} bytes, expected {MAX_CHUNK_BYTES} at most"
+                )
             if chunk.compression in _UNPACKERS:
-                _count(data, chunk.compression, LARGEST_CHUNK)
+                _check_size(data, chunk.compression, MAX_CHUNK_BYTES)
             chunks.append(chunk)
-    most = _most_at_once(chunks)
-    if most > LARGEST_AT_ONCE:
+    most = _peak_bytes(chunks)
+    if most > MAX_OVERLAP_BYTES:
         raise TooLargeError(
-            f"found chunks of {most} bytes that hold the same instant, expected {LARGEST_AT_ONCE} at most"
+            f"found chunks of {most} bytes that hold the same instant, expected {MAX_OVERLAP_BYTES} at most"
         )
 
 
-def _count(data: bytes, compression: str, largest: int) -> None:
-    """Raises TooLargeError where more is packed; broken data is the reader's to refuse."""
+def _check_size(data: bytes, compression: str, max_bytes: int) -> None:
+    """Raise TooLargeError if the data expands beyond the limit.
+
+    Damaged data is left to the reader to reject.
+    """
     total = 0
     try:
-        for part in _parts(BytesIO(data), compression):
+        for part in _decompressed_blocks(BytesIO(data), compression):
             total += len(part)
-            if total > largest:
-                raise TooLargeError(f"found a chunk of more than {largest} bytes, expected fewer")
+            if total > max_bytes:
+                raise TooLargeError(f"found a chunk of more than {max_bytes} bytes, expected fewer")
     except TooLargeError:
         raise
     except Exception:
@@ -101,18 +139,18 @@ def _count(data: bytes, compression: str, largest: int) -> None:
 
 
 def _chunks(file: IO[bytes]) -> Iterator[tuple[_Chunk, bytes]]:
-    """Each whole chunk of an MCAP file, with its packed data."""
+    """Yield the header and the compressed data of each complete chunk of an MCAP file."""
     end = file.seek(0, 2)
     file.seek(0)
     if file.read(len(MAGIC)) != MAGIC:
         return
-    while len(head := file.read(RECORD.size)) == RECORD.size:
-        kind, length = RECORD.unpack(head)
+    while len(head := file.read(RECORD_HEADER.size)) == RECORD_HEADER.size:
+        kind, length = RECORD_HEADER.unpack(head)
         begin = file.tell()
         if not kind or begin + length > end:
             return
-        if kind == CHUNK and length > CHUNK_HEAD.size + LENGTH.size:
-            first, last, size, _ = CHUNK_HEAD.unpack(file.read(CHUNK_HEAD.size))
+        if kind == CHUNK_OPCODE and length > CHUNK_HEADER.size + LENGTH.size:
+            first, last, size, _ = CHUNK_HEADER.unpack(file.read(CHUNK_HEADER.size))
             (letters,) = LENGTH.unpack(file.read(LENGTH.size))
             compression = file.read(min(letters, 16)).decode(errors="replace")
             file.seek(8, 1)
@@ -120,8 +158,9 @@ def _chunks(file: IO[bytes]) -> Iterator[tuple[_Chunk, bytes]]:
         file.seek(begin + length)
 
 
-def _most_at_once(chunks: list[_Chunk]) -> int:
-    """Bytes of the chunks that hold one instant, at most."""
+def _peak_bytes(chunks: list[_Chunk]) -> int:
+    """Return the largest total size of chunks that cover one instant, bytes."""
+    # Sweep over time: a chunk adds its size at its first message and removes it after its last.
     changes = [(chunk.first, chunk.size) for chunk in chunks] + [
         (chunk.last + 1, -chunk.size) for chunk in chunks
     ]
@@ -133,11 +172,18 @@ def _most_at_once(chunks: list[_Chunk]) -> int:
 
 
 def check_packed_file(path: Path) -> None:
-    """Raises TooLargeError where a packed file of a rosbag2 needs more than half of the free disk, to which it is unpacked."""
+    """Check that a compressed rosbag2 file fits on the disk to which it is decompressed.
+
+    Args:
+        path: The compressed file (`.zstd`).
+
+    Raises:
+        TooLargeError: The file expands to more than half of the free space of the temporary folder.
+    """
     free = shutil.disk_usage(tempfile.gettempdir()).free // 2
     total = 0
     with path.open("rb") as file:
-        for part in _parts(file, "zstd"):
+        for part in _decompressed_blocks(file, "zstd"):
             total += len(part)
             if total > free:
                 raise TooLargeError(f"{path.name}: unpacks to more than {free} bytes, half of the free disk")

@@ -1,6 +1,6 @@
-"""What can be read of an MCAP file whose recorder was killed: the chunks that reached the disk whole.
+"""Recovery of MCAP files whose recorder was killed: all chunks that are complete on disk.
 
-Such a file has no summary and no end, and perhaps half a chunk.
+Such a file has no summary and no footer, and may end within a chunk.
 """
 
 from __future__ import annotations
@@ -16,8 +16,16 @@ from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
 
 
 @attrs.frozen
-class Kept:
-    """A message of a cut-off file: its topic, its type's name and definition, when it was written (ns), and its bytes."""
+class RecoveredMessage:
+    """A message of a truncated file.
+
+    Attributes:
+        topic: Its topic.
+        typename: Its type, such as "geometry_msgs/msg/Twist".
+        definition: The definition of that type in the file.
+        time: When it was written, ns.
+        data: The serialised message.
+    """
 
     topic: str
     typename: str
@@ -26,8 +34,15 @@ class Kept:
     data: bytes
 
 
-def is_cut_off(path: Path) -> bool:
-    """Whether the file begins as MCAP files do and does not end as they do."""
+def is_truncated(path: Path) -> bool:
+    """Return whether a file starts with the MCAP magic bytes but does not end with them.
+
+    Args:
+        path: The file; anything else than a file counts as not truncated.
+
+    Returns:
+        True for an MCAP file without a footer.
+    """
     if not path.is_file():
         return False
     with path.open("rb") as file:
@@ -36,8 +51,15 @@ def is_cut_off(path: Path) -> bool:
         return begins and (path.stat().st_size == len(MCAP0_MAGIC) or file.read() != MCAP0_MAGIC)
 
 
-def kept_messages(path: Path) -> Iterator[Kept]:
-    """The messages up to the first record that is not whole, in the order in which they were written."""
+def recover_messages(path: Path) -> Iterator[RecoveredMessage]:
+    """Yield the messages before the first incomplete record.
+
+    Args:
+        path: A truncated MCAP file.
+
+    Yields:
+        The messages in the order in which they were written.
+    """
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     for record in _records(path):
@@ -48,20 +70,32 @@ def kept_messages(path: Path) -> Iterator[Kept]:
         elif isinstance(record, Message):
             channel = channels[record.channel_id]
             schema = schemas[channel.schema_id]
-            yield Kept(channel.topic, schema.name, _definition(schema), record.log_time, record.data)
+            yield RecoveredMessage(
+                channel.topic, schema.name, _definition(schema), record.log_time, record.data
+            )
 
 
 def _definition(schema: Schema) -> MessageDefinition:
-    """As rosbags has it; that of an IDL file is left out, as nobody reads it."""
+    """Convert a schema to a definition of rosbags.
+
+    IDL definitions are not read, so they become empty.
+    """
     if schema.encoding != "ros2msg":
         return MessageDefinition(MessageDefinitionFormat.NONE, "")
     return MessageDefinition(MessageDefinitionFormat.MSG, schema.data.decode(errors="replace"))
 
 
-def what_is_kept(path: Path) -> str:
-    """How much of the file is whole, in words, or "" where nothing is. It reads the whole file."""
+def recovery_summary(path: Path) -> str:
+    """Describe how much of a truncated file is readable. Reads the whole file.
+
+    Args:
+        path: A truncated MCAP file.
+
+    Returns:
+        Duration and number of messages in words, or "" if nothing is readable.
+    """
     count, first, last = 0, 0, 0
-    for message in kept_messages(path):
+    for message in recover_messages(path):
         first = min(first, message.time) if count else message.time
         last = max(last, message.time)
         count += 1
@@ -69,7 +103,7 @@ def what_is_kept(path: Path) -> str:
 
 
 def _records(path: Path) -> Iterator[McapRecord]:
-    """Records outside of chunks and in them, as long as they are whole."""
+    """Yield the records inside and outside of chunks until the first incomplete one."""
     with path.open("rb") as file:
         records = StreamReader(file, emit_chunks=True, record_size_limit=path.stat().st_size).records
         try:

@@ -1,5 +1,4 @@
-"""Definitions of the messages and services that quadvel's nodes speak, those of ROS 2 Jazzy that `rosbags` carries and ours, and
-of the robots' messages that recordings are read of."""
+"""Definitions of all messages and services: ROS 2 Jazzy's, quadvel's and Unitree's."""
 
 from __future__ import annotations
 
@@ -13,8 +12,8 @@ from . import unitree_go
 
 HERE = Path(__file__).parent
 OWN_PACKAGE = "quadvel_msgs"
-# Services of ROS 2 that our nodes need; rosbags carries messages alone.
-SERVICES = {
+
+SERVICE_DEFINITIONS = {
     "std_srvs/srv/Empty": "---",
     "std_srvs/srv/SetBool": "bool data\n---\nbool success\nstring message",
     "std_srvs/srv/Trigger": "---\nbool success\nstring message",
@@ -27,17 +26,18 @@ SERVICES = {
     "rcl_interfaces/srv/SetParameters": "Parameter[] parameters\n---\nSetParametersResult[] results",
     "rcl_interfaces/srv/SetParametersAtomically": "Parameter[] parameters\n---\nSetParametersResult result",
 }
-ZEROS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
-"""Default values of fields by their type; those of all others are 0."""
-DEFAULTS = {
+"""Definitions of the ROS 2 services in use; those of messages are in rosbags."""
+TYPE_DEFAULTS = {"bool": False, "string": "", "float32": 0.0, "float64": 0.0}
+"""Default values of primitive fields by type; all other types default to 0."""
+FIELD_DEFAULTS = {
     ("geometry_msgs/msg/Quaternion", "w"): 1.0,
     ("sensor_msgs/msg/NavSatStatus", "status"): -2,
 }
-"""Default values of single fields, which the definitions carried by rosbags leave out."""
+"""Default values of single fields, which the definitions in rosbags omit."""
 
 
 def _own_definitions() -> Path:
-    """In `interfaces` where pip installed us, beside us in the source tree, or where colcon installed them."""
+    """Return the folder of the quadvel_msgs definitions, installed or in the source tree."""
     prefixes = os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
     shares = [Path(prefix) / "share" / OWN_PACKAGE for prefix in prefixes]
     folders = (HERE / "interfaces", HERE.parents[1] / OWN_PACKAGE, *shares)
@@ -45,16 +45,19 @@ def _own_definitions() -> Path:
 
 
 def _load_store() -> Any:
-    """Jazzy's definitions and ours. rosbags knows no services: each half is parsed as if it was a message."""
+    """Register Jazzy's and quadvel's definitions.
+
+    The type store of rosbags has no services, so request and response are parsed as messages.
+    """
     store, own_files = get_typestore(Stores.ROS2_JAZZY), _own_definitions()
     for file in sorted(own_files.glob("msg/*.msg")):
         store.register(get_types_from_msg(file.read_text(), f"{OWN_PACKAGE}/msg/{file.stem}"))
     for name, text in unitree_go.DEFINITIONS.items():
         store.register(get_types_from_msg(text, f"unitree_go/msg/{name}"))
     own = {f"{OWN_PACKAGE}/srv/{file.stem}": file.read_text() for file in sorted(own_files.glob("srv/*.srv"))}
-    for name, text in {**SERVICES, **own}.items():
+    for name, text in {**SERVICE_DEFINITIONS, **own}.items():
         package, _, short = name.split("/")
-        # Line breaks around: the "---" may start the text or end it, where a request or a response is empty.
+        # Add line breaks: for an empty request or response "---" is the first or last line.
         request, _, response = f"\n{text}\n".partition("\n---\n")
         for part, definition in {"Request": request, "Response": response}.items():
             (parsed,) = get_types_from_msg(definition, f"{package}/msg/{short}").values()
@@ -63,4 +66,4 @@ def _load_store() -> Any:
 
 
 STORE = _load_store()
-"""All of them by full name ("geometry_msgs/msg/Twist"), as rosbags has it."""
+"""All definitions by full name ("geometry_msgs/msg/Twist"), as a type store of rosbags."""

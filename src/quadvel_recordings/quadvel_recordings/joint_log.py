@@ -1,7 +1,8 @@
-"""States and commands of joints out of a recording, whichever of three kinds of messages they are.
+"""Joint states and joint commands from recordings of three message families.
 
-`quadvel_msgs` LowState and LowCmd, `unitree_go` LowState and LowCmd, or two topics of `sensor_msgs/JointState`. They are found by
-their types; the names of topics decide where several could be meant.
+The families are LowState and LowCmd of `quadvel_msgs`, LowState and LowCmd of `unitree_go`, and two
+topics of `sensor_msgs/JointState`. Topics are found by their types; if several topics match, their
+names decide.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .reading import RecordingError, read_messages, topics
-from .stamps import stamp_of, unstamped
+from .stamps import missing_stamp_notices, stamp_of
 
 Array = NDArray[Any]  # of floats
 Names = tuple[str, ...]
@@ -25,48 +26,56 @@ Names = tuple[str, ...]
 LEG_JOINTS = tuple(
     f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")
 )
-"""The joints of LowState and LowCmd, Unitree's and ours, in their order."""
+"""The joints of LowState and LowCmd, Unitree's and quadvel's, in order."""
 STATE_FIELDS = ("q", "dq", "tau")
 COMMAND_FIELDS = ("q", "dq", "tau", "kp", "kd")
 OWN_SERVO, UNITREE_SERVO = 10, 1
-"""Modes in which a drive obeys position and gains."""
-NO_TARGET = 1e4
-"""Unitree sends an angle of 2.146e9 rad and a speed of 16000 rad/s for "none"."""
-COMMANDS = re.compile(
+"""Modes in which a drive tracks position with gains."""
+NO_TARGET_THRESHOLD = 1e4
+"""Smallest value, rad or rad/s, that means "no target".
+
+Unitree sends 2.146e9 rad and 16000 rad/s for it.
+"""
+COMMAND_TOPIC_PATTERN = re.compile(
     r"cmd|command|desired|target|reference|(^|[/_])(des|ref)($|[/_])|goal|setpoint|action", re.IGNORECASE
 )
-"""How topics of commands are called."""
-SLOW = re.compile(r"(^|/)lf/")
-"""Where Unitree publishes the same states once more, less often."""
+"""Pattern of the names of command topics."""
+LOW_RATE_TOPIC_PATTERN = re.compile(r"(^|/)lf/")
+"""Pattern of the topics on which Unitree repeats the states at a lower rate."""
 
 
 def _own_state(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau (3, 12) of a quadvel LowState."""
     return LEG_JOINTS, np.array([m.q, m.dq, m.tau])
 
 
 def _own_command(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau, kp, kd (5, 12) of a quadvel LowCmd."""
     values = np.array([m.q, m.dq, m.tau, m.kp, m.kd])
-    if m.mode != OWN_SERVO:  # kp and tau are ignored, see LowCmd.msg
+    if m.mode != OWN_SERVO:  # a drive then ignores tau and kp, see LowCmd.msg
         values[2:4] = 0.0
     return LEG_JOINTS, values
 
 
 def _unitree_state(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau (3, 12) of a Unitree LowState."""
     motors = m.motor_state[: len(LEG_JOINTS)]
     return LEG_JOINTS, np.array([[one.q, one.dq, one.tau_est] for one in motors], np.float32).T
 
 
 def _unitree_command(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau, kp, kd (5, 12) of a Unitree LowCmd."""
     motors = m.motor_cmd[: len(LEG_JOINTS)]
     values = np.array([[one.q, one.dq, one.tau, one.kp, one.kd] for one in motors], np.float32).T
     values[2:, [one.mode != UNITREE_SERVO for one in motors]] = 0.0
     for target, gain in ((0, 3), (1, 4)):
-        none = np.abs(values[target]) >= NO_TARGET
+        none = np.abs(values[target]) >= NO_TARGET_THRESHOLD
         values[target, none] = values[gain, none] = 0.0
     return LEG_JOINTS, values
 
 
 def _joint_state(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau (3, J) of a JointState; NaN for an empty field."""
     values = np.full((len(STATE_FIELDS), len(m.name)), np.nan)
     for row, field in enumerate((m.position, m.velocity, m.effort)):
         if len(field) not in (0, len(m.name)):
@@ -76,13 +85,21 @@ def _joint_state(m: Any) -> tuple[Names, Array]:
 
 
 def _joint_command(m: Any) -> tuple[Names, Array]:
+    """Return joint names and q, dq, tau, kp, kd (5, J) of a JointState; NaN for the gains."""
     names, values = _joint_state(m)
     return names, np.vstack([values, np.full((2, len(names)), np.nan)])
 
 
 @attrs.frozen
-class _Family:
-    """Two types of messages that belong together, and what reads them: names of joints, fields (k, J)."""
+class _MessageFamily:
+    """The message types of states and commands, and their readers.
+
+    Attributes:
+        state: Type of the states.
+        command: Type of the commands.
+        read_state: Returns joint names and fields (3, J) of a state.
+        read_command: Returns joint names and fields (5, J) of a command.
+    """
 
     state: str
     command: str
@@ -92,15 +109,23 @@ class _Family:
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 FAMILIES = (
-    _Family("quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd", _own_state, _own_command),
-    _Family("unitree_go/msg/LowState", "unitree_go/msg/LowCmd", _unitree_state, _unitree_command),
-    _Family(JOINT_STATE, JOINT_STATE, _joint_state, _joint_command),
+    _MessageFamily("quadvel_msgs/msg/LowState", "quadvel_msgs/msg/LowCmd", _own_state, _own_command),
+    _MessageFamily("unitree_go/msg/LowState", "unitree_go/msg/LowCmd", _unitree_state, _unitree_command),
+    _MessageFamily(JOINT_STATE, JOINT_STATE, _joint_state, _joint_command),
 )
 
 
 @attrs.frozen(eq=False)
 class Series:
-    """What one topic holds of J joints: times (n,), s, and values (n, J) of each field that is there."""
+    """The joint values of one topic.
+
+    Attributes:
+        topic: The topic.
+        joints: Names of the J joints.
+        time: (n,), s since the first state.
+        values: (n, J) for each recorded field: q (rad), dq (rad/s), tau (N m), kp (N m/rad), kd (N
+            m s/rad).
+    """
 
     topic: str
     joints: Names
@@ -110,19 +135,23 @@ class Series:
 
 @attrs.frozen(eq=False)
 class JointLog:
-    """States and, where there are any, commands, on one time base that begins with the first state.
+    """Joint states and, if recorded, joint commands on one time base.
 
-    begin: ns, that instant on the clock that counts. received: times of receipt count, as stamps are missing.
+    Attributes:
+        state: The states.
+        command: The commands, or None.
+        start_ns: Time of the first state, ns, by stamp or by receipt; the time base starts there.
+        uses_receipt_times: Whether times are times of receipt, because stamps are missing.
     """
 
     state: Series
     command: Series | None
-    begin: int
-    received: bool
+    start_ns: int
+    uses_receipt_times: bool
 
 
 class _Rows:
-    """Stamps and times of receipt (ns) and the values of one topic, kept as bytes while they come: a log is long."""
+    """Stamps and times of receipt (ns) and values of one topic, packed as bytes to save memory."""
 
     def __init__(self) -> None:
         self.stamps: list[int | None] = []
@@ -131,6 +160,13 @@ class _Rows:
         self.dtype: Any = np.float32
 
     def add(self, stamp: int | None, received: int, values: Array) -> None:
+        """Append one message.
+
+        Args:
+            stamp: Its stamp, ns, or None.
+            received: Time of receipt, ns.
+            values: (k, J), one row per field.
+        """
         if not self.stamps:
             self.dtype = values.dtype
         self.stamps.append(stamp)
@@ -138,13 +174,32 @@ class _Rows:
         self.values += values.astype(self.dtype, copy=False).tobytes()
 
     def series(self, topic: str, joints: Names, fields: Sequence[str], received: bool, begin: int) -> Series:
-        """The rows as arrays; a field that no message has is left out."""
+        """Return the rows as arrays without the fields that no message has.
+
+        Args:
+            topic: The topic.
+            joints: Names of the J joints.
+            fields: Names of the k fields.
+            received: Use times of receipt instead of stamps.
+            begin: Start of the time base, ns.
+
+        Returns:
+            The series of the topic.
+        """
         rows = np.frombuffer(self.values, self.dtype).reshape(len(self.stamps), len(fields), len(joints))
         values = {field: rows[:, k] for k, field in enumerate(fields)}
         there = {field: each for field, each in values.items() if not np.isnan(each).all()}
         return Series(topic, joints, 1e-9 * (self.times(received) - begin), there)
 
     def times(self, received: bool) -> NDArray[np.int64]:
+        """Return stamps or times of receipt.
+
+        Args:
+            received: Use times of receipt.
+
+        Returns:
+            Times (n,), ns.
+        """
         return np.array(self.received if received else self.stamps, np.int64)
 
 
@@ -152,31 +207,37 @@ def read_joint_log(
     path: Path,
     state_topic: str | None = None,
     command_topic: str | None = None,
-    tell: Callable[[str], None] | None = None,
+    notify: Callable[[str], None] | None = None,
     warn: Callable[[str], None] | None = None,
 ) -> JointLog:
-    """The states of joints in a recording, and the commands if there are any.
+    """Read joint states and, if there are any, joint commands from a recording.
 
     Args:
-        path: a recording as `read_messages` reads it.
-        state_topic: topic of the states, where several could be meant.
-        command_topic: topic of the commands, likewise.
-        tell: called with a sentence for what had to be assumed; without it such sentences become warnings.
-        warn: called with a sentence for stamps that are missing; without it these go to `tell`.
+        path: A recording that `read_messages` can read.
+        state_topic: Topic of the states; needed if several topics match.
+        command_topic: Topic of the commands; needed if several topics match.
+        notify: Receives a sentence for each assumption; by default such sentences become warnings.
+        warn: Receives a sentence for missing stamps; by default `notify` receives it.
+
+    Returns:
+        The log on one time base.
 
     Raises:
-        RecordingError: no states, or several topics that could hold them; the sentence names the topics that are there.
+        RecordingError: The recording holds no joint states, or several topics match. The sentence
+            lists its topics.
     """
     there = topics(path)
-    found = _pair(path, there, state_topic, command_topic)
-    rows = _rows(path, there, found, tell)
-    state, command = (_most(path, topic, rows[topic], tell) if topic else None for topic in found)
+    found = _select_topics(path, there, state_topic, command_topic)
+    rows = _read_rows(path, there, found, notify)
+    state, command = (_select_joints(path, topic, rows[topic], notify) if topic else None for topic in found)
     assert state is not None
     both = [one for one in (state, command) if one is not None]
     stamps = [one for _, _, one in both]
-    sentences = unstamped({topic: one.times(False) for topic, _, one in both if None not in one.stamps})
+    sentences = missing_stamp_notices(
+        {topic: one.times(False) for topic, _, one in both if None not in one.stamps}
+    )
     for sentence in sentences:
-        (warn or tell or (lambda _: None))(sentence)
+        (warn or notify or (lambda _: None))(sentence)
     received = bool(sentences) or any(None in one.stamps for one in stamps)
     begin = int(state[2].times(received)[0])
     series = [
@@ -186,17 +247,17 @@ def read_joint_log(
     return JointLog(series[0], series[1] if len(series) > 1 else None, begin, received)
 
 
-def _rows(
-    path: Path, there: Mapping[str, str], found: tuple[str, str | None], tell: Callable[[str], None] | None
+def _read_rows(
+    path: Path, there: Mapping[str, str], found: tuple[str, str | None], notify: Callable[[str], None] | None
 ) -> dict[str, dict[Names, _Rows]]:
-    """By topic, the rows of each list of joints that its messages name."""
+    """Read the rows of each topic, separately for each list of joint names."""
     rows: dict[str, dict[Names, _Rows]] = {topic: defaultdict(_Rows) for topic in found if topic}
     readers = {}
     for topic, role in zip(found, ("state", "command"), strict=True):
         for family in FAMILIES:
             if topic and there[topic] == getattr(family, role):
                 readers[topic] = getattr(family, f"read_{role}")
-    for topic, received, message in read_messages(path, lambda topic, _: topic in readers, tell):
+    for topic, received, message in read_messages(path, lambda topic, _: topic in readers, notify):
         try:
             names, values = readers[topic](message)
         except ValueError as error:
@@ -205,29 +266,29 @@ def _rows(
     return rows
 
 
-def _most(
-    path: Path, topic: str, rows: Mapping[Names, _Rows], tell: Callable[[str], None] | None
+def _select_joints(
+    path: Path, topic: str, rows: Mapping[Names, _Rows], notify: Callable[[str], None] | None
 ) -> tuple[str, Names, _Rows]:
-    """The joints that most messages of a topic name, with their rows."""
+    """Return the joint names that most messages of a topic have, with their rows."""
     if not rows:
         raise RecordingError(f"{path}: {topic}: no messages were recorded on it")
     joints = max(rows, key=lambda names: len(rows[names].stamps))
     others = sum(len(one.stamps) for names, one in rows.items() if names != joints)
-    if others and tell:
-        tell(f"{topic}: {others} messages name other joints than {joints[0]}, ... and are left out")
+    if others and notify:
+        notify(f"{topic}: {others} messages name other joints than {joints[0]}, ... and are skipped")
     return topic, joints, rows[joints]
 
 
-def _pair(
+def _select_topics(
     path: Path, there: Mapping[str, str], state: str | None, command: str | None
 ) -> tuple[str, str | None]:
-    """The topics of states and commands. Raises RecordingError."""
+    """Return the topics of states and commands, or raise RecordingError."""
     for topic, role in ((state, "state"), (command, "command")):
         types = [getattr(family, role) for family in FAMILIES]
         if topic is not None and there.get(topic) not in types:
             found = there.get(topic, "no such topic")
             raise RecordingError(
-                f"{path}: {topic}: found {found}, expected {' or '.join(types)}; {_listed(there)}"
+                f"{path}: {topic}: found {found}, expected {' or '.join(types)}; {_describe_topics(there)}"
             )
     halves: tuple[str, str | None] | None = None
     for family in FAMILIES:
@@ -235,51 +296,72 @@ def _pair(
         for candidates, role in ((states, "state"), (commands, "command")):
             if len(candidates) > 1:
                 listed = f"{', '.join(candidates)}: several topics of the type {getattr(family, role)}"
-                raise RecordingError(f"{path}: {listed}; --{role}-topic says which")
+                raise RecordingError(f"{path}: {listed}; select one with --{role}-topic")
         if states and commands:
             return states[0], commands[0]
         if states and halves is None:
             halves = states[0], command
     if halves is None:
         expected = "expected states of joints: " + ", ".join(family.state for family in FAMILIES)
-        raise RecordingError(f"{path}: {expected}; {_listed(there)}")
+        raise RecordingError(f"{path}: {expected}; {_describe_topics(there)}")
     return halves
 
 
 def _candidates(
-    there: Mapping[str, str], family: _Family, state: str | None, command: str | None
+    there: Mapping[str, str], family: _MessageFamily, state: str | None, command: str | None
 ) -> tuple[list[str], list[str]]:
-    """Topics that may hold a family's states and commands."""
+    """Return the topics that match the states and the commands of a family."""
     states = [topic for topic, typename in there.items() if typename == family.state]
     commands = [topic for topic, typename in there.items() if typename == family.command]
     if family.state == family.command:
-        states = [topic for topic in states if not COMMANDS.search(topic) and topic != command]
-        commands = [topic for topic in commands if COMMANDS.search(topic) and topic != state]
-    states = [topic for topic in states if not SLOW.search(topic)] or states
+        states = [topic for topic in states if not COMMAND_TOPIC_PATTERN.search(topic) and topic != command]
+        commands = [topic for topic in commands if COMMAND_TOPIC_PATTERN.search(topic) and topic != state]
+    states = [topic for topic in states if not LOW_RATE_TOPIC_PATTERN.search(topic)] or states
     return [state] if state else states, [command] if command else commands
 
 
-def _listed(there: Mapping[str, str]) -> str:
-    """The topics of a recording in words."""
+def _describe_topics(there: Mapping[str, str]) -> str:
+    """List the topics of a recording for an error sentence."""
     listed = [f"{topic} ({typename})" for topic, typename in sorted(there.items())]
     more = f" and {len(listed) - 20} more" if len(listed) > 20 else ""
     return f"the recording has {', '.join(listed[:20]) or 'no topics'}{more}"
 
 
-def expect_commands(path: Path, log: JointLog) -> Series:
-    """The commands of a recording that has to have some. Raises RecordingError."""
+def require_commands(path: Path, log: JointLog) -> Series:
+    """Return the commands of a log, or fail if there are none.
+
+    Args:
+        path: The recording, for the error sentence.
+        log: What was read from it.
+
+    Returns:
+        The commands, with positions among their fields.
+
+    Raises:
+        RecordingError: The log has no commands, or the commands have no positions.
+    """
     if log.command is None:
         types = ", ".join(dict.fromkeys(family.command for family in FAMILIES))
-        expected = f"expected commands beside the states on {log.state.topic}: a topic of {types}"
-        raise RecordingError(f"{path}: {expected}; --command-topic says which; {_listed(topics(path))}")
+        expected = f"expected commands for the states on {log.state.topic}: a topic of {types}"
+        raise RecordingError(
+            f"{path}: {expected}; select one with --command-topic; {_describe_topics(topics(path))}"
+        )
     if "q" not in log.command.values:
         raise RecordingError(
-            f"{path}: {log.command.topic}: found no angles in it, expected commanded positions"
+            f"{path}: {log.command.topic}: found no joint angles, expected commanded positions"
         )
     return log.command
 
 
-def shared(joints: Iterable[str], others: Iterable[str]) -> list[str]:
-    """The joints that both name, in the first one's order."""
+def common_joints(joints: Iterable[str], others: Iterable[str]) -> list[str]:
+    """Return the joints that both lists contain.
+
+    Args:
+        joints: Names of joints.
+        others: Names of joints.
+
+    Returns:
+        The common names in the order of `joints`.
+    """
     named = set(others)
     return [joint for joint in joints if joint in named]

@@ -1,6 +1,7 @@
-"""Messages out of a recording: an MCAP file, a rosbag2 folder or its .db3, a bag of ROS 1. Writing is `quadvel_bringup.recorder`'s.
+"""Reading of messages from MCAP files, rosbag2 folders and .db3 files, and ROS 1 bags.
 
-Definitions come from the recording or from `definitions`, so it is read where no ROS 2 is installed.
+Definitions come from the recording or from `definitions`, so no ROS 2 installation is needed.
+`quadvel_bringup.recorder` writes recordings.
 """
 
 from __future__ import annotations
@@ -17,69 +18,100 @@ from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag1.reader import decompressors
 from rosbags.rosbag2 import Reader
 
-from .bounds import TooLargeError, check_chunks, check_packed_file, unpacked
-from .cut_off import is_cut_off, kept_messages, what_is_kept
-from .recorded import is_known, read
+from .bounds import TooLargeError, check_chunks, check_packed_file, decompress
+from .cut_off import is_truncated, recover_messages, recovery_summary
+from .recorded import deserialize, is_known
 
 STORAGES = {".mcap": "mcap", ".db3": "sqlite3"}
-"""What metadata.yaml calls the files of a rosbag2, by their suffix."""
+"""Storage identifiers of metadata.yaml by suffix of the file."""
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be read; one sentence that names the file."""
+    """A recording is unreadable; the sentence names the file."""
 
 
 def read_messages(
-    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None = None
+    path: Path, wanted: Callable[[str, str], bool], notify: Callable[[str], None] | None = None
 ) -> Iterator[tuple[str, int, Any]]:
-    """Topic, time of arrival (ns) and message, in the order of arrival, where `wanted(topic, typename)`.
+    """Yield the messages of selected topics in the order of arrival.
 
-    Of an MCAP file whose recorder was killed come the messages that were written whole. One sentence that says so goes
-    to `tell`, or becomes a warning. Raises RecordingError for what is no recording, and OSError where there is no such file.
+    If the recorder of an MCAP file was killed, the complete messages are read.
+
+    Args:
+        path: An MCAP file, a rosbag2 folder, a .db3 file or a ROS 1 bag.
+        wanted: Predicate of topic and type name that selects topics.
+        notify: Receives a sentence if the recording is incomplete; by default it becomes a warning.
+
+    Yields:
+        Topic, time of arrival (ns) and message.
+
+    Raises:
+        RecordingError: The path is not a readable recording. OSError for a missing file passes
+            through.
     """
-    for topic, time, message in unread_messages(path, wanted, tell):
+    for topic, time, message in lazy_messages(path, wanted, notify):
         try:
             whole = message()
         except Exception as error:
-            raise _broken(path, error) from error
+            raise _unreadable(path, error) from error
         yield topic, time, whole
 
 
-def unread_messages(
-    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None = None
+def lazy_messages(
+    path: Path, wanted: Callable[[str, str], bool], notify: Callable[[str], None] | None = None
 ) -> Iterator[tuple[str, int, Callable[[], Any]]]:
-    """The same where most messages are never looked at: in place of each message what reads it out of its bytes."""
+    """Yield messages as `read_messages` does, but deserialise each one only on demand.
+
+    Args:
+        path: As for `read_messages`.
+        wanted: As for `read_messages`.
+        notify: As for `read_messages`.
+
+    Yields:
+        Topic, time of arrival (ns) and a function that deserialises and returns the message.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+    """
     if not path.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
-    for part in _parts(path, tell):
+    for part in _recording_files(path, notify):
         if part.suffix == ".mcap":
-            _check(part, partial(check_chunks, part))
-        if is_cut_off(part):
-            yield from _kept(part, wanted, tell)
+            _check_bounds(part, partial(check_chunks, part))
+        if is_truncated(part):
+            yield from _recovered_messages(part, wanted, notify)
         elif part.suffix == ".bag":
-            yield from _of_ros1(part, wanted)
+            yield from _ros1_messages(part, wanted)
         else:
-            yield from _of_ros2(part, wanted)
+            yield from _ros2_messages(part, wanted)
 
 
 def topics(path: Path) -> dict[str, str]:
-    """All topics of a recording, each with its type. Raises as `read_messages` does."""
+    """List the topics of a recording.
+
+    Args:
+        path: As for `read_messages`; it raises the same errors.
+
+    Returns:
+        The type name of each topic.
+    """
     found: dict[str, str] = {}
 
     def look(topic: str, typename: str) -> bool:
+        """Note topic and type, and read no message."""
         found[topic] = typename
         return False
 
-    for _ in unread_messages(path, look, lambda _: None):
+    for _ in lazy_messages(path, look, lambda _: None):
         pass
     return found
 
 
-def _parts(path: Path, tell: Callable[[str], None] | None) -> Sequence[Path]:
-    """The recording itself, or the files in a folder whose metadata.yaml is missing or does not name their kind."""
+def _recording_files(path: Path, notify: Callable[[str], None] | None) -> Sequence[Path]:
+    """Return the recording, or its files if metadata.yaml is missing or names no known storage."""
     if not path.is_dir():
         return [path]
-    files = sorted((one for one in path.iterdir() if one.suffix in STORAGES), key=_number)
+    files = sorted((one for one in path.iterdir() if one.suffix in STORAGES), key=_file_order)
     metadata = path / "metadata.yaml"
     if not metadata.exists():
         if not files:
@@ -95,65 +127,71 @@ def _parts(path: Path, tell: Callable[[str], None] | None) -> Sequence[Path]:
         if not files or name in STORAGES.values():
             return [path]
         reason = f"metadata.yaml: storage_identifier is '{name}', expected mcap or sqlite3"
-    _say(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", tell)
+    _report(path, f"recording: {reason}; read from {', '.join(one.name for one in files)}", notify)
     return files
 
 
-def _number(path: Path) -> tuple[int, str]:
-    """Recorders number the files of a long recording: name_0, name_1, ..., name_10."""
+def _file_order(path: Path) -> tuple[int, str]:
+    """Sort key of the files of a split recording: name_0, name_1, ..., name_10."""
     number = re.search(r"_(\d+)$", path.stem)
     return (int(number[1]) if number else -1), path.name
 
 
-def _say(path: Path, text: str, tell: Callable[[str], None] | None) -> None:
-    if tell is None:
+def _report(path: Path, text: str, notify: Callable[[str], None] | None) -> None:
+    """Pass a sentence about a recording to the callback, or issue a warning."""
+    if notify is None:
         warnings.warn(f"{path}: {text}", stacklevel=5)
     else:
-        tell(text)
+        notify(text)
 
 
-def _check(path: Path, check: Callable[[], None]) -> None:
+def _check_bounds(path: Path, check: Callable[[], None]) -> None:
+    """Run a size check and add the name of the file to its error."""
     try:
         check()
     except TooLargeError as error:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _of_ros2(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
-    """Out of a rosbag2 folder or one of its files."""
+def _ros2_messages(
+    path: Path, wanted: Callable[[str, str], bool]
+) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+    """Yield messages of a rosbag2 folder or of one of its files."""
     if path.is_dir():
         for packed in sorted(path.glob("*.zstd")):
-            _check(path, partial(check_packed_file, packed))
+            _check_bounds(path, partial(check_packed_file, packed))
         for chunked in sorted(path.glob("*.mcap")):
-            _check(path, partial(check_chunks, chunked))
+            _check_bounds(path, partial(check_chunks, chunked))
     try:
         with Reader(path) as reader:
-            chosen = _chosen(reader.connections, wanted)
+            chosen = _select_connections(reader.connections, wanted)
             packed_messages = reader.compression_mode == "message"
             if packed_messages:
                 _check_messages(reader, chosen)
-            # Without any chosen channel the reader would give all messages.
+            # With an empty selection the reader would return all messages.
             for channel, time, data in reader.messages(chosen) if chosen else ():
-                yield channel.topic, time, partial(read, data, channel.msgtype, channel.msgdef)
+                yield channel.topic, time, partial(deserialize, data, channel.msgtype, channel.msgdef)
     except TooLargeError as error:
         raise RecordingError(f"{path}: {error}") from None
     except PermissionError:
         raise
     except Exception as error:  # a broken file fails anywhere in bag reader, decompression or deserialisation
-        raise _broken(path, error) from error
+        raise _unreadable(path, error) from error
 
 
 def _check_messages(reader: Reader, chosen: Collection[Connection]) -> None:
-    """Raises TooLargeError where a message that was packed on its own is too large."""
+    """Raise TooLargeError if an individually compressed message is too large."""
     topics = {channel.topic for channel in chosen}
     for storage in getattr(reader.storage, "storages", ()):
         channels = [channel for channel in storage.connections if channel.topic in topics]
         for _, _, data in storage.messages(channels) if channels else ():
-            unpacked(data, "zstd")
+            decompress(data, "zstd")
 
 
-def _of_ros1(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tuple[str, int, Callable[[], Any]]]:
-    """Out of a bag of ROS 1, whose chunks are unpacked no further than they may."""
+def _ros1_messages(
+    path: Path, wanted: Callable[[str, str], bool]
+) -> Iterator[tuple[str, int, Callable[[], Any]]]:
+    """Yield messages of a ROS 1 bag, with bounded decompression of its chunks."""
     try:
         with Ros1Reader(path) as reader:
             for position, chunk in reader.chunks.items():
@@ -161,38 +199,45 @@ def _of_ros1(path: Path, wanted: Callable[[str, str], bool]) -> Iterator[tuple[s
                     (name for name in ("bz2", "lz4") if chunk.decompressor is decompressors[name]), None
                 )
                 if packing:
-                    bounded = partial(unpacked, compression=packing)
+                    bounded = partial(decompress, compression=packing)
                     reader.chunks[position] = chunk._replace(decompressor=bounded)
-            chosen = _chosen(reader.connections, wanted)
+            chosen = _select_connections(reader.connections, wanted)
             for channel, time, data in reader.messages(chosen) if chosen else ():
-                yield channel.topic, time, partial(read, data, channel.msgtype, channel.msgdef, ros1=True)
+                yield (
+                    channel.topic,
+                    time,
+                    partial(deserialize, data, channel.msgtype, channel.msgdef, ros1=True),
+                )
     except TooLargeError as error:
         raise RecordingError(f"{path}: {error}") from None
     except PermissionError:
         raise
     except Exception as error:  # as above
-        raise _broken(path, error) from error
+        raise _unreadable(path, error) from error
 
 
-def _chosen(channels: Collection[Connection], wanted: Callable[[str, str], bool]) -> list[Connection]:
-    """Those that are wanted, of a type that is known."""
+def _select_connections(
+    channels: Collection[Connection], wanted: Callable[[str, str], bool]
+) -> list[Connection]:
+    """Return the connections that are wanted and whose type is known."""
     return [one for one in channels if wanted(one.topic, one.msgtype) and is_known(one.msgtype, one.msgdef)]
 
 
-def _broken(path: Path, error: Exception) -> RecordingError:
+def _unreadable(path: Path, error: Exception) -> RecordingError:
+    """Return the error for a file that the reader rejects."""
     what = " ".join(str(error).split()) or type(error).__name__
-    return RecordingError(f"{path}: no whole recording: {what}")
+    return RecordingError(f"{path}: not a complete recording: {what}")
 
 
-def _kept(
-    path: Path, wanted: Callable[[str, str], bool], tell: Callable[[str], None] | None
+def _recovered_messages(
+    path: Path, wanted: Callable[[str, str], bool], notify: Callable[[str], None] | None
 ) -> Iterator[tuple[str, int, Callable[[], Any]]]:
-    """The same of a file that was cut off."""
-    kept = what_is_kept(path)
+    """Yield the complete messages of a truncated MCAP file."""
+    kept = recovery_summary(path)
     if not kept:
-        raise RecordingError(f"{path}: the recording was cut off before anything of it was whole")
-    text = f"recording: it was cut off; {kept} are kept"
-    _say(path, text, tell)
-    for one in kept_messages(path):
+        raise RecordingError(f"{path}: the recording is truncated and holds no complete chunk")
+    text = f"recording: it is truncated; {kept} are readable"
+    _report(path, text, notify)
+    for one in recover_messages(path):
         if wanted(one.topic, one.typename) and is_known(one.typename, one.definition):
-            yield one.topic, one.time, partial(read, one.data, one.typename, one.definition)
+            yield one.topic, one.time, partial(deserialize, one.data, one.typename, one.definition)

@@ -1,6 +1,7 @@
-"""Messages of Unitree's robots of the unitree_go family (Go2, B2), as their low-level interface has them on the wire.
+"""Message definitions of Unitree's unitree_go robots (Go2, B2): the low-level interface.
 
-Written from the layout of the bytes; rosbag2 of versions before Jazzy's records carry no definitions of their own.
+Derived from the byte layout. Needed because a rosbag2 made before ROS 2 Jazzy contains no
+definitions.
 """
 
 DEFINITIONS = {
@@ -72,4 +73,4 @@ uint32 reserve
 uint32 crc
 """,
 }
-"""Text of each .msg file, by name; a type stands after those that it is made of."""
+"""Content of each .msg file by name; a type follows the types of its fields."""

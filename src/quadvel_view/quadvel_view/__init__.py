@@ -1,4 +1,5 @@
-"""Eyes and hands of whoever runs the robot: a page in the browser, live and from recordings, and teleoperation.
+"""Operator interface: a page in the browser, and teleoperation by keyboard and gamepad.
 
-It knows topics and services alone, and not who serves them: a simulated robot, a real one, or a recording.
+It shows a running robot or a recording. It uses topics and services only, and is independent of
+what serves them: simulated robot, real robot or recording.
 """

@@ -1,6 +1,6 @@
-"""Topics live for Foxglove and Lichtblick, by Foxglove's own WebSocket protocol, without ROS 2: bytes are handed on as they come.
+"""Live topics for Foxglove and Lichtblick by Foxglove's WebSocket protocol, without ROS 2.
 
-Which topics there are and how their messages come is others' matter.
+Serialised messages are forwarded unchanged. `quadvel_bringup.foxglove` supplies them.
 """
 
 from __future__ import annotations
@@ -16,21 +16,28 @@ from quadvel_recordings.definitions import STORE
 from .guard import is_loopback
 from .server import AddressError
 
-PORT = 8765
-"""TCP port at which Foxglove looks first"""
+DEFAULT_PORT = 8765
+"""TCP port that Foxglove suggests."""
 
 
 class FoxgloveServer:
-    """Serves from the time it is made until `close`.
+    """Serves topics from construction until `close`.
 
-    Raises AddressError where address and port can't be listened on, and for the address of another interface than the
-    loopback one: whoever reaches this server sees all topics, and it asks nobody who he is.
+    It listens on the loopback interface only, because there is no authentication.
+
+    Args:
+        host: Address of the loopback interface.
+        port: TCP port.
+
+    Raises:
+        AddressError: The address is unavailable, or not that of the loopback interface.
     """
 
     def __init__(self, host: str, port: int) -> None:
         if not is_loopback(host):
             raise AddressError(
-                f"{host}: topics are served to this host alone, as Foxglove shows no token; come by ssh -L {port}:127.0.0.1:{port}"
+                f"{host}: Foxglove has no authentication, so topics are served to this computer only; "
+                f"from others use ssh -L {port}:127.0.0.1:{port}"
             )
         self._channels: dict[str, foxglove.Channel] = {}
         self._kept: dict[str, bytes] = {}
@@ -42,11 +49,17 @@ class FoxgloveServer:
                 name="quadvel", host=host, port=port, context=self._context, server_listener=_Latch(self)
             )
         except Exception as error:
-            raise AddressError(f"{host}:{port}: the topics can't be served there: {error}") from None
+            raise AddressError(f"{host}:{port}: cannot serve the topics: {error}") from None
         self.url = f"ws://{host}:{self._server.port}"
 
     def offer(self, topic: str, typename: str, latched: bool = False) -> None:
-        """Offer a topic of a type that is known. latched: its last message is for those, too, who come later."""
+        """Offer a topic.
+
+        Args:
+            topic: The topic.
+            typename: Its type, which `STORE` defines.
+            latched: Whether late subscribers get its last message.
+        """
         text, _ = STORE.generate_msgdef(typename, ros_version=2)
         schema = foxglove.Schema(name=typename, encoding="ros2msg", data=text.encode())
         with self._lock:
@@ -56,31 +69,48 @@ class FoxgloveServer:
             if latched:
                 self._latched.add(topic)
 
-    def tell(self, topic: str, data: bytes, time: int) -> None:
-        """A message of a topic that is offered, and when it was sent, ns."""
+    def publish(self, topic: str, data: bytes, time: int) -> None:
+        """Send a message of an offered topic.
+
+        Args:
+            topic: The topic.
+            data: The message in CDR.
+            time: When it was sent, ns.
+        """
         if topic in self._latched:
             with self._lock:
                 self._kept[topic] = data
         self._channels[topic].log(data, log_time=time)
 
-    def again(self, topic: str) -> None:
-        """Tell once more what was kept of a topic: to all, as the library names no client."""
+    def republish(self, topic: str) -> None:
+        """Send the latched message of a topic again, to all clients.
+
+        The library cannot address one.
+
+        Args:
+            topic: The topic.
+        """
         with self._lock:
             data = self._kept.get(topic)
         if data is not None:
             self._channels[topic].log(data)
 
     def close(self) -> None:
-        """End all connections."""
+        """Close all connections."""
         self._server.stop()
 
 
 class _Latch(ServerListener):
-    """Sends what was published once to those who come later."""
+    """Sends latched messages to late subscribers."""
 
     def __init__(self, server: FoxgloveServer) -> None:
         self._latching = server
 
     def on_subscribe(self, client: Any, channel: Any) -> None:
-        """A client wants a topic."""
-        self._latching.again(channel.topic)
+        """Repeat the latched message of a topic.
+
+        Args:
+            client: The subscriber.
+            channel: The subscribed channel.
+        """
+        self._latching.republish(channel.topic)

@@ -1,14 +1,14 @@
-"""A gamepad, by Linux's evdev: a velocity while its dead-man's button is held. What its buttons mean, and not which device it is.
+"""Velocity commands from a gamepad, through Linux's evdev, with a dead-man's button.
 
-left shoulder   dead-man's button: only while it is held do the sticks count
+left shoulder   dead-man's button: the sticks act only while it is held
 left stick      forward and sideways
 right stick     turn
-cross up, down  speed, in steps
-B (circle)      STOP: the joints brake, and stay so
+D-pad up, down  speed, in steps
+B (circle)      STOP: the joints are damped until the release
 start           release the STOP
 
-Whatever is held perfectly still for 5 s counts as let go, as a pad whose radio link is lost sends nothing either;
-the dead-man's button then has to be pressed again.
+After 5 s without any input the dead-man's button counts as released, because a pad that lost its
+radio link sends nothing either. Press the button again to continue.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from .keyboard import FASTEST_TURN, FIRST_STEP, SIDEWAYS, STEPS, TURN
+from .keyboard import FIRST_STEP, MAX_TURN_RAD_S, SIDEWAYS_SHARE, SPEED_STEPS_M_S, TURN_PER_SPEED
 
 Array = NDArray[np.float64]
 
@@ -28,94 +28,136 @@ Array = NDArray[np.float64]
 SYNCHRONISATION, KEY, ABSOLUTE = 0, 1, 3
 REPORT, DROPPED = 0, 3  # SYN_REPORT, SYN_DROPPED
 DEAD_MAN, STOP, RELEASE = 0x136, 0x131, 0x13B  # BTN_TL, BTN_EAST, BTN_START
-FORWARD, SIDE, YAW, CROSS = 0x01, 0x00, 0x03, 0x11  # ABS_Y, ABS_X, ABS_RX, ABS_HAT0Y
+FORWARD, SIDE, YAW, DPAD_Y = 0x01, 0x00, 0x03, 0x11  # ABS_Y, ABS_X, ABS_RX, ABS_HAT0Y
 STICKS = (FORWARD, SIDE, YAW)
-SILENCE = 5.0
-"""s without an event after which a pad counts as let go: a held stick trembles, and the kernel misses a lost radio link for 20 s"""
-DEAD_ZONE = 0.1  # share of a stick's way that counts as its middle
+SILENCE_TIMEOUT_S = 5.0
+"""Time without an event after which the dead-man's button counts as released.
+
+A held stick always jitters, and the kernel reports a lost radio link only after 20 s.
+"""
+DEAD_ZONE = 0.1
+"""Half-width of the stick's neutral range, as a share of its travel."""
 
 
 @attrs.frozen
-class Span:
-    """The numbers between which an axis goes."""
+class AxisRange:
+    """Range of values of an axis.
+
+    Attributes:
+        lowest: Its smallest value.
+        highest: Its largest value.
+    """
 
     lowest: int
     highest: int
 
-    def share(self, value: int) -> float:
-        """-1 to 1, and 0 about the middle."""
+    def normalise(self, value: int) -> float:
+        """Scale a value to -1 to 1, with a dead zone around the centre.
+
+        Args:
+            value: Raw value of the axis.
+
+        Returns:
+            sign(s) max(|s| - d, 0) / (1 - d), at most 1, for the raw share s and the dead zone d.
+        """
         share = 2.0 * (value - self.lowest) / (self.highest - self.lowest) - 1.0
         beyond = max(abs(share) - DEAD_ZONE, 0.0) / (1.0 - DEAD_ZONE)
         return float(np.copysign(min(beyond, 1.0), share))
 
 
 class Gamepad:
-    """Follows one gamepad's events.
+    """Tracks the state of a gamepad from its events.
 
     Args:
-        spans: those of its axes, by their codes.
-        clock: seconds of a steady clock.
+        spans: Ranges of the axes by their codes.
+        clock: Returns the time of a monotonic clock, s.
 
     Raises:
-        ValueError: where sticks miss.
+        ValueError: A stick is missing.
     """
 
-    def __init__(self, spans: Mapping[int, Span], clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, spans: Mapping[int, AxisRange], clock: Callable[[], float] = time.monotonic) -> None:
         missing = [f"{code:#x}" for code in STICKS if code not in spans]
         if missing:
             raise ValueError(f"the gamepad has no axis {', '.join(missing)}, expected two sticks")
         self._spans, self._clock = spans, clock
         self._shares = dict.fromkeys(STICKS, 0.0)
-        self._held = self._events_lost = self._fell_silent = False
+        self._held = self._events_lost = self._timed_out = False
         self._heard = clock()
         self._step = FIRST_STEP
 
     @property
     def speed(self) -> float:
-        """m/s, straight on."""
-        return STEPS[self._step]
+        """Forward speed at full deflection, m/s."""
+        return SPEED_STEPS_M_S[self._step]
 
     @property
-    def fell_silent(self) -> bool:
-        """Whether the dead-man's button counts as let go since the pad sent nothing for SILENCE."""
-        return self._fell_silent
+    def timed_out(self) -> bool:
+        """Whether the dead-man's button counts as released because of SILENCE_TIMEOUT_S."""
+        return self._timed_out
 
-    def follow(self, kind: int, code: int, value: int) -> str:
-        """Take an event; "stop" or "release" where a button asked for that, "restore" where events were lost, else "".
+    def handle_event(self, kind: int, code: int, value: int) -> str:
+        """Process an event.
 
-        After "restore" the caller hands the state of the device to `restore`; until then nothing is held.
+        After "restore" the caller passes the state of the device to `restore`; until then no
+        velocity is commanded.
+
+        Args:
+            kind: Type of the event.
+            code: Code of the event.
+            value: Value of the event.
+
+        Returns:
+            "stop" or "release" for these buttons, "restore" after lost events, else "".
         """
         self._heard = self._clock()
         if (kind, code) == (SYNCHRONISATION, DROPPED):
             self._held, self._events_lost = False, True
-        elif self._events_lost:  # the rest of a report that was cut says nothing
+        elif self._events_lost:  # the rest of an incomplete report is meaningless
             return "restore" if (kind, code) == (SYNCHRONISATION, REPORT) else ""
         elif kind == KEY and code == DEAD_MAN:
             self._hold(value != 0 and (self._held or value == 1))
         elif kind == KEY and value == 1:
             return {STOP: "stop", RELEASE: "release"}.get(code, "")
         elif kind == ABSOLUTE and code in self._shares:
-            self._shares[code] = self._spans[code].share(value)
-        elif kind == ABSOLUTE and code == CROSS and value:
-            self._step = min(max(self._step - value, 0), len(STEPS) - 1)
+            self._shares[code] = self._spans[code].normalise(value)
+        elif kind == ABSOLUTE and code == DPAD_Y and value:
+            self._step = min(max(self._step - value, 0), len(SPEED_STEPS_M_S) - 1)
         return ""
 
     def restore(self, keys: Collection[int], axes: Mapping[int, int]) -> str:
-        """Go on after lost events from the keys that are down and the values of the sticks; "stop" where STOP is down."""
+        """Set the state after lost events.
+
+        Args:
+            keys: Codes of the pressed buttons.
+            axes: Raw values of the sticks by code.
+
+        Returns:
+            "stop" if the STOP button is pressed, else "".
+        """
         self._events_lost = False
-        self._shares = {code: self._spans[code].share(axes[code]) for code in STICKS}
+        self._shares = {code: self._spans[code].normalise(axes[code]) for code in STICKS}
         self._hold(DEAD_MAN in keys)
         return "stop" if STOP in keys else ""
 
     def velocity(self) -> Array | None:
-        """vx, vy (m/s), wz (rad/s) while the dead-man's button is held, else None."""
-        if self._held and self._clock() - self._heard > SILENCE:
-            self._held, self._fell_silent = False, True
+        """Return the commanded velocity.
+
+        Returns:
+            vx, vy (m/s), wz (rad/s) while the dead-man's button is held, else None.
+        """
+        if self._held and self._clock() - self._heard > SILENCE_TIMEOUT_S:
+            self._held, self._timed_out = False, True
         if not self._held:
             return None
         shares = np.array([-self._shares[code] for code in STICKS])
-        return shares * [self.speed, SIDEWAYS * self.speed, min(TURN * self.speed, FASTEST_TURN)]
+        return shares * [
+            self.speed,
+            SIDEWAYS_SHARE * self.speed,
+            min(TURN_PER_SPEED * self.speed, MAX_TURN_RAD_S),
+        ]
 
     def _hold(self, held: bool) -> None:
+        """Set the dead-man's button."""
         self._held = held
-        self._fell_silent = self._fell_silent and not held
+        self._timed_out = self._timed_out and not held

@@ -1,7 +1,7 @@
-"""Who may come in to the page, by the headers of a request alone. What is served there is `server`'s matter.
+"""Access control of the page's server by request headers.
 
-Three things are checked: the token where there is one; a Host that is this host's own where there is none, against names that
-somebody lets point at this host; and for WebSockets an Origin that is our own page, against other pages in the browser.
+It checks the token if there is one, or else that the Host is a loopback name (against DNS
+rebinding); and for WebSockets that the Origin is the page itself (against cross-origin requests).
 """
 
 from __future__ import annotations
@@ -19,7 +19,11 @@ HOST = re.compile(r"(?P<name>\[(?P<v6>[0-9A-Fa-f:.]+)\]|[\w.-]+)(?P<port>:[0-9]{
 
 
 class RequestError(Exception):
-    """A request that gets no answer but this one: a status, and a sentence."""
+    """A rejected request.
+
+    Attributes:
+        status: The HTTP status.
+    """
 
     def __init__(self, status: HTTPStatus, why: str) -> None:
         super().__init__(why)
@@ -28,7 +32,14 @@ class RequestError(Exception):
 
 @attrs.frozen
 class Visitor:
-    """What an accepted request asks for. name, port: of its Host header, the port with its colon, or empty."""
+    """An accepted request.
+
+    Attributes:
+        path: The path without the query.
+        name: Host name of the Host header.
+        port: Port of the Host header with its colon, or "".
+        wants_socket: Whether it asks for a WebSocket.
+    """
 
     path: str
     name: str
@@ -37,12 +48,12 @@ class Visitor:
 
 
 @attrs.frozen
-class Guard:
-    """Decides who may come in.
+class AccessControl:
+    """Accepts or rejects requests.
 
     Attributes:
-        token: What every request must show, as a cookie of any name or in its address; empty on the loopback interface, where
-            other hosts do not come.
+        token: Secret that a request must have as a cookie of any name or in its query; "" on the
+            loopback interface.
     """
 
     token: str
@@ -50,24 +61,34 @@ class Guard:
     def admit(self, request: Request) -> Visitor:
         """Check a request.
 
+        Args:
+            request: The HTTP request.
+
+        Returns:
+            The accepted request.
+
         Raises:
-            RequestError: 400 where a header makes no sense, 403 for who may not come in.
+            RequestError: 400 for an invalid header, 403 for a missing token, a wrong Host or a
+                wrong Origin.
         """
-        visitor = _read(request)
+        visitor = _parse(request)
         if self.token:
-            if not any(_same(shown, self.token) for shown in self._shown(request)):
+            if not any(_equal_tokens(shown, self.token) for shown in self._shown(request)):
                 raise _forbidden(
-                    "this page needs the token that `quadvel view` printed: open the whole address"
+                    "this page needs the token: open the full address that `quadvel view` printed"
                 )
         elif not is_loopback(visitor.name.strip("[]")):
-            raise _forbidden(f"this page is for this host alone, and not for '{visitor.name}'")
+            raise _forbidden(f"host '{visitor.name}' rejected: this page accepts this computer only")
         if visitor.wants_socket:
-            _check_origin(_single(request, "Origin"), visitor)
+            _check_origin(_single_header(request, "Origin"), visitor)
         return visitor
 
     @staticmethod
     def _shown(request: Request) -> list[str]:
-        """What may be the token. Cookies of other programs on this host come along, and need not follow any standard."""
+        """Return all cookie values and query tokens.
+
+        Cookies of other programs on this host may violate the standard.
+        """
         cookies = ";".join(request.headers.get_all("Cookie")).split(";")
         return [cookie.partition("=")[2].strip() for cookie in cookies] + parse_qs(
             urlsplit(request.path).query
@@ -75,25 +96,32 @@ class Guard:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether a name or address means this host, by its loopback interface."""
+    """Return whether a host name or address is that of the loopback interface.
+
+    Args:
+        host: A name or an IP address without brackets.
+
+    Returns:
+        True for "localhost" and loopback addresses.
+    """
     return ipaddress.ip_address(host).is_loopback if _is_address(host) else host == "localhost"
 
 
-def _read(request: Request) -> Visitor:
-    host = HOST.fullmatch(_single(request, "Host"))
+def _parse(request: Request) -> Visitor:
+    """Parse Host, path and Upgrade of a request."""
+    host = HOST.fullmatch(_single_header(request, "Host"))
     if host is None or (host["v6"] and not _is_address(host["v6"])):
-        raise _bad(request, "Host", "a name or an address, with a port or without")
+        raise _bad_request(request, "Host", "a name or an address, with a port or without")
     try:
         path = urlsplit(request.path).path
     except ValueError as error:
-        raise RequestError(
-            HTTPStatus.BAD_REQUEST, f"the path {request.path!a} makes no sense: {error}"
-        ) from None
-    wants_socket = _single(request, "Upgrade").lower() == "websocket"
+        raise RequestError(HTTPStatus.BAD_REQUEST, f"the path {request.path!a} is invalid: {error}") from None
+    wants_socket = _single_header(request, "Upgrade").lower() == "websocket"
     return Visitor(path, host["name"], host["port"] or "", wants_socket)
 
 
 def _is_address(text: str) -> bool:
+    """Return whether a text is an IP address."""
     try:
         ipaddress.ip_address(text)
     except ValueError:
@@ -102,28 +130,31 @@ def _is_address(text: str) -> bool:
 
 
 def _check_origin(origin: str, visitor: Visitor) -> None:
-    """Compare as text: browsers write both headers in the same way."""
+    """Compare Origin and Host as text: browsers write both in the same way."""
     ours = f"{visitor.name}{visitor.port}"
     if origin not in (f"http://{ours}", f"https://{ours}"):
-        raise _forbidden(f"a page of {origin!a} may not connect to the page of '{ours}'")
+        raise _forbidden(f"cross-origin request from {origin!a} to '{ours}' rejected")
 
 
-def _single(request: Request, name: str) -> str:
-    """A header that may be there once."""
+def _single_header(request: Request, name: str) -> str:
+    """Return a header that may occur once, or ""."""
     values = request.headers.get_all(name)
     if len(values) > 1:
-        raise _bad(request, name, "one header")
+        raise _bad_request(request, name, "one header")
     return values[0] if values else ""
 
 
-def _same(shown: str, token: str) -> bool:
+def _equal_tokens(shown: str, token: str) -> bool:
+    """Compare tokens in constant time."""
     return hmac.compare_digest(shown.encode("utf-8", "surrogateescape"), token.encode())
 
 
-def _bad(request: Request, name: str, expected: str) -> RequestError:
+def _bad_request(request: Request, name: str, expected: str) -> RequestError:
+    """Return the error for an invalid header."""
     found = ", ".join(map(ascii, request.headers.get_all(name))) or "missing"
     return RequestError(HTTPStatus.BAD_REQUEST, f"{name} is {found}, expected {expected}")
 
 
 def _forbidden(why: str) -> RequestError:
+    """Return the error for a request without access."""
     return RequestError(HTTPStatus.FORBIDDEN, why)

@@ -1,10 +1,10 @@
-"""Keys of a terminal as hands that hold something. A terminal tells of no key that is let go: it repeats one that is held.
+"""Velocity commands from the keys of a terminal, which repeats held keys but reports no release.
 
     w s     forward, back           + -    speed, in steps
-    a d     turn left, right        space  STOP: the joints brake, and stay so until r
+    a d     turn left, right        space  STOP: damp the joints until r
     q e     sideways left, right    r      release the STOP; u stands up, x lies down; Ctrl-C ends
 
-The arrows do what w, s, a and d do. A held key counts until its repeats end.
+The arrows act as w, s, a and d. The robot moves while a key is held and stops when its repeats end.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-WAYS = {
+KEY_DIRECTIONS = {
     "w": (1.0, 0.0, 0.0),
     "s": (-1.0, 0.0, 0.0),
     "a": (0.0, 0.0, 1.0),
@@ -24,18 +24,19 @@ WAYS = {
     "q": (0.0, 1.0, 0.0),
     "e": (0.0, -1.0, 0.0),
 }
+"""Shares of vx, vy, wz by key."""
 ARROWS = {"\x1b[A": "w", "\x1b[B": "s", "\x1b[D": "a", "\x1b[C": "d"}
-STEPS = (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0)  # m/s
+SPEED_STEPS_M_S = (0.1, 0.2, 0.3, 0.5, 0.8, 1.2, 1.6, 2.0)  # m/s
 FIRST_STEP = 3
-TURN, SIDEWAYS, FASTEST_TURN = 1.6, 0.6, 2.0  # rad/s per m/s, share of the speed, rad/s
-UNTIL_REPEAT = 0.7
-"""s after a key's first stroke within which its repeats begin: 0.25 to 0.66 on usual systems"""
-BETWEEN_REPEATS = 0.2
-"""s within which one repeat follows the other: 0.03 to 0.1"""
+TURN_PER_SPEED, SIDEWAYS_SHARE, MAX_TURN_RAD_S = 1.6, 0.6, 2.0  # rad/s per m/s, share of the speed, rad/s
+FIRST_REPEAT_TIMEOUT_S = 0.7
+"""Time after the first press within which repeats begin; usual systems need 0.25 to 0.66 s."""
+REPEAT_TIMEOUT_S = 0.2
+"""Time within which one repeat follows another; usual systems need 0.03 to 0.1 s."""
 
 
 class Keyboard:
-    """What is held now, told from strokes and the times (s) at which they came."""
+    """Tracks the held key from key presses and their times."""
 
     def __init__(self) -> None:
         self._step = FIRST_STEP
@@ -44,36 +45,55 @@ class Keyboard:
 
     @property
     def speed(self) -> float:
-        """m/s, straight on."""
-        return STEPS[self._step]
+        """Forward speed, m/s."""
+        return SPEED_STEPS_M_S[self._step]
 
-    def stroke(self, key: str, now: float) -> None:
-        """A key came: one that drives, or one that changes the speed; others are left alone, and let go what was held."""
+    def press(self, key: str, now: float) -> None:
+        """Process a key: it drives, changes the speed, or, if unknown, ends the motion.
+
+        Args:
+            key: Character or escape sequence.
+            now: s.
+        """
         key = ARROWS.get(key, key)
         if key in ("+", "=", "-"):
-            self._step = min(max(self._step + (-1 if key == "-" else 1), 0), len(STEPS) - 1)
+            self._step = min(max(self._step + (-1 if key == "-" else 1), 0), len(SPEED_STEPS_M_S) - 1)
             return
-        if key not in WAYS:
-            self.let_go()
+        if key not in KEY_DIRECTIONS:
+            self.release()
             return
         repeats = key == self._key and now <= self._until
-        self._until = now + (BETWEEN_REPEATS if repeats else UNTIL_REPEAT)
+        self._until = now + (REPEAT_TIMEOUT_S if repeats else FIRST_REPEAT_TIMEOUT_S)
         self._key = key
 
-    def let_go(self) -> None:
-        """Nothing is held."""
+    def release(self) -> None:
+        """Release the held key."""
         self._until = -math.inf
 
     def velocity(self, now: float) -> Array | None:
-        """vx, vy (m/s), wz (rad/s) while a key is held, else None."""
+        """Return the commanded velocity.
+
+        Args:
+            now: s.
+
+        Returns:
+            (3,) vx, vy (m/s), wz (rad/s) while a key is held, else None.
+        """
         if now > self._until:
             return None
-        scale = [self.speed, SIDEWAYS * self.speed, min(TURN * self.speed, FASTEST_TURN)]
-        return np.multiply(WAYS[self._key], scale)
+        scale = [self.speed, SIDEWAYS_SHARE * self.speed, min(TURN_PER_SPEED * self.speed, MAX_TURN_RAD_S)]
+        return np.multiply(KEY_DIRECTIONS[self._key], scale)
 
 
-def strokes(text: str) -> list[str]:
-    """What a terminal sent, cut into keys; an arrow is three characters."""
+def split_keys(text: str) -> list[str]:
+    """Split terminal input into keys; an arrow has three characters.
+
+    Args:
+        text: Input of the terminal.
+
+    Returns:
+        Characters and escape sequences.
+    """
     keys = []
     while text:
         length = 3 if text[:3] in ARROWS else 1

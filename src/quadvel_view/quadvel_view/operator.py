@@ -1,6 +1,7 @@
-"""What the operator wants: a velocity while something is held down, and a STOP that stays. No ROS, no page.
+"""The operator's intent: a velocity while a control is held, and a latched STOP. No ROS, no page.
 
-Page, keyboard and gamepad are alike here: each says what is held, again and again, and silence means that it was let go.
+Page, keyboard and gamepad work alike: each repeats its hold, and the hold ends when the repeats
+stop.
 """
 
 from __future__ import annotations
@@ -13,88 +14,136 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-SILENCE = 0.4
-"""s without a word from who holds, after which it counts as let go: twenty words a second are expected, but a browser may stall"""
-LATE = 0.2
-"""s between two words of who holds, from which on they are late"""
-LATE_SHOWN = 2.0
-"""s for which late words are reported"""
-AFTERGLOW = 0.5
-"""s of zeros once all is let go; then whoever else commands the robot has its turn"""
-PERIOD = 0.05
-"""s from one velocity to the next"""
-STOP_AGAIN = 0.25
-"""s after which a STOP that was not heeded is said again"""
-BRAKING = ("passive", "fault")
-"""Modes in which the joints brake"""
-TOP_SPEED = np.array([3.2, 2.0, 3.0])
-"""m/s, m/s, rad/s: no hand asks for more"""
+HOLD_TIMEOUT_S = 0.4
+"""Time without a repeat after which a hold ends; repeats come at 20 Hz, but a browser may stall."""
+LATE_GAP_S = 0.2
+"""Gap between two repeats of a hold from which they are late."""
+LATE_DISPLAY_S = 2.0
+"""Time for which late repeats are reported."""
+ZERO_DURATION_S = 0.5
+"""Time of zero velocity after a hold; then other sources may command the robot."""
+PUBLISH_PERIOD_S = 0.05
+"""Time between two published velocities."""
+STOP_RETRY_S = 0.25
+"""Time after which an unacknowledged STOP is sent again."""
+BRAKING_MODES = ("passive", "fault")
+"""Modes with damped joints."""
+MAX_VELOCITY = np.array([3.2, 2.0, 3.0])
+"""Largest vx, vy (m/s), wz (rad/s) that an operator can command."""
 
 
 class Operator:
-    """Who holds what. stopped: whether STOP was pressed and not released since."""
+    """Holds and STOP of one operator station.
+
+    Attributes:
+        stopped: Whether STOP is latched.
+    """
 
     def __init__(self) -> None:
         self.stopped = False
         self._holder: object = None
         self._velocity = np.zeros(3)
-        self._held_at = self._let_go_at = -math.inf
+        self._held_at = self._ended_at = -math.inf
         self._held_since = self._late_at = -math.inf
         self._late_by = 0.0
 
     def hold(self, holder: object, velocity: Sequence[float], now: float) -> None:
-        """`holder` holds this velocity (vx, vy in m/s, wz in rad/s), and says so at least every SILENCE (s).
+        """Start or repeat a hold, at least every HOLD_TIMEOUT_S.
 
-        While one holds, others are not listened to. Raises ValueError for what is no velocity.
+        Other holders are ignored meanwhile.
+
+        Args:
+            holder: Identity of the page or device.
+            velocity: vx, vy (m/s), wz (rad/s).
+            now: s.
+
+        Raises:
+            ValueError: The velocity is not three finite numbers.
         """
         wanted = np.array(velocity, float)
         if wanted.shape != (3,) or not np.isfinite(wanted).all():
             raise ValueError(f"velocity is {list(velocity)}, expected three finite numbers")
         if self._is_held(now) and holder != self._holder:
             return
-        goes_on = holder == self._holder and self._held_at > -math.inf
-        if goes_on and now - self._held_at > LATE:
+        is_repeat = holder == self._holder and self._held_at > -math.inf
+        if is_repeat and now - self._held_at > LATE_GAP_S:
             self._late_at, self._late_by = now, now - self._held_at
-        if not goes_on:
+        if not is_repeat:
             self._held_since = now
         self._holder, self._held_at = holder, now
-        self._velocity = np.clip(wanted, -TOP_SPEED, TOP_SPEED)
+        self._velocity = np.clip(wanted, -MAX_VELOCITY, MAX_VELOCITY)
 
-    def let_go(self, holder: object, now: float) -> None:
-        """`holder` holds nothing any more."""
+    def end_hold(self, holder: object, now: float) -> None:
+        """End the hold of a holder.
+
+        Args:
+            holder: As for `hold`.
+            now: s.
+        """
         if holder == self._holder and self._held_at > -math.inf:
-            self._held_at, self._let_go_at = -math.inf, min(now, self._held_at + SILENCE)
+            self._held_at, self._ended_at = -math.inf, min(now, self._held_at + HOLD_TIMEOUT_S)
 
     def stop(self) -> None:
-        """STOP: no velocity any more until `release`."""
+        """Latch STOP: no velocity until `release`."""
         self.stopped = True
-        self._held_at = self._let_go_at = -math.inf
+        self._held_at = self._ended_at = -math.inf
 
     def release(self) -> None:
-        """End the STOP. What was held when it came does not count."""
+        """Release the STOP. Earlier holds do not resume."""
         self.stopped = False
-        self._held_at = self._let_go_at = -math.inf
+        self._held_at = self._ended_at = -math.inf
 
-    def is_unheeded(self, mode: str, since: float) -> bool:
-        """Whether STOP has to be said again, `since` (s) it was said last. mode: the robot's, "" where it is not known."""
-        return self.stopped and since > STOP_AGAIN and mode not in BRAKING
+    def should_resend_stop(self, mode: str, since: float) -> bool:
+        """Return whether an unacknowledged STOP is due to be sent again.
 
-    def held_for(self, now: float) -> float:
-        """For how long a velocity has been held, s; 0 where none is."""
+        Args:
+            mode: Mode of the robot, "" if unknown.
+            since: Time since it was last sent, s.
+
+        Returns:
+            True if STOP is latched, STOP_RETRY_S have passed, and the joints are not damped.
+        """
+        return self.stopped and since > STOP_RETRY_S and mode not in BRAKING_MODES
+
+    def hold_duration(self, now: float) -> float:
+        """Return the duration of the present hold.
+
+        Args:
+            now: s.
+
+        Returns:
+            s; 0 without a hold.
+        """
         return now - self._held_since if self._is_held(now) else 0.0
 
-    def lateness(self, now: float) -> float:
-        """How far apart words of who holds came in the last LATE_SHOWN, s; 0 where none was late."""
-        return self._late_by if now - self._late_at <= LATE_SHOWN else 0.0
+    def message_gap(self, now: float) -> float:
+        """Return the last late gap between repeats within LATE_DISPLAY_S.
+
+        Args:
+            now: s.
+
+        Returns:
+            s; 0 if no repeat was late.
+        """
+        return self._late_by if now - self._late_at <= LATE_DISPLAY_S else 0.0
 
     def velocity(self, now: float) -> Array | None:
-        """What is to be published now: the velocity that is held, zeros for a while after it, or None: nothing."""
+        """Return the velocity to publish now.
+
+        Args:
+            now: s.
+
+        Returns:
+            (3,) vx, vy (m/s), wz (rad/s): the held one, then zeros for ZERO_DURATION_S; None if
+            nothing is to be published.
+        """
         if self.stopped:
             return None
         if self._is_held(now):
             return self._velocity.copy()
-        ended = max(self._let_go_at, self._held_at + SILENCE)
-        return np.zeros(3) if now - ended <= AFTERGLOW else None
+        ended = max(self._ended_at, self._held_at + HOLD_TIMEOUT_S)
+        return np.zeros(3) if now - ended <= ZERO_DURATION_S else None
 
     def _is_held(self, now: float) -> bool:
-        return now - self._held_at <= SILENCE
+        """Return whether a hold is active."""
+        return now - self._held_at <= HOLD_TIMEOUT_S

@@ -1,4 +1,4 @@
-"""What the page is told of a picture, an operator and a recording: numbers and words as JSON has them."""
+"""Readings of the page as JSON, from a picture and the operator's state."""
 
 from __future__ import annotations
 
@@ -8,60 +8,70 @@ from typing import Any
 
 from quadvel_description import robot
 
-from .operator import BRAKING, PERIOD, Operator
-from .picture import FRESH, RobotPicture
+from .operator import BRAKING_MODES, PUBLISH_PERIOD_S, Operator
+from .picture import FRESH_S, RobotPicture
 
-SOURCES = {"/controller/state": "controller", "/command": "command mux", "/joint_states": "robot"}
-"""Topics that come all the time, and who publishes them"""
+TOPIC_PUBLISHERS = {"/controller/state": "controller", "/command": "command mux", "/joint_states": "robot"}
+"""Topics with a continuous stream, and their publishers."""
 OWN_SOURCE = "teleop"
-"""the command mux's name for what the page commands"""
-IN_EFFECT = 0.5
-"""s after which a velocity that is held should be followed"""
+"""Name of the page's input in the command mux."""
+EFFECT_DELAY_S = 0.5
+"""Time after which the command mux should have selected the page's input."""
 
 
 def panel(picture: RobotPicture, operator: Operator, now: float) -> dict[str, Any]:
-    """The readings of the page; None stands for a number that is not there. now: s, on the clock of the picture."""
+    """Return the readings of the page; None stands for an unknown number.
+
+    Args:
+        picture: The state of the robot.
+        operator: Hold and STOP.
+        now: s, on the clock of the picture.
+
+    Returns:
+        Numbers and texts for JSON.
+    """
     alive = picture.is_fresh("/controller/state", now) and picture.state is not None
     return {
         "mode": picture.state.mode_name if alive else "",
-        **_why(picture, operator, alive),
+        **_mode_reasons(picture, operator, alive),
         "notices": list(_notices(picture, operator, now)),
         "stopped": operator.stopped,
         "source": picture.source if picture.is_fresh("/command", now) else "",
         "commanded": _rounded(picture.commanded, alive),
         "measured": _rounded(picture.measured, picture.is_fresh("/odom", now)),
-        "torque": _rounded(picture.torque / robot.TORQUE_LIMIT, picture.shows_joints(now)),
-        "loop": _loop(picture.state) if alive else {},
+        "torque": _rounded(picture.torque / robot.TORQUE_LIMIT, picture.has_fresh_joints(now)),
+        "loop": _loop_timing(picture.state) if alive else {},
         "lamps": _lamps(picture, alive),
         "simulated": any(name in picture.nodes for name in ("sim_node", "board")),
     }
 
 
-def _why(picture: RobotPicture, operator: Operator, alive: bool) -> dict[str, str]:
-    """Why the robot is in its mode, and why it follows no velocity."""
+def _mode_reasons(picture: RobotPicture, operator: Operator, alive: bool) -> dict[str, str]:
+    """Explain the mode of the robot, and why it follows no velocity."""
     if not alive:
-        return {"reason": "no controller is heard", "refusal": ""}
+        return {"reason": "no message from the controller", "refusal": ""}
     if operator.stopped:
-        braking = picture.state.mode_name in BRAKING
+        braking = picture.state.mode_name in BRAKING_MODES
         return {
-            "reason": "STOP was pressed" if braking else "STOP was pressed; the robot does not brake yet",
-            "refusal": "release it, then stand up",
+            "reason": "STOP is latched" if braking else "STOP is latched; the joints are not damped yet",
+            "refusal": "release the STOP, then stand up",
         }
     return {"reason": picture.state.reason, "refusal": picture.state.walk_refusal}
 
 
 def _notices(picture: RobotPicture, operator: Operator, now: float) -> Iterator[str]:
-    """What keeps the operator's commands from the robot, or the robot from the page, a sentence each."""
-    for topic, name in SOURCES.items():
-        if (silence := picture.silence(topic, now)) > FRESH:
+    """Yield a sentence for each obstacle between operator and robot."""
+    for topic, name in TOPIC_PUBLISHERS.items():
+        if (silence := picture.silence(topic, now)) > FRESH_S:
             yield f"no message from the {name} for {silence:.0f} s"
-    if late := operator.lateness(now):
-        yield f"commands arrive {late:.1f} s apart, expected {PERIOD:g} s: the robot may stop between them"
-    if operator.held_for(now) > IN_EFFECT and picture.source != OWN_SOURCE:
-        yield f"the command mux does not follow this page; its source is '{picture.source}'"
+    if late := operator.message_gap(now):
+        yield f"commands arrive {late:.1f} s apart, expected {PUBLISH_PERIOD_S:g} s: the robot may stop in between"
+    if operator.hold_duration(now) > EFFECT_DELAY_S and picture.source != OWN_SOURCE:
+        yield f"the command mux follows another source: '{picture.source}'"
 
 
-def _loop(state: Any) -> dict[str, float | None]:
+def _loop_timing(state: Any) -> dict[str, float | None]:
+    """Return rate and timing of the control loop."""
     return {
         "rate": _number(state.rate_hz, 1),
         "period": _number(state.period_p99_ms, 2),
@@ -71,23 +81,24 @@ def _loop(state: Any) -> dict[str, float | None]:
 
 
 def _lamps(picture: RobotPicture, alive: bool) -> list[dict[str, str]]:
-    """Faults first, then what was found, then how the nodes are."""
+    """List the fault first, then findings, then the nodes' health."""
     lamps = []
     if alive and picture.state.fault:
         lamps.append({"name": picture.state.fault, "level": "error", "text": picture.state.reason})
     if alive:
-        lamps += [{"name": "found", "level": "warning", "text": text} for text in picture.state.findings]
+        lamps += [{"name": "finding", "level": "warning", "text": text} for text in picture.state.findings]
     for name, node in sorted(picture.nodes.items()):
         lamps.append({"name": name, "level": node.level, "text": node.text})
-    for topic, error in sorted(picture.refused.items()):
-        lamps.append({"name": topic, "level": "warning", "text": f"a message was refused: {error}"})
+    for topic, error in sorted(picture.rejected.items()):
+        lamps.append({"name": topic, "level": "warning", "text": f"invalid message: {error}"})
     return lamps
 
 
 def _rounded(values: Any, known: bool) -> list[float | None]:
+    """Round values to three digits; None if unknown."""
     return [_number(value, 3) if known else None for value in values]
 
 
 def _number(value: float, digits: int) -> float | None:
-    """For JSON, which has no NaN."""
+    """Round a number; None if it is not finite, because JSON has no NaN."""
     return round(float(value), digits) if math.isfinite(value) else None

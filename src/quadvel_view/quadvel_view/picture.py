@@ -1,4 +1,4 @@
-"""What is known of a robot from its topics, live or recorded: `RobotPicture`. No ROS, and nothing of how it is drawn."""
+"""State of a robot as known from its topics, live or recorded. No ROS, no drawing."""
 
 from __future__ import annotations
 
@@ -27,24 +27,41 @@ TOPICS = {
     "/tf_static": "tf2_msgs/msg/TFMessage",
     "/ground": "visualization_msgs/msg/Marker",
 }
-"""What a picture is made of, live"""
+"""Topics that update a picture, live or recorded."""
 LOW_STATE = "/low_state"
-"""What it is made of where a recording has nothing better; live it would come 200 times a second"""
+"""Fallback topic of recordings without joint_states; live it would arrive at 200 Hz."""
 LATCHED = ("/tf_static", "/ground")
-"""Published once and kept for those who come later"""
-FRESH = 1.0  # s, after which what came counts as silent
-LONGEST_SILENCE = 3.0  # s, of a node on /diagnostics, which speaks once a second
-TRAIL_STEP = 0.05  # m between two points of the way behind
-TRAIL = 600  # points of it
-JUMP = 1.0  # m between two poses: nobody walked this way
-STARTED_AGAIN = 0.5  # share of the variance of a position before: one that grows by dead reckoning falls where that starts again
-CYLINDER, TRIANGLES = 3, 11  # of visualization_msgs/Marker
-LEVELS = ("ok", "warning", "error", "stale")  # of diagnostic_msgs/DiagnosticStatus
+"""Topics with transient-local durability."""
+FRESH_S = 1.0
+"""Age from which the last message of a topic is stale."""
+MAX_DIAGNOSTICS_AGE_S = 3.0
+"""Age from which a node on /diagnostics is stale; nodes report once a second."""
+TRAIL_SPACING_M = 0.05
+"""Distance between two points of the trail."""
+TRAIL_LENGTH = 600
+"""Number of points of the trail."""
+JUMP_M = 1.0
+"""Distance between two poses that no walk explains."""
+RESTART_VARIANCE_RATIO = 0.5
+"""Ratio of new to old position variance below which odometry was restarted.
+
+The variance of dead reckoning only grows.
+"""
+CYLINDER, TRIANGLES = 3, 11
+"""Types of visualization_msgs/Marker."""
+LEVELS = ("ok", "warning", "error", "stale")
+"""Levels of diagnostic_msgs/DiagnosticStatus, by number."""
 
 
 @attrs.frozen
 class Person:
-    """Where a tracked person stands, (2,) m in odom, the id of its track, and the colour that the tracker gave it."""
+    """A tracked person.
+
+    Attributes:
+        position: (2,) m, frame odom.
+        id: The track.
+        colour: Red, green, blue, 0 to 255, as the tracker assigned it.
+    """
 
     position: Array
     id: int
@@ -53,29 +70,48 @@ class Person:
 
 @attrs.frozen
 class NodeHealth:
-    """What a node said last on /diagnostics, and when, s."""
+    """The last diagnostics of a node.
+
+    Attributes:
+        level: One of LEVELS.
+        text: The message.
+        received_at: s, on the clock of the picture.
+    """
 
     level: str
     text: str
-    heard: float
+    received_at: float
 
 
 @attrs.frozen
 class Ground:
-    """A surface in the frame odom: vertices (N, 3) m; each three of them are a triangle."""
+    """A triangulated surface.
+
+    Attributes:
+        vertices: (N, 3) m, frame odom; three consecutive vertices form a triangle.
+    """
 
     vertices: Array
 
     def height(self, x: float, y: float) -> float:
-        """Height at a place, m; beyond the edge that of the edge.
+        """Interpolate the height at a point; points outside get the height at the edge.
 
-        It is a + u (b - a) + v (c - a) in the triangle a, b, c for which the weights u, v and 1 - u - v are not negative.
+        In the triangle a, b, c with barycentric weights u, v, 1 - u - v >= 0 the height is a + u (b
+        - a) + v (c - a).
+
+        Args:
+            x: m, frame odom.
+            y: m, frame odom.
+
+        Returns:
+            Height, m; 0 if all triangles are vertical.
         """
         low, high = self.vertices[:, :2].min(axis=0), self.vertices[:, :2].max(axis=0)
         a, b, c = self.vertices.reshape(-1, 3, 3).transpose(1, 0, 2)
+        # Cramer's rule in the plane: u = (ap x ac) / (ab x ac), v = (ab x ap) / (ab x ac).
         ab, ac, ap = b - a, c - a, np.clip((x, y), low, high) - a[:, :2]
         area = ab[:, 0] * ac[:, 1] - ab[:, 1] * ac[:, 0]
-        area[area == 0.0] = np.nan  # a triangle that stands upright
+        area[area == 0.0] = np.nan  # a vertical triangle
         u = (ap[:, 0] * ac[:, 1] - ap[:, 1] * ac[:, 0]) / area
         v = (ab[:, 0] * ap[:, 1] - ab[:, 1] * ap[:, 0]) / area
         outside = np.nan_to_num(np.max([-u, -v, u + v - 1.0], axis=0), nan=np.inf)
@@ -85,63 +121,108 @@ class Ground:
 
 @attrs.define
 class RobotPicture:
-    """The newest of everything. Joint order as everywhere; positions in the frame odom; velocities in the body frame."""
+    """The newest value of everything that is shown.
+
+    Joint order FR, FL, RR, RL, each hip, thigh, calf.
+
+    Attributes:
+        q: (12,) rad.
+        torque: (12,) N m; NaN if unknown.
+        position: (3,) m, base in the frame odom.
+        quaternion: (4,) w, x, y, z, base in the frame odom.
+        measured: (3,) vx, vy (m/s), wz (rad/s), body frame.
+        commanded: (3,) velocity command in effect, as `measured`.
+        source: Selected input of the command mux.
+        state: The newest controller/state, or None.
+        nodes: Diagnostics by node.
+        scan: (N, 3) m, laser points in the frame odom.
+        persons: The tracked people.
+        path: (N, 3) m, planned path in the frame odom.
+        ground: The ground, or None if flat.
+        trail: Past positions (3,) m, frame odom.
+        rejected: Error of the newest message of a topic, if it was invalid.
+    """
 
     q: Array = attrs.field(factory=lambda: np.array(robot.NOMINAL_Q))
     torque: Array = attrs.field(factory=lambda: np.zeros(12))
     position: Array = attrs.field(factory=lambda: np.array([0.0, 0.0, robot.NOMINAL_HEIGHT]))
     quaternion: Array = attrs.field(factory=lambda: np.array([1.0, 0.0, 0.0, 0.0]))
     measured: Array = attrs.field(factory=lambda: np.zeros(3))
-    """vx, vy (m/s), wz (rad/s)"""
     commanded: Array = attrs.field(factory=lambda: np.zeros(3))
-    """the command in effect"""
     source: str = "none"
-    """which input of the command mux counts"""
     state: Any = None
-    """the newest controller/state"""
     nodes: dict[str, NodeHealth] = attrs.field(factory=dict)
     scan: Array = attrs.field(factory=lambda: np.zeros((0, 3)))
     persons: Sequence[Person] = ()
     path: Array = attrs.field(factory=lambda: np.zeros((0, 3)))
     ground: Ground | None = None
-    trail: deque[Array] = attrs.field(factory=lambda: deque(maxlen=TRAIL))
-    refused: dict[str, str] = attrs.field(factory=dict)
-    """by topic: what was wrong with its newest message, where that could not be taken"""
+    trail: deque[Array] = attrs.field(factory=lambda: deque(maxlen=TRAIL_LENGTH))
+    rejected: dict[str, str] = attrs.field(factory=dict)
+
     _position_variance: float = 0.0
     _heard: dict[str, float] = attrs.field(factory=dict)
     _fixed: dict[str, tuple[str, Array, Array]] = attrs.field(factory=dict)
 
-    def read(self, topic: str, read: Callable[[], Any], now: float) -> None:
-        """Take what `read` returns, or note in `refused` what is wrong with it: no message ends the page, and STOP with it."""
-        try:
-            self.take(topic, read(), now)
-        except Exception as error:  # bytes that are no message fail in as many ways as there are decoders
-            self.refused[topic] = f"{error}" or type(error).__name__
-        else:
-            self.refused.pop(topic, None)
+    def update_lazily(self, topic: str, read: Callable[[], Any], now: float) -> None:
+        """Deserialise a message and update the picture.
 
-    def take(self, topic: str, message: Any, now: float) -> None:
-        """Note a message of one of TOPICS, or of LOW_STATE; others are left alone. now: s, on any clock that goes on.
+        Errors go to `rejected`, so that no message ends the page and its STOP.
 
-        Raises ValueError for a message whose joints are not the robot's, or whose places are not finite.
+        Args:
+            topic: The topic.
+            read: Returns the message.
+            now: s, on the clock of `update`.
         """
-        take = _TAKES.get(topic)
+        try:
+            self.update(topic, read(), now)
+        except Exception as error:  # decoders raise many kinds of errors for invalid bytes
+            self.rejected[topic] = f"{error}" or type(error).__name__
+        else:
+            self.rejected.pop(topic, None)
+
+    def update(self, topic: str, message: Any, now: float) -> None:
+        """Update the picture by a message of TOPICS or LOW_STATE; other topics are ignored.
+
+        Args:
+            topic: The topic.
+            message: The message. Wrong joints or non-finite positions raise ValueError.
+            now: s, on any monotonic clock.
+        """
+        take = _HANDLERS.get(topic)
         if take is not None:
             take(self, message, now)
             self._heard[topic] = now
 
     def is_fresh(self, topic: str, now: float) -> bool:
-        """Whether something came on a topic within the last second."""
-        return now - self._heard.get(topic, -np.inf) < FRESH
+        """Return whether a topic had a message within the last second.
 
-    def shows_joints(self, now: float) -> bool:
-        """Whether the joints' angles and torques are those of the last second."""
+        Args:
+            topic: The topic.
+            now: s.
+
+        Returns:
+            True if the last message is younger than FRESH_S.
+        """
+        return now - self._heard.get(topic, -np.inf) < FRESH_S
+
+    def has_fresh_joints(self, now: float) -> bool:
+        """Return whether joint angles and torques are at most a second old.
+
+        Args:
+            now: s.
+
+        Returns:
+            True if a topic with joint states is fresh.
+        """
         return self.is_fresh("/joint_states", now) or self.is_fresh(LOW_STATE, now)
 
-    def floor(self) -> tuple[float, float]:
-        """The ground below the lowest foot, m in odom, and how far that foot is above it, m.
+    def ground_below_feet(self) -> tuple[float, float]:
+        """Return the ground below the lowest foot and the clearance of that foot.
 
-        The latter is what odometry and ground are off each other, mostly.
+        The clearance is mostly the drift of odometry relative to the ground.
+
+        Returns:
+            Height of the ground in the frame odom, m, and height of the foot above it, m.
         """
         feet = rotate(self.quaternion, foot_positions(self.q)) + self.position
         x, y, z = feet[feet[:, 2].argmin()]
@@ -149,81 +230,98 @@ class RobotPicture:
         return floor, float(z) - robot.FOOT_RADIUS - floor
 
     def silence(self, topic: str, now: float) -> float:
-        """For how long nothing came on a topic, s; 0 where nothing ever came."""
+        """Return the time since the last message of a topic.
+
+        Args:
+            topic: The topic.
+            now: s.
+
+        Returns:
+            s; 0 if there was no message yet.
+        """
         return now - self._heard.get(topic, now)
 
-    def forget_the_past(self) -> None:
-        """As after a jump in time: nothing was heard, and there is no way behind."""
+    def clear_history(self) -> None:
+        """Forget messages, trail and diagnostics, after a jump in time."""
         self._heard.clear()
         self.trail.clear()
         self.nodes.clear()
-        self.refused.clear()
+        self.rejected.clear()
         self._position_variance = 0.0
         self.scan, self.path, self.persons, self.state = np.zeros((0, 3)), np.zeros((0, 3)), (), None
 
-    # How each message is taken.
+    # Handlers of the topics.
 
     def _joint_states(self, message: Any, now: float) -> None:
+        """Update angles and torques."""
         order = robot.joint_index(message.name)
         self.q[order] = _finite("position", message.position)
         self.torque[order] = message.effort if len(message.effort) == len(order) else np.nan
 
     def _low_state(self, message: Any, now: float) -> None:
+        """Update joints and orientation, unless better topics are fresh."""
         if not self.is_fresh("/joint_states", now):
             self.q, self.torque = _finite("q", message.q), np.array(message.tau, float)
         if not self.is_fresh("/odom", now):
             self.quaternion = _finite("orientation_wxyz", message.orientation_wxyz)
 
     def _odom(self, message: Any, now: float) -> None:
+        """Update pose, velocity and trail; a restart of odometry clears the trail."""
         self.position = _vector(message.pose.pose.position)
         self.quaternion = _quaternion(message.pose.pose.orientation)
         self.measured = _planar(message.twist.twist)
         here = self.position * [1.0, 1.0, 0.0]
         variance = float(message.pose.covariance[0])
-        if variance < STARTED_AGAIN * self._position_variance or (
-            self.trail and np.linalg.norm(here - self.trail[-1]) > JUMP
+        if variance < RESTART_VARIANCE_RATIO * self._position_variance or (
+            self.trail and np.linalg.norm(here - self.trail[-1]) > JUMP_M
         ):
             self.trail.clear()
         self._position_variance = variance
-        if not self.trail or np.linalg.norm(here - self.trail[-1]) > TRAIL_STEP:
+        if not self.trail or np.linalg.norm(here - self.trail[-1]) > TRAIL_SPACING_M:
             self.trail.append(here)
 
     def _command(self, message: Any, now: float) -> None:
+        """Update the source of the command."""
         self.source = message.source
 
     def _controller_state(self, message: Any, now: float) -> None:
+        """Update the state of the controller and the command in effect."""
         self.state = message
         self.commanded = _planar(message.command)
 
     def _diagnostics(self, message: Any, now: float) -> None:
+        """Update the diagnostics of the nodes, and mark stale ones."""
         for one in message.status:
             level = one.level if isinstance(one.level, int) else ord(one.level)
             self.nodes[one.name] = NodeHealth(LEVELS[min(level, 3)], one.message, now)
-        gone = [name for name, node in self.nodes.items() if now - node.heard > LONGEST_SILENCE]
+        gone = [name for name, node in self.nodes.items() if now - node.received_at > MAX_DIAGNOSTICS_AGE_S]
         for name in gone:
             self.nodes[name] = attrs.evolve(
-                self.nodes[name], level="stale", text=f"no diagnostics for {LONGEST_SILENCE:g} s"
+                self.nodes[name], level="stale", text=f"no diagnostics for {MAX_DIAGNOSTICS_AGE_S:g} s"
             )
 
     def _tf_static(self, message: Any, now: float) -> None:
+        """Store fixed transforms, by child frame."""
         for one in message.transforms:
             placed = _vector(one.transform.translation), _quaternion(one.transform.rotation)
             self._fixed[one.child_frame_id] = (one.header.frame_id, *placed)
 
     def _scan(self, message: Any, now: float) -> None:
+        """Transform the valid ranges of a scan to points in the frame odom."""
         ranges = np.array(message.ranges, float)
         _finite("angles", [message.angle_min, message.angle_increment])
         seen = (ranges >= message.range_min) & (ranges < message.range_max)
         angles = (message.angle_min + message.angle_increment * np.arange(len(ranges)))[seen]
         flat = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
         points, frame = flat * ranges[seen, None], message.header.frame_id
-        for _ in self._fixed:  # a tree has no longer branch; what is none does not keep us here
+        for _ in self._fixed:  # no branch of a tree is longer; this bounds the loop if frames form a cycle
             if frame in self._fixed:
                 frame, origin, turn = self._fixed[frame]
                 points = rotate(turn, points) + origin
         self.scan = rotate(self.quaternion, points) + self.position
 
     def _markers(self, message: Any, now: float) -> None:
+        """Update the tracked people."""
         self.persons = [
             Person(
                 _vector(one.pose.position)[:2],
@@ -235,9 +333,11 @@ class RobotPicture:
         ]
 
     def _path(self, message: Any, now: float) -> None:
+        """Update the planned path."""
         self.path = np.array([_vector(one.pose.position) for one in message.poses]).reshape(-1, 3)
 
     def _ground(self, message: Any, now: float) -> None:
+        """Update the ground."""
         self.ground = None
         if message.type == TRIANGLES and message.points:
             points = _finite("points", [(p.x, p.y, p.z) for p in message.points])
@@ -246,7 +346,7 @@ class RobotPicture:
             self.ground = Ground(points)
 
 
-_TAKES: dict[str, Callable[[RobotPicture, Any, float], None]] = {
+_HANDLERS: dict[str, Callable[[RobotPicture, Any, float], None]] = {
     "/joint_states": RobotPicture._joint_states,
     "/odom": RobotPicture._odom,
     "/command": RobotPicture._command,
@@ -262,7 +362,7 @@ _TAKES: dict[str, Callable[[RobotPicture, Any, float], None]] = {
 
 
 def _finite(field: str, values: Any) -> Array:
-    """The values (...) as an array. Raises ValueError where one of them is not finite."""
+    """Convert values to an array, or raise ValueError if one is not finite."""
     found = np.array(values, float)
     if not np.isfinite(found).all():
         raise ValueError(f"{field} is {found[~np.isfinite(found)][0]}, expected finite numbers")
@@ -270,12 +370,15 @@ def _finite(field: str, values: Any) -> Array:
 
 
 def _vector(message: Any) -> Array:
+    """Convert a Vector3 or Point to (3,)."""
     return _finite("place", [message.x, message.y, message.z])
 
 
 def _quaternion(message: Any) -> Array:
+    """Convert a Quaternion to (4,) w, x, y, z."""
     return _finite("orientation", [message.w, message.x, message.y, message.z])
 
 
 def _planar(twist: Any) -> Array:
+    """Convert a Twist to (3,) vx, vy (m/s), wz (rad/s)."""
     return np.array([twist.linear.x, twist.linear.y, twist.angular.z], float)

@@ -1,4 +1,4 @@
-"""A recording as a film: play, pause, pace, and any moment of it as a picture. No ROS, no page."""
+"""Playback of a recording: play, pause, speed, and the picture at any time. No ROS, no page."""
 
 from __future__ import annotations
 
@@ -10,33 +10,52 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_recordings.reading import RecordingError, unread_messages
+from quadvel_recordings.reading import RecordingError, lazy_messages
 
 from .picture import LOW_STATE, TOPICS, RobotPicture
 
-PACES = (0.25, 4.0)  # slowest and fastest
-ALL = "/diagnostics"
-"""Of this topic each message counts, as each node has its own; of all others the newest"""
-AGO = 20.0  # s before a moment from which the way behind the robot is shown
-BEHIND = 200  # messages of that way that are looked at
+PACE_RANGE = (0.25, 4.0)
+"""Smallest and largest playback speed."""
+PER_NODE_TOPIC = "/diagnostics"
+"""Topic whose messages are all applied, one per node; of other topics only the newest is."""
+TRAIL_DURATION_S = 20.0
+"""Duration of the trail before the present time."""
+MAX_TRAIL_MESSAGES = 200
+"""Largest number of messages from which the trail is built."""
 
 
 @attrs.frozen
 class _Track:
-    """The messages of one topic: when they came, s since the first of all, and what reads each."""
+    """The messages of one topic.
+
+    Attributes:
+        times: (n,), s since the first message of the recording.
+        messages: Functions that deserialise them.
+    """
 
     times: NDArray[np.float64]
     messages: list[Callable[[], Any]]
 
     def between(self, after: float, until: float) -> list[Callable[[], Any]]:
+        """Return the messages in the interval (after, until], s."""
         first, last = np.searchsorted(self.times, (after, until), side="right")
         return self.messages[first:last]
 
 
 class Playback:
-    """Begins at the first message, and plays. picture: that moment.
+    """A recording that plays from its start.
 
-    Raises RecordingError for what is no recording of a robot, and OSError where there is no such file.
+    Attributes:
+        name: Name of the file.
+        length: Duration, s.
+        picture: The state of the robot at `time`.
+        playing: Whether it plays.
+        pace: Playback speed, multiple of real time.
+        time: Present time, s since the start.
+
+    Raises:
+        RecordingError: The file is not a recording of a robot. OSError for a missing file passes
+            through.
     """
 
     def __init__(self, path: Path) -> None:
@@ -48,35 +67,51 @@ class Playback:
         self.seek(0.0)
 
     def advance(self, elapsed: float) -> None:
-        """So many seconds have passed for who watches."""
+        """Advance by a step of real time.
+
+        Args:
+            elapsed: s.
+        """
         if not self.playing:
             return
         before, self.time = self.time, min(self.time + self.pace * elapsed, self.length)
-        self._take_between(before, self.time)
+        self._apply_between(before, self.time)
         self.playing = self.time < self.length
 
     def toggle(self) -> None:
-        """Play, from the beginning where it was at its end, or pause."""
+        """Toggle play and pause; at the end it plays again from the start."""
         if not self.playing and self.time >= self.length:
             self.seek(0.0)
         self.playing = not self.playing
 
     def seek(self, time: float) -> None:
-        """Go to a moment, s since the beginning; beyond either end to that end."""
+        """Jump to a time, limited to the recording.
+
+        Args:
+            time: s since the start.
+        """
         self.time = min(max(time, 0.0), self.length)
-        self.picture.forget_the_past()
+        self.picture.clear_history()
         if "/odom" in self._tracks:
-            behind = self._tracks["/odom"].between(self.time - AGO, self.time)
-            for message in behind[:: max(1, len(behind) // BEHIND)]:
-                self.picture.read("/odom", message, self.time)
-        self._take_between(-np.inf, self.time)
+            behind = self._tracks["/odom"].between(self.time - TRAIL_DURATION_S, self.time)
+            for message in behind[:: max(1, len(behind) // MAX_TRAIL_MESSAGES)]:
+                self.picture.update_lazily("/odom", message, self.time)
+        self._apply_between(-np.inf, self.time)
 
     def set_pace(self, pace: float) -> None:
-        """How fast time passes, held to PACES."""
-        self.pace = min(max(pace, PACES[0]), PACES[1])
+        """Set the playback speed, limited to PACE_RANGE.
 
-    def words(self) -> dict[str, Any]:
-        """What the page is told of it."""
+        Args:
+            pace: Multiple of real time.
+        """
+        self.pace = min(max(pace, PACE_RANGE[0]), PACE_RANGE[1])
+
+    def status(self) -> dict[str, Any]:
+        """Return the state of the playback for the page.
+
+        Returns:
+            Name, times and speed for JSON.
+        """
         return {
             "name": self.name,
             "time": round(self.time, 3),
@@ -85,20 +120,22 @@ class Playback:
             "pace": self.pace,
         }
 
-    def _take_between(self, after: float, until: float) -> None:
+    def _apply_between(self, after: float, until: float) -> None:
+        """Apply the messages of an interval to the picture."""
         for topic, track in self._tracks.items():
-            came = track.between(max(after, until - 3.0) if topic == ALL else after, until)
-            for message in came if topic == ALL else came[-1:]:
-                self.picture.read(topic, message, until)
+            came = track.between(max(after, until - 3.0) if topic == PER_NODE_TOPIC else after, until)
+            for message in came if topic == PER_NODE_TOPIC else came[-1:]:
+                self.picture.update_lazily(topic, message, until)
 
 
 def _load(path: Path) -> dict[str, _Track]:
+    """Index the messages of a recording by topic."""
     known = {**TOPICS, LOW_STATE: "quadvel_msgs/msg/LowState"}
     found: dict[str, list[tuple[int, Callable[[], Any]]]] = {}
-    for topic, time, message in unread_messages(path, lambda topic, kind: known.get(topic) == kind):
+    for topic, time, message in lazy_messages(path, lambda topic, kind: known.get(topic) == kind):
         found.setdefault(topic, []).append((time, message))
     if not found.keys() & {"/joint_states", LOW_STATE}:
-        raise RecordingError(f"{path}: no robot in it: neither joint_states nor low_state were recorded")
+        raise RecordingError(f"{path}: not a recording of a robot: it has no joint_states and no low_state")
     begin = min(came[0][0] for came in found.values())
     return {
         topic: _Track(np.array([1e-9 * (time - begin) for time, _ in came]), [message for _, message in came])

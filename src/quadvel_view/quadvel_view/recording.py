@@ -1,4 +1,4 @@
-"""The recordings that the page starts and ends: `quadvel record`, as a process of its own beside the page."""
+"""Recordings started from the page: `quadvel record` in a separate process."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ import sys
 from datetime import datetime
 from pathlib import Path
 
-PATIENCE = 10.0  # s for files to be finished at the end
+FINISH_TIMEOUT_S = 10.0
+"""Time for the recorder to finish its file at the end."""
 
 
-class Recording:
-    """One at a time, into a folder, named after the time."""
+class PageRecorder:
+    """Runs one recorder at a time; files are named after the time of day."""
 
     def __init__(self, folder: str) -> None:
         self._folder = Path(folder)
@@ -22,28 +23,33 @@ class Recording:
 
     @property
     def file(self) -> str | None:
-        """The file that is being written now."""
+        """Name of the file being recorded, or None."""
         return self._name if self._is_running and not self._is_finishing else None
 
     def toggle(self) -> str:
-        """Begin, or have the file finished, for which nobody waits here; what to tell of it.
+        """Start a recording, or request its end without waiting.
 
-        The next file begins after the last one is finished, so that there is one process, however often a page asks.
+        A new recording starts only after the previous recorder has exited, so at most one process
+        runs.
+
+        Returns:
+            A status sentence.
         """
         if self.file:
             self._finish()
-            return f"recorded to {self._name}"
+            return f"saved {self._name}"
         if self._is_running:
-            return f"{self._name} is still being finished"
+            return f"still saving {self._name}"
         self._is_finishing = False
         self._name = str(self._folder / f"{datetime.now():%Y-%m-%d_%H-%M-%S}.mcap")
         try:
             self._recorder = self._start()
-        except OSError as error:  # no process or no file descriptor is left
-            return f"no recording: {error}"
-        return f"records to {self._name}"
+        except OSError as error:  # the limit of processes or file descriptors is reached
+            return f"cannot record: {error}"
+        return f"recording to {self._name}"
 
     def _start(self) -> subprocess.Popen[bytes]:
+        """Start the recorder process."""
         return subprocess.Popen(
             [sys.executable, "-m", "quadvel_bringup", "record", "--out", self._name],
             stdin=subprocess.DEVNULL,
@@ -53,21 +59,23 @@ class Recording:
         )
 
     def close(self) -> None:
-        """End what runs, and wait until its file is whole."""
+        """Stop the recorder and wait until its file is complete."""
         if self.file:
             self._finish()
         if self._recorder is not None:
             try:
-                self._recorder.wait(PATIENCE)
+                self._recorder.wait(FINISH_TIMEOUT_S)
             except subprocess.TimeoutExpired:
                 self._recorder.kill()
                 self._recorder.wait()
 
     @property
     def _is_running(self) -> bool:
+        """Whether the recorder process runs."""
         return self._recorder is not None and self._recorder.poll() is None
 
     def _finish(self) -> None:
+        """Request the end of the recording."""
         assert self._recorder is not None
         self._recorder.send_signal(signal.SIGINT)
         self._is_finishing = True

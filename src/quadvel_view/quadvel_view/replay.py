@@ -1,4 +1,4 @@
-"""A recording on the operator's page, without ROS: `Playback` behind the controls of a film."""
+"""Replay of a recording on the operator page, without ROS."""
 
 from __future__ import annotations
 
@@ -9,46 +9,59 @@ from queue import Empty, SimpleQueue
 
 from .operator import Operator
 from .playback import Playback
-from .viewer import FRAME, Viewer
-from .words import Pace, Play, Seek, Word
+from .viewer import FRAME_PERIOD_S, Viewer
+from .words import Pace, PageMessage, Play, Seek
 
 
 def replay(
-    path: Path, host: str, port: int, is_over: Callable[[float], bool], tell: Callable[[str], None]
+    path: Path, host: str, port: int, is_over: Callable[[float], bool], announce: Callable[[str], None]
 ) -> None:
-    """Serve the page, where it plays while somebody watches, until `is_over(seconds)`, which waits for so long, says so.
+    """Serve the page and play the recording while a page is open.
 
-    tell: told the address. Raises RecordingError, OSError, and AddressError where the page can't be served.
+    Args:
+        path: A recording of a robot.
+        host: Address to listen on.
+        port: TCP port, 0 for a free one.
+        is_over: Waits for the given time (s) and returns whether to end.
+        announce: Receives the address of the page.
+
+        Errors pass through: RecordingError, OSError, and AddressError if the address is
+        unavailable.
     """
     playback = Playback(path)
-    words: SimpleQueue[Word] = SimpleQueue()
+    words: SimpleQueue[PageMessage] = SimpleQueue()
     viewer = Viewer(host, port, lambda page, word: words.put(word), lambda page: None)
-    nobody = Operator()
+    idle = Operator()
     try:
-        tell(viewer.url)
+        announce(viewer.url)
         then = time.monotonic()
-        while not is_over(FRAME):
+        while not is_over(FRAME_PERIOD_S):
             now = time.monotonic()
             if viewer.is_watched:
                 playback.advance(now - then)
             then = now
-            while (word := _next(words)) is not None:
-                heed(playback, word)
+            while (word := _next_or_none(words)) is not None:
+                execute(playback, word)
             viewer.show(
                 playback.picture,
-                nobody,
+                idle,
                 playback.time,
                 said="",
                 recording=None,
                 notices=[],
-                playback=playback.words(),
+                playback=playback.status(),
             )
     finally:
         viewer.close()
 
 
-def heed(playback: Playback, word: Word) -> None:
-    """Do what the page asks of a recording; the orders to a robot are ignored."""
+def execute(playback: Playback, word: PageMessage) -> None:
+    """Execute an order of the page on the playback; orders to a robot are ignored.
+
+    Args:
+        playback: The playback.
+        word: The order.
+    """
     match word:
         case Play():
             playback.toggle()
@@ -58,7 +71,8 @@ def heed(playback: Playback, word: Word) -> None:
             playback.set_pace(pace)
 
 
-def _next(words: SimpleQueue[Word]) -> Word | None:
+def _next_or_none(words: SimpleQueue[PageMessage]) -> PageMessage | None:
+    """Return the next queued order, or None."""
     try:
         return words.get_nowait()
     except Empty:

@@ -1,6 +1,6 @@
-"""The robot and what surrounds it in 3-D, on a viser server: what a picture becomes to the eye. Not for controls.
+"""3-D scene of the robot and its surroundings, on a viser server. It has no controls.
 
-The robot stays in the middle and the world moves under it, so that a camera that orbits it needs no word from here.
+The robot stays at the origin and the world moves, so that the orbiting camera needs no updates.
 """
 
 from __future__ import annotations
@@ -29,17 +29,30 @@ BACKGROUND: Colour = (14, 17, 22)
 GRID, GRID_SECTION = (38, 44, 54), (58, 67, 80)
 GROUND: Colour = (58, 66, 72)
 SCAN, TRAIL, PATH = (64, 196, 255), (72, 110, 150), (120, 230, 140)
-PERSON_HEIGHT, PERSON_RADIUS = 1.7, 0.2  # m
-CORNER = 0.012  # m, by which edges of boxes are rounded, so that light catches them
-LIFTING = 0.15  # share of what the feet are off the floor that is made up for in a picture: they may leave it for a moment
-ABOVE = 0.006  # m, of lines over the floor that they lie on
-CAMERA = (1.2, -1.3, 0.6)
-"""m, from the robot"""
+PERSON_HEIGHT_M, PERSON_RADIUS_M = 1.7, 0.2
+"""Size of the column that represents a person."""
+CORNER_RADIUS_M = 0.012
+"""Radius of the rounded edges of boxes, which make shading visible."""
+LIFT_SMOOTHING = 0.15
+"""Share of the height error corrected per frame.
+
+It is low, because feet leave the ground in a flight phase.
+"""
+LINE_OFFSET_M = 0.006
+"""Height of lines above the ground that they lie on."""
+CAMERA_POSITION_M = (1.2, -1.3, 0.6)
+"""Initial position of the camera relative to the robot."""
 
 
 @attrs.frozen
 class Shape:
-    """A visible part of a link: a mesh in the link's frame, and its colour."""
+    """A visible part of a link.
+
+    Attributes:
+        link: Name of the link.
+        mesh: Its mesh in the frame of the link, m.
+        colour: Red, green, blue, 0 to 255.
+    """
 
     link: str
     mesh: trimesh.Trimesh
@@ -47,15 +60,19 @@ class Shape:
 
 
 class Scene:
-    """The nodes of the scene. `draw` moves them; what did not change since is not sent again."""
+    """The nodes of the scene. Unchanged objects are not sent again.
+
+    Args:
+        server: The viser server.
+    """
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server, scene = server, server.scene
         scene.set_up_direction("+z")
-        server.initial_camera.position = CAMERA
+        server.initial_camera.position = CAMERA_POSITION_M
         server.initial_camera.look_at = (0.0, 0.0, -0.05)
         server.initial_camera.fov = 0.75
-        _furnish(server)
+        _configure_appearance(server)
         self._world = scene.add_frame("/world", show_axes=False)
         self._base = scene.add_frame("/robot", show_axes=False)
         self._links = self._add_links()
@@ -69,18 +86,23 @@ class Scene:
             fade_distance=14.0,
             shadow_opacity=0.35,
         )
-        self._lifted = 0.0  # m, by which odometry has the robot too high; its height drifts
-        self._floor = 0.0  # m, of the ground below the robot in odom
+        self._drift = 0.0  # m, smoothed height error of the odometry
+        self._floor = 0.0  # m, smoothed height of the ground below the robot, frame odom
         self._drawn: dict[str, Any] = {}
         self._persons: dict[int, Any] = {}
 
     def draw(self, picture: RobotPicture) -> None:
-        """Show the picture."""
+        """Draw a picture.
+
+        Args:
+            picture: The state of the robot.
+        """
         x, y, z = picture.position.tolist()
-        floor, above = picture.floor()
-        self._floor += LIFTING * (floor - self._floor)
-        self._lifted += LIFTING * (above - self._lifted)
-        height = z - self._lifted - self._floor - robot.NOMINAL_HEIGHT
+        # First-order low pass of the ground's height and of the odometry's height error.
+        floor, above = picture.ground_below_feet()
+        self._floor += LIFT_SMOOTHING * (floor - self._floor)
+        self._drift += LIFT_SMOOTHING * (above - self._drift)
+        height = z - self._drift - self._floor - robot.NOMINAL_HEIGHT
         with self._server.atomic():
             self._base.position, self._base.wxyz = (0.0, 0.0, height), picture.quaternion
             self._world.position = (-x, -y, -self._floor - robot.NOMINAL_HEIGHT)
@@ -90,6 +112,7 @@ class Scene:
             self._draw_world(picture)
 
     def _draw_world(self, picture: RobotPicture) -> None:
+        """Draw everything that changed around the robot."""
         if self._is_new("ground", picture.ground):
             self._draw_ground(picture.ground)
         if self._is_new("scan", picture.scan):
@@ -104,55 +127,57 @@ class Scene:
             self._draw_persons(picture)
 
     def _draw_ground(self, ground: Ground | None) -> None:
-        """The ground as it is, or the grid where it is flat."""
+        """Draw the ground mesh, or a grid if it is flat."""
         self._grid.visible = ground is None
         if ground is None:
             self._server.scene.remove_by_name("/world/ground")
             return
         faces = np.arange(len(ground.vertices)).reshape(-1, 3)
-        merged = trimesh.Trimesh(ground.vertices, faces)  # one vertex where triangles meet, for smooth light
+        merged = trimesh.Trimesh(ground.vertices, faces)  # merges vertices, for smooth shading
         self._server.scene.add_mesh_simple(
             "/world/ground", merged.vertices, merged.faces, color=GROUND, side="double", cast_shadow=False
         )
 
     def _draw_line(self, name: str, points: Array, colour: Colour) -> None:
+        """Draw a polyline on the ground, or remove it if it has no segment."""
         if len(points) < 2:
             self._server.scene.remove_by_name(name)
             return
-        segments = np.stack([points[:-1], points[1:]], axis=1) + np.array([0.0, 0.0, ABOVE])
+        segments = np.stack([points[:-1], points[1:]], axis=1) + np.array([0.0, 0.0, LINE_OFFSET_M])
         self._server.scene.add_line_segments(name, segments, colour, thickness=2.5, thickness_units="screen")
 
     def _draw_persons(self, picture: RobotPicture) -> None:
-        """A column for each, of the colour that the tracker gave it, and its number above."""
+        """Draw a column per person in the colour of the track, with its number above."""
         now = {person.id: person for person in picture.persons}
         for gone in self._persons.keys() - now.keys():
             self._persons.pop(gone).remove()
         for number, person in now.items():
             if number not in self._persons:
                 self._persons[number] = self._add_person(person)
-            self._persons[number].position = (*person.position.tolist(), 0.5 * PERSON_HEIGHT)
+            self._persons[number].position = (*person.position.tolist(), 0.5 * PERSON_HEIGHT_M)
 
     def _add_person(self, person: Person) -> Any:
+        """Add the column and the label of a person."""
         name = f"/world/person_{person.id}"
         handle = self._server.scene.add_cylinder(
-            name, PERSON_RADIUS, PERSON_HEIGHT, person.colour, opacity=0.65
+            name, PERSON_RADIUS_M, PERSON_HEIGHT_M, person.colour, opacity=0.65
         )
-        self._server.scene.add_label(f"{name}/id", str(person.id), position=(0.0, 0.0, 0.6 * PERSON_HEIGHT))
+        self._server.scene.add_label(f"{name}/id", str(person.id), position=(0.0, 0.0, 0.6 * PERSON_HEIGHT_M))
         return handle
 
     def _is_new(self, name: str, what: Any) -> bool:
-        """Whether this is another object than what was drawn last under the name."""
+        """Return whether this is another object than the last one under this name."""
         before = self._drawn.get(name)
         self._drawn[name] = what
         return before is not what
 
     def _add_links(self) -> dict[str, Any]:
-        """A frame for each link that moves, below that of its parent, with the link's shapes in it."""
+        """Add a frame per moving link in that of its parent, with the meshes of the link."""
         scene, names, frames = self._server.scene, {"base_link": "/robot"}, {}
         for link in robot.LINKS:
             names[link.name] = f"{names[link.parent or 'base_link']}/{link.name}"
             frames[link.name] = scene.add_frame(names[link.name], show_axes=False, position=link.origin)
-        for number, shape in enumerate(shapes()):
+        for number, shape in enumerate(robot_shapes()):
             scene.add_mesh_simple(
                 f"{names[shape.link]}/shape_{number}",
                 shape.mesh.vertices,
@@ -162,8 +187,12 @@ class Scene:
         return frames
 
 
-def shapes() -> Iterator[Shape]:
-    """What of the robot is to be seen, by its URDF."""
+def robot_shapes() -> Iterator[Shape]:
+    """Yield the visual shapes of the robot's URDF.
+
+    Yields:
+        One shape per visual element.
+    """
     for link in ElementTree.fromstring(urdf()).iter("link"):
         for visual in link.iter("visual"):
             geometry = visual.find("geometry/*")
@@ -178,9 +207,10 @@ def shapes() -> Iterator[Shape]:
 
 
 def _mesh(geometry: ElementTree.Element) -> trimesh.Trimesh:
+    """Build the mesh of a URDF geometry; boxes get rounded edges."""
     sizes = {key: np.array(value.split(), float) for key, value in geometry.items()}
     if geometry.tag == "box":
-        corner = min(CORNER, 0.45 * sizes["size"].min())
+        corner = min(CORNER_RADIUS_M, 0.45 * sizes["size"].min())
         centres = trimesh.creation.box(sizes["size"] - 2 * corner).vertices
         ball = trimesh.creation.icosphere(subdivisions=2, radius=corner)
         return trimesh.convex.convex_hull((centres[:, None] + ball.vertices).reshape(-1, 3))
@@ -190,14 +220,15 @@ def _mesh(geometry: ElementTree.Element) -> trimesh.Trimesh:
 
 
 def _transform(origin: ElementTree.Element) -> Array:
+    """Convert a URDF origin to a homogeneous transform (4, 4)."""
     place, angles = (np.array(origin.get(key, "0 0 0").split(), float) for key in ("xyz", "rpy"))
     matrix: Array = trimesh.transformations.euler_matrix(*angles)  # type: ignore[no-untyped-call]
     matrix[:3, 3] = place
     return matrix
 
 
-def _furnish(server: viser.ViserServer) -> None:
-    """Light and background, and none of viser's own controls."""
+def _configure_appearance(server: viser.ViserServer) -> None:
+    """Set light and background, and hide viser's controls."""
     scene = server.scene
     scene.configure_default_lights(enabled=False)
     scene.configure_environment_map(None)

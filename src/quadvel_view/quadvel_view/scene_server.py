@@ -1,10 +1,11 @@
-"""viser's server without a port of its own: it listens on a Unix socket in a folder that only this user can open.
+"""viser's server on a Unix socket in a private folder, without a TCP port.
 
-viser answers whoever connects, and at a message called ShareUrlRequest it opens a tunnel to a public address. No browser
-reaches a Unix socket: what a browser gets of the scene has passed the page's guard, and nothing that it says comes here.
+viser answers all clients, and a ShareUrlRequest message makes it open a tunnel to a public address.
+Browsers cannot connect to a Unix socket: the page's server checks access, forwards the scene, and
+forwards nothing to viser.
 
-This rests on how viser starts, so pyproject.toml holds viser at one minor version: it calls `websockets.asyncio.server.serve`
-once. Where it does not, there is no scene.
+This relies on viser's start-up calling `websockets.asyncio.server.serve` once, so pyproject.toml
+pins viser to one minor version. If the call is missing, the scene is refused.
 """
 
 from __future__ import annotations
@@ -23,23 +24,24 @@ import viser
 from viser import _messages
 from websockets.asyncio import server as websockets_server
 
-TUNNEL = (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect)
+TUNNEL_MESSAGES = (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect)
+"""Messages that open or close viser's public tunnel; their handlers are removed."""
 _starting = Lock()
 
 
 class SceneServerError(RuntimeError):
-    """viser cannot be kept from the network; one sentence."""
+    """viser cannot be isolated from the network; one sentence."""
 
 
 class SceneServer:
-    """Runs from the time it is made until `close`.
+    """viser's server on a Unix socket, from construction until `close`.
 
     Attributes:
-        viser: What draws the scene.
-        path: The Unix socket that viser listens on.
+        viser: The server that draws the scene.
+        path: The Unix socket.
 
     Raises:
-        SceneServerError: Where the socket cannot be made, or viser listens elsewhere.
+        SceneServerError: The socket cannot be created, or viser listens elsewhere.
     """
 
     def __init__(self) -> None:
@@ -50,22 +52,23 @@ class SceneServer:
         except BaseException:
             self._folder.cleanup()
             raise
-        for message in TUNNEL:
+        for message in TUNNEL_MESSAGES:
             self.viser._websock_server.unregister_handler(message)
 
     def close(self) -> None:
-        """End viser and its socket."""
+        """Stop viser and remove the socket."""
         _stop(self.viser)
         self._folder.cleanup()
 
     def _start(self) -> viser.ViserServer:
+        """Start viser on a new Unix socket."""
         listener = socket.socket(socket.AF_UNIX)  # viser closes it
         try:
             listener.bind(str(self.path))
         except OSError as error:
             listener.close()
             raise SceneServerError(
-                f"{self.path}: no socket can be made there: {error}; TMPDIR names the folder"
+                f"{self.path}: cannot create a socket: {error}; TMPDIR selects another folder"
             ) from None
         with (
             _starting,
@@ -77,19 +80,26 @@ class SceneServer:
             listener.close()
             _stop(started)
             raise SceneServerError(
-                f"viser {viser.__version__} opens a port of its own: install a version that pyproject.toml names"
+                f"viser {viser.__version__} opens a TCP port: install a version that pyproject.toml allows"
             )
         return started
 
 
-def page() -> bytes:
-    """viser's page: one file that unpacks itself."""
+def client_page() -> bytes:
+    """Return viser's web client, one self-extracting HTML file.
+
+    Returns:
+        The content of the file.
+    """
     return files("viser").joinpath("client", "build", "index.html").read_bytes()
 
 
 @contextmanager
 def _serving_on(listener: socket.socket) -> Iterator[list[Any]]:
-    """Until the end of the block, servers that websockets makes listen on this socket. Gives the list of their handlers."""
+    """Redirect servers of `websockets` to this socket within the block.
+
+    Yields the list of their handlers.
+    """
     serve, handlers = websockets_server.serve, list[Any]()
 
     def serve_on_listener(handler: Any, *address: Any, **options: Any) -> Any:
@@ -104,5 +114,6 @@ def _serving_on(listener: socket.socket) -> Iterator[list[Any]]:
 
 
 def _stop(server: viser.ViserServer) -> None:
+    """Stop viser without its output."""
     with redirect_stdout(StringIO()):
         server.stop()

@@ -1,10 +1,12 @@
-"""The web server of the page: its files, its words both ways, and viser's scene behind the same port and the same guard.
+"""Web server of the page, its messages in both directions, and viser's scene on the same port.
 
-The scene goes one way: what viser draws is passed on to the browser, and what the browser says to viser ends here.
+The scene is one-way: viser's messages are forwarded to the browser, and the browser's messages to
+viser are dropped.
 
-Where the page is called 127.0.0.1 its scene is called localhost, and the other way round: to the browser these are two sites,
-each with a process of its own, so that drawing never keeps pad and STOP waiting. Where there is a token both have one name, as
-the cookie with the token stays with the name that it was set for.
+If the page has the host name 127.0.0.1, its scene has localhost, and vice versa. To the browser
+these are two sites with a process each, so that rendering never delays the pad and the STOP. With a
+token both have the same name, because the browser sends the token's cookie only to the name that
+set it.
 """
 
 from __future__ import annotations
@@ -31,23 +33,35 @@ from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
 from . import scene_server
-from .guard import Guard, RequestError, Visitor, is_loopback
-from .words import LARGEST_WORD, Word, WordError, read_word
+from .guard import AccessControl, RequestError, Visitor, is_loopback
+from .words import MAX_MESSAGE_BYTES, PageMessage, PageMessageError, parse_message
 
 COOKIE = "quadvel_view"
-"""start of the name of the cookie with the token; the port follows, as cookies are sent to all ports of a host"""
-KINDS = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
-PAGE = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
-SCENE, WORDS = "/scene", "/words"
+"""Prefix of the name of the token's cookie.
+
+The port follows, because browsers send cookies to all ports of a host.
+"""
+CONTENT_TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
+PAGE_FILES = {"/": "index.html", "/style.css": "style.css", "/app.js": "app.js"}
+SCENE_PATH, MESSAGES_PATH = "/scene", "/words"
 SCENE_FRAME, WITH_TOKEN = b'<iframe id="scene"', b" data-with-token"
-"""how the page is told that there is a token, which it cannot see itself"""
-MOST_FRAGMENTS = 16
-"""of one message: browsers send one of LARGEST_WORD whole, and an empty fragment costs memory, too"""
-MOST_SOCKETS = 32
-"""at a time, of which a page has two: each takes time from the words of the others, STOP among them"""
-# viser's own panel and notes have no place beside ours: of its page there is the picture alone. It looks for its server while
-# it has the focus, which stays with our page.
-PICTURE_ALONE = (
+"""Attribute of the scene's frame that shows the page that a token exists.
+
+Its script cannot read the cookie.
+"""
+MAX_FRAGMENTS = 16
+"""Largest number of fragments of a message.
+
+Browsers send MAX_MESSAGE_BYTES in one, and even empty ones cost memory.
+"""
+MAX_SOCKETS = 32
+"""Largest number of connections, two per page.
+
+Each one delays the messages of the others, including STOP.
+"""
+# Hide everything of viser's page but the canvas. viser reconnects only while it has the focus,
+# which our page keeps.
+CANVAS_ONLY = (
     b"<style>body *{visibility:hidden!important}canvas{visibility:visible!important}</style>"
     b"<script>document.hasFocus = () => true;"
     b"new MutationObserver((_, self) => { if (document.querySelector('canvas')) { self.disconnect();"
@@ -56,23 +70,30 @@ PICTURE_ALONE = (
 
 
 class AddressError(ValueError):
-    """The page cannot be served there; one sentence."""
+    """The page cannot be served at this address; one sentence."""
 
 
-def _is_own_fault(record: logging.LogRecord) -> bool:
-    """Whether a line of the log is about more than a handshake that makes no sense or is left, which anybody may do."""
+def _is_server_error(record: logging.LogRecord) -> bool:
+    """Return whether a log record is more than a failed handshake, which any client can cause."""
     return not (record.exc_info and isinstance(record.exc_info[1], InvalidHandshake | ConnectionClosed))
 
 
 LOG = logging.getLogger("quadvel_view.page")
-LOG.addFilter(_is_own_fault)
+LOG.addFilter(_is_server_error)
 
 
 class PageServer:
-    """Serves from the time it is made until `close`, in a thread of its own.
+    """Serves the page from construction until `close`, in its own thread.
 
-    on_word: called there with the number of a page and what it said; on_leave: with that of one that left.
-    scene: the Unix socket of viser. Raises AddressError where address and port can't be listened on.
+    Args:
+        host: Address to listen on.
+        port: TCP port, 0 for a free one.
+        scene: Unix socket of viser.
+        on_message: Receives the number of a page and its message, in the server's thread.
+        on_disconnect: Receives the number of a page that disconnected, in the server's thread.
+
+    Raises:
+        AddressError: The address is unavailable.
     """
 
     def __init__(
@@ -80,16 +101,16 @@ class PageServer:
         host: str,
         port: int,
         scene: Path,
-        on_word: Callable[[int, Word], None],
-        on_leave: Callable[[int], None],
+        on_message: Callable[[int, PageMessage], None],
+        on_disconnect: Callable[[int], None],
     ) -> None:
         if not host:
             raise AddressError(
                 "host is '', expected an address such as 127.0.0.1, or 0.0.0.0 for all interfaces"
             )
         self._host, self._port, self._scene = host, port, scene
-        self._on_word, self._on_leave = on_word, on_leave
-        self._guard = Guard("" if is_loopback(host) else secrets.token_urlsafe(18))
+        self._on_message, self._on_disconnect = on_message, on_disconnect
+        self._guard = AccessControl("" if is_loopback(host) else secrets.token_urlsafe(18))
         self._pages: set[ServerConnection] = set()
         self._count = 0
         self._ready, self._error = Event(), ""
@@ -105,7 +126,7 @@ class PageServer:
 
     @property
     def url(self) -> str:
-        """What to open, with the token where one is needed."""
+        """Address of the page, with the token if there is one."""
         host = f"[{self._host}]" if ":" in self._host else self._host
         query = f"?token={self._guard.token}" if self._guard.token else ""
         return f"http://{host}:{self._port}/{query}"
@@ -115,68 +136,75 @@ class PageServer:
         """Whether a page is open."""
         return bool(self._pages)
 
-    def tell(self, words: dict[str, Any]) -> None:
-        """Say something to every page; from any thread."""
+    def send_to_pages(self, words: dict[str, Any]) -> None:
+        """Send a message to all pages; callable from any thread.
+
+        Args:
+            words: Content for JSON.
+        """
         if self._pages:
             text = json.dumps(words, separators=(",", ":"), allow_nan=False)
             self._loop.call_soon_threadsafe(lambda: broadcast(self._pages, text))
 
     def close(self) -> None:
-        """End all connections, and the thread."""
+        """Close all connections and end the thread."""
         self._loop.call_soon_threadsafe(self._stop.set)
         self._thread.join()
         self._loop.close()
 
     async def _serve(self) -> None:
+        """Serve until `close`."""
         try:
             async with serve(
                 self._serve_socket,
                 self._host,
                 self._port,
-                process_request=self._answer,
+                process_request=self._process_request,
                 select_subprotocol=lambda connection, offered: offered[0] if offered else None,
                 compression=None,
-                max_size=LARGEST_WORD,
+                max_size=MAX_MESSAGE_BYTES,
                 logger=LOG,
             ) as server:
                 self._port = next(iter(server.sockets)).getsockname()[1]
                 self._ready.set()
                 await self._stop.wait()
-        except (OSError, OverflowError, UnicodeError) as error:  # the latter two: no port, no host name
+        except (OSError, OverflowError, UnicodeError) as error:  # the latter two: invalid port or host name
             reason = getattr(error, "strerror", None) or error
-            self._error = f"{self._host}:{self._port}: the page can't be served there: {reason}"
+            self._error = f"{self._host}:{self._port}: cannot serve the page: {reason}"
         finally:
             self._ready.set()
 
-    def _answer(self, connection: ServerConnection, request: Request) -> Response | None:
-        """The answer to a request for a file, or None for a WebSocket that may come in."""
+    def _process_request(self, connection: ServerConnection, request: Request) -> Response | None:
+        """Return the response to a file request, or None for an accepted WebSocket."""
         try:
             visitor = self._guard.admit(request)
         except RequestError as error:
-            return _sentence(error.status, str(error))
+            return _text_response(error.status, str(error))
         if visitor.wants_socket:
             return self._refusal_of_socket(connection, visitor)
-        if visitor.path == f"{SCENE}/":
-            return _page("text/html", self._scene_page, visitor)
-        if visitor.path not in PAGE:
-            return _sentence(HTTPStatus.NOT_FOUND, "there is no such page")
-        return self._file(PAGE[visitor.path], visitor)
+        if visitor.path == f"{SCENE_PATH}/":
+            return _page_response("text/html", self._scene_page, visitor)
+        if visitor.path not in PAGE_FILES:
+            return _text_response(HTTPStatus.NOT_FOUND, "there is no such page")
+        return self._file(PAGE_FILES[visitor.path], visitor)
 
     @staticmethod
     def _refusal_of_socket(connection: ServerConnection, visitor: Visitor) -> Response | None:
-        if visitor.path not in (SCENE, WORDS):
-            return _sentence(HTTPStatus.NOT_FOUND, "there is no such socket")
-        if len(connection.server.connections) >= MOST_SOCKETS:
-            reason = f"{MOST_SOCKETS} connections are open: close another page of this robot"
-            return _sentence(HTTPStatus.SERVICE_UNAVAILABLE, reason)
+        """Return the rejection of a WebSocket, or None."""
+        if visitor.path not in (SCENE_PATH, MESSAGES_PATH):
+            return _text_response(HTTPStatus.NOT_FOUND, "there is no such socket")
+        if len(connection.server.connections) >= MAX_SOCKETS:
+            reason = f"{MAX_SOCKETS} connections are open: close another page of this robot"
+            return _text_response(HTTPStatus.SERVICE_UNAVAILABLE, reason)
         return None
 
     def _file(self, name: str, visitor: Visitor) -> Response:
+        """Return a file of the page; with a token, the main page sets its cookie."""
         body = files("quadvel_view").joinpath("page", name).read_bytes()
         with_token = visitor.path == "/" and self._guard.token
         if with_token:
             body = body.replace(SCENE_FRAME, SCENE_FRAME + WITH_TOKEN)
-        response = _page(KINDS[name.rpartition(".")[2]], body, visitor)
+        response = _page_response(CONTENT_TYPES[name.rpartition(".")[2]], body, visitor)
         if with_token:
             keep = f"{COOKIE}_{self._port}={self._guard.token}; Path=/; HttpOnly; SameSite=Strict"
             response.headers["Set-Cookie"] = keep
@@ -184,46 +212,52 @@ class PageServer:
 
     @cached_property
     def _scene_page(self) -> bytes:
-        return scene_server.page().replace(b"</head>", PICTURE_ALONE + b"</head>", 1)
+        """The page of viser, reduced to its canvas."""
+        return scene_server.client_page().replace(b"</head>", CANVAS_ONLY + b"</head>", 1)
 
     async def _serve_socket(self, connection: ServerConnection) -> None:
+        """Serve a WebSocket of the page or of the scene."""
         assert connection.request is not None
-        if urlsplit(connection.request.path).path == SCENE:
+        if urlsplit(connection.request.path).path == SCENE_PATH:
             await self._relay(connection)
         else:
-            await self._listen(connection)
+            await self._receive_messages(connection)
 
-    async def _listen(self, connection: ServerConnection) -> None:
-        """Hear one page until it leaves."""
+    async def _receive_messages(self, connection: ServerConnection) -> None:
+        """Receive the messages of a page until it disconnects."""
         self._count += 1
         page = self._count
         self._pages.add(connection)
         try:
-            while (text := await _message(connection)) is not None:
-                self._on_word(page, read_word(text))
-        except WordError as error:
+            while (text := await _next_message(connection)) is not None:
+                self._on_message(page, parse_message(text))
+        except PageMessageError as error:
             await connection.close(1008, str(error))
         except ConnectionClosed:
             pass
         finally:
             self._pages.discard(connection)
-            self._on_leave(page)
+            self._on_disconnect(page)
 
     async def _relay(self, browser: ServerConnection) -> None:
-        """Show a browser what viser draws, until one of them leaves. What the browser says is not passed on."""
+        """Forward viser's messages to a browser until one side disconnects.
+
+        Drop the browser's messages.
+        """
         spoken = [Subprotocol(browser.subprotocol)] if browser.subprotocol else None
         path = str(self._scene)
         async with unix_connect(
             path, "ws://viser/", subprotocols=spoken, compression=None, max_size=None
         ) as scene:
-            ways = [asyncio.create_task(way) for way in (_show(scene, browser), _ignore(browser))]
+            ways = [asyncio.create_task(way) for way in (_forward(scene, browser), _discard(browser))]
             await asyncio.wait(ways, return_when=asyncio.FIRST_COMPLETED)
             for way in ways:
                 way.cancel()
             await asyncio.gather(*ways, return_exceptions=True)
 
 
-async def _show(scene: ClientConnection, browser: ServerConnection) -> None:
+async def _forward(scene: ClientConnection, browser: ServerConnection) -> None:
+    """Forward viser's messages to a browser."""
     try:
         async for message in scene:
             await browser.send(message)
@@ -231,8 +265,8 @@ async def _show(scene: ClientConnection, browser: ServerConnection) -> None:
         return
 
 
-async def _ignore(browser: ServerConnection) -> None:
-    """Read a browser's messages, fragment by fragment, so that pings are answered and its leaving is seen."""
+async def _discard(browser: ServerConnection) -> None:
+    """Read and drop a browser's messages, so that pings are answered and its end is noticed."""
     try:
         while True:
             async for _ in browser.recv_streaming(decode=False):
@@ -241,33 +275,37 @@ async def _ignore(browser: ServerConnection) -> None:
         return
 
 
-async def _message(connection: ServerConnection) -> bytes | None:
-    """The next message of a page, or None where it has too many fragments. Raises ConnectionClosed when the page left."""
+async def _next_message(connection: ServerConnection) -> bytes | None:
+    """Return the next message of a page, or None after too many fragments.
+
+    Raises ConnectionClosed at its end.
+    """
     fragments = []
     async for fragment in connection.recv_streaming(decode=False):
         fragments.append(fragment)
-        if len(fragments) > MOST_FRAGMENTS:
-            await connection.close(CloseCode.MESSAGE_TOO_BIG, f"more than {MOST_FRAGMENTS} fragments")
+        if len(fragments) > MAX_FRAGMENTS:
+            await connection.close(CloseCode.MESSAGE_TOO_BIG, f"more than {MAX_FRAGMENTS} fragments")
             return None
     return b"".join(fragments)
 
 
-def _sentence(status: HTTPStatus, sentence: str) -> Response:
+def _text_response(status: HTTPStatus, sentence: str) -> Response:
+    """Return a plain-text response."""
     return _response(
         status, "text/plain", f"{sentence}\n".encode(), "default-src 'none'; frame-ancestors 'none'"
     )
 
 
-def _page(kind: str, body: bytes, visitor: Visitor) -> Response:
-    """A file of the page or of the scene, and what the browser may do with it.
+def _page_response(kind: str, body: bytes, visitor: Visitor) -> Response:
+    """Return a file with its content security policy.
 
-    It loads nothing from any other host. Only our page may show the scene in a frame, and no page may show ours in one, where a
-    press of a button would be taken for the operator's. viser's page is one file that unpacks itself, hence 'unsafe-eval'.
+    It allows no content from other hosts. Only the page may embed the scene, and no site may embed
+    the page, against clickjacking. viser's page unpacks itself, which requires 'unsafe-eval'.
     """
     ours = "'self'"
-    if is_loopback(visitor.name.strip("[]")):  # the page and its scene under the two names of this host
+    if is_loopback(visitor.name.strip("[]")):  # page and scene have two names of the same host
         ours += "".join(f" http://{name}{visitor.port}" for name in ("127.0.0.1", "localhost"))
-    ancestors = ours if visitor.path == f"{SCENE}/" else "'none'"
+    ancestors = ours if visitor.path == f"{SCENE_PATH}/" else "'none'"
     policy = (
         "default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' data: blob:; form-action 'none'; "
         f"frame-src {ours}; frame-ancestors {ancestors}"
@@ -276,6 +314,7 @@ def _page(kind: str, body: bytes, visitor: Visitor) -> Response:
 
 
 def _response(status: HTTPStatus, kind: str, body: bytes, policy: str) -> Response:
+    """Return a response with the common security headers."""
     headers = Headers(
         {
             "Content-Type": f"{kind}; charset=utf-8",

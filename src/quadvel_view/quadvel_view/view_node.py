@@ -1,6 +1,7 @@
-"""The node `view`: the operator's page on the robot that runs. What it shows is `picture`'s and `scene`'s matter.
+"""The node `view`: the operator page of a running robot.
 
-Messages come as bytes and wait: only the newest of each topic is read, as often as a picture is drawn.
+`picture` and `scene` define what it shows. Messages are queued as bytes. Only the newest message of
+each topic is deserialised, once per frame.
 """
 
 from __future__ import annotations
@@ -23,148 +24,172 @@ from quadvel_msgs.srv import Push, ResetSim, SetMode
 from quadvel_nodes.node import StartError, read_parameters, run
 from quadvel_recordings.definitions import STORE
 
-from .operator import PERIOD, Operator
+from .operator import PUBLISH_PERIOD_S, Operator
 from .picture import LATCHED, TOPICS, RobotPicture
-from .recording import Recording
+from .recording import PageRecorder
 from .server import AddressError
-from .viewer import FRAME, LARGEST_PORT, PORT, Viewer
-from .words import Allow, Hold, LetGo, ModeRequest, Record, Release, Reset, Stop, Word
+from .viewer import DEFAULT_PORT, FRAME_PERIOD_S, MAX_PORT, Viewer
+from .words import Allow, Hold, LetGo, ModeRequest, PageMessage, Record, Release, Reset, Stop
 from .words import Push as PushWord
 
-KEPT = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-NEWEST = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-SIMULATIONS = ("sim_node", "board")
-PUSH, PUSH_TIME = 60.0, 0.2  # N, s
-SLOPE = 0.175  # rad, of the page's slope
+LATCHED_QOS = QoSProfile(depth=10, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+LATEST_QOS = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+SIMULATOR_NODES = ("sim_node", "board")
+PUSH_FORCE_N, PUSH_DURATION_S = 60.0, 0.2
+"""Force of the page's push, N."""
+SLOPE_RAD = 0.175
+"""Inclination of the terrain "slope" of the page."""
 
 
 def _parameter(default: Any, description: str) -> Any:
+    """Declare a node parameter with its default value and description."""
     return attrs.field(default=default, metadata={"description": description})
 
 
 @attrs.frozen
 class ViewParameters:
-    """The node's parameters."""
+    """Parameters of the node.
+
+    Attributes:
+        host: Address of the page's server.
+        port: TCP port of the page, 0 for a free one.
+        record_folder: Folder for recordings.
+    """
 
     host: str = _parameter(
         "127.0.0.1", "address on which the page is served; others than this host's need the token"
     )
-    port: int = _parameter(PORT, "TCP port of the page; 0: any that is free")
+    port: int = _parameter(DEFAULT_PORT, "TCP port of the page; 0: any that is free")
     record_folder: str = _parameter("out", "folder for recordings that the page starts")
 
     def __attrs_post_init__(self) -> None:
-        if not 0 <= self.port <= LARGEST_PORT:
-            raise ValueError(f"port is {self.port}, expected 0 to {LARGEST_PORT}")
+        if not 0 <= self.port <= MAX_PORT:
+            raise ValueError(f"port is {self.port}, expected 0 to {MAX_PORT}")
 
 
 class View(Node):
-    """The page, what it shows, and what it asks for."""
+    """The operator page with its subscriptions, publishers and service clients."""
 
     def __init__(self) -> None:
         super().__init__("view")
         settings = read_parameters(self, ViewParameters)
         self._picture, self._operator = RobotPicture(), Operator()
-        self._waiting: dict[str, deque[bytes]] = {}
-        self._said, self._stop_asked = "", 0.0
-        self._recording = Recording(settings.record_folder)
+        self._pending: dict[str, deque[bytes]] = {}
+        self._status_text, self._stop_sent_at = "", 0.0
+        self._recording = PageRecorder(settings.record_folder)
         self._velocity = self.create_publisher(Twist, "cmd_vel_teleop", 10)
         self._set_mode = self.create_client(SetMode, "controller/set_mode")
         self._enable = self.create_client(SetBool, "controller/enable_walking")
         self._reset_odometry = self.create_client(Trigger, "estimator/reset_odometry")
-        self._resets = [self.create_client(ResetSim, f"{name}/reset") for name in SIMULATIONS]
-        self._pushes = [self.create_client(Push, f"{name}/push") for name in SIMULATIONS]
+        self._resets = [self.create_client(ResetSim, f"{name}/reset") for name in SIMULATOR_NODES]
+        self._pushes = [self.create_client(Push, f"{name}/push") for name in SIMULATOR_NODES]
         for topic, typename in TOPICS.items():
             self._subscribe(topic, typename)
         try:
-            self._viewer = Viewer(settings.host, settings.port, self._on_word, self._on_leave)
+            self._viewer = Viewer(settings.host, settings.port, self._on_message, self._on_disconnect)
         except AddressError as error:
             raise StartError(str(error)) from None
         steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(FRAME, self._show, clock=steady)
-        self.create_timer(PERIOD, self._drive, clock=steady)
+        self.create_timer(FRAME_PERIOD_S, self._draw, clock=steady)
+        self.create_timer(PUBLISH_PERIOD_S, self._publish_velocity, clock=steady)
         self.get_logger().info(f"open {self._viewer.url}")
 
     def destroy_node(self) -> None:
-        """End the page, then the node."""
+        """Stop the page and the recorder, then destroy the node."""
         self._viewer.close()
         self._recording.close()
         super().destroy_node()
 
     def _subscribe(self, topic: str, typename: str) -> None:
+        """Queue the messages of a topic as bytes."""
         package, kind, name = typename.split("/")
-        waiting = self._waiting[topic] = deque(maxlen=10 if topic in ("/diagnostics", *LATCHED) else 1)
+        waiting = self._pending[topic] = deque(maxlen=10 if topic in ("/diagnostics", *LATCHED) else 1)
         self.create_subscription(
             getattr(import_module(f"{package}.{kind}"), name),
             topic if topic in ("/diagnostics", "/tf_static") else topic[1:],
             lambda message: waiting.append(message),
-            KEPT if topic in LATCHED else NEWEST,
+            LATCHED_QOS if topic in LATCHED else LATEST_QOS,
             raw=True,
         )
 
-    def _show(self) -> None:
-        """Thirty times a second: read what came, draw it, where somebody looks or a STOP waits to be seen through."""
+    def _draw(self) -> None:
+        """Update picture and page (30 Hz), if a page is open or a STOP is not acknowledged yet."""
         if not self._viewer.is_watched and not self._operator.stopped:
             return
         now = time.monotonic()
-        for topic, waiting in self._waiting.items():
+        for topic, waiting in self._pending.items():
             while waiting:
-                self._picture.read(
+                self._picture.update_lazily(
                     topic, partial(STORE.deserialize_cdr, waiting.popleft(), TOPICS[topic]), now
                 )
         self._viewer.show(
-            self._picture, self._operator, now, said=self._said, recording=self._recording.file, playback=None
+            self._picture,
+            self._operator,
+            now,
+            said=self._status_text,
+            recording=self._recording.file,
+            playback=None,
         )
 
-    def _drive(self) -> None:
-        """Twenty times a second: the velocity that is held; and STOP again until the joints brake."""
+    def _publish_velocity(self) -> None:
+        """Publish the held velocity (20 Hz), and repeat the STOP until the joints are damped."""
         now = time.monotonic()
         velocity = self._operator.velocity(now)
         if velocity is not None:
             twist = Twist()
             twist.linear.x, twist.linear.y, twist.angular.z = velocity.tolist()
             self._velocity.publish(twist)
-        if self._operator.is_unheeded(self._mode(now), now - self._stop_asked):
-            self._ask_to_stop()
+        if self._operator.should_resend_stop(self._mode(now), now - self._stop_sent_at):
+            self._send_stop()
 
     def _mode(self, now: float) -> str:
+        """Return the mode of the controller, or "" if its state is stale."""
         return self._picture.state.mode_name if self._picture.is_fresh("/controller/state", now) else ""
 
-    def _ask_to_stop(self) -> None:
-        self._stop_asked = time.monotonic()
+    def _send_stop(self) -> None:
+        """Request the passive mode."""
+        self._stop_sent_at = time.monotonic()
         self._call(self._set_mode, SetMode.Request(mode="passive"), "STOP")
 
-    # What a page says; it comes in the server's thread, and is heeded in the executor's.
+    # Messages of the page arrive in the server's thread and are executed in the executor's.
 
-    def _on_word(self, page: int, word: Word) -> None:
-        self._soon(partial(self._heed, page, word))
+    def _on_message(self, page: int, word: PageMessage) -> None:
+        """Schedule the execution of a message."""
+        self._run_in_executor(partial(self._execute, page, word))
 
-    def _on_leave(self, page: int) -> None:
-        self._soon(lambda: self._operator.let_go(page, time.monotonic()))
+    def _on_disconnect(self, page: int) -> None:
+        """Schedule the end of the hold of a page that disconnected."""
+        self._run_in_executor(lambda: self._operator.end_hold(page, time.monotonic()))
 
-    def _soon(self, task: Any) -> None:
+    def _run_in_executor(self, task: Any) -> None:
+        """Run a function in the executor's thread."""
         if self.executor is not None:
             self.executor.create_task(task)
 
-    def _heed(self, page: int, word: Word) -> None:
+    def _execute(self, page: int, word: PageMessage) -> None:
+        """Execute a message of the page.
+
+        While STOP is latched, only STOP, its release, holds and recording are executed.
+        """
         match word:
             case Stop():
                 self._operator.stop()
                 self.get_logger().warning("STOP was pressed on the page")
-                self._ask_to_stop()
+                self._send_stop()
             case Hold(velocity=velocity):
                 self._operator.hold(page, velocity, time.monotonic())
             case LetGo():
-                self._operator.let_go(page, time.monotonic())
+                self._operator.end_hold(page, time.monotonic())
             case Release():
                 self._operator.release()
                 self.get_logger().info("the STOP was released on the page")
             case Record():
-                self._said = self._recording.toggle()
+                self._status_text = self._recording.toggle()
             case _ if not self._operator.stopped:
-                self._order(word)
+                self._execute_unless_stopped(word)
 
-    def _order(self, word: Word) -> None:
-        """What may not be asked for while STOP is pressed."""
+    def _execute_unless_stopped(self, word: PageMessage) -> None:
+        """Execute the orders that STOP blocks."""
         match word:
             case ModeRequest():
                 self._call(self._set_mode, SetMode.Request(mode=word.mode), word.mode.replace("_", " "))
@@ -173,17 +198,20 @@ class View(Node):
             case Reset(terrain=terrain):
                 self._reset(terrain)
             case PushWord(to=side):
-                force = Vector3(y=-PUSH if side == "right" else PUSH)
-                request = Push.Request(body="trunk", wrench=Wrench(force=force), duration=PUSH_TIME)
-                self._call(_ready(self._pushes), request, "push")
+                force = Vector3(y=-PUSH_FORCE_N if side == "right" else PUSH_FORCE_N)
+                request = Push.Request(body="trunk", wrench=Wrench(force=force), duration=PUSH_DURATION_S)
+                self._call(_ready_client(self._pushes), request, "push")
 
     def _reset(self, terrain: str) -> None:
-        """Put the simulated robot back: a jump to another place is a fault of a robot that is not passive."""
-        slope = SLOPE if terrain == "slope" else 0.0
+        """Reset the simulated robot through passive mode.
+
+        In other modes a jump in position is a fault.
+        """
+        slope = SLOPE_RAD if terrain == "slope" else 0.0
         request = ResetSim.Request(keyframe="lie", terrain=terrain, slope=slope)
 
         def put_back() -> None:
-            self._call(_ready(self._resets), request, "reset", then=start_odometry)
+            self._call(_ready_client(self._resets), request, "reset", then=start_odometry)
 
         def start_odometry() -> None:
             if self._reset_odometry.service_is_ready():
@@ -195,25 +223,31 @@ class View(Node):
             put_back()
 
     def _call(self, client: Any, request: Any, what: str, then: Callable[[], None] = lambda: None) -> None:
-        """Call a service, show its answer, and where it was a success do what comes `then`."""
+        """Call a service, show its answer, and call `then` on success."""
         if not client.service_is_ready():
-            self._said = f"{what}: nobody is there who could"
+            self._status_text = f"{what}: the service is not available"
             return
 
         def answered(future: Any) -> None:
             response = future.result()
-            self._said = response.message if response.success else f"{what} refused: {response.message}"
+            self._status_text = (
+                response.message if response.success else f"{what} refused: {response.message}"
+            )
             if response.success:
                 then()
 
         client.call_async(request).add_done_callback(answered)
 
 
-def _ready(clients: list[Any]) -> Any:
-    """The first whose service is there, or the first."""
+def _ready_client(clients: list[Any]) -> Any:
+    """Return the first client whose service is available, or else the first client."""
     return next((client for client in clients if client.service_is_ready()), clients[0])
 
 
 def main(args: list[str] | None = None) -> None:
-    """Entry point of the node. It has the priority of the robot's own nodes, as STOP comes through it."""
+    """Run the node. It has the priority of the robot's own nodes, because it transmits the STOP.
+
+    Args:
+        args: Arguments of ROS 2; those of the process if None.
+    """
     run(View, args)

@@ -1,4 +1,4 @@
-"""The page as a whole: viser's scene, the web server, and what both show. Where the picture comes from is others' matter."""
+"""The complete page: scene, web server and readings. The caller supplies the picture."""
 
 from __future__ import annotations
 
@@ -11,33 +11,43 @@ from .picture import RobotPicture
 from .scene import Scene
 from .scene_server import SceneServer, SceneServerError
 from .server import AddressError, PageServer
-from .words import Word
+from .words import PageMessage
 
-FRAME = 1.0 / 30.0
-"""s, between two pictures"""
-PORT = 8770
-"""TCP port of the page, unless told otherwise"""
-LARGEST_PORT = 65535
-"""of TCP"""
+FRAME_PERIOD_S = 1.0 / 30.0
+"""Time between two frames."""
+DEFAULT_PORT = 8770
+"""Default TCP port of the page."""
+MAX_PORT = 65535
+"""Largest TCP port."""
 
 
 class Viewer:
-    """Serves the page from the time it is made until `close`. on_word, on_leave: as of PageServer, in its thread."""
+    """Serves the page from construction until `close`.
+
+    Args:
+        host: Address to listen on.
+        port: TCP port, 0 for a free one.
+        on_message: Receives the number of a page and its message, in the server's thread.
+        on_disconnect: Receives the number of a page that disconnected, in the server's thread.
+
+    Raises:
+        AddressError: The address is unavailable, or the scene cannot start.
+    """
 
     def __init__(
         self,
         host: str,
         port: int,
-        on_word: Callable[[int, Word], None],
-        on_leave: Callable[[int], None],
+        on_message: Callable[[int, PageMessage], None],
+        on_disconnect: Callable[[int], None],
     ) -> None:
         try:
             self._scene_server = SceneServer()
         except SceneServerError as error:
-            raise AddressError(f"the scene can't be drawn: {error}") from None
+            raise AddressError(f"the scene cannot be drawn: {error}") from None
         try:
             self._scene = Scene(self._scene_server.viser)
-            self._page = PageServer(host, port, self._scene_server.path, on_word, on_leave)
+            self._page = PageServer(host, port, self._scene_server.path, on_message, on_disconnect)
         except BaseException:
             self._scene_server.close()
             raise
@@ -45,15 +55,22 @@ class Viewer:
 
     @property
     def is_watched(self) -> bool:
-        """Whether somebody has the page open."""
+        """Whether a page is open."""
         return self._page.is_watched
 
     def show(self, picture: RobotPicture, operator: Operator, now: float, **more: Any) -> None:
-        """One picture, and the readings, to which `more` is added. now: s, on the clock of the picture."""
+        """Draw a frame and send the readings.
+
+        Args:
+            picture: The state of the robot.
+            operator: Hold and STOP.
+            now: s, on the clock of the picture.
+            more: Further readings.
+        """
         self._scene.draw(picture)
-        self._page.tell({**panel(picture, operator, now), **more})
+        self._page.send_to_pages({**panel(picture, operator, now), **more})
 
     def close(self) -> None:
-        """End both servers."""
+        """Stop both servers."""
         self._page.close()
         self._scene_server.close()

@@ -1,4 +1,4 @@
-"""The schema of what a page may send to `/words`: one record for each order of the operator. No ROS, no sockets."""
+"""Schema of the messages that a page sends to `/words`, one record per order."""
 
 from __future__ import annotations
 
@@ -6,47 +6,54 @@ from typing import Literal, TypeAlias
 
 import msgspec
 
-LARGEST_WORD = 4096
-"""bytes of one message"""
-LONGEST_REASON = 120
-"""characters of a refusal; a WebSocket's close frame holds 123 bytes"""
+MAX_MESSAGE_BYTES = 4096
+"""Largest size of one message."""
+MAX_REASON_CHARS = 120
+"""Longest rejection sentence; the close frame of a WebSocket holds 123 bytes."""
 
 
-class WordError(ValueError):
-    """A message that the schema refuses; one sentence in ASCII, at most LONGEST_REASON characters."""
+class PageMessageError(ValueError):
+    """A message does not match the schema.
+
+    One ASCII sentence of at most MAX_REASON_CHARS characters.
+    """
 
     def __init__(self, error: object) -> None:
-        super().__init__(f"not understood: {error}".encode("ascii", "replace").decode()[:LONGEST_REASON])
+        super().__init__(f"not understood: {error}".encode("ascii", "replace").decode()[:MAX_REASON_CHARS])
 
 
-class _Word(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
-    """The field `do` names the order; no other fields than those of its record are accepted."""
+class _Order(msgspec.Struct, tag_field="do", forbid_unknown_fields=True):
+    """Base of all orders. The field `do` selects the record; unknown fields are rejected."""
 
 
-class Stop(_Word, tag="stop"):
-    """Brake the joints at once, until Release."""
+class Stop(_Order, tag="stop"):
+    """Damp the joints at once, until Release."""
 
 
-class Release(_Word, tag="release"):
-    """End the STOP."""
+class Release(_Order, tag="release"):
+    """Release the STOP."""
 
 
-class Hold(_Word, tag="hold"):
-    """The operator holds this velocity: vx, vy (m/s), wz (rad/s), body frame."""
+class Hold(_Order, tag="hold"):
+    """Hold a velocity.
+
+    Attributes:
+        velocity: vx, vy (m/s), wz (rad/s), body frame.
+    """
 
     velocity: tuple[float, float, float]
 
 
-class LetGo(_Word, tag="let_go"):
-    """The operator holds nothing."""
+class LetGo(_Order, tag="let_go"):
+    """End the hold."""
 
 
-class Record(_Word, tag="record"):
-    """Start a recording, or finish the one that runs."""
+class Record(_Order, tag="record"):
+    """Start a recording, or finish the current one."""
 
 
-class ModeRequest(_Word):
-    """Request a mode of the controller, which is the name of the order."""
+class ModeRequest(_Order):
+    """Request the mode of the controller that has the name of the order."""
 
     @property
     def mode(self) -> str:
@@ -55,7 +62,7 @@ class ModeRequest(_Word):
 
 
 class Passive(ModeRequest, tag="passive"):
-    """The joints brake; the way out of a fault."""
+    """Damp the joints; also resets a fault."""
 
 
 class StandUp(ModeRequest, tag="stand_up"):
@@ -67,68 +74,84 @@ class Stance(ModeRequest, tag="stance"):
 
 
 class Walk(ModeRequest, tag="walk"):
-    """Let the policy drive."""
+    """Walk with the policy."""
 
 
 class LieDown(ModeRequest, tag="lie_down"):
     """Lie down."""
 
 
-class Allow(_Word, tag="allow"):
-    """Allow walking."""
+class Allow(_Order, tag="allow"):
+    """Permit walking."""
 
 
-class Reset(_Word, tag="reset"):
-    """Put the simulated robot back; terrain: "" keeps the ground."""
+class Reset(_Order, tag="reset"):
+    """Reset the simulated robot.
+
+    Attributes:
+        terrain: The new terrain; "" keeps the present one.
+    """
 
     terrain: Literal["", "flat", "slope", "rough"] = ""
 
 
-class Push(_Word, tag="push"):
-    """Push the simulated robot to one side."""
+class Push(_Order, tag="push"):
+    """Push the simulated robot sideways.
+
+    Attributes:
+        to: The direction.
+    """
 
     to: Literal["left", "right"]
 
 
-class Play(_Word, tag="play"):
-    """Play a recording, or pause it."""
+class Play(_Order, tag="play"):
+    """Toggle play and pause of a recording."""
 
 
-class Seek(_Word, tag="seek"):
-    """Go to a time of a recording, s since its beginning."""
+class Seek(_Order, tag="seek"):
+    """Jump to a time of a recording.
+
+    Attributes:
+        time: s since its start.
+    """
 
     time: float
 
 
-class Pace(_Word, tag="pace"):
-    """Play at this multiple of real time."""
+class Pace(_Order, tag="pace"):
+    """Set the playback speed.
+
+    Attributes:
+        pace: Multiple of real time.
+    """
 
     pace: float
 
 
-Word: TypeAlias = (
+PageMessage: TypeAlias = (
     Stop | Release | Hold | LetGo | Record | Allow | Reset | Push
     | Passive | StandUp | Stance | Walk | LieDown
     | Play | Seek | Pace
 )  # fmt: skip
-_DECODER: msgspec.json.Decoder[Word] = msgspec.json.Decoder(Word)
+_DECODER: msgspec.json.Decoder[PageMessage] = msgspec.json.Decoder(PageMessage)
 
 
-def read_word(text: str | bytes) -> Word:
-    """Read one message of a page.
+def parse_message(text: str | bytes) -> PageMessage:
+    """Parse one message of a page.
 
     Args:
-        text: JSON, at most LARGEST_WORD long.
+        text: JSON of at most MAX_MESSAGE_BYTES.
 
     Returns:
-        The record of its order. All its numbers are finite.
+        The record of the order; all its numbers are finite.
 
     Raises:
-        WordError: The text is too long, is not JSON, or does not match the schema.
+        PageMessageError: The text is too long, is not JSON, or does not match the schema.
     """
-    if len(text) > LARGEST_WORD:
-        raise WordError(f"{len(text)} bytes, expected at most {LARGEST_WORD}")
+    if len(text) > MAX_MESSAGE_BYTES:
+        raise PageMessageError(f"{len(text)} bytes, expected at most {MAX_MESSAGE_BYTES}")
     try:
         return _DECODER.decode(text)
     except (ValueError, RecursionError) as error:
-        raise WordError(error) from None
+        raise PageMessageError(error) from None

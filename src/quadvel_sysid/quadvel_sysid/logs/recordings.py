@@ -12,7 +12,7 @@ from typing import Any
 import attrs
 import numpy as np
 
-from quadvel_recordings.joint_log import Series, expect_commands, read_joint_log, shared
+from quadvel_recordings.joint_log import Series, common_joints, read_joint_log, require_commands
 from quadvel_recordings.reading import RecordingError
 
 from .log import Array, Log, LogError, joint_name
@@ -50,7 +50,7 @@ def read_recording(path: Path, topics: Topics) -> Log:
     warnings: list[str] = []
     try:
         found = read_joint_log(path, topics.state, topics.command, remarks.append, warnings.append)
-        state, command = found.state, expect_commands(path, found)
+        state, command = found.state, require_commands(path, found)
     except RecordingError as error:
         raise LogError(str(error)) from None
     joints = _joints(path, state, command, remarks)
@@ -83,7 +83,7 @@ def read_recording(path: Path, topics: Topics) -> Log:
 
 def _joints(path: Path, state: Series, command: Series, remarks: list[str]) -> list[str]:
     """Joints that both states and commands name."""
-    joints = shared(state.joints, command.joints)
+    joints = common_joints(state.joints, command.joints)
     if not joints:
         found = f"found {', '.join(command.joints[:3])}, ..."
         raise LogError(

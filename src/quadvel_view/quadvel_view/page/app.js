@@ -1,12 +1,12 @@
-// The operator's page: shows what the server says thirty times a second, and says what the operator holds and presses.
+// The operator page: shows the readings that the server sends at 30 Hz, and sends the operator's holds and orders.
 "use strict";
 
-const AGAIN = 50;          // ms between two words of a hand that holds something
-const TURN = 1.6;          // rad/s at the pad's edge, per m/s of the speed that is set, 1.2 at most
-const SIDEWAYS = 0.6;      // share of the speed that is set
-const SECONDS = 10;        // of the graphs
-const SILENT = 1.5;        // s without news, of which thirty a second are expected
-const SLOW = 30_000;       // ms after which the 3-D view should have been loaded
+const HOLD_PERIOD_MS = 50;  // ms between two messages of a hold
+const TURN_PER_SPEED = 1.6;  // rad/s at the pad's edge per m/s of the selected speed, which counts up to 1.2
+const SIDEWAYS_SHARE = 0.6;  // share of the selected speed
+const GRAPH_DURATION_S = 10;  // s shown in the graphs
+const NEWS_TIMEOUT_S = 1.5;  // s without readings, which are expected at 30 Hz
+const SCENE_TIMEOUT_MS = 30_000;  // ms after which the 3-D view should be loaded
 const DASH = "\u2013";
 const AXES = [["forward", "m/s"], ["left", "m/s"], ["turn", "rad/s"]];
 const LEGS = ["FR", "FL", "RR", "RL"], JOINTS = ["hip", "thigh", "calf"];
@@ -15,7 +15,7 @@ const $ = (id) => document.getElementById(id);
 let socket = null;
 let state = null;
 
-function say(word) {
+function send(word) {
   if (socket && socket.readyState === WebSocket.OPEN) socket.send(JSON.stringify(word));
 }
 
@@ -28,50 +28,50 @@ function connect() {
     document.body.classList.add("lost");
     $("mode").className = "pill fault";
     $("mode").textContent = "no connection";
-    $("reason").textContent = "the page lost `quadvel view`; it tries again";
+    $("reason").textContent = "connection to `quadvel view` lost; reconnecting";
     $("refusal").textContent = "";
-    letGo();
+    releaseAll();
     setTimeout(connect, 1000);
   };
 }
 
-// Hands: what is held, by pointer or by key. Nothing is said of a hand that holds nothing.
+// Input: what is held, by pointer or by key. Without a hold no messages are sent.
 
 const held = { pad: null, strafe: null, keys: new Set() };
 const KEYS = { KeyW: [1, 0, 0], KeyS: [-1, 0, 0], KeyA: [0, 0, 1], KeyD: [0, 0, -1], KeyQ: [0, 1, 0], KeyE: [0, -1, 0],
                ArrowUp: [1, 0, 0], ArrowDown: [-1, 0, 0], ArrowLeft: [0, 0, 1], ArrowRight: [0, 0, -1] };
 let wasHeld = false;
 
-function wanted() {
+function heldVelocity() {
   const share = [0, 0, 0];
   if (held.pad) { share[0] += held.pad[1]; share[2] += held.pad[0]; }
   if (held.strafe) share[1] += held.strafe[0];
   for (const key of held.keys) KEYS[key].forEach((value, axis) => { share[axis] += value; });
   const speed = Number($("speed").value);
-  const scale = [speed, SIDEWAYS * speed, TURN * Math.min(speed, 1.2)];
+  const scale = [speed, SIDEWAYS_SHARE * speed, TURN_PER_SPEED * Math.min(speed, 1.2)];
   return share.map((value, axis) => Math.max(-1, Math.min(1, value)) * scale[axis]);
 }
 
 function isHeld() { return held.pad !== null || held.strafe !== null || held.keys.size > 0; }
 
-function speak() {
-  if (isHeld()) { say({ do: "hold", velocity: wanted() }); wasHeld = true; }
-  else if (wasHeld) { say({ do: "let_go" }); wasHeld = false; }
+function sendHold() {
+  if (isHeld()) { send({ do: "hold", velocity: heldVelocity() }); wasHeld = true; }
+  else if (wasHeld) { send({ do: "let_go" }); wasHeld = false; }
 }
 
-function letGo() {
-  for (const name of ["pad", "strafe"]) { held[name] = null; place($(name), 0, 0); $(name).classList.remove("held"); }
+function releaseAll() {
+  for (const name of ["pad", "strafe"]) { held[name] = null; placeKnob($(name), 0, 0); $(name).classList.remove("held"); }
   held.keys.clear();
-  speak();
+  sendHold();
 }
 
-function place(element, x, y) {
+function placeKnob(element, x, y) {
   const knob = element.querySelector(".knob");
   knob.style.setProperty("--x", `${x}px`);
   knob.style.setProperty("--y", `${y}px`);
 }
 
-// name: the element that is dragged; both: whether it goes up and down, too.
+// name: id of the dragged element; both: whether it also moves vertically.
 function draggable(name, both) {
   const element = $(name);
   const follow = (event) => {
@@ -80,10 +80,10 @@ function draggable(name, both) {
     const far = Math.hypot(x, y), most = (box.width - element.querySelector(".knob").offsetWidth) / 2;
     if (far > most) { x *= most / far; y *= most / far; }
     held[name] = [-x / most, -y / most];
-    place(element, x, y);
-    speak();
+    placeKnob(element, x, y);
+    sendHold();
   };
-  const end = () => { held[name] = null; place(element, 0, 0); element.classList.remove("held"); speak(); };
+  const end = () => { held[name] = null; placeKnob(element, 0, 0); element.classList.remove("held"); sendHold(); };
   element.addEventListener("pointerdown", (event) => {
     event.preventDefault();
     element.focus({ preventScroll: true });
@@ -95,26 +95,26 @@ function draggable(name, both) {
   for (const over of ["pointerup", "pointercancel", "lostpointercapture"]) element.addEventListener(over, end);
 }
 
-function stopOrRelease() { say({ do: state && state.stopped ? "release" : "stop" }); }
+function toggleStop() { send({ do: state && state.stopped ? "release" : "stop" }); }
 
 addEventListener("keydown", (event) => {
   if (document.body.classList.contains("playing")) return;
-  if (event.code === "Space") { event.preventDefault(); if (!event.repeat) { letGo(); say({ do: "stop" }); } }
+  if (event.code === "Space") { event.preventDefault(); if (!event.repeat) { releaseAll(); send({ do: "stop" }); } }
   else if (event.code in KEYS && !event.ctrlKey && !event.altKey && event.target.type !== "range") {
     event.preventDefault();
     held.keys.add(event.code);
   }
 });
-addEventListener("keyup", (event) => { if (event.code === "Space") event.preventDefault(); if (held.keys.delete(event.code)) speak(); });
-for (const over of ["blur", "pagehide"]) addEventListener(over, letGo);
-// A click into the scene must not keep the space bar from us.
+addEventListener("keyup", (event) => { if (event.code === "Space") event.preventDefault(); if (held.keys.delete(event.code)) sendHold(); });
+for (const over of ["blur", "pagehide"]) addEventListener(over, releaseAll);
+// After a click into the scene, return the focus, so that the space bar still works.
 addEventListener("blur", () => setTimeout(() => { if (document.activeElement === $("scene")) { $("scene").blur(); window.focus(); } }));
-document.addEventListener("visibilitychange", () => { if (document.hidden) letGo(); });
-setInterval(speak, AGAIN);
+document.addEventListener("visibilitychange", () => { if (document.hidden) releaseAll(); });
+setInterval(sendHold, HOLD_PERIOD_MS);
 
 // Readings.
 
-const past = [];  // [ms, commanded, measured]
+const samples = [];  // [ms, commanded, measured]
 
 let heardAt = performance.now();
 
@@ -127,7 +127,7 @@ function show(news) {
   $("operator").hidden = playing;
   $("playback").hidden = !playing;
   $("simulation").hidden = !news.simulated;
-  $("mode").textContent = news.mode.replace("_", " ") || (playing ? "recording" : "silent");
+  $("mode").textContent = news.mode.replace("_", " ") || (playing ? "recording" : "no data");
   $("mode").className = `pill ${news.mode}`;
   $("reason").textContent = playing && !news.mode ? news.playback.name : news.reason;
   $("refusal").textContent = news.refusal;
@@ -137,8 +137,8 @@ function show(news) {
   $("record").lastElementChild.textContent = news.recording ? "Recording" : "Record";
   document.querySelectorAll("#modes button").forEach((one) => one.classList.toggle("on", one.dataset.do === news.mode));
   if (playing) showPlayback(news.playback);
-  past.push([performance.now(), news.commanded, news.measured]);
-  while (past.length && past[0][0] < performance.now() - 1000 * SECONDS) past.shift();
+  samples.push([performance.now(), news.commanded, news.measured]);
+  while (samples.length && samples[0][0] < performance.now() - 1000 * GRAPH_DURATION_S) samples.shift();
 }
 
 function drawReadings() {
@@ -153,26 +153,26 @@ function drawReadings() {
     bar.className = `bar ${share > 0.95 ? "full" : share > 0.7 ? "high" : ""}`;
   });
   const { rate, period, compute, missed } = state.loop;
-  const rows = rate === undefined ? [["", "silent"]]
-    : [["rate", text(rate, 0, " Hz")], ["period", text(period, 1, " ms")], ["compute", text(compute && compute / 1000, 1, " ms")], ["missed", missed]];
+  const rows = rate === undefined ? [["", "no data"]]
+    : [["rate", numberText(rate, 0, " Hz")], ["period", numberText(period, 1, " ms")], ["compute", numberText(compute && compute / 1000, 1, " ms")], ["missed", missed]];
   fill(document.querySelector("#loop dl"), rows.flatMap(([name, value]) => [["dt", name], ["dd", value]]));
   showLamps(state.lamps);
   const silence = (performance.now() - heardAt) / 1000;
-  fill($("notices"), [...state.notices, ...(silence > SILENT ? [`no news from quadvel view for ${silence.toFixed(0)} s`] : [])].map((one) => ["li", one]));
+  fill($("notices"), [...state.notices, ...(silence > NEWS_TIMEOUT_S ? [`no data from quadvel view for ${silence.toFixed(0)} s`] : [])].map((one) => ["li", one]));
 }
 
-// A number for people; a dash where it is not there.
-function text(value, digits, unit = "") { return value === null ? DASH : value.toFixed(digits) + unit; }
+// Format a number; a dash if it is unknown.
+function numberText(value, digits, unit = "") { return value === null ? DASH : value.toFixed(digits) + unit; }
 
 function fill(parent, children) {
   parent.replaceChildren(...children.map(([tag, text]) => Object.assign(document.createElement(tag), { textContent: text })));
 }
 
-let lampsShown = "";
+let shownLamps = "";
 function showLamps(lamps) {
   const text = JSON.stringify(lamps);
-  if (text === lampsShown) return;
-  lampsShown = text;
+  if (text === shownLamps) return;
+  shownLamps = text;
   $("lamps").replaceChildren(...lamps.map((lamp) => {
     const item = document.createElement("li"), words = document.createElement("span");
     item.className = lamp.level;
@@ -189,7 +189,7 @@ function drawGraph(canvas, axis) {
   const ratio = devicePixelRatio || 1, width = canvas.clientWidth * ratio, height = canvas.clientHeight * ratio;
   if (canvas.width !== width || canvas.height !== height) { canvas.width = width; canvas.height = height; }
   const context = canvas.getContext("2d"), now = performance.now();
-  const most = Math.max(0.6, ...past.map(([, asked, got]) => Math.max(Math.abs(asked[axis] ?? 0), Math.abs(got[axis] ?? 0))));
+  const most = Math.max(0.6, ...samples.map(([, asked, got]) => Math.max(Math.abs(asked[axis] ?? 0), Math.abs(got[axis] ?? 0))));
   context.clearRect(0, 0, width, height);
   context.fillStyle = "#252c37";
   context.fillRect(0, height / 2, width, ratio);
@@ -198,9 +198,9 @@ function drawGraph(canvas, axis) {
     context.lineWidth = 1.5 * ratio;
     context.beginPath();
     let gap = true;
-    for (const one of past) {
+    for (const one of samples) {
       if (one[which][axis] === null) { gap = true; continue; }
-      context[gap ? "moveTo" : "lineTo"](width * (1 - (now - one[0]) / (1000 * SECONDS)), height * (0.5 - 0.46 * one[which][axis] / most));
+      context[gap ? "moveTo" : "lineTo"](width * (1 - (now - one[0]) / (1000 * GRAPH_DURATION_S)), height * (0.5 - 0.46 * one[which][axis] / most));
       gap = false;
     }
     context.stroke();
@@ -221,7 +221,7 @@ function showPlayback({ time, length, playing, pace, name }) {
   document.querySelectorAll("#paces button").forEach((one) => one.classList.toggle("on", Number(one.dataset.pace) === pace));
 }
 
-// Set up.
+// Initialisation.
 
 AXES.forEach(([name, unit]) => {
   const graph = document.createElement("div");
@@ -237,22 +237,22 @@ LEGS.forEach((leg) => {
 });
 draggable("pad", true);
 draggable("strafe", false);
-$("stop").addEventListener("click", () => { letGo(); stopOrRelease(); });
-const FIELDS = { reset: () => ({ terrain: $("ground").value }), push: (button) => ({ to: button.dataset.to }) };  // of the words that have some
-document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => say({ do: one.dataset.do, ...FIELDS[one.dataset.do]?.(one) })));
+$("stop").addEventListener("click", () => { releaseAll(); toggleStop(); });
+const FIELDS = { reset: () => ({ terrain: $("ground").value }), push: (button) => ({ to: button.dataset.to }) };  // fields of the orders that have any
+document.querySelectorAll("[data-do]").forEach((one) => one.addEventListener("click", () => send({ do: one.dataset.do, ...FIELDS[one.dataset.do]?.(one) })));
 $("speed").addEventListener("input", () => { $("top").textContent = `${Number($("speed").value).toFixed(1)} m/s`; });
 $("speed").dispatchEvent(new Event("input"));
-$("play").addEventListener("click", () => say({ do: "play" }));
-$("time").addEventListener("input", () => { seeking = true; say({ do: "seek", time: Number($("time").value) }); });
+$("play").addEventListener("click", () => send({ do: "play" }));
+$("time").addEventListener("input", () => { seeking = true; send({ do: "seek", time: Number($("time").value) }); });
 $("time").addEventListener("change", () => { seeking = false; });
-document.querySelectorAll("#paces button").forEach((one) => one.addEventListener("click", () => say({ do: "pace", pace: Number(one.dataset.pace) })));
+document.querySelectorAll("#paces button").forEach((one) => one.addEventListener("click", () => send({ do: "pace", pace: Number(one.dataset.pace) })));
 setInterval(drawReadings, 100);
 
 addEventListener("message", (event) => { if (event.source === $("scene").contentWindow && event.data === "drawn") $("loading").hidden = true; });
-setTimeout(() => { $("loading").textContent = "no 3-D view yet: this browser may lack WebGL, or be short of time"; }, SLOW);
+setTimeout(() => { $("loading").textContent = "no 3-D view yet: this browser may lack WebGL, or be too busy"; }, SCENE_TIMEOUT_MS);
 
-// Under the other name of this host the scene is another site to the browser, and is drawn in another process than ours. A
-// token's cookie stays with the name that it was set for.
+// With the other name of this host the scene is another site, which the browser renders in another process. With a token
+// both have the same name, because its cookie is bound to the name that set it.
 const OTHER_NAME = "withToken" in $("scene").dataset ? {} : { "127.0.0.1": "localhost", localhost: "127.0.0.1" };
 $("scene").src = `${location.protocol}//${OTHER_NAME[location.hostname] || location.hostname}:${location.port}/scene/?darkMode`;
 connect();
