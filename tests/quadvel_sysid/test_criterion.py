@@ -9,10 +9,10 @@ from quadvel_sysid.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
     DataSplit,
-    clusters,
+    cluster_starts,
     noise_variance,
-    normality,
-    whiteness,
+    normality_p_values,
+    whiteness_p_values,
 )
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.signals import Samples
@@ -21,7 +21,7 @@ BEGIN, END = 2.0, 4.0  # s, of a stand
 
 
 def starts_of(log: Log) -> np.ndarray:
-    return clusters(Samples([log]))
+    return cluster_starts(Samples([log]))
 
 
 def standing(log: Log, sway: float, rate: float) -> Log:
@@ -53,7 +53,7 @@ def test_what_shakes_all_joints_alike_counts_once() -> None:
     called = 0
     for _ in range(400):
         before = slow() + rng.normal(size=(5000, 6))
-        called += parts.compare(before, before - 0.05 * slow(), rows).p < SIGNIFICANCE_LEVEL
+        called += parts.compare(before, before - 0.05 * slow(), rows).p_value < SIGNIFICANCE_LEVEL
     assert called <= 12
 
 
@@ -79,8 +79,8 @@ def test_noise_is_white_and_normal_and_what_is_not_is_told_of_its_joint() -> Non
     noise[:, 1] += 0.3 * np.sin(np.arange(3000) / 20.0)
     noise[::150, 2] += 4.0
     rows, start = np.ones(noise.shape, dtype=bool), np.arange(3000) == 0
-    assert (whiteness(noise, rows, start) < WHITENESS_LEVEL).tolist() == [False, True, False]
-    assert (normality(noise, rows) < WHITENESS_LEVEL).tolist() == [False, False, True]
+    assert (whiteness_p_values(noise, rows, start) < WHITENESS_LEVEL).tolist() == [False, True, False]
+    assert (normality_p_values(noise, rows) < WHITENESS_LEVEL).tolist() == [False, False, True]
 
 
 def test_the_noise_of_a_torque_shows_without_a_model() -> None:

@@ -61,7 +61,7 @@ def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
     report = identify([fitted], [clipped]).report
     assert report["effects"] == []
     after = report["after"]
-    left = f"held-out data leave {after['heldout_mse']:.3g} N^2 m^2 where the fitted ones leave {after['train_mse']:.3g}:"
+    left = f"held-out error is {after['heldout_mse']:.3g} N^2 m^2, the error of the fitted data {after['train_mse']:.3g}:"
     assert left in report["decision"]
     plain = identify([fitted], [held_out]).report
     assert "held-out data leave" not in plain["decision"]

@@ -46,7 +46,7 @@ def test_rare_blows_that_no_signal_foretells_are_not_passed_over_as_noise():
     assert report["unexplained"]["verdict"] == "structured"
     assert report["unexplained"]["depends_on"] == []
     assert report["unexplained"]["joints"] == [log.joints[1]]
-    assert "goes with no signal of the log" in report["decision"]
+    assert "uncorrelated with every logged signal" in report["decision"]
 
 
 def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):

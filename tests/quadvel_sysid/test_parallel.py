@@ -12,7 +12,7 @@ from simulated_joints import NAMES, parameters, record
 
 from quadvel_actuator import Effect
 from quadvel_sysid.identify import identify
-from quadvel_sysid.parallel import side_by_side
+from quadvel_sysid.parallel import parallel_map
 from quadvel_sysid.signals import Samples
 
 
@@ -23,7 +23,7 @@ def samples():
 
 def test_answers_are_those_of_one_core_and_name_the_samples_that_are_here(samples):
     for cores in (1, 2):
-        found = side_by_side(lambda k: (k * k, samples), 4, cores, samples)
+        found = parallel_map(lambda k: (k * k, samples), 4, cores, samples)
         assert [square for square, _ in found] == [0, 1, 4, 9]
         assert all(one is samples for _, one in found)
 
@@ -37,9 +37,9 @@ def of_the_helper(act):
 def test_an_error_of_the_work_and_the_end_of_a_helper_come_out(samples):
     for work in (lambda k: 1 // 0, of_the_helper(lambda k: 1 // 0)):
         with pytest.raises(ZeroDivisionError):
-            side_by_side(work, 4, 2, samples)
+            parallel_map(work, 4, 2, samples)
     with pytest.raises(ChildProcessError, match="killed"):
-        side_by_side(of_the_helper(lambda k: os.kill(os.getpid(), signal.SIGKILL)), 4, 2, samples)
+        parallel_map(of_the_helper(lambda k: os.kill(os.getpid(), signal.SIGKILL)), 4, 2, samples)
 
 
 def test_a_helper_ends_with_the_work_that_was_broken_off(samples, monkeypatch):
@@ -57,7 +57,7 @@ def test_a_helper_ends_with_the_work_that_was_broken_off(samples, monkeypatch):
     monkeypatch.setattr(os, "fork", remembered)
     here, begun = os.getpid(), time.monotonic()
     with pytest.raises(KeyboardInterrupt):
-        side_by_side(work, 4, 2, samples)
+        parallel_map(work, 4, 2, samples)
     assert time.monotonic() - begun < 5.0
     assert len(helpers) == 1
     assert not Path(f"/proc/{helpers[0]}").exists()

@@ -189,14 +189,14 @@ def _run(
         material, long = _material(logs, holdout, joints, names, topics, gains, messages, tell)
         if not long:
             keep_freed_arrays()
-        from .identify import identified
+        from .identify import identify_prepared
 
         cores = cores or (1 if long else min(CORES, len(os.sched_getaffinity(0))))
         with threadpool_limits(1):  # of each copy of this process: they share the cores
-            found = identified(material, parameters, cores, tell, robot)
-    from .report.report import write
+            found = identify_prepared(material, parameters, cores, tell, robot)
+    from .report.report import write_report
 
-    write(found, out)
+    write_report(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
     console.print(errors(found.report), soft_wrap=True, highlight=False)

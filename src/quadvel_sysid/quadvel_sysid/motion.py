@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .eam import LONGEST_INPUT
+from .eam import MAX_INPUT_DELAY_S
 from .logs.log import Log, LogError
 from .signals import Array, Bools, Samples
 
@@ -169,7 +169,7 @@ def implied(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     coarse, ddq = spans(log)
     samples = Samples([coarse])
     if body is None:
-        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP)
+        delays = np.arange(0.0, MAX_INPUT_DELAY_S, _DELAY_STEP)
         body = min((_fitted(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
         for joint, inertia in zip(log.joints, body.inertia, strict=True):
             if inertia <= 0.0:

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from .criterion import DataSplit, clusters, encoder_variance, noise_variance
+from .criterion import DataSplit, cluster_starts, encoder_variance, noise_variance
 from .eam import Eam, fit_eam
 from .identification_data import IdentificationData
 from .logs.excerpts import evened, jitters
@@ -77,8 +77,8 @@ def split_rows(samples: Samples, material: IdentificationData, shortest: float) 
     spans = [one.log.duration for one in samples.logs]
     length = float(np.clip(min(spans) / _BLOCKS, shortest, _LONGEST))
     block = np.floor(samples.t / length).astype(int)
-    if material.heldout:
-        report = samples.log_of_row >= material.fitted
+    if material.has_heldout:
+        report = samples.log_of_row >= material.fitted_count
         select = (block % 2 == 1) & ~report
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
@@ -93,7 +93,7 @@ def split_rows(samples: Samples, material: IdentificationData, shortest: float) 
                 f"expected {_LEAST_ROWS} or more"
             )
     overlap = 0 if material.body is None else 1
-    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
+    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], cluster_starts(samples), overlap)
 
 
 def reference_gains(samples: Samples) -> tuple[float, float]:
