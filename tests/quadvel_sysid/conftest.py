@@ -1,4 +1,4 @@
-"""Makes `simulated_joints`, which lies beside the tests, importable by name."""
+"""Makes the helper modules of this folder importable by name."""
 
 import sys
 from pathlib import Path

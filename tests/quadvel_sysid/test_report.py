@@ -1,4 +1,4 @@
-"""The files of an identification: complete, readable by themselves, and all of them or none."""
+"""Files of a report: complete, self-contained, and written all together."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def identification(**changes: Any) -> Identification:
 
 
 class Page(HTMLParser):
-    """Checks that tags close, and gathers text and what the page would load."""
+    """Checks that tags close, and collects the text and the resources that the page loads."""
 
     VOID = ("meta", "br", "img", "hr")
 
@@ -172,7 +172,7 @@ def test_the_page_is_well_formed_and_loads_nothing(page: Page) -> None:
     assert len(page.ids) == len(set(page.ids))
 
 
-def test_the_page_says_the_decision_first_and_shows_what_it_stands_on(page: Page) -> None:
+def test_the_page_starts_with_the_decision_and_shows_its_evidence(page: Page) -> None:
     text = page.text
     assert DECISION in text
     order = [
@@ -193,7 +193,7 @@ def test_the_page_says_the_decision_first_and_shows_what_it_stands_on(page: Page
         assert word in text
 
 
-def test_what_was_not_told_apart_comes_with_the_motion_that_would(page: Page) -> None:
+def test_indistinguishable_effects_are_listed_with_a_distinguishing_motion(page: Page) -> None:
     assert (
         "To distinguish stribeck_friction from coulomb_friction, record slow motion around standstill"
         in page.text
@@ -203,16 +203,14 @@ def test_what_was_not_told_apart_comes_with_the_motion_that_would(page: Page) ->
     assert "quadvel excite solo" in page.text
 
 
-def test_written_again_the_page_is_the_same_to_the_byte_and_other_files_stay(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_second_write_gives_the_same_bytes_and_keeps_other_files(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
     write_report(identification(), tmp_path)
     assert (tmp_path / "report.html").read_bytes() == (folder / "report.html").read_bytes()
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_a_report_that_cannot_be_written_leaves_the_former_one_whole(folder: Path) -> None:
+def test_a_failed_write_keeps_the_former_report(folder: Path) -> None:
     former = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match="not JSON compliant"):
         write_report(identification(noise_floor=float("nan")), folder)
@@ -221,7 +219,7 @@ def test_a_report_that_cannot_be_written_leaves_the_former_one_whole(folder: Pat
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == former
 
 
-def test_a_report_without_effects_says_so(tmp_path: Path) -> None:
+def test_a_report_without_effects_states_that(tmp_path: Path) -> None:
     white = {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
     bare = identification(effects=[], rejected=[], unexplained=white, decision="Nothing significant.")
     write_report(attrs.evolve(bare, shapes=(), traces={}), tmp_path)

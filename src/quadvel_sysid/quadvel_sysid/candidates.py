@@ -94,9 +94,7 @@ class Candidates:
         )
 
     def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
-        """The model, refitted from nearby delays if that is better: regressors are screened at one
-        delay pair.
-        """
+        """Refit a regressor from nearby delays if that is better; its screening used one pair."""
         if not isinstance(fitted.last_effect.law, SignalTerm):
             return fitted
         other = FittedModel(fit_near_delays(fitted.model, self._evaluator.parts.fit), self._evaluator)
@@ -118,7 +116,7 @@ class Candidates:
             rows = evaluator.parts.fit
             model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
         starts = [model, near] if law.shifts or law.confounded_with_gain else [model]
-        fitted = min((evaluator.fit(start) for start in starts), key=lambda candidate: candidate.criterion)
+        fitted = min((evaluator.fit(start) for start in starts), key=lambda one: one.criterion)
         return evaluator.restrict_joints(fitted, len(fitted.model.effects) - 1).model
 
 

@@ -148,9 +148,7 @@ class Comparison:
 
     @property
     def p_value(self) -> float:
-        """The smaller of two p-values: all joints pooled, and the best joint after Bonferroni
-        correction.
-        """
+        """Smaller p-value of all joints pooled and the best joint (Bonferroni-corrected)."""
         sums = (
             x.sum(axis=1, keepdims=True) for x in (self.error_reduction, self.score, self.noise, self.rows)
         )

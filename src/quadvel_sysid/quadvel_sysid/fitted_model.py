@@ -54,8 +54,7 @@ class FittedModel:
 
     @cached_property
     def criterion(self) -> float:
-        """Information criterion: the sum over joints of ln(mse / noise variance), plus a parameter
-        penalty.
+        """Information criterion: sum over joints of ln(mse / noise) plus the parameter penalty.
 
         The logarithm is twice the negative log-likelihood of a row for normal noise of unknown
         variance. Lower is better.
@@ -184,7 +183,7 @@ class ModelEvaluator:
         if not needed.any() or (needed == effect.active).all():
             return fitted
         fewer = self.fit(fitted.model.with_replaced_effect(index, attrs.evolve(effect, active=needed)))
-        return min(fitted, fewer, key=lambda effect: effect.criterion)
+        return min(fitted, fewer, key=lambda one: one.criterion)
 
     def share_across_joints(self, fitted: FittedModel, index: int) -> FittedModel:
         """Share the values of an effect between joints, if that lowers the criterion.

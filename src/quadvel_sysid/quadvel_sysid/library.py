@@ -177,7 +177,7 @@ class SignalTerm(AddedLaw):
             return np.broadcast_to(total * factor(self.times, s, x), s.q.shape)
         weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
         columns = (
-            self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(weight, s) for weight in x])
+            self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(inputs, s) for inputs in x])
         )
         if columns.ndim == 3 and weights.ndim == 2:
             return np.einsum("kj,knj->nj", weights, columns)
@@ -295,15 +295,17 @@ def law_candidates(context: Context) -> Iterator[EffectLaw]:
             yield from law.variants(context)
 
 
-_LAG_TIMES_S = np.geomspace(0.01, 1.0, 8)  # s
-_RESONANCE_FREQUENCIES_HZ, _DAMPING_RATIOS = (
-    np.geomspace(3.0, 110.0, 26),
-    (0.02, 0.07, 0.2),
-)  # Hz, of the critical one
-_HISTORY_S = 0.02  # s
-_WAVE_RATES = np.arange(3.0, 120.0, 0.5)  # rad/rad
+_LAG_TIMES_S = np.geomspace(0.01, 1.0, 8)
+_RESONANCE_FREQUENCIES_HZ = np.geomspace(3.0, 110.0, 26)
+_DAMPING_RATIOS = 0.02, 0.07, 0.2
+_HISTORY_S = 0.02
+"""Span of filters over a signal's past, s."""
+_WAVE_RATES = np.arange(3.0, 120.0, 0.5)
+"""Phase of a wave per angle of the joint, rad/rad."""
 _CURVE_PIECES = 6
+"""Pieces of a curve."""
 _FINE_PIECES, _MAX_PIECES = 25, 100
+"""Pieces of a fine curve, and of the finest one after refinement."""
 
 
 def term_candidates(context: Context) -> Iterator[SignalTerm]:

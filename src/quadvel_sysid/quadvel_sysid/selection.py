@@ -104,8 +104,7 @@ class Search:
         return () if best is None else best.last_effect.law.inputs  # type: ignore[attr-defined]
 
     def prune(self, fitted: FittedModel) -> FittedModel:
-        """Simplify a model: drop effects and joints, use special cases of laws, share values and
-        gains.
+        """Simplify a model: fewer effects and joints, special cases, shared values and gains.
 
         Args:
             fitted: A fitted model.
@@ -146,9 +145,7 @@ class Search:
         )
 
     def _replace_by_special_case(self, fitted: FittedModel, index: int) -> FittedModel:
-        """Replace a law by its special case (Stribeck friction by Coulomb's), unless selection rows
-        need it.
-        """
+        """Replace a law by its special case (Stribeck by Coulomb friction), unless rows need it."""
         effect = fitted.model.effects[index]
         special_case = effect.law.special_case(dict(zip(effect.law.names, effect.values, strict=True)))
         if special_case is None:
@@ -191,7 +188,7 @@ class Search:
     def _add_best(self, before: FittedModel, kinds: str) -> FittedModel | None:
         """The model with the best candidate added; None if no candidate passes the test."""
         candidates = [*self._candidates(before, kinds), *self._finer_groupings(before)]
-        candidates.sort(key=lambda candidate: candidate.criterion)
+        candidates.sort(key=lambda one: one.criterion)
         self._record_rivals(before, candidates)
         for candidate in candidates:
             reason = self._rejection_reason(before, candidate)
