@@ -54,7 +54,7 @@ SWITCHES: dict[str, dict[str, Any]] = {
     "half as many fits": {"candidates.MAX_FITTED_LAWS": 3, "candidates.MAX_FITTED_TERMS": 2},
     "three valleys of delays": {"fit._DELAY_STARTS": 1},
     "far delays": {"fit._FAR_DELAY_CHANGES_S": ()},
-    "laws before terms": {"selection._term_count": lambda account: account.criterion},
+    "laws before terms": {"selection._term_count": lambda fitted: fitted.criterion},
     "nesting": {"selection.Search._replace_by_special_case": _identity_method},
     "no repeats": {"selection.duplicates_effect": lambda *_: False},
     "elimination": {"selection.Search.eliminate": _identity_method},

@@ -50,7 +50,7 @@ def test_error_and_p_value_come_from_rows_that_select_nothing():
     """A change of the reported rows changes neither the effects nor the training error."""
     log = _log(FRICTION)
     first = identify([log]).report
-    block = (log.t / 0.2).astype(int) % 5 == 4  # s; as `preparation.divided` has it
+    block = (log.t / 0.2).astype(int) % 5 == 4  # s, as in `preparation.split_rows`
     loud = log.tau.copy()
     loud[block] += 0.5 * (-1.0) ** (log.t[block, None] * 500.0).round()
     second = identify([attrs.evolve(log, tau=loud)]).report

@@ -21,9 +21,9 @@ from .signals import Array, Bools
 CONFIDENCE_LEVEL = 0.95
 """Coverage of the intervals."""
 _CLOCK_ERROR_S = 0.25e-3
-"""Systematic error of delays and time constants, s: a log does not record the clock of the drive."""
+"""Systematic error of delays and time constants, s: a log does not record the drive's clock."""
 _SYSTEMATIC_FRACTION, _SYSTEMATIC_GAIN_FRACTION = 0.01, 0.005
-"""Systematic error, relative to an effect's value and to a gain: samples of the motion are noisy."""
+"""Systematic error relative to an effect's value, and to a gain: motion samples are noisy."""
 _EQUIVALENT_ERROR_RATIO = 1.003
 """Ratio of squared errors below which another form of a law explains the log equally well."""
 
@@ -93,7 +93,7 @@ def _random_half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
     inverse /= np.outer(scale, scale)
 
     # Two covariances of the form H^-1 M H^-1; the larger variance of each unknown counts:
-    #     white residuals:   M = sum_j s_j^2 J_j'J_j                (s_j^2: error variance of joint j)
+    #     white residuals:   M = sum_j s_j^2 J_j'J_j              (s_j^2: error variance of joint j)
     #     cluster-robust:    M = sum_c g_c g_c',  g_c = sum over the rows of cluster c of J'r
     noise = np.sum(residual**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
     white = unknowns.accumulate(noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))

@@ -195,8 +195,8 @@ def whiteness_p_values(residual: Array, rows: Bools, start: Bools, noise_overlap
     """
     # Ljung-Box statistic with autocorrelations r_k of the n samples of a joint:
     #     Q = sum_{k=m+1}^{m+h} n^2 r_k^2 / (number of pairs at lag k)
-    # Noise correlated over m lags gives r_k the variance (1 + 2 sum_{k<=m} r_k^2) / n (Bartlett), so
-    # that Q / (1 + 2 sum_{k<=m} r_k^2) has a chi-squared distribution with h degrees of freedom.
+    # Noise correlated over m lags gives r_k the variance (1 + 2 sum_{k<=m} r_k^2) / n (Bartlett),
+    # so that Q / (1 + 2 sum_{k<=m} r_k^2) has a chi-squared distribution with h degrees of freedom.
     # The mean is not subtracted: an offset is structure, too.
     residual = np.where(rows, residual, 0.0)
     power = np.sum(residual * residual, axis=0) + 1e-300
@@ -242,8 +242,8 @@ def cluster_starts(samples: Samples) -> NDArray[np.intp]:
     Returns:
         Row at which each cluster begins, (C,).
     """
-    # Intervals of CLUSTER_DURATION_S first; those in which no joint has left the range of the angles
-    # since the last start by CLUSTER_MOTION_RAD are merged.
+    # Intervals of CLUSTER_DURATION_S; merged while the angles of all joints stay within
+    # CLUSTER_MOTION_RAD of those in the first interval of the cluster.
     at = np.floor(samples.t / CLUSTER_DURATION_S).astype(int) + 10**7 * samples.log_of_row
     starts = np.flatnonzero(np.diff(at, prepend=at[0] - 1))
     q = samples.at(0.0, 0.0, 0.0).q

@@ -20,7 +20,7 @@ DRIVE_STEP_S = 0.001
 _DELAY_STEP_S = 5e-5  # s
 _RELATIVE_TOLERANCE = 1e-9  # of the error
 _CHI2_99 = 9.21
-"""99 % quantile of chi-squared with 2 degrees of freedom (two delays), times the noise variance."""
+"""99 % quantile of chi-squared with 2 degrees of freedom, for the two delays."""
 _REFINEMENT_STEPS_S = (0.25 * DRIVE_STEP_S, 0.125 * DRIVE_STEP_S, 0.0625 * DRIVE_STEP_S)
 _ROUND_OFF_STEPS = 1e-6  # of a step
 

@@ -180,7 +180,8 @@ class _CrossProducts:
         Returns:
             The pair of delays with the least mean squared error, with its gains.
         """
-        # Cramer's rule for [aa ab; ab bb] [g0 g1]' = [az bz]'. Where b is 0 or collinear with a, g1 = 0.
+        # Cramer's rule for [aa ab; ab bb] [g0 g1]' = [az bz]'; g1 = 0 where b is 0 or collinear to
+        # a.
         aa, ab, bb, az, bz = self._aa, self._ab, self._bb, self._az, self._bz
         det, ridge = aa * bb - ab * ab, 1e-12 * (aa + bb) ** 2 + 1e-300
         g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))

@@ -68,7 +68,7 @@ def _fitted_rows_only(model: Model, rows: Bools) -> tuple[Model, Bools]:
 
 _TOTAL_DELAY_CHANGES_S = np.arange(-0.003, 0.0031, 0.0005)
 _OUTPUT_DELAY_CHANGES_S = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
-"""Grid of delays, s: changes of their sum, and of the output delay. Step commands make local minima."""
+"""Grid of delays, s: changes of their sum, and of the output delay."""
 _FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
 """Further changes of the sum alone, s: a missing effect may have biased the delays by so much."""
 _DELAY_STARTS = 3
@@ -88,8 +88,9 @@ def fit_delay_profile(model: Model, rows: Bools, cores: int = 1) -> Model:
     Returns:
         The model with the least squared error, among `model` and the fits.
     """
-    # Profile likelihood: at each pair of delays one step adapts the other parameters. Full fits start
-    # from the pairs with the least error, as step commands give the error several local minima.
+    # Profile likelihood: at each pair of delays one step adapts the other parameters. Full fits
+    # start from the pairs with the least error, as step commands give the error several local
+    # minima.
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     shifts = (
         *product(_TOTAL_DELAY_CHANGES_S, _OUTPUT_DELAY_CHANGES_S),

@@ -66,8 +66,8 @@ def prepare(
         first, body = implied(logs[0])
         logs = [first, *(implied(log, body)[0] for log in logs[1:])]
     rows = values // (len(logs) * len(logs[0].joints))
-    # One script may have generated all logs. Excerpts of held-out logs therefore lie between those of
-    # the fitted logs in time.
+    # One script may have generated all logs. Excerpts of held-out logs therefore lie between those
+    # of the fitted logs in time.
     parts = [pieces(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
     chosen = tuple(log for part in parts for log in part)
     fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)

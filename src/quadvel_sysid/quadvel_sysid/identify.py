@@ -45,7 +45,7 @@ from .signals import Array, Bools, Samples
 _SEARCH_VALUES, _MAX_SEARCH_STEP_S = 30_000, 0.002
 """Torque values that the search uses, unless their rows are further apart (s). The fit uses all."""
 _REPLAY_ERROR_RATIO = 0.9
-"""Replay error of a larger model, relative to that of a smaller one, below which it is preferred."""
+"""Ratio of the replay error of a larger to a smaller model below which the larger one is chosen."""
 
 
 def identify(

@@ -41,12 +41,12 @@ from .signals import Array, Bools, Signals
 _CACHE_SIZE = 12
 """Number of cached sets of regressors."""
 _regressor_cache: dict[tuple[Any, ...], tuple[Shape, Signals, Array]] = {}
-"""Cached regressors, most recent last. An entry keeps the objects alive whose `id` is in its key."""
+"""Cached regressors, most recent last. Entries keep the objects alive whose `id` is in the key."""
 _DRIVE_SIGNALS = "q_des", "error", "tau"
 _MEMORY_COST = 0.5
 """Further cost, in parameters, of a law with memory or one that resembles a delay."""
 _SIGNAL_COST = 5.0
-"""Cost, in parameters, of each signal of a regressor. Its weights are free, as a penalty smooths them."""
+"""Cost, in parameters, of each signal of a regressor. Its penalised weights cost nothing."""
 
 
 @cache
@@ -268,7 +268,8 @@ class Context:
         others = np.concatenate([s.q, s.dq, self.torque], axis=1)
         found = []
         for j in range(len(joints)):
-            # With Z the signals orthogonal to the joint's own ones, Z'r^2 / Z'Z is the error reduction.
+            # For a signal z, orthogonal to the joint's own ones, (z'r)^2 / z'z is the error
+            # reduction.
             keep = self.parts.fit[:, j]
             own = np.column_stack([np.ones(keep.sum()), s.q[keep, j], s.dq[keep, j], s.q_des[keep, j]])
             basis, _ = np.linalg.qr(own)

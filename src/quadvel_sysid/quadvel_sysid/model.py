@@ -191,8 +191,8 @@ class Model:
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
         """Evaluate the torque at the rows of `samples`, without upsampling."""
-        # tau = x + sum_i f_i(x) + sum_k g_k(x + sum_i f_i(x)), with the drive torque x, the added laws f_i,
-        # and the added laws g_k that read the total torque.
+        # tau = x + sum_i f_i(x) + sum_k g_k(x + sum_i f_i(x)), with the drive torque x, the added
+        # laws f_i, and the added laws g_k that read the total torque.
         x = self._drive_torque(gains, values)
         added = [pair for pair in zip(self.effects, values, strict=True) if _is_added(pair[0])]
         total = x
@@ -464,7 +464,7 @@ _MAX_GAIN_RATIO = 4.0
 RELATIVE_STEP = 0.01
 """Finite-difference step, as a fraction of the parameter's scale."""
 DELAY_STEP_S = 0.0003
-"""Half the span of the central difference along a delay, s. Commands are steps, so it is not small."""
+"""Half the span of central differences along a delay, s; not small, as commands are steps."""
 
 
 def _parameter_slots(

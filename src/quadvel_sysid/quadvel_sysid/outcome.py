@@ -38,7 +38,7 @@ _DELTAS = "delta_kp", "delta_kd"
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
 """Units of the report's numbers."""
 _MIN_REMOVABLE = 0.05
-"""Minimum error of the plain EAM above the noise floor, relative to the floor, to state a fraction."""
+"""Minimum error of the plain EAM above the noise floor, relative to it, to state a fraction."""
 
 _SAME_DELAY_MS = 0.05
 """Difference of delays between joints, ms, below which they count as equal."""

@@ -105,8 +105,8 @@ class CandidateScreening:
             solutions = [points[law.has_memory].best_start(law, table) for law, table in with_starts]
             return points[False].baseline_sse, solutions
 
-        # Profile over the delays: the baseline is the best grid point without a candidate, and each law
-        # is scored at its own best grid point.
+        # Profile over the delays: the baseline is the best grid point without a candidate, and each
+        # law is scored at its own best grid point.
         found = parallel_map(solve_at, len(self._grid), self._cores, self.context.samples)
         self.baseline_sse = np.min([baseline for baseline, _ in found], axis=0)
         return [
@@ -232,8 +232,9 @@ class DelayGridPoint:
         residual = (model.samples.tau - predicted)[rows] * weight  # (n, J)
         slopes = slopes[:, :, rows] * weight.T[:, None]  # (J, A, n)
 
-        # The parameters of effects belong to one joint each: with an orthonormal basis B of their columns
-        # every other column c becomes (I - B B') c. Gains and delays are shared by joints and stay columns.
+        # Parameters of effects belong to one joint each: with an orthonormal basis B of their
+        # columns every other column c becomes (I - B B') c. Gains and delays are shared by joints
+        # and stay columns.
         shared_slots = [0, 1, slopes.shape[1] - 2, slopes.shape[1] - 1]
         self.basis = [
             _orthonormal_basis(one[np.linalg.norm(one, axis=1) > 0.0]) for one in slopes[:, 2:-2]
@@ -302,6 +303,8 @@ class DelayGridPoint:
         found = []
         model, groups = self.model, np.arange(joints)
         if law.stage == Stage.ADDED:
+            # Regressors phi_l of tau = ... + sum_l w_l phi_l, at the starts of the other
+            # parameters.
             x, rows = self.drive_torque(AppliedEffect(law, all_joints, table[0], groups)), self.rows
             if len(x) > len(self.screening.rows) and not law.has_memory:
                 x, rows = x[rows], slice(None)
@@ -310,6 +313,7 @@ class DelayGridPoint:
                 effect = AppliedEffect(law, all_joints, values, groups)
                 found.append(linear_columns(model, effect, x)[:, rows].transpose(2, 0, 1))
         else:
+            # d tau = tau(with the law at its start) - tau, for an amplitude of 1.
             base = self.torque
             for first in range(0, len(table), _BATCH_SIZE):
                 values = table[first : first + _BATCH_SIZE]
@@ -344,9 +348,9 @@ class DelayGridPoint:
         Returns the squared error (J,), the best start of each joint, the change (4, J) of gains and
         delays, and the weights (J, L) of the regressors.
         """
-        # Linear model of joint j at start s: residual r = C'w + S'b + noise, with the regressors C (L, n)
-        # and weights w of the candidate, and the derivatives S (4, n) and changes b of gains and delays.
-        # cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r.
+        # Linear model of joint j at start s: residual r = C'w + S'b + noise, with the regressors
+        # C (L, n) and weights w of the candidate, and the derivatives S (4, n) and changes b of
+        # gains and delays. cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r.
         joints, size = columns.shape[1:3]
         cc = columns @ columns.swapaxes(-1, -2)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
@@ -359,15 +363,16 @@ class DelayGridPoint:
         ss = self.shared_slopes @ self.shared_slopes.swapaxes(-1, -2)
         sr = np.einsum("jkn,jn->jk", self.shared_slopes, self.residual)
 
-        # For given b the best weights are w = cc^-1 (cr - cs b). They leave the reduced problem in b
-        #     error(b) = r'r - cr'cc^-1 cr - 2 g'b + b'H b,   g = sr - cs'cc^-1 cr,   H = ss - cs'cc^-1 cs
+        # For given b the best weights are w = cc^-1 (cr - cs b). The reduced problem in b is
+        #     error(b) = r'r - cr'cc^-1 cr - 2 g'b + b'H b
+        #     g = sr - cs'cc^-1 cr,   H = ss - cs'cc^-1 cs
         # (the Schur complement of cc in the normal equations).
         error = np.einsum("jn,jn->j", self.residual, self.residual) - np.einsum("sjl,sjl->sj", cr, local)
         gradient = sr - np.einsum("sjlk,sjl->sjk", cs, local)
         hessian = ss - np.einsum("sjlk,sjlm->sjkm", cs, cc_cs)
 
-        # The best start of each joint depends on b, which joints share. Alternate twice: begin with a b of
-        # each joint's own, solve b for the chosen starts, and choose the starts again for this b.
+        # The best start of each joint depends on b, which joints share. Alternate twice: begin with
+        # a separate b of each joint, solve b for the chosen starts, and choose the starts again.
         joint_error = error - np.einsum("sjk,sjk->sj", gradient, _ridge_solve(hessian, gradient))
         joint, choice = np.arange(joints), np.argmin(joint_error, axis=0)
         for _ in range(2):
@@ -404,7 +409,7 @@ class DelayGridPoint:
             total[np.ix_(at, at)] += hessian[j]
             right[at] += gradient[j]
         change = _ridge_solve(total, right)
-        # Delays, the last unknowns, stay where the linearisation is valid; the gains then follow them.
+        # Delays, the last unknowns, stay in the range of the linearisation; the gains follow them.
         is_delay = np.arange(self.count) >= self.index[2].min()
         beyond = is_delay & (np.abs(change) > _MAX_DELAY_CHANGE_S)
         if beyond.any():
