@@ -25,7 +25,7 @@ from rich.progress import track
 
 from tests.identification import adapter, table
 from tests.identification.hidden.cases import GROUP_OF, make_case
-from tests.identification.judge import score_report
+from tests.identification.verdicts import score_report
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "results" / "identification_score.md"

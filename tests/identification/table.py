@@ -1,4 +1,4 @@
-"""Tables of the score: rows of `judge.score_report` as Markdown and CSV."""
+"""Tables of the score: rows of `verdicts.score_report` as Markdown and CSV."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ import pytest
 
 from tests.identification import adapter
 from tests.identification.hidden.cases import make_case
-from tests.identification.judge import score_report
+from tests.identification.verdicts import score_report
 
 
 @pytest.mark.parametrize(

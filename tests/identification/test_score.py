@@ -5,7 +5,7 @@ import json
 import pytest
 
 from tests.identification import adapter, score, table
-from tests.identification.judge import score_report
+from tests.identification.verdicts import score_report
 
 
 def _entry(name, joints=("A_hip_joint",), others=(), **params):

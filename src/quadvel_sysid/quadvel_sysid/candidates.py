@@ -43,6 +43,7 @@ class Candidates:
         self._context = Context(before.model, before.evaluator.parts, before.evaluator.noise)
 
     def _filtered(self, candidates: Iterable[Law]) -> Iterator[Law]:
+        """The candidates to consider."""
         return (one for one in candidates if self._only is None or candidate_key(one) in self._only)
 
     def fitted_candidates(self, kinds: str) -> tuple[list[FittedModel], int]:
@@ -59,10 +60,12 @@ class Candidates:
 
     @cached_property
     def _screening(self) -> CandidateScreening:
+        """Screening on top of the model."""
         return CandidateScreening(self._context, self._evaluator.cores)
 
     @cached_property
     def _laws(self) -> tuple[list[FittedModel], int]:
+        """The best laws, fitted, and the number of screened laws."""
         several = len(self._context.samples.joints) > 1
         found = self._screening.screen_laws(
             one
@@ -74,6 +77,7 @@ class Candidates:
 
     @cached_property
     def _terms(self) -> tuple[list[FittedModel], int]:
+        """The best regressors, refined and fitted, and the number of screened sets of signals."""
         found = self._screening.screen_terms(list(self._filtered(library.term_candidates(self._context))))
         best = _first_distinct(promising(found), MAX_FITTED_TERMS)
         finer = self._parallel_map(lambda k: _refine_term(best[k], self._screening), len(best))
@@ -81,6 +85,7 @@ class Candidates:
         return self._fit_screened(best), len({candidate_key(one.law) for one in found})
 
     def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
+        """Fit the candidates, and share the values of the best ones across joints."""
         fitted = self._fit_parallel(lambda k: self._fit_candidate(chosen[k]), len(chosen))
         fitted.sort(key=lambda one: one.criterion)
         best, others = fitted[:MAX_SHARED_TRIALS], fitted[MAX_SHARED_TRIALS:]
@@ -101,6 +106,7 @@ class Candidates:
         return min(fitted, other, key=lambda one: one.criterion)
 
     def _fit_parallel(self, work: Callable[[int], Model], count: int) -> list[FittedModel]:
+        """Fitted models of several tasks."""
         return [FittedModel(one, self._evaluator) for one in self._parallel_map(work, count)]
 
     def _parallel_map(self, work: Callable[[int], Result], count: int) -> list[Result]:

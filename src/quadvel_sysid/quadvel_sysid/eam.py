@@ -141,30 +141,41 @@ class _CrossProducts:
     def __init__(
         self, samples: Samples, rows: Bools, totals: Array, outputs: Array, window: float, at: float
     ) -> None:
+        """Sum the cross products.
+
+        Args:
+            samples: Rows of logs.
+            rows: Samples to fit, (N, J) bool.
+            totals: Sums of both delays, (T,), s.
+            outputs: Output delays, (D,), s.
+            window: Step of the drive, s; 0 for none.
+            at: Age of the gains that count at a row, s.
+        """
         self._totals, self._outputs, self._window, self._at = totals, outputs, window, at
         self._joints, self._count = len(samples.joints), int(rows.sum())
         self._aa, self._ab, self._bb, self._az, self._bz, self._zz = np.zeros((6, len(totals), len(outputs)))
         offset = 0
-        for one in samples.logs:
-            for first in range(0, len(one.t), _CHUNK_ROWS):
-                t = one.t[first : first + _CHUNK_ROWS]
+        for log in samples.logs:
+            for first in range(0, len(log.t), _CHUNK_ROWS):
+                t = log.t[first : first + _CHUNK_ROWS]
                 here = slice(offset + first, offset + first + len(t))
                 if rows[here].any():
-                    self._add(one, t, samples.tau[here], rows[here].astype(float))
-            offset += len(one.t)
+                    self._add(log, t, samples.tau[here], rows[here].astype(float))
+            offset += len(log.t)
 
-    def _add(self, one: LogSignals, t: Array, tau: Array, keep: Array) -> None:
+    def _add(self, log: LogSignals, t: Array, tau: Array, keep: Array) -> None:
+        """Add the rows at the times `t` of one log; `keep` is 1 on samples to fit, 0 on others."""
         # With a = C - Q, b = D - V and z = tau - F, each product of sums separates, for example
         #     a'a = C'C - 2 C'Q + Q'Q,   C by the row of the sum, Q by the column.
-        packet = one.in_force(t - self._at)
-        kp, kd = (one.gains[name][packet] * keep for name in ("kp", "kd"))
+        packet = log.in_force(t - self._at)
+        kp, kd = (log.gains[name][packet] * keep for name in ("kp", "kd"))
         c, d, f = (
-            _stack_rows(one.command(name, t - late, self._window) * by for late in self._totals)
-            for name, by in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
+            _stack_rows(log.command(name, t - delay, self._window) * factor for delay in self._totals)
+            for name, factor in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
         )
         q, v = (
-            _stack_rows(one.state(name, t - late) * by for late in self._outputs)
-            for name, by in (("q", kp), ("dq", kd))
+            _stack_rows(log.state(name, t - delay) * factor for delay in self._outputs)
+            for name, factor in (("q", kp), ("dq", kd))
         )
         z = (tau * keep).ravel() - f
         self._aa += _row_products(c, c)[:, None] - 2.0 * c @ q.T + _row_products(q, q)
@@ -187,12 +198,12 @@ class _CrossProducts:
         g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))
         g1 = np.where(det > ridge, (aa * bz - ab * az) / np.maximum(det, ridge), 0.0)
         mse = np.maximum(self._zz - g0 * az - g1 * bz, 0.0) / max(self._count, 1)
-        inputs = self._totals[:, None] - self._outputs
-        possible = (inputs >= -1e-9) & (inputs <= MAX_INPUT_DELAY_S + 1e-9)
+        input_delays = self._totals[:, None] - self._outputs
+        possible = (input_delays >= -1e-9) & (input_delays <= MAX_INPUT_DELAY_S + 1e-9)
         at = np.unravel_index(np.argmin(np.where(possible, mse, np.inf)), mse.shape)
-        gains, delays = np.array([g0[at], g1[at]]), (max(inputs[at], 0.0), self._outputs[at[1]])
-        every = np.ones(self._joints)
-        return Eam(gains[:, None] * every, delays[0] * every, delays[1] * every, self._window, float(mse[at]))
+        gains, delays = np.array([g0[at], g1[at]]), (max(input_delays[at], 0.0), self._outputs[at[1]])
+        ones = np.ones(self._joints)
+        return Eam(gains[:, None] * ones, delays[0] * ones, delays[1] * ones, self._window, float(mse[at]))
 
 
 def _stack_rows(signals: Iterable[Array]) -> Array:

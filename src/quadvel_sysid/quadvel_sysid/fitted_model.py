@@ -238,6 +238,6 @@ def joint_groupings(joints: Sequence[str]) -> list[Groups]:
     Returns:
         Group numbers, (J,) each; the grouping by kind only where several joints are of one kind.
     """
-    each = np.arange(len(joints))
+    own = np.arange(len(joints))
     by_kind = joint_kinds(joints)
-    return [by_kind, each] if by_kind.max() + 1 < len(joints) else [each]
+    return [by_kind, own] if by_kind.max() + 1 < len(joints) else [own]

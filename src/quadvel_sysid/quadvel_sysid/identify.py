@@ -193,9 +193,10 @@ def _outcome(
 ) -> Outcome:
     """Collect the results: both models refitted to every row, with errors on the reported rows."""
     parts, samples = preprocessed.parts, preprocessed.samples
-    every = parts.fit_or_select if data.has_heldout else parts.all_rows
+    final_rows = parts.fit_or_select if data.has_heldout else parts.all_rows
     before_all_rows, model_all_rows = (
-        quantised_delays(longest_equivalent_delay(fit(one, every), every), every) for one in (before, model)
+        quantised_delays(longest_equivalent_delay(fit(one, final_rows), final_rows), final_rows)
+        for one in (before, model)
     )
     effects = tuple(
         SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k))
@@ -207,11 +208,21 @@ def _outcome(
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
     commanded = np.ones_like(model_all_rows.gains)
     commanded[1] = 0.0 if samples.undamped else 1.0
-    ideal = pd_torque(samples, commanded, 0.0, 0.0, 0.0)
     return Outcome(
-        before, before_all_rows, model, model_all_rows, effects, rejected, fitted.is_white, correlates,
-        intervals(model_all_rows, attrs.evolve(parts, report=parts.report & every)), ideal, search.evaluator.noise, parts, base,
-    )  # fmt: skip
+        before=before,
+        before_all_rows=before_all_rows,
+        model=model,
+        model_all_rows=model_all_rows,
+        effects=effects,
+        rejected=rejected,
+        is_white=fitted.is_white,
+        residual_correlates=correlates,
+        half_widths=intervals(model_all_rows, attrs.evolve(parts, report=parts.report & final_rows)),
+        ideal_torque=pd_torque(samples, commanded, 0.0, 0.0, 0.0),
+        noise=search.evaluator.noise,
+        parts=parts,
+        base=base,
+    )
 
 
 def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
@@ -282,6 +293,7 @@ class _Replayer:
         }
 
     def _replay(self, model: Model, rows: Bools) -> Replay:
+        """Replay errors of a model on some rows."""
         logs = [one.log for one in self.preprocessed.samples.logs]
         corrected = actuator_parameters(model, self.preprocessed.parts, self.base)
         if self.legs is not None:

@@ -51,11 +51,13 @@ _SIGNAL_COST = 5.0
 
 @cache
 def _weights(count: int) -> tuple[Parameter, ...]:
+    """Parameters of `count` weights."""
     return tuple(Parameter(name, "N m", -1e6, 1e6, 1.0) for name in _names(count))
 
 
 @cache
 def _names(count: int) -> tuple[str, ...]:
+    """Names of `count` weights."""
     return tuple(f"w{k}" for k in range(count))
 
 
@@ -157,6 +159,7 @@ class SignalTerm(AddedLaw):
         return found[2]
 
     def _regressors(self, x: Array, s: Signals) -> Array:
+        """Torque per unit weight, (K, N, J), without the cache."""
         columns = self.shape.columns(self._read(x, s), s.start[:, 0], float(np.median(s.dt)))  # (N, K, C)
         found = np.moveaxis(columns, 1, 0) * factor(self.times, s, x)
         return np.broadcast_to(found, (len(found), *s.q.shape))
@@ -167,15 +170,17 @@ class SignalTerm(AddedLaw):
 
     @override
     def torque(self, x: Array, s: Any, p: Params) -> Array:
-        each = [p[name] for name in self.names]
-        if any(weight.ndim > 1 for weight in each):
-            each = list(np.broadcast_arrays(*each))
+        weight_list = [p[name] for name in self.names]
+        if any(weight.ndim > 1 for weight in weight_list):
+            weight_list = list(np.broadcast_arrays(*weight_list))
         if x.ndim > 2 and (len(x) == 1 or not self.reads_total):
             x = x[0]
-        if x.ndim == 2 and each[0].ndim == 1 and not self.has_memory:
-            total, _ = self.shape.advance(self._read(x, s), 0.0, np.array(each), ())
+        if x.ndim == 2 and weight_list[0].ndim == 1 and not self.has_memory:
+            total, _ = self.shape.advance(self._read(x, s), 0.0, np.array(weight_list), ())
             return np.broadcast_to(total * factor(self.times, s, x), s.q.shape)
-        weights = np.stack(each, axis=-2) if each[0].ndim > 1 else np.array(each)  # (B, 1, K, J), or (K, J)
+        weights = (
+            np.stack(weight_list, axis=-2) if weight_list[0].ndim > 1 else np.array(weight_list)
+        )  # (B, 1, K, J), or (K, J)
         columns = (
             self.regressors(x, s) if x.ndim == 2 else np.stack([self.regressors(inputs, s) for inputs in x])
         )
@@ -361,6 +366,7 @@ class _TermFactory:
         return SignalTerm(of, times, shape, self.joints, at=at)
 
     def _read(self, of: str) -> Array:
+        """Values of a signal, (N, C)."""
         s = self._context.signals
         return read(of, _causal_signals(s) if of.endswith("ddq") else s, self._context.torque, self.joints)
 

@@ -117,14 +117,16 @@ class Search:
             fitted = self._replace_by_special_case(
                 self.evaluator.restrict_joints(self._replace_by_special_case(fitted, k), k), k
             )
-        model, one = fitted.model, np.zeros(len(self.evaluator.noise), dtype=np.intp)
+        model, common = fitted.model, np.zeros(len(self.evaluator.noise), dtype=np.intp)
         if model.gain_groups.any():
             shared = self.evaluator.fit(
-                attrs.evolve(model, gains=_mean_over_joints(model.gains), gain_groups=one)
+                attrs.evolve(model, gains=_mean_over_joints(model.gains), gain_groups=common)
             )
             fitted = min(fitted, shared, key=lambda each: each.criterion)
         if model.delay_groups.any():
-            same = attrs.evolve(fitted.model, delay_groups=one).with_delays(_mean_over_joints(model.delays))
+            same = attrs.evolve(fitted.model, delay_groups=common).with_delays(
+                _mean_over_joints(model.delays)
+            )
             fitted = min(fitted, self.evaluator.fit(same), key=lambda each: each.criterion)
         for k in range(len(fitted.model.effects)):
             fitted = self.evaluator.share_across_joints(fitted, k)
