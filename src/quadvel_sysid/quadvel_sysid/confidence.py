@@ -142,6 +142,7 @@ def parameters_at_bound(model: Model) -> tuple[str, ...]:
     ]
     for effect in model.effects:
         for parameter, values in zip(effect.law.parameters, effect.values, strict=True):
+            # Relative round-off of the bounds.
             reach = 1e-9 * max(abs(parameter.low), abs(parameter.high))
             at_bound = (values <= parameter.low + reach) | (values >= parameter.high - reach)
             if (at_bound & effect.active).any():

@@ -43,7 +43,11 @@ from .selection import Search
 from .signals import Array, Bools, Samples
 
 _SEARCH_VALUES, _MAX_SEARCH_STEP_S = 30_000, 0.002
-"""Torque values that the search uses, unless their rows are further apart (s). The fit uses all."""
+"""Number of torque values that the search uses, and the maximum step of its rows, s.
+
+The step has priority: the search uses more values rather than a larger step. The final fit uses all
+rows.
+"""
 _REPLAY_ERROR_RATIO = 0.9
 """Ratio of the replay error of a larger to a smaller model below which the larger one is chosen."""
 

@@ -206,6 +206,7 @@ def _causal_signals(s: Signals) -> Signals:
     """Signals with an acceleration from past samples only, as a running model computes it."""
     dt = float(np.median(s.dt))
     back = max(1, round(SLOPE / dt))
+    # Backward difference over SLOPE s, shorter at the start of a stretch.
     n = np.arange(len(s.dq))
     began = np.maximum.accumulate(np.where(s.start[:, 0], n, 0))
     slope = (s.dq - s.dq[np.maximum(n - back, began)]) / (back * dt)
@@ -397,6 +398,7 @@ class _TermFactory:
         u = self._read(f"{joint}/q")
         rates = _WAVE_RATES[1.5 * 2.0 * np.pi / max(float(np.ptp(u)), 1e-3) < _WAVE_RATES]
         if rates.size:
+            # Power |sum exp(-i n u) r|^2 of the residual r over the angle u, for each rate n.
             power = np.abs(np.exp(-1j * rates[:, None] * u[:, 0]) @ self._context.residual) ** 2
             yield self(f"{joint}/q", "", Wave(rates[np.argmax(power.max(axis=1))], 2))
 
@@ -409,6 +411,8 @@ class _TermFactory:
         t, left = self._context.signals.t[:, 0], self._context.residual
         span = float(np.ptp(t))
         grid = np.arange(max(2.0, 3.0 / span), 0.45 / self.dt, 0.5 / span)
+        # Periodogram of the residual on regular times, the largest of all joints. The resolution is
+        # 1 / span, and the grid has half that step.
         even = np.arange(t.min(), t.max(), self.dt)
         order = np.argsort(t, kind="stable")
         power = np.zeros(len(grid))
@@ -417,6 +421,7 @@ class _TermFactory:
             found = np.interp(grid, np.fft.rfftfreq(2 * len(even), self.dt), np.abs(spectrum))
             power = np.maximum(power, found)
         for best in np.argsort(-power)[:3]:
+            # Refine each line by |sum_t exp(-2 pi i f t) r(t)|^2 at the true times.
             near = grid[best] + np.linspace(-0.5 / span, 0.5 / span, 21)
             waves = np.exp(-2j * np.pi * np.outer(near, t)) @ left
             frequency = near[int(np.argmax((np.abs(waves) ** 2).sum(axis=1)))]

@@ -182,6 +182,7 @@ class Search:
             if more is None:
                 break
             best = self.evaluator.refine_delays(self.eliminate(more, kept=1))
+            # Further effects gain at most as much as the last one each.
             gained, left = before.criterion - best.criterion, most - len(best.model.effects)
             if best.criterion - left * gained > bound:
                 break
