@@ -1,9 +1,9 @@
-"""What each device of the identification's search is worth: the score without it, on the same logs, one after the other.
+"""Ablation study of the effect search: its score without each device, on the same logs.
 
     python -m tests.identification.ablation --logs 2 --seed 912 --jobs 2 --out out/ablation [--switches nesting,elimination]
 
-Each switch takes one device out. A campaign can be broken off and taken up again, as that of `tests.identification.score`.
-Logs that are told otherwise than with everything are what a device changes: the comparison is paired.
+Each switch disables one device. An interrupted run continues where it stopped, as that of
+`tests.identification.score`. The comparison is paired: it counts the logs whose verdict changes.
 """
 
 from __future__ import annotations
@@ -24,44 +24,47 @@ from rich.console import Console
 from rich.progress import track
 
 from tests.identification.hidden.cases import GROUP_OF
-from tests.identification.score import keep, score_case
+from tests.identification.score import save_row, score_case
 
-WHOLE = "everything"
+BASELINE = "everything"
 
 
-def _same(found: Any, *_: Any, **__: Any) -> Any:
+def _identity(found: Any, *_: Any, **__: Any) -> Any:
+    """Replacement for a function: returns its first argument."""
     return found
 
 
-def _method_same(_: Any, found: Any, *__: Any, **___: Any) -> Any:
+def _identity_method(_: Any, found: Any, *__: Any, **___: Any) -> Any:
+    """Replacement for a method: returns its first argument after self."""
     return found
 
 
 def _fitted_once(self: Any, one: Any) -> Any:
-    evaluator = self._judge
+    """Replacement for the fit of a candidate: one start instead of several."""
+    evaluator = self._evaluator
     return evaluator.restrict_joints(evaluator.fit(one.model), len(one.model.effects) - 1).model
 
 
 SWITCHES: dict[str, dict[str, Any]] = {
-    WHOLE: {},
-    "second starts": {"candidates.Candidates._fit": _fitted_once},
-    "ties at once": {"candidates.SIMPLIFIED": 0},
-    "terms at nearby delays": {"candidates.Candidates._deeper": _method_same},
-    "finer terms": {"candidates._refined": _same},
-    "half as many fits": {"candidates.FITTED": 3, "candidates.FITTED_TERMS": 2},
+    BASELINE: {},
+    "second starts": {"candidates.Candidates._fit_candidate": _fitted_once},
+    "sharing per candidate": {"candidates.MAX_SHARED_TRIALS": 0},
+    "terms at nearby delays": {"candidates.Candidates._refit_near_delays": _identity_method},
+    "finer terms": {"candidates._refine_term": _identity},
+    "half as many fits": {"candidates.MAX_FITTED_LAWS": 3, "candidates.MAX_FITTED_TERMS": 2},
     "three valleys of delays": {"fit._DELAY_STARTS": 1},
     "far delays": {"fit._FAR_DELAY_CHANGES_S": ()},
-    "laws before terms": {"selection._regressor_count": lambda account: account.criterion},
-    "nesting": {"selection.Search._replace_by_special_case": _method_same},
+    "laws before terms": {"selection._term_count": lambda fitted: fitted.criterion},
+    "nesting": {"selection.Search._replace_by_special_case": _identity_method},
     "no repeats": {"selection.duplicates_effect": lambda *_: False},
-    "elimination": {"selection.Search.eliminate": _method_same},
-    "gains of each joint": {"selection.Search._finer_groups": lambda *_: []},
-    "cost of a past": {"library._PAST_COST": 0.0},
+    "elimination": {"selection.Search.eliminate": _identity_method},
+    "gains of each joint": {"selection.Search._finer_groupings": lambda *_: []},
+    "cost of memory": {"library._MEMORY_COST": 0.0},
     "grid of a screening": {
         "screening._TOTAL_DELAY_CHANGES_S": (0.0,),
         "screening._OUTPUT_DELAYS_S": (0.0025,),
     },
-    "kurtosis": {"fitted_model.normality": lambda residual, rows: np.ones(residual.shape[1])},
+    "kurtosis": {"fitted_model.normality_p_values": lambda residual, rows: np.ones(residual.shape[1])},
     "clusters in motion": {"criterion.CLUSTER_MOTION_RAD": 0.0},
     "averaged encoders": {"preparation._steadied": lambda found, _: (found, 0.0)},
     "even clocks": {"preparation.jitters": lambda _: False},
@@ -70,14 +73,24 @@ SWITCHES: dict[str, dict[str, Any]] = {
     },
     "between rows": {"model.BETWEEN": 1, "signals.BETWEEN": 1},
     "losses at random": {"lost_commands._at_random": lambda *_: True},
-    "latest delays": {"identify.longest_equivalent_delay": _same, "identify.quantised_delays": _same},
+    "longest delays": {
+        "identify.longest_equivalent_delay": _identity,
+        "identify.quantised_delays": _identity,
+    },
 }
-"""What is replaced in quadvel_sysid, and by what, to take each device out"""
+"""For each device the names in quadvel_sysid to replace, and the replacements that disable it."""
 
 
 @contextlib.contextmanager
 def without(switches: str) -> Iterator[None]:
-    """The identification without some devices, joined by +."""
+    """Disable some devices of the identification.
+
+    Args:
+        switches: Keys of `SWITCHES`, joined by `+`.
+
+    Yields:
+        Nothing; the devices are restored on exit.
+    """
     with contextlib.ExitStack() as stack:
         for switch in switches.split("+"):
             for name, value in SWITCHES[switch].items():
@@ -86,17 +99,25 @@ def without(switches: str) -> Iterator[None]:
 
 
 def _work(switches: str, kind: str, index: int, seed: int, path: Path) -> None:
+    """Score one log without some devices, into its file."""
     with without(switches):
-        keep(score_case(kind, index, seed), path)
+        save_row(score_case(kind, index, seed), path)
 
 
 def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
-    """Of each switch: logs told otherwise, those right with everything and without, errors and time as ratios."""
+    """Build the table of the study.
+
+    Args:
+        rows: Rows of the score by switch and log; `BASELINE` has every device.
+
+    Returns:
+        Markdown: changed verdicts, right verdicts with and without, and ratios of error and time.
+    """
     lines = [
-        "| without | logs | told otherwise | right with it | without | error left | computing |",
+        "| without | logs | verdict changes | right with it | right without | error ratio | time ratio |",
         "|---|---|---|---|---|---|---|",
     ]
-    whole = rows[WHOLE]
+    whole = rows[BASELINE]
     for switch, found in rows.items():
         both = sorted(found.keys() & whole.keys())
         pairs = [(whole[name], found[name]) for name in both]
@@ -114,14 +135,17 @@ def table(rows: dict[str, dict[str, dict[str, Any]]]) -> str:
 
 
 def main(
-    logs: Annotated[int, typer.Option(help="Logs a kind.")] = 2,
-    switches: Annotated[str, typer.Option(help="Separated by commas; some at once are joined by +.")] = "",
+    logs: Annotated[int, typer.Option(help="Logs of each kind.")] = 2,
+    switches: Annotated[
+        str,
+        typer.Option(help="Keys of SWITCHES, separated by commas; joined by + to disable several together."),
+    ] = "",
     seed: int = 0,
     jobs: int = 2,
-    out: Annotated[Path, typer.Option(help="Where verdicts go.")] = Path("out/ablation"),
+    out: Annotated[Path, typer.Option(help="Folder of the verdicts.")] = Path("out/ablation"),
 ) -> None:
-    """Score the identification without one of its devices after the other."""
-    asked = [WHOLE, *(switches.split(",") if switches else [one for one in SWITCHES if one != WHOLE])]
+    """Score the identification without each of its devices in turn."""
+    asked = [BASELINE, *(switches.split(",") if switches else [one for one in SWITCHES if one != BASELINE])]
     unknown = {one for switch in asked for one in switch.split("+")} - SWITCHES.keys()
     if unknown:
         raise typer.BadParameter(

@@ -1,4 +1,4 @@
-"""The one place where the score touches the tool: files in, report.json's dict out."""
+"""Interface between the score and the identification: files in, the content of report.json out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from typing import Any
 
 
 def identify(logs: list[Path], holdout: list[Path]) -> dict[str, Any]:
-    """The report on NPZ files, as `quadvel identify LOG... [--holdout LOG...]` makes it."""
+    """Identify logs as `quadvel identify LOG... [--holdout LOG...]` does.
+
+    Args:
+        logs: NPZ files to fit.
+        holdout: NPZ files to report on; may be empty.
+
+    Returns:
+        Content of report.json.
+    """
     from quadvel_sysid.identify import identify as run
     from quadvel_sysid.logs.read_log import read_log
 

@@ -1,8 +1,8 @@
-"""How far good logs stay from the limits of the checks: what the constants of `quadvel_sysid.logs.response` rest on.
+"""Margins of the log checks on valid logs, the basis of the constants of `logs.response`.
 
     python -m tests.identification.limits [FOLDER of further logs, .npz]
 
-Looks at two logs of every kind of the blind test, whose effects nobody declared, and at those in FOLDER.
+Evaluates two logs of every kind of the blind test, and those in FOLDER.
 """
 
 from __future__ import annotations
@@ -24,7 +24,14 @@ SHARES = (0, 1, 5, 50, 95, 99, 100)
 
 
 def responses(folder: Path) -> list[Response]:
-    """Of the logs in the folder that have torque and are not refused."""
+    """Measure the response of the joints in all logs of a folder.
+
+    Args:
+        folder: Folder with NPZ files.
+
+    Returns:
+        Responses of the logs that have torque and are not refused.
+    """
     found = []
     for path in sorted(folder.glob("*.npz")):
         try:
@@ -39,7 +46,11 @@ def responses(folder: Path) -> list[Response]:
 
 
 def report(found: list[Response]) -> None:
-    """Percentiles over the joints, and of the lag over the logs."""
+    """Print percentiles over the joints, and those of the lag over the logs.
+
+    Args:
+        found: Responses of all logs.
+    """
     near = [np.flatnonzero(np.abs(one.lags) <= MAX_LAG_S) for one in found]
     lags = [
         one.lags[k][np.log(one.error_share[k] + 1e-6).mean(axis=1).argmin()]
@@ -47,10 +58,10 @@ def report(found: list[Response]) -> None:
     ]
     gains = [one.gain / np.median(one.log.kp, axis=0) for one in found if one.log.kp is not None]
     rows = {
-        "share of the torque that is left": np.concatenate([one.min_error_share for one in found]),
+        "unexplained fraction of the torque": np.concatenate([one.min_error_share for one in found]),
         "partial correlation with the command": np.concatenate([one.command_correlation for one in found]),
-        "share that the position error explains": np.concatenate([one.answered_share for one in found]),
-        "gain over the one commanded": np.concatenate(gains),
+        "fraction that the position error explains": np.concatenate([one.answered_share for one in found]),
+        "ratio of real to commanded gain": np.concatenate(gains),
         "best lag, ms": 1e3 * np.array(lags),
     }
     print(f"{len(found)} logs; percentiles {', '.join(map(str, SHARES))}:")

@@ -1,9 +1,9 @@
-"""Scores the identification on logs whose effect nobody declared.
+"""Benchmark of the identification on logs with undeclared effects (blind test).
 
     python -m tests.identification.score --logs 20 --jobs 2 --out out/identification_score [--kinds cogging,none] [--write]
 
-A campaign can be broken off and taken up again: each log's verdict is a file of its own under DIR/cases. Delete DIR after
-a change of the tool.
+An interrupted run continues where it stopped: the verdict of each log is a file under DIR/cases.
+Delete DIR after a change of the identification.
 """
 
 from __future__ import annotations
@@ -25,22 +25,31 @@ from rich.progress import track
 
 from tests.identification import adapter, table
 from tests.identification.hidden.cases import GROUP_OF, make_case
-from tests.identification.judge import judge
+from tests.identification.verdicts import score_report
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "results" / "identification_score.md"
 
 
 def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
-    """One row of the score. An exception of the tool is a verdict as well."""
+    """Generate one log, identify it and score the report.
+
+    Args:
+        kind: Kind of log, a key of `GROUP_OF`.
+        index: Number of the log.
+        seed: Seed of the benchmark.
+
+    Returns:
+        One row of the score. An exception of the identification is a row with `error`.
+    """
     case = make_case(kind, index, seed)
     with TemporaryDirectory() as folder:
         paths = case.save(Path(folder) / "truth")
-        shown = [path.rename(Path(folder) / path.name) for path in paths]  # without the truth beside it
+        shown = [path.rename(Path(folder) / path.name) for path in paths]  # the truth stays in another folder
         start = time.process_time()
         try:
             report = adapter.identify(shown[:1], shown[1:])
-        except Exception as error:  # whatever it raises, the campaign goes on
+        except Exception as error:  # any exception is a verdict, and the benchmark continues
             found: dict[str, Any] = {
                 "kind": kind,
                 "group": GROUP_OF[kind],
@@ -48,33 +57,42 @@ def score_case(kind: str, index: int, seed: int) -> dict[str, Any]:
                 "trace": traceback.format_exc(),
             }
         else:
-            found = judge(report, case.truth) | {
+            found = score_report(report, case.truth) | {
                 "report_effects": report["effects"],
                 "decision": report["decision"],
             }
-        found |= {"seconds": time.process_time() - start}  # of computing: what else runs here does not count
+        found |= {"seconds": time.process_time() - start}  # of CPU time
     return {"name": case.name, **found, "truth": case.truth}
 
 
-def engine() -> str:
-    """The last commit that touched the tool, with a + where its files differ from it."""
+def engine_commit() -> str:
+    """Return the last commit that touched the identification.
+
+    Returns:
+        Short hash, with `+` if its files differ from that commit.
+    """
     tool = ("src/quadvel_actuator", "src/quadvel_sysid")
-    said = [
+    outputs = [
         subprocess.run(
             ["git", *call, "--", *tool], cwd=ROOT, capture_output=True, text=True, check=True
         ).stdout
         for call in (("log", "-1", "--format=%h"), ("status", "--porcelain"))
     ]
-    return said[0].strip() + ("+" if said[1] else "")
+    return outputs[0].strip() + ("+" if outputs[1] else "")
 
 
 def _work(kind: str, index: int, seed: int, path: Path) -> None:
-    """Scores a case into its file."""
-    keep(score_case(kind, index, seed) | {"engine": engine()}, path)
+    """Score one log into its file."""
+    save_row(score_case(kind, index, seed) | {"engine": engine_commit()}, path)
 
 
-def keep(row: dict[str, Any], path: Path) -> None:
-    """Write a row of the score into its file, whole or not at all."""
+def save_row(row: dict[str, Any], path: Path) -> None:
+    """Write one row of the score to a file, atomically.
+
+    Args:
+        row: The row.
+        path: File to write.
+    """
     part = path.with_suffix(f".{os.getpid()}.part")
     part.write_text(json.dumps(row, indent=1, default=float))
     part.replace(path)
@@ -83,7 +101,22 @@ def keep(row: dict[str, Any], path: Path) -> None:
 def run_campaign(
     kinds: list[str], logs: int, seed: int, jobs: int, out: Path, done: bool = False
 ) -> list[dict[str, Any]]:
-    """Scores what is not scored yet, unless only what is `done` is asked for, and returns all rows of these kinds."""
+    """Score all logs that have no file yet.
+
+    Args:
+        kinds: Kinds of logs.
+        logs: Logs of each kind.
+        seed: Seed of the benchmark.
+        jobs: Worker processes.
+        out: Folder of the verdicts.
+        done: Only return existing rows.
+
+    Returns:
+        Rows of these kinds, by kind and number.
+
+    Raises:
+        BadParameter: If `out` has verdicts of another seed.
+    """
     folder = out / "cases"
     folder.mkdir(parents=True, exist_ok=True)
     settings = out / "settings.json"
@@ -111,18 +144,18 @@ def run_campaign(
 
 def main(
     logs: Annotated[
-        int, typer.Option(help="Logs a kind; even ones lift feet, odd ones move in mixed ways.")
+        int, typer.Option(help="Logs of each kind; even ones lift feet, odd ones use mixed motions.")
     ] = 20,
-    kinds: Annotated[str, typer.Option(help="Kinds or groups, separated by commas; all without it.")] = "",
+    kinds: Annotated[str, typer.Option(help="Kinds or groups, separated by commas (default: all).")] = "",
     seed: int = 0,
     jobs: int = 2,
-    out: Annotated[Path, typer.Option(help="Where verdicts, CSV and page go.")] = Path(
+    out: Annotated[Path, typer.Option(help="Folder of verdicts, CSV and page.")] = Path(
         "out/identification_score"
     ),
     done: Annotated[
-        bool, typer.Option("--done", help="Score nothing more: the page of what is there.")
+        bool, typer.Option("--done", help="Do not score further logs; only build the page.")
     ] = False,
-    write: Annotated[bool, typer.Option("--write", help=f"Write {PAGE.name} in the docs, too.")] = False,
+    write: Annotated[bool, typer.Option("--write", help=f"Also write {PAGE.name} in the docs.")] = False,
 ) -> None:
     """Score the identification on logs with undeclared effects."""
     asked = kinds.split(",") if kinds else list(GROUP_OF)

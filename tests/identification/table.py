@@ -1,4 +1,4 @@
-"""The score as tables: rows of `judge.judge` to Markdown and CSV."""
+"""Tables of the score: rows of `verdicts.score_report` as Markdown and CSV."""
 
 from __future__ import annotations
 
@@ -14,23 +14,32 @@ Row = dict[str, Any]
 
 GROUPS = {
     "table 4": "Table 4 of the paper",
-    "none": "Nothing beside the actuator model",
+    "none": "The actuator model without effects",
     "alone": "One effect of the registry",
-    "together": "Two or three effects at once",
-    "outside": "One effect that the registry does not hold",
+    "together": "Two or three effects together",
+    "outside": "One effect outside the registry",
 }
-ASKED = {"table 4": "each", "none": "95 %", "alone": "95 %", "together": "80 %", "outside": "90 %"}
+TARGETS = {"table 4": "each", "none": "95 %", "alone": "95 %", "together": "80 %", "outside": "90 %"}
 
 
 def markdown(rows: list[Row], seed: int) -> str:
-    """The whole page."""
+    """Build the page of the benchmark.
+
+    Args:
+        rows: Rows of the score.
+        seed: Seed of the benchmark.
+
+    Returns:
+        Markdown text.
+    """
     done = [row for row in rows if "error" not in row]
     parts = [
         "# Score of the identification on logs with an undeclared effect\n",
         f"{len(rows)} logs, seed {seed}; made by `python -m tests.identification.score`, whose generator shares no code with"
-        " the registry. Half of the logs of a kind lift feet (Eq. 9 of the paper, rates and heights varied), half move in"
-        " mixed ways; each effect is worth at least 0.3 of the torque noise. Errors are mean squares over held-out samples,"
-        " as multiples of the true floor (torque noise and what the encoders' noise makes of it): median, and 9 of 10 logs.\n",
+        " the registry. Half of the logs of a kind lift feet (Eq. 9 of the paper, with varied rates and heights), half use"
+        " mixed motions; the error of each effect is at least 0.3 of the torque noise. Errors are mean squares over held-out"
+        " samples, as multiples of the true floor (torque noise, and encoder noise through the gains): median and 90 %"
+        " quantile.\n",
         _overview(rows, done),
     ]
     for group, title in GROUPS.items():
@@ -44,13 +53,14 @@ def markdown(rows: list[Row], seed: int) -> str:
 
 
 def _overview(rows: list[Row], done: list[Row]) -> str:
-    lines = ["| | logs | named rightly | asked for | within the error asked for |", "|---|---|---|---|---|"]
+    """Table of the groups of logs, coverage of the intervals, time and commits."""
+    lines = ["| | logs | named correctly | target | within the target error |", "|---|---|---|---|---|"]
     for group, title in GROUPS.items():
         mine = [row for row in rows if row["group"] == group]
         if mine:
             right = np.mean([row.get("verdict") == "right" for row in mine])
             within = np.mean([bool(row.get("within")) for row in mine])
-            lines.append(f"| {title} | {len(mine)} | {right:.0%} | {ASKED[group]} | {within:.0%} |")
+            lines.append(f"| {title} | {len(mine)} | {right:.0%} | {TARGETS[group]} | {within:.0%} |")
     intervals = [interval["covered"] for row in done for interval in row["intervals"]]
     if intervals:
         lines.append(
@@ -59,11 +69,11 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
     if done:
         seconds = [row["seconds"] for row in done]
         lines.append(
-            f"\nSeconds of computing a log: median {np.median(seconds):.1f}, most {max(seconds):.1f}."
+            f"\nComputing time of a log: median {np.median(seconds):.1f} s, maximum {max(seconds):.1f} s."
         )
     engines = Counter(row.get("engine", "unknown") for row in rows)
     lines.append(
-        "\nCommits of the identification that they were scored on: "
+        "\nCommits of the identification: "
         + ", ".join(f"{name} ({count} logs)" for name, count in engines.most_common())
         + "."
     )
@@ -74,8 +84,10 @@ def _overview(rows: list[Row], done: list[Row]) -> str:
 
 
 def _kinds_table(group: str, kinds: list[list[Row]]) -> str:
+    """Table of the kinds of logs of one group."""
     lines = [
-        "| effect | logs | right | otherwise | added besides | right joints (signals) | before | after | within | intervals | s |",
+        "| effect | logs | right | other verdicts | further effects | right joints (signals) "
+        "| before | after | within | intervals | s |",
         "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for rows in kinds:
@@ -86,7 +98,7 @@ def _kinds_table(group: str, kinds: list[list[Row]]) -> str:
                     f"| {rows[0]['kind']}",
                     str(len(rows)),
                     f"{sum(row.get('verdict') == 'right' for row in rows)}",
-                    _otherwise(rows),
+                    _other_verdicts(rows),
                     _counts(name for row in done for name in row["extra"])
                     if group in ("alone", "together")
                     else "",
@@ -102,16 +114,16 @@ def _kinds_table(group: str, kinds: list[list[Row]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _otherwise(rows: list[Row]) -> str:
-    """What was said instead, most frequent first."""
-    said = []
+def _other_verdicts(rows: list[Row]) -> str:
+    """Verdicts other than right, most frequent first."""
+    others = []
     for row in rows:
         verdict = row.get("verdict", f"error: {row.get('error', '')[:40]}")
         if verdict != "right":
             first = row.get("named", [])[:1] if row["group"] == "alone" else row.get("named", [])
             named = "+".join(first)
-            said.append(f"{verdict} ({named})" if named else verdict)
-    return _counts(said)
+            others.append(f"{verdict} ({named})" if named else verdict)
+    return _counts(others)
 
 
 def _counts(items: Iterable[str]) -> str:
@@ -145,6 +157,12 @@ COLUMNS = (
 
 
 def write_csv(rows: list[Row], path: Path) -> None:
+    """Write the rows of the score as CSV.
+
+    Args:
+        rows: Rows of the score.
+        path: File to write.
+    """
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
         writer.writeheader()

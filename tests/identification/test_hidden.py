@@ -1,4 +1,4 @@
-"""The blind generator against closed form and against what it promises."""
+"""Tests of the blind generator against closed forms and its specification."""
 
 import ast
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_an_effect_is_worth_between_a_third_and_some_times_the_noise(kind):
     worth, noise = case.truth["worth"]["left"], case.truth["noise_var"]
     asked, measured = _asked(case.log, case.truth)
     assert 0.3 * noise <= worth <= 6 * noise
-    # The fitted model leaves less than the true one; the worth is taken on some of the rows.
+    # The fitted model has a smaller error than the true one; the effect's size uses some of the rows.
     assert np.mean((measured - asked) ** 2) >= 0.9 * (worth + noise)
     assert np.all(np.isfinite(case.log["q"]))
     assert np.abs(case.log["dq"]).max() < 30
@@ -127,7 +127,7 @@ def test_the_log_holds_nothing_but_what_the_format_names(tmp_path):
 def test_a_command_counts_from_its_arrival_until_the_next_arrives():
     assert arrivals(np.array([0, 4, 8]), 3, 14).tolist() == [0] * 7 + [1] * 4 + [2] * 3
     late = arrivals(np.array([0, 4, 8]), np.array([3, 9, 3]), 14)
-    assert late.tolist() == [0] * 11 + [2] * 3  # what arrives after a newer one is not taken
+    assert late.tolist() == [0] * 11 + [2] * 3  # a command that arrives after a newer one is ignored
 
 
 def test_foot_height_follows_equation_9():

@@ -1,58 +1,58 @@
-"""Hidden effects that the tool once took for another one."""
+"""Regression tests: hidden effects that the identification once named wrongly."""
 
 import pytest
 
 from tests.identification import adapter
 from tests.identification.hidden.cases import make_case
-from tests.identification.judge import judge
+from tests.identification.verdicts import score_report
 
 
 @pytest.mark.parametrize(
     ("kind", "index", "seed"),
     [
-        ("velocity_filter", 0, 17),  # beside delays of 20 ms it promises little as long as these are wrong
+        ("velocity_filter", 0, 17),  # with wrong delays of 20 ms its score is low
         (
             "torque_saturation",
             0,
             606,
-        ),  # it had led the plain fit's delays 10 ms astray, out of the grid's reach
-        ("soft_stop", 1, 913),  # a spring and less than a period of cogging add up to any curve
-        ("backlash", 2, 912),  # play goes with commands to come nearly as well as with those it answers
+        ),  # it biased the delays of the plain fit by 10 ms, beyond the grid
+        ("soft_stop", 1, 913),  # a spring and less than a period of cogging can form any curve
+        ("backlash", 2, 912),  # backlash fits later commands nearly as well as the true ones
         pytest.param(
             "triple", 0, 606, marks=pytest.mark.long
-        ),  # gains kept those of delays that a score test had to cut back
+        ),  # gains kept the values for delays that the score test had clipped
         pytest.param(
             "cross_coupling", 0, 17, marks=pytest.mark.long
-        ),  # to an angle, whose zero is a convention
+        ),  # coupling to an angle, whose zero is a convention
         pytest.param(
             "quadratic_drag", 1, 18, marks=pytest.mark.long
-        ),  # every second row met commands at 500 Hz alike, which hid a wrong delay
+        ),  # every second row had the same phase to commands at 500 Hz, which hid a wrong delay
         pytest.param(
             "backlash", 0, 21, marks=pytest.mark.long
-        ),  # the right form keeps little of what it promises at delays that are not its own
+        ),  # at other delays than its own the right form has a low score
         pytest.param(
             "close_pair", 1, 21, marks=pytest.mark.long
         ),  # cogging on three joints, a spring on one of them
         pytest.param(
             "close_pair", 3, 27, marks=pytest.mark.long
-        ),  # the drag of a hip that moves slowly was out of bounds
+        ),  # the drag of a slow hip exceeded its bounds
         pytest.param(
             "close_pair", 1, 27, marks=pytest.mark.long
-        ),  # given up before a spring replaced the offset
-        pytest.param("pair", 2, 27, marks=pytest.mark.long),  # a lag that one joint shows alone
+        ),  # the search stopped before a spring replaced the offset
+        pytest.param("pair", 2, 27, marks=pytest.mark.long),  # a lag that only one joint shows
         pytest.param(
             "table_4", 5, 27, marks=pytest.mark.long
-        ),  # of 20 logs one takes delays off the drive's steps by chance
+        ),  # in 1 of 20 logs the delays leave the drive's steps by chance
         pytest.param(
             "speed_band_drag", 0, 28, marks=pytest.mark.long
-        ),  # a drag that was read off the torque as commands that are lost
+        ),  # a drag that was identified as lost commands
         pytest.param(
             "table_4", 6, 17, marks=pytest.mark.long
-        ),  # the rows of the held-out log lie otherwise between their commands
+        ),  # held-out rows have another phase to their commands
     ],
 )
-def test_it_is_named_now(kind, index, seed, tmp_path):
-    assert _judged(kind, index, seed, tmp_path)["verdict"] == "right"
+def test_the_effect_is_named_correctly(kind, index, seed, tmp_path):
+    assert _scored(kind, index, seed, tmp_path)["verdict"] == "right"
 
 
 @pytest.mark.parametrize(
@@ -60,14 +60,14 @@ def test_it_is_named_now(kind, index, seed, tmp_path):
     [
         pytest.param(
             "armature", 14, 28, marks=pytest.mark.long
-        ),  # feet that are lifted hardly tell which part of the delays comes after an inertia
+        ),  # lifted feet hardly separate the two delays of an inertia
     ],
 )
-def test_its_intervals_hold_the_truth_now(kind, index, seed, tmp_path):
-    assert [one["covered"] for one in _judged(kind, index, seed, tmp_path)["intervals"]] == [True]
+def test_the_intervals_contain_the_truth(kind, index, seed, tmp_path):
+    assert [one["covered"] for one in _scored(kind, index, seed, tmp_path)["intervals"]] == [True]
 
 
-def _judged(kind, index, seed, tmp_path):
+def _scored(kind, index, seed, tmp_path):
     case = make_case(kind, index, seed)
     logs = [path.rename(tmp_path / path.name) for path in case.save(tmp_path / "truth")]
-    return judge(adapter.identify(logs[:1], logs[1:]), case.truth)
+    return score_report(adapter.identify(logs[:1], logs[1:]), case.truth)

@@ -1,11 +1,11 @@
-"""What counts as right: verdicts on made-up reports, and a campaign that is taken up again."""
+"""Tests of the score: verdicts on synthetic reports, and an interrupted benchmark that continues."""
 
 import json
 
 import pytest
 
 from tests.identification import adapter, score, table
-from tests.identification.judge import judge
+from tests.identification.verdicts import score_report
 
 
 def _entry(name, joints=("A_hip_joint",), others=(), **params):
@@ -50,34 +50,34 @@ def _truth(group, *names, **more):
     ],
 )
 def test_one_effect_has_to_be_named_first_or_among_three_that_the_first_looks_like(effects, verdict):
-    assert judge(_report(*effects), _truth("alone", "cogging"))["verdict"] == verdict
+    assert score_report(_report(*effects), _truth("alone", "cogging"))["verdict"] == verdict
 
 
-@pytest.mark.parametrize(("said", "right"), [(0.09, True), (0.04, False)])
-def test_commands_lost_at_random_are_judged_by_their_share_and_not_by_the_error(said, right):
+@pytest.mark.parametrize(("fraction", "right"), [(0.09, True), (0.04, False)])
+def test_lost_commands_are_scored_by_their_fraction_and_not_by_the_error(fraction, right):
     truth = _truth("alone", "command_hold", params={"share_of_samples": 0.1})
-    report = _report(_entry("command_hold") | {"samples_hit": said}, after=0.3)
-    assert judge(report, truth)["within"] == right
+    report = _report(_entry("command_hold") | {"samples_hit": fraction}, after=0.3)
+    assert score_report(report, truth)["within"] == right
 
 
 def test_several_effects_have_all_to_be_named():
     truth = _truth("together", "cogging", "armature")
-    assert judge(_report(_entry("armature"), _entry("cogging")), truth)["verdict"] == "right"
-    assert judge(_report(_entry("armature")), truth)["verdict"] == "some"
+    assert score_report(_report(_entry("armature"), _entry("cogging")), truth)["verdict"] == "right"
+    assert score_report(_report(_entry("armature")), truth)["verdict"] == "some"
 
 
 def test_without_an_effect_anything_named_is_wrong():
-    assert judge(_report(), _truth("none"))["verdict"] == "right"
-    assert judge(_report(_entry("learned_residual")), _truth("none"))["verdict"] == "wrong"
+    assert score_report(_report(), _truth("none"))["verdict"] == "right"
+    assert score_report(_report(_entry("learned_residual")), _truth("none"))["verdict"] == "wrong"
 
 
 def test_an_effect_outside_the_registry_needs_its_signal_and_most_of_its_error_removed():
     truth = _truth("outside", "rubbing_cable")
     found = {"verdict": "structured", "depends_on": ["q", "t"]}
-    assert judge(_report(**found), truth)["verdict"] == "right"
-    assert judge(_report(**found, after=0.25), truth)["verdict"] == "right, too little removed"
-    assert judge(_report(verdict="structured", depends_on=["dq"]), truth)["verdict"] == "wrong signal"
-    assert judge(_report(), truth)["verdict"] == "missed"
+    assert score_report(_report(**found), truth)["verdict"] == "right"
+    assert score_report(_report(**found, after=0.25), truth)["verdict"] == "right, too little removed"
+    assert score_report(_report(verdict="structured", depends_on=["dq"]), truth)["verdict"] == "wrong signal"
+    assert score_report(_report(), truth)["verdict"] == "missed"
 
 
 @pytest.mark.parametrize(("left", "right"), [(0.1, True), (0.13, False)])
@@ -86,21 +86,21 @@ def test_a_joint_may_be_left_out_where_an_effect_leaves_nothing(left, right):
     truth["effects"][0]["joints"] = ["A_hip_joint", "B_hip_joint"]
     report = _report(_entry("cogging")) | {"joints": ["A_hip_joint", "B_hip_joint"]}
     report["after"]["per_joint"] = [0.1, left]
-    assert judge(report, truth)["right_joints"] == right
+    assert score_report(report, truth)["right_joints"] == right
 
 
 def test_an_interval_counts_in_the_units_that_the_report_gives():
     entry = _entry("cogging", c={"value": 520.0, "ci95": [480.0, 560.0], "unit": "mrad"})
-    (interval,) = judge(_report(entry), _truth("alone", "cogging"))["intervals"]
+    (interval,) = score_report(_report(entry), _truth("alone", "cogging"))["intervals"]
     assert interval["covered"]
     assert interval["value"] == pytest.approx(0.52)
 
 
-def test_an_interval_of_each_joint_is_judged_for_itself():
+def test_intervals_of_joints_are_scored_one_by_one():
     values = {"value": [0.5, 0.7], "ci95": [[0.45, 0.55], [0.65, 0.75]], "unit": "N m"}
     truth = _truth("alone", "cogging")
     truth["effects"][0]["params"] = {"c": 0.52}
-    found = judge(_report(_entry("cogging", c=values)), truth)["intervals"]
+    found = score_report(_report(_entry("cogging", c=values)), truth)["intervals"]
     assert [one["covered"] for one in found] == [True, False]
 
 
@@ -115,17 +115,17 @@ def test_what_the_tool_raises_is_a_verdict_and_the_table_shows_it(monkeypatch):
 
 
 def test_the_tool_sees_the_log_and_not_the_truth(monkeypatch):
-    def look(logs, holdout):
+    def check_folder(logs, holdout):
         (log,) = logs
         assert [path.name for path in log.parent.iterdir() if path.is_file()] == [log.name]
         assert "truth" not in str(log)
         return _report()
 
-    monkeypatch.setattr(adapter, "identify", look)
+    monkeypatch.setattr(adapter, "identify", check_folder)
     assert "error" not in score.score_case("none", 1, 0)
 
 
-def test_a_campaign_takes_up_what_is_there_and_refuses_another_seed(tmp_path):
+def test_a_benchmark_continues_and_rejects_another_seed(tmp_path):
     (tmp_path / "cases").mkdir()
     row = {"kind": "none", "group": "none", "verdict": "right", "error": "x"}
     (tmp_path / "cases" / "none-000.json").write_text(json.dumps(row))

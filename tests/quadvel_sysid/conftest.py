@@ -1,4 +1,4 @@
-"""Makes the helper modules next to the tests importable by name."""
+"""Makes the helper modules of this folder importable by name."""
 
 import sys
 from pathlib import Path

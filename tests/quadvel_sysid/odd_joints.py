@@ -1,6 +1,6 @@
-"""Joints with effects that no registry holds, each as a torque added to what the actuator model gives.
+"""Simulated joints with effects outside the registry, each a change of the actuator model's torque.
 
-Signals are named as in a report; one of `signals` is what a right report names.
+Signals have the names of the report. A correct report names one of `signals`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,13 @@ Distort = Callable[[int, np.ndarray, np.ndarray, np.ndarray], np.ndarray]
 
 @attrs.frozen
 class Odd:
-    """A torque that is added, as a law of (k, q, dq, tau), made anew for each log, as it may remember."""
+    """An effect outside the registry.
+
+    Attributes:
+        make: Creates the law (k, q, dq, tau) -> tau for one log, as it may have memory.
+        signals: Signals of which a correct report names one.
+        joints: Indices of the affected joints.
+    """
 
     make: Callable[[], Distort]
     signals: tuple[str, ...]
@@ -35,7 +41,7 @@ def _on(joints: tuple[int, ...], extra: Callable[..., Any]) -> Callable[[], Dist
 
 
 def _resonance(frequency: float, damping: float, gain: float, joints: tuple[int, ...]) -> Odd:
-    """A flexible part that the joint's torque shakes, and that shakes the joint."""
+    """Resonance of a flexible part that the torque of the joint excites."""
     w = 2.0 * np.pi * frequency
     mask = np.isin(np.arange(JOINTS), joints)
 
@@ -54,7 +60,7 @@ def _resonance(frequency: float, damping: float, gain: float, joints: tuple[int,
 
 
 def _creep() -> Odd:
-    """A spring that gives way slowly: what it holds back follows the joint's own past."""
+    """Spring that relaxes slowly, so that its torque depends on the past of the angle."""
     mask = np.isin(np.arange(JOINTS), (1, 2))
 
     def make() -> Distort:
@@ -107,11 +113,11 @@ ODD = {
 
 
 def _error_stiffness() -> Distort:
-    """A drive whose gain grows with what it asks for."""
+    """Drive whose gain increases with its torque."""
     return lambda k, q, dq, tau: tau + 0.05 * tau * np.abs(tau)
 
 
 def log(name: str, motion: str = "mixed", seed: int = 0, seconds: float = 5.0, rate: int = 500) -> Log:
-    """A log of the joints with this effect."""
+    """Simulate and log joints with the effect `name`."""
     truth = attrs.evolve(parameters(), joints=NAMES[:JOINTS])
     return record(truth, JOINTS, seconds, rate, motion, seed, distort=ODD[name].make())

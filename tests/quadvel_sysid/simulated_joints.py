@@ -1,4 +1,4 @@
-"""Joints that move under the actuator model, with a log of it: truth to identify against."""
+"""Simulated joints under the actuator model, as logs with known parameters."""
 
 import attrs
 import numpy as np
@@ -17,6 +17,7 @@ TABLE_4 = {
 
 
 def parameters(effects=(), joints=12, **values):
+    """Actuator parameters with Table 4 of the paper, changed by `values`, and some effects."""
     given = TABLE_4 | values
     pair = DelayPair(given["input_delay"], given["output_delay"], given["noise"])
     return attrs.evolve(
@@ -31,7 +32,7 @@ def parameters(effects=(), joints=12, **values):
 
 
 def targets(t, joints, rng, motion="lift"):
-    """Joint targets (N, J), new ones at 200 Hz: trotting steps, or chirps with random offsets."""
+    """Joint targets (N, J), rad, updated at 200 Hz: trotting steps, or chirps with random offsets."""
     held = np.floor(t * 200 + 1e-6) / 200
     phase = rng.uniform(0, 2 * np.pi, joints)
     amplitude = rng.uniform(0.12, 0.3, joints)
@@ -55,9 +56,22 @@ def record(
     extra=None,
     load=4.0,
 ):
-    """A log (N, J) of joints with inertia and a load from the ground (N m at most), at `rate`; the actuators run at 1 kHz.
+    """Simulate joints with inertia and a ground load, and log them.
 
-    `distort(k, q, dq, tau_mean) -> tau` adds what the model does not hold, before the noise of `truth`.
+    Args:
+        truth: Parameters of the actuators, which run at 1 kHz.
+        joints: Number of joints J.
+        seconds: Duration of the log, s.
+        rate: Rate of the rows, Hz.
+        motion: `lift` for trotting steps, anything else for chirps with random offsets.
+        seed: Seed of motion, load and noise.
+        inertia: Inertia of each joint, kg m^2.
+        distort: Changes the torque by an effect outside the model: (k, q, dq, tau) -> tau.
+        extra: Further fields of the log.
+        load: Peak torque of the ground, N m.
+
+    Returns:
+        A log of N rows and J joints.
     """
     dt, rng = 0.001, np.random.default_rng(seed)
     noise = np.sqrt(truth.torque_noise)

@@ -1,4 +1,4 @@
-"""What counts as independent evidence, as noise, and as structure."""
+"""Clusters, score test, noise variance and whiteness tests."""
 
 import attrs
 import numpy as np
@@ -9,10 +9,10 @@ from quadvel_sysid.criterion import (
     SIGNIFICANCE_LEVEL,
     WHITENESS_LEVEL,
     DataSplit,
-    clusters,
+    cluster_starts,
     noise_variance,
-    normality,
-    whiteness,
+    normality_p_values,
+    whiteness_p_values,
 )
 from quadvel_sysid.logs.log import Log
 from quadvel_sysid.signals import Samples
@@ -21,11 +21,11 @@ BEGIN, END = 2.0, 4.0  # s, of a stand
 
 
 def starts_of(log: Log) -> np.ndarray:
-    return clusters(Samples([log]))
+    return cluster_starts(Samples([log]))
 
 
 def standing(log: Log, sway: float, rate: float) -> Log:
-    """The log with a stand, in which encoders say what the joints do not and one joint sways (rad, Hz)."""
+    """The log with a stand: encoder noise, and one joint that sways (rad, Hz)."""
     rng = np.random.default_rng(1)
     still = ((log.t >= BEGIN) & (log.t < END))[:, None]
     stand = log.q[int(BEGIN * 1000)] + 0.5e-3 * rng.normal(size=log.q.shape)
@@ -33,7 +33,7 @@ def standing(log: Log, sway: float, rate: float) -> Log:
     return attrs.evolve(log, q=np.where(still, stand, log.q))
 
 
-def test_a_stand_says_once_what_it_says_and_motion_each_tenth_of_a_second() -> None:
+def test_a_stand_is_one_cluster_and_motion_is_one_cluster_each_tenth_of_a_second() -> None:
     log = record(parameters(), joints=2, seconds=5.0)
     moving, stood = starts_of(log), starts_of(standing(log, 0.0, 1.0))
     assert len(moving) == 50
@@ -42,22 +42,22 @@ def test_a_stand_says_once_what_it_says_and_motion_each_tenth_of_a_second() -> N
     assert not ((at > BEGIN + 0.05) & (at < END - 0.05)).any()
 
 
-def test_what_shakes_all_joints_alike_counts_once() -> None:
-    """Of noise that joints share, and a change that has nothing to do with it, a hundredth is called significant."""
+def test_a_disturbance_of_all_joints_counts_once() -> None:
+    """With noise shared by joints, 1 % of unrelated changes are significant at the 1 % level."""
     rng, rows = np.random.default_rng(0), np.ones((5000, 6), dtype=bool)
     parts = DataSplit(rows, rows, rows, np.arange(0, 5000, 100))
 
     def slow() -> np.ndarray:
         return np.repeat(rng.normal(size=(50, 1)), 100, axis=0)
 
-    called = 0
+    significant = 0
     for _ in range(400):
         before = slow() + rng.normal(size=(5000, 6))
-        called += parts.compare(before, before - 0.05 * slow(), rows).p < SIGNIFICANCE_LEVEL
-    assert called <= 12
+        significant += parts.compare(before, before - 0.05 * slow(), rows).p_value < SIGNIFICANCE_LEVEL
+    assert significant <= 12
 
 
-def test_a_torque_in_coarse_ticks_has_the_noise_of_rounding_and_a_constant_one_that_of_the_others() -> None:
+def test_quantised_torque_has_rounding_noise_and_constant_torque_the_noise_of_other_joints() -> None:
     log = record(parameters(), joints=3, seconds=2.0)
     tau = log.tau.copy()
     tau[:, 1] = np.round(tau[:, 1] / 4.0) * 4.0
@@ -68,22 +68,22 @@ def test_a_torque_in_coarse_ticks_has_the_noise_of_rounding_and_a_constant_one_t
     assert noise[2] == np.mean(noise[:2])
 
 
-def test_a_fast_sway_about_one_posture_is_motion() -> None:
+def test_a_fast_sway_around_one_posture_is_motion() -> None:
     log = record(parameters(), joints=2, seconds=5.0)
     assert len(starts_of(standing(log, 0.03, 20.0))) == 50
 
 
-def test_noise_is_white_and_normal_and_what_is_not_is_told_of_its_joint() -> None:
+def test_whiteness_and_normality_are_tested_for_each_joint() -> None:
     rng = np.random.default_rng(3)
     noise = rng.normal(size=(3000, 3))
     noise[:, 1] += 0.3 * np.sin(np.arange(3000) / 20.0)
     noise[::150, 2] += 4.0
     rows, start = np.ones(noise.shape, dtype=bool), np.arange(3000) == 0
-    assert (whiteness(noise, rows, start) < WHITENESS_LEVEL).tolist() == [False, True, False]
-    assert (normality(noise, rows) < WHITENESS_LEVEL).tolist() == [False, False, True]
+    assert (whiteness_p_values(noise, rows, start) < WHITENESS_LEVEL).tolist() == [False, True, False]
+    assert (normality_p_values(noise, rows) < WHITENESS_LEVEL).tolist() == [False, False, True]
 
 
-def test_the_noise_of_a_torque_shows_without_a_model() -> None:
+def test_the_noise_variance_needs_no_model() -> None:
     samples = Samples([record(parameters(), joints=2, seconds=5.0)])
     found = noise_variance(samples, samples.evaluated, samples.tau)
     np.testing.assert_allclose(found, 0.066, rtol=0.15)

@@ -1,4 +1,4 @@
-"""Which of the delays that a log cannot tell apart are reported."""
+"""Choice among delays that a log cannot resolve."""
 
 import attrs
 import numpy as np
@@ -29,59 +29,59 @@ def _fitted(log, input_delay, output_delay):
     return fit(model, samples.evaluated, 20), samples.evaluated
 
 
-def test_a_log_that_tells_little_is_read_as_a_drive_that_works_in_whole_steps():
+def test_uncertain_delays_are_rounded_to_whole_steps():
     fitted, rows = _fitted(_log(2.0), 0.007, 0.001)
     assert abs(fitted.delays[1, 0] - 0.001) > 1e-5
-    told = quantised_delays(fitted, rows)
-    np.testing.assert_allclose(told.delays[:, 0], [0.007, 0.001], atol=1e-9)
+    rounded = quantised_delays(fitted, rows)
+    np.testing.assert_allclose(rounded.delays[:, 0], [0.007, 0.001], atol=1e-9)
 
 
-def test_delays_that_a_log_tells_clearly_stay_between_the_steps():
+def test_well_determined_delays_stay_between_steps():
     fitted, rows = _fitted(_log(5.0, input_delay=0.0066, output_delay=0.0024, noise=1e-3), 0.0066, 0.0024)
     assert quantised_delays(fitted, rows) is fitted
 
 
 @pytest.mark.parametrize("heldout", [False, True])
-def test_values_come_from_every_row_but_those_of_a_log_that_is_held_out(heldout):
+def test_values_are_fitted_to_all_rows_except_those_of_held_out_logs(heldout):
     log = _log(3.0, seed=4)
     found = identify([log], [_log(3.0, seed=5)] if heldout else []).report["before"]
     whole, _ = _fitted(log, 0.007, 0.001)
-    told = quantised_delays(whole, whole.samples.evaluated)
-    assert found["delta_kp"] == pytest.approx((told.gains[0, 0] - 1.0) * 30.0, abs=0.002)
+    rounded = quantised_delays(whole, whole.samples.evaluated)
+    assert found["delta_kp"] == pytest.approx((rounded.gains[0, 0] - 1.0) * 30.0, abs=0.002)
 
 
 @pytest.mark.parametrize("window", [0.0, 0.001])
-def test_a_running_model_does_not_blur_what_the_drive_does_not(window):
-    """A fit says the same with an output delay between two steps, which averages the noise of encoders, too."""
+def test_a_running_model_does_not_smooth_the_commands_twice(window):
+    """An output delay between two steps fits equally well, and averages encoder noise too."""
     drive, log = _quiet(0.007, 0.001)
     fitted = np.array([0.00666, 0.00133])
-    told = running_delays(_model(drive, log, window, fitted), log.valid)
-    assert told == pytest.approx((0.007, 0.001), abs=3e-5)
-    assert _run(drive, log, told) < 0.01 * _run(drive, log, fitted)
+    delays = running_delays(_model(drive, log, window, fitted), log.valid)
+    assert delays == pytest.approx((0.007, 0.001), abs=3e-5)
+    assert _run(drive, log, delays) < 0.01 * _run(drive, log, fitted)
 
 
-def test_a_running_model_waits_between_the_steps_where_the_drive_does():
+def test_a_running_model_keeps_the_drive_s_delay_between_steps():
     drive, log = _quiet(0.0066, 0.0024)
-    told = running_delays(_model(drive, log, 0.001, np.array([0.0066, 0.0024])), log.valid)
-    assert told == pytest.approx((0.0066, 0.0024), abs=3e-5)
+    delays = running_delays(_model(drive, log, 0.001, np.array([0.0066, 0.0024])), log.valid)
+    assert delays == pytest.approx((0.0066, 0.0024), abs=3e-5)
 
 
 def _quiet(*delays):
-    """A drive, and a log of it with hardly any noise."""
+    """A drive, and its log with little noise."""
     truth = parameters(input_delay=delays[0], output_delay=delays[1], noise=1e-6)
     drive = attrs.evolve(truth, joints=JOINTS)
     return drive, record(drive, 2, 3.0)
 
 
 def _model(drive, log, window, delays):
-    """With the gains of the drive."""
+    """A model with the gains of the drive."""
     gains = np.array([1.0 + drive.delta_kp / drive.kp_ref, 1.0 + drive.delta_kd / drive.kd_ref])
     each = np.repeat(np.asarray(delays)[:, None], 2, axis=1)
     return Model(Samples([log]), window, gains[:, None] * np.ones(2), ONE, each, ONE)
 
 
 def _run(drive, log, delays):
-    """Mean squared torque error of the drive as it runs with these delays, past the beginning."""
+    """Mean squared torque error of the running drive with these delays, after the first 0.1 s."""
     pair = attrs.evolve(drive.pairs[0], input_delay_s=delays[0], output_delay_s=delays[1])
     model = ActuatorModel(attrs.evolve(drive, pairs=(pair,), torque_noise=0.0), (2,), 0.001)
     rows = zip(log.q, log.dq, log.q_des, strict=True)
@@ -89,8 +89,8 @@ def _run(drive, log, delays):
     return np.mean((log.tau - torque)[100:] ** 2)
 
 
-def test_a_fit_on_a_grid_of_stamps_foretells_commands_that_come_between_its_rows():
-    """7 and 1 ms: on rows and commands of one grid, any input delay from 6 ms on says the same."""
+def test_a_fit_on_a_grid_of_stamps_predicts_commands_between_its_rows():
+    """With rows and commands on one grid, any input delay above 6 ms fits delays of 7 and 1 ms."""
     fitted, judged = (_driven(0.001, 0.001, 1), _driven(0.001, 0.00525, 2))
     report = identify([fitted], [judged]).report
     assert report["before"]["input_delay_ms"] == pytest.approx(7.0, abs=0.2)
@@ -98,7 +98,7 @@ def test_a_fit_on_a_grid_of_stamps_foretells_commands_that_come_between_its_rows
 
 
 def _driven(row, command, seed):
-    """A log with a row every `row` s and a command about every `command` s of a drive with delays of 7 and 1 ms."""
+    """Log of a drive with delays of 7 and 1 ms: a row every `row` s, a command every `command` s."""
     t, rng = np.arange(round(3.0 / row)) * row, np.random.default_rng(seed)
     sent = np.round(np.arange(0.0, 3.0, command) / 0.00025) * 0.00025
     phase = np.array([0.0, 1.0])
@@ -118,7 +118,7 @@ def _driven(row, command, seed):
     return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
 
 
-def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
+def test_the_longest_of_the_equivalent_delays_on_a_grid_is_chosen():
     log = _driven(0.001, 0.001, 1)
     samples = Samples([log])
     eam = fit_eam(samples, samples.evaluated)
@@ -128,8 +128,8 @@ def test_of_delays_that_a_grid_of_stamps_cannot_tell_the_whole_step_is_taken():
     assert longest_equivalent_delay(model, samples.evaluated).delays[0, 0] == pytest.approx(0.007, abs=2e-4)
 
 
-def test_of_small_valleys_that_commands_in_steps_make_the_deepest_one_is_found():
-    """A command every 5.25 ms, in steps: from 2 ms off a fit ends in a valley of its own."""
+def test_the_global_minimum_over_the_delays_is_found_with_step_commands():
+    """With a step command every 5.25 ms, a fit from 2 ms away ends in a local minimum."""
     log = _driven(0.001, 0.00525, 2)
     samples = Samples([log])
     off = np.repeat([[0.0095], [0.0005]], 2, axis=1)

@@ -1,4 +1,4 @@
-"""Identification against injected truth: short logs of two joints, so that it takes seconds."""
+"""Identification of known effects in short simulated logs of two joints."""
 
 import weakref
 
@@ -38,7 +38,7 @@ def test_nothing_is_added_to_a_log_that_the_eam_explains():
     assert report["decision"].startswith("Nothing significant")
 
 
-def test_friction_is_found_beside_a_joint_whose_torque_is_not_measured():
+def test_friction_is_found_next_to_a_joint_without_torque_measurement():
     log = record(_truth(Effect("coulomb_friction", JOINTS[:1], {"c": 1.0, "v_0": 0.02})), 2, 3.0, 500, seed=4)
     silent = log.tau.copy()
     silent[:, 1] = np.round(silent[:, 1] / 20.0)
@@ -46,29 +46,29 @@ def test_friction_is_found_beside_a_joint_whose_torque_is_not_measured():
     assert (found["name"], found["joints"]) == ("coulomb_friction", [JOINTS[0]])
 
 
-def test_gains_that_a_log_holds_are_not_overridden():
+def test_gains_in_a_log_override_the_argument():
     log = record(_truth(), 2, 3.0, 500, seed=4)
     with_them = attrs.evolve(log, kp=np.full(log.q_des.shape, 30.0), kd=np.full(log.q_des.shape, 0.5))
     before = identify([with_them], gains=(60.0, 1.0)).report["before"]
     assert before == identify([with_them]).report["before"]
 
 
-def test_an_effect_that_held_out_data_alone_show_is_told_as_such():
-    """A bound that the fitted log never reaches."""
+def test_the_summary_states_an_effect_of_the_held_out_data_alone():
+    """The fitted log never reaches the torque limit of the held-out log."""
     fitted, held_out = (record(_truth(), 2, 3.0, 500, seed=seed) for seed in (4, 5))
     bound = 0.6 * np.abs(held_out.tau).max()
     clipped = attrs.evolve(held_out, tau=held_out.tau.clip(-bound, bound))
     report = identify([fitted], [clipped]).report
     assert report["effects"] == []
     after = report["after"]
-    left = f"held-out data leave {after['heldout_mse']:.3g} N^2 m^2 where the fitted ones leave {after['train_mse']:.3g}:"
+    left = f"held-out error is {after['heldout_mse']:.3g} N^2 m^2, the error of the fitted data {after['train_mse']:.3g}:"
     assert left in report["decision"]
     plain = identify([fitted], [held_out]).report
-    assert "held-out data leave" not in plain["decision"]
+    assert "held-out error is" not in plain["decision"]
 
 
-def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_not_confirmed():
-    """Both logs follow one script, and both joints are pushed when it begins and when it ends."""
+def test_disturbances_in_the_fitted_excerpts_alone_are_not_confirmed():
+    """Both logs follow one script, with a push on both joints at its start and at its end."""
 
     def pushed(k, q, dq, tau):
         return tau + 1.0 * (k < 800 or k >= 5200)
@@ -76,29 +76,29 @@ def test_what_long_logs_show_at_the_instants_that_are_fitted_alone_is_not_confir
     logs = [record(_truth(), 2, 6.0, 500, seed=4, distort=pushed) for _ in range(2)]
     again = np.random.default_rng(1).normal(0.0, np.sqrt(TABLE_4["noise"]), logs[1].tau.shape)
     logs[1] = attrs.evolve(logs[1], tau=logs[1].tau + again)
-    report = identify(logs[:1], logs[1:], values=3000).report  # two pieces of 0.75 s of each
+    report = identify(logs[:1], logs[1:], values=3000).report  # two excerpts of 0.75 s each
     unconfirmed = " ".join(report["warnings"])
     assert all(f"{one['name']} is not confirmed" in unconfirmed for one in report["effects"])
 
 
-def test_pieces_of_a_long_log_at_a_low_rate_hold_enough_rows():
+def test_excerpts_of_a_slow_log_have_enough_rows():
     log = record(_truth(), 2, 30.0, 50, seed=4)
     found = cut_excerpts(log, 12.0)
     assert len(found) > 4
     assert all(len(piece.t) >= 50 for piece in found)
 
 
-def test_a_long_log_can_be_let_go_of_once_its_pieces_are_taken():
+def test_a_long_log_is_released_after_its_excerpts_are_copied():
     log = record(_truth(), 2, 6.0, 500, seed=4)
     alive = [weakref.ref(array) for array in (log.q, log.dq, log.tau, log.q_des, log.t)]
-    material = prepare(Dataset.inspect_all([log]), values=3000)
+    data = prepare(Dataset.inspect_all([log]), values=3000)
     del log
-    assert sum(len(log.t) for log in material.logs) == 1500
+    assert sum(len(log.t) for log in data.logs) == 1500
     assert [array() for array in alive] == [None] * len(alive)
 
 
-def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
-    """A quarter of the torque's noise again, through kd: whatever averages dq would predict better than the truth."""
+def test_encoder_noise_that_the_drive_did_not_see_is_no_effect():
+    """Through kd it adds a quarter of the torque noise, so that averaging dq reduces the error."""
     log = record(parameters(joints=3), joints=3, seed=6)
     log = attrs.evolve(log, dq=log.dq + np.random.default_rng(6).normal(0.0, 0.25, log.dq.shape))
     report = identify([log]).report
@@ -108,8 +108,8 @@ def test_encoders_noise_that_the_drive_did_not_act_on_is_no_effect():
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason="decision 49: a second effect is added beside friction on blurred speeds")
-def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
+@pytest.mark.xfail(reason="decision 49: a second effect is added to friction on noisy speeds")
+def test_friction_on_noisy_speeds_needs_no_second_effect():
     truth = _truth(Effect("coulomb_friction", JOINTS, {"c": 0.8, "v_0": 0.05}))
     log = record(truth, 2, 5.0, 1000, seed=3)
     noise = np.random.default_rng(0).normal(0.0, 0.04, log.dq.shape)
@@ -118,17 +118,17 @@ def test_friction_on_speeds_that_are_noisy_needs_no_other_effect_beside_it():
     assert any("noise" in one["text"] and "averaged" in one["text"] for one in report["findings"])
 
 
-def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base():
+def test_the_report_states_gains_of_each_joint_and_torques_above_the_limit():
     def weaker(k, q, dq, tau):
         return tau * np.array([1.0, 0.6])
 
     base = attrs.evolve(ActuatorParameters.default(), torque_limit=2.0)
     report = identify([record(_truth(), 2, 3.0, 500, seed=4, distort=weaker)], base=base).report
     assert report["effects"] == []
-    error = f"{report['after']['heldout_mse']:.3g} N^2 m^2, with one for all to {report['before']['heldout_mse']:.3g}"
+    error = f"{report['after']['heldout_mse']:.3g} N^2 m^2, with common ones to {report['before']['heldout_mse']:.3g}"
     assert error in report["decision"]
-    assert report["warnings"][0].startswith("FR_hip_joint: up to ")
-    assert report["warnings"][0].endswith("torque_limit in actuator.yaml, which is the base's, is 2.0 N m")
+    assert report["warnings"][0].startswith("FR_hip_joint: the measured torque reaches ")
+    assert report["warnings"][0].endswith("torque_limit in actuator.yaml, from the base, is 2.0 N m")
 
 
 @pytest.mark.parametrize(
@@ -139,7 +139,7 @@ def test_gains_of_each_joint_are_told_and_torques_beyond_the_limit_of_the_base()
         ("parallel_spring", {"k": 3.0, "q0": 0.1}),
     ],
 )
-def test_an_effect_is_named_with_an_interval_that_holds_its_truth(name, truth):
+def test_an_effect_is_named_with_an_interval_that_contains_the_truth(name, truth):
     injected = truth | ({"v_0": 0.1} if name == "coulomb_friction" else {})
     found = identify([record(_truth(Effect(name, JOINTS, injected)), 2, 3.0, 500, seed=2)])
     first = found.report["effects"][0]
@@ -162,20 +162,20 @@ def test_friction_on_one_joint_is_found_there_only():
     ]
 
 
-def test_drag_on_most_joints_is_named_and_not_hidden_in_gains_of_the_others():
-    """The damping that all joints share stands for it: what is off are the joints without, until it is named."""
+def test_drag_on_most_joints_is_named_and_not_explained_by_gains():
+    """The shared damping explains it at first, so that the joint without drag has the error."""
     six = NAMES[:6]
     drag = Effect("viscous_friction", six[:5], {"b": 0.2})
     report = identify([record(attrs.evolve(parameters((drag,)), joints=six), 6, 3.0, 500, seed=1)]).report
     (one,) = report["effects"]
-    # A late speed on the sixth says the same: which of the two it is, is chance.
+    # A delayed speed on the sixth joint explains the log equally well; chance decides.
     assert "viscous_friction" in {one["name"], *one["indistinguishable"]}
     assert one["joints"] == list(six[:5] if one["name"] == "viscous_friction" else six[5:])
 
 
 @pytest.mark.long
-@pytest.mark.xfail(reason="decision 49: one curve over the angle says as much in fewer parameters")
-def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both():
+@pytest.mark.xfail(reason="decision 49: one curve over the angle needs fewer parameters")
+def test_spring_and_cogging_are_both_found_although_a_long_wave_nearly_fits():
     three = NAMES[:3]
     spring = Effect("parallel_spring", three, {"k": 5.0, "q0": 0.1})
     cogging = Effect("cogging", three, {"a": 0.5, "n": 12.0, "phi": 0.7})
@@ -185,7 +185,7 @@ def test_a_spring_and_cogging_are_both_found_though_a_long_wave_nearly_says_both
     assert report["after"]["heldout_mse"] < 1.05 * 0.066
 
 
-def test_drives_that_are_stronger_one_way_only_are_not_hidden_in_the_gains_of_all():
+def test_drives_with_more_torque_in_one_direction_are_not_explained_by_gains():
     def stronger(k, q, dq, tau):
         return tau * np.where((tau > 0.0) & (np.arange(4) < 2), 1.15, 1.0)
 
@@ -196,7 +196,7 @@ def test_drives_that_are_stronger_one_way_only_are_not_hidden_in_the_gains_of_al
     ]
 
 
-def test_hum_of_the_mains_is_told_as_a_line_in_time():
+def test_mains_hum_is_reported_as_a_function_of_time():
     def hum(k, q, dq, tau):
         return tau + 0.35 * np.sin(2 * np.pi * 50.0 * k * 0.001)
 

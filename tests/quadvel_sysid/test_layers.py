@@ -1,4 +1,4 @@
-"""Imports follow the order of modules in docs/sysid.md, which also lists the tuned constants."""
+"""docs/sysid.md lists all modules in the order of their imports, and the tuned constants."""
 
 import ast
 import re
@@ -40,7 +40,7 @@ def test_imports_go_downwards_in_the_list_of_modules() -> None:
         assert not above, f"{path.name} imports {above}, which stand above it in {PAGE.name}"
 
 
-def test_tuned_constants_have_the_documented_values() -> None:
+def test_the_tuned_constants_have_the_documented_values() -> None:
     rows = re.findall(r"^\| `(\w+)\.(\w+)` \| ([\d.]+) \|", PAGE.read_text(), re.MULTILINE)
     assert len(rows) == 29
     for module, name, value in rows:

@@ -1,4 +1,4 @@
-"""Effects that the registry does not hold: the right signal is named, most of the error goes, and the model runs so."""
+"""Effects outside the registry: the signal is named, and the learned term removes the error."""
 
 import attrs
 import numpy as np
@@ -14,7 +14,7 @@ VARIANCE = 0.066  # of the torque noise of these logs
 
 MARKS = {
     "creep": (
-        pytest.mark.xfail(reason="decision 49: creep is told as a curve over q_des"),
+        pytest.mark.xfail(reason="decision 49: creep is reported as a curve over q_des"),
         pytest.mark.long,
     ),
     "drag_in_part_of_the_range": pytest.mark.long,
@@ -37,16 +37,16 @@ def test_the_signal_behind_an_odd_effect_is_named_and_most_of_its_error_goes(nam
     assert set(report["unexplained"]["joints"]) >= {odd_joints.NAMES[j] for j in odd.joints}
 
 
-def test_rare_blows_that_no_signal_foretells_are_not_passed_over_as_noise():
+def test_rare_unpredictable_blows_are_not_ignored_as_noise():
     log = record(parameters(joints=2), 2, 4.0, 500, seed=4)
     tau = log.tau.copy()
-    tau[[700, 1701], 1] += [8.0, -8.0]  # three such rows would be taken for faults of the sensor
+    tau[[700, 1701], 1] += [8.0, -8.0]  # three such rows would count as sensor faults
     report = identify([attrs.evolve(log, tau=tau)]).report
     assert report["effects"] == []
     assert report["unexplained"]["verdict"] == "structured"
     assert report["unexplained"]["depends_on"] == []
     assert report["unexplained"]["joints"] == [log.joints[1]]
-    assert "goes with no signal of the log" in report["decision"]
+    assert "uncorrelated with every logged signal" in report["decision"]
 
 
 def test_the_corrected_model_run_step_by_step_gives_what_the_report_claims(tmp_path):

@@ -1,4 +1,4 @@
-"""Identification on measured walks of a Go2: fit one, evaluate on the other; one leg, to save time."""
+"""Identification on measured walks of a Go2: one is fitted, the other held out; one leg only."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ from quadvel_sysid.identify import identify
 from quadvel_sysid.logs.read_log import read_log
 
 LEG = ("FR_hip", "FR_thigh", "FR_calf")
-GAINS = (35.0, 0.5)  # the recording lab's driver; the logs hold none
+GAINS = (35.0, 0.5)  # of the recording lab's driver; the logs contain no gains
 
 
 @pytest.fixture(scope="module")
@@ -23,9 +23,9 @@ def walks():
 
 @pytest.mark.long
 @pytest.mark.parametrize("order", [(0, 1), (1, 0)], ids=["1 to 2", "2 to 1"])
-def test_a_walk_explains_the_other_with_at_most_half_of_the_error_of_the_eam(walks, order):
-    fitted, judged = (walks[k] for k in order)
-    report = identify([fitted], [judged], gains=GAINS).report
+def test_a_model_of_one_walk_halves_the_error_of_the_eam_on_the_other(walks, order):
+    fitted, heldout = (walks[k] for k in order)
+    report = identify([fitted], [heldout], gains=GAINS).report
     effects = [effect["name"] for effect in report["effects"]]
     assert "armature" in effects[:2]
     assert report["after"]["heldout_mse"] < 0.5 * report["before"]["heldout_mse"]

@@ -1,4 +1,4 @@
-"""The files of an identification: complete, readable by themselves, and all of them or none."""
+"""Files of a report: complete, self-contained, and written all together."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 
 from quadvel_actuator import ActuatorParameters
 from quadvel_sysid.identification import Identification, Shape, Trace
-from quadvel_sysid.report.report import FILES, write
+from quadvel_sysid.report.report import REPORT_FILES, write_report
 
 JOINTS = ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint"]
 DECISION = "Add stribeck_friction & a bound: the held-out error falls from 0.31 to 0.07 <N m>²."
@@ -88,7 +88,7 @@ REPORT: dict[str, Any] = {
             "text": "2 gaps of 30 ms <here>",
         }
     ],
-    "warnings": ["stribeck_friction.c sits on its bound"],
+    "warnings": ["stribeck_friction.c is at its bound"],
 }
 
 
@@ -111,7 +111,7 @@ def identification(**changes: Any) -> Identification:
 
 
 class Page(HTMLParser):
-    """Checks that tags close, and gathers text and what the page would load."""
+    """Checks that tags close, and collects the text and the resources that the page loads."""
 
     VOID = ("meta", "br", "img", "hr")
 
@@ -148,7 +148,7 @@ class Page(HTMLParser):
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("report") / "new"
-    write(identification(), out)
+    write_report(identification(), out)
     return out
 
 
@@ -158,7 +158,7 @@ def page(folder: Path) -> Page:
 
 
 def test_three_files_are_written_and_nothing_else(folder: Path) -> None:
-    assert sorted(path.name for path in folder.iterdir()) == sorted(FILES)
+    assert sorted(path.name for path in folder.iterdir()) == sorted(REPORT_FILES)
 
 
 def test_the_json_is_the_report_and_the_yaml_the_model(folder: Path) -> None:
@@ -172,7 +172,7 @@ def test_the_page_is_well_formed_and_loads_nothing(page: Page) -> None:
     assert len(page.ids) == len(set(page.ids))
 
 
-def test_the_page_says_the_decision_first_and_shows_what_it_stands_on(page: Page) -> None:
+def test_the_page_starts_with_the_decision_and_shows_its_evidence(page: Page) -> None:
     text = page.text
     assert DECISION in text
     order = [
@@ -187,45 +187,46 @@ def test_the_page_says_the_decision_first_and_shows_what_it_stands_on(page: Page
     assert places == sorted(places)
     words = [
         *("backlash", "no gain on held-out blocks", "0.38 … 0.43", "-0.76 … -0.7", "6.95 … 7.07"),
-        *("2 gaps of 30 ms <here>", "stribeck_friction.c sits on its bound", "structured", "smooth"),
+        *("2 gaps of 30 ms <here>", "stribeck_friction.c is at its bound", "structured", "smooth"),
     ]
     for word in words:
         assert word in text
 
 
-def test_what_was_not_told_apart_comes_with_the_motion_that_would(page: Page) -> None:
-    assert "stribeck_friction and coulomb_friction come apart with slow motion around standstill" in page.text
+def test_indistinguishable_effects_are_listed_with_a_distinguishing_motion(page: Page) -> None:
+    assert (
+        "To distinguish stribeck_friction from coulomb_friction, record slow motion around standstill"
+        in page.text
+    )
     assert "stribeck_friction, coulomb_friction" in page.text
     assert "quadvel excite creep --seconds 40" in page.text
     assert "quadvel excite solo" in page.text
 
 
-def test_written_again_the_page_is_the_same_to_the_byte_and_other_files_stay(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_a_second_write_gives_the_same_bytes_and_keeps_other_files(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("mine")
-    write(identification(), tmp_path)
+    write_report(identification(), tmp_path)
     assert (tmp_path / "report.html").read_bytes() == (folder / "report.html").read_bytes()
     assert (tmp_path / "notes.txt").read_text() == "mine"
 
 
-def test_a_report_that_cannot_be_written_leaves_the_former_one_whole(folder: Path) -> None:
+def test_a_failed_write_keeps_the_former_report(folder: Path) -> None:
     former = {path.name: path.read_bytes() for path in folder.iterdir()}
     with pytest.raises(ValueError, match="not JSON compliant"):
-        write(identification(noise_floor=float("nan")), folder)
+        write_report(identification(noise_floor=float("nan")), folder)
     with pytest.raises(KeyError):
-        write(attrs.evolve(identification(), report={"schema": 1}), folder)
+        write_report(attrs.evolve(identification(), report={"schema": 1}), folder)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == former
 
 
-def test_a_report_without_effects_says_so(tmp_path: Path) -> None:
+def test_a_report_without_effects_states_that(tmp_path: Path) -> None:
     white = {"verdict": "white", "fraction": 0.0, "depends_on": [], "joints": []}
     bare = identification(effects=[], rejected=[], unexplained=white, decision="Nothing significant.")
-    write(attrs.evolve(bare, shapes=(), traces={}), tmp_path)
+    write_report(attrs.evolve(bare, shapes=(), traces={}), tmp_path)
     text = Page((tmp_path / "report.html").read_text()).text
     for sentence in (
         "Nothing significant.",
         "No candidate was tried.",
-        "Nothing is left open",
+        "No question is open",
     ):
         assert sentence in text

@@ -1,4 +1,4 @@
-"""The search for effects, from outside: logs in, reports out."""
+"""Search for effects, end to end: logs in, reports out."""
 
 import attrs
 import pytest
@@ -22,20 +22,20 @@ def _named(*effects, **options):
     return {one["name"]: one for one in report["effects"]}, report
 
 
-def test_two_effects_that_hide_each_other_are_both_found():
+def test_two_effects_that_mask_each_other_are_both_found():
     found, report = _named(FRICTION, SPRING)
     assert set(found) == {"coulomb_friction", "parallel_spring"}
     assert report["after"]["heldout_mse"] < 1.15 * 0.066
 
 
-def test_a_lag_is_told_from_the_delays_that_it_bends():
+def test_a_lag_is_distinguished_from_the_delays_that_it_biases():
     found, report = _named(Effect("first_order_lag", JOINTS, {"T": 0.01}))
     assert set(found) == {"first_order_lag"}
     low, high = report["after"]["output_delay_ms_ci95"]
     assert low < 3.0 < high
 
 
-def test_values_that_are_the_same_on_all_joints_are_told_once_and_others_of_each():
+def test_shared_values_are_reported_once_and_others_for_each_joint():
     same, _ = _named(FRICTION)
     assert isinstance(same["coulomb_friction"]["params"]["c"]["value"], float)
     other = [
@@ -46,11 +46,11 @@ def test_values_that_are_the_same_on_all_joints_are_told_once_and_others_of_each
     assert each["coulomb_friction"]["params"]["c"]["value"] == pytest.approx([0.4, 1.2], rel=0.15)
 
 
-def test_the_error_and_the_p_value_are_of_rows_that_chose_nothing():
-    """What is changed on the rows that are reported alone changes no choice and no value of the fit before."""
+def test_error_and_p_value_come_from_rows_that_select_nothing():
+    """A change of the reported rows changes neither the effects nor the training error."""
     log = _log(FRICTION)
     first = identify([log]).report
-    block = (log.t / 0.2).astype(int) % 5 == 4  # s; as `preparation.divided` has it
+    block = (log.t / 0.2).astype(int) % 5 == 4  # s, as in `preparation.split_rows`
     loud = log.tau.copy()
     loud[block] += 0.5 * (-1.0) ** (log.t[block, None] * 500.0).round()
     second = identify([attrs.evolve(log, tau=loud)]).report

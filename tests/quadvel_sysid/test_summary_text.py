@@ -1,10 +1,10 @@
-"""The sentence that a report comes to."""
+"""Summary sentences of a report."""
 
 from __future__ import annotations
 
 from typing import Any
 
-from quadvel_sysid.summary_text import decision
+from quadvel_sysid.summary_text import summary_text
 
 
 def report(*effects: tuple[str, float]) -> dict[str, Any]:
@@ -17,18 +17,18 @@ def report(*effects: tuple[str, float]) -> dict[str, Any]:
     }
 
 
-def test_effects_that_the_reported_rows_show_are_to_be_added() -> None:
-    text = decision(report(("armature", 1e-9), ("first_order_lag", 1e-3)))
+def test_significant_effects_are_added() -> None:
+    text = summary_text(report(("armature", 1e-9), ("first_order_lag", 1e-3)))
     assert text == (
         "Add armature, first_order_lag: the held-out error falls by 75 %, from 1 to 0.25 N^2 m^2 (noise floor 0.2)."
     )
 
 
-def test_an_effect_that_they_do_not_show_is_not_among_them() -> None:
-    text = decision(report(("armature", 1e-9), ("supply_sag", 1.0)))
+def test_an_effect_that_the_reported_rows_do_not_confirm_is_stated_separately() -> None:
+    text = summary_text(report(("armature", 1e-9), ("supply_sag", 1.0)))
     assert text.startswith("Add armature: the held-out error falls by 75 %")
-    assert "supply_sag is in the model, too, but the rows that are reported do not confirm it" in text
+    assert "the model contains supply_sag as well, but the reported rows do not confirm it" in text
 
 
-def test_where_they_show_none_what_was_chosen_is_told() -> None:
-    assert decision(report(("armature", 0.3))).startswith("Add armature:")
+def test_without_a_confirmed_effect_the_selected_effects_are_stated() -> None:
+    assert summary_text(report(("armature", 0.3))).startswith("Add armature:")

@@ -1,4 +1,4 @@
-"""Effects between the rows of a log, and skewed time stamps, against independent computations."""
+"""Effects between the rows of a log, and skewed channels, compared with independent computations."""
 
 import attrs
 import numpy as np
@@ -16,7 +16,7 @@ from quadvel_sysid.signals import Samples
 
 
 def _slewing(rate):
-    """A drive that computes every 50 us, on rows of 2 ms with one or two commands between them, and what was asked."""
+    """Log of a drive with a step of 50 us, with a row every 2 ms, and its requested torque."""
     dt, rng = 5e-5, np.random.default_rng(4)
     t = np.arange(20000) * dt
     q = 0.3 * np.sin(2 * np.pi * 3.0 * t)
@@ -33,7 +33,7 @@ def _slewing(rate):
     return log, asked[step]
 
 
-def test_a_slew_limit_is_followed_between_the_rows():
+def test_a_slew_limit_is_simulated_between_rows():
     rate = 60.0
     log, asked = _slewing(rate)
     tau = log.tau[:, 0]
@@ -55,8 +55,8 @@ def _of_one_joint(log, law, value, input_delay=0.0):
     return Model(Samples([log]), 0.0, gains, one, delays, one, (applied,))
 
 
-def test_lag_is_recomputed_at_other_delays_with_the_same_commands():
-    """Commands and rows on one grid of 2 ms: delays of 0.5 and 1.5 ms show the same commands, of other age."""
+def test_a_lag_is_recomputed_at_other_delays_with_the_same_commands():
+    """On a grid of 2 ms, delays of 0.5 and 1.5 ms see the same commands with another age."""
     law = registry()["first_order_lag"]()
     model = _of_one_joint(_driven(0.002, 0.002, 3), law, 0.004, 0.0005)
     model.predict()
@@ -66,8 +66,8 @@ def test_lag_is_recomputed_at_other_delays_with_the_same_commands():
     assert np.abs(later.predict() - model.predict()).max() > 0.01
 
 
-def test_a_filtered_velocity_is_followed_between_the_rows():
-    """A sine of 8 Hz through a lag of 6 ms, known from rows of 2 ms: amplitude and phase in closed form."""
+def test_a_filtered_velocity_is_simulated_between_rows():
+    """Amplitude and phase of a sine of 8 Hz after a lag of 6 ms, in closed form, from rows of 2 ms."""
     w, lag = 2 * np.pi * 8.0, 0.006
     t = np.arange(0.0, 2.0, 0.002)
     dq = np.sin(w * t)
@@ -92,7 +92,7 @@ def test_a_channel_stamped_early_or_late_on_one_joint_is_found(channel, late):
 
 
 def _driven(row, command, seed):
-    """A log with a row every `row` s and a command about every `command` s of a drive with delays of 7 and 1 ms."""
+    """Log of a drive with delays of 7 and 1 ms: a row every `row` s, a command every `command` s."""
     t, rng = np.arange(round(3.0 / row)) * row, np.random.default_rng(seed)
     sent = np.round(np.arange(0.0, 3.0, command) / 0.00025) * 0.00025
     phase = np.array([0.0, 1.0])
@@ -112,8 +112,8 @@ def _driven(row, command, seed):
     return Log("grid", NAMES[:2], t, q(t), dq(t), sent, q_des, np.ones(tau.shape, bool), tau=tau, **gains)
 
 
-def test_send_times_of_commands_in_state_rows_are_restored(tmp_path):
-    """97 Hz in rows of 500 Hz: a row shows up to 2 ms late what was sent, which lost commands would explain."""
+def test_the_stamps_of_a_regular_sender_are_restored_from_rows_with_commands(tmp_path):
+    """At 97 Hz in rows of 500 Hz a command appears up to 2 ms late, as after a lost command."""
     rows = fields()
     sending = np.floor(rows["t"] * 97.0 + 1e-9)
     rows["q_des"] = rows["q_des"][np.searchsorted(sending, sending)]

@@ -14,8 +14,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from quadvel_eval.replay import GROWTH_INTERVAL_MS
-from quadvel_sysid.report.figures import AFTER, BEFORE, MEASURED, svg
-from quadvel_sysid.report.page import document, number, table, tiles
+from quadvel_sysid.report.figures import AFTER, BEFORE, MEASURED, svg_figure
+from quadvel_sysid.report.page import html_document, html_table, html_tiles, number_text
 
 Entry = Mapping[str, Any]
 
@@ -73,7 +73,7 @@ def twin_page(results: Sequence[Entry]) -> str:
         The HTML document.
     """
     body = _overview(results) + f'<p class="note">{escape(NOTE)}</p>' + "".join(map(_plant, results))
-    return document("Closing the loop on the stack itself", summary_sentence(results), body)
+    return html_document("Closing the loop on the stack itself", summary_sentence(results), body)
 
 
 def summary_sentence(results: Sequence[Entry]) -> str:
@@ -109,12 +109,12 @@ def _overview(results: Sequence[Entry]) -> str:
         for one in results
     ]
     head = ("plant", "identified", *(f"#{row.title}" for row in ROWS))
-    return svg(9.5, 2.9, lambda figure: draw_overview(figure, results)) + table(head, rows)
+    return svg_figure(9.5, 2.9, lambda figure: draw_overview(figure, results)) + html_table(head, rows)
 
 
 def _before_after(entry: Entry, row: Row) -> str:
     """Return both errors of an entry as HTML."""
-    return f"{number(row.error(entry['before']))} → <b>{number(row.error(entry['after']))}</b>"
+    return f"{number_text(row.error(entry['before']))} → <b>{number_text(row.error(entry['after']))}</b>"
 
 
 def draw_overview(figure: Figure, results: Sequence[Entry]) -> None:
@@ -172,25 +172,27 @@ def _plant(entry: Entry) -> str:
     rows = []
     for row in ROWS:
         before, after = row.error(entry["before"]), row.error(entry["after"])
-        noise = number(row.noise(entry))
-        rows.append((escape(row.title), number(before), number(after), _reduction(before, after), noise))
+        noise = number_text(row.noise(entry))
+        rows.append(
+            (escape(row.title), number_text(before), number_text(after), _reduction(before, after), noise)
+        )
     name = escape(entry["name"])
     text = (
         f'<section id="{name}"><h2>{name}</h2><p><b>{escape(entry["decision"])}</b> '
         f'<a href="{name}/identify/report.html">The report</a>.</p>'
     )
-    text += tiles(
+    text += html_tiles(
         [
-            (number(entry["fit"]["eam"]), "held-out error of the plain EAM, N² m²"),
-            (number(entry["fit"]["corrected"]), "of the corrected model, N² m²"),
-            (number(entry["noise_floor"]), "noise floor, N² m²"),
+            (number_text(entry["fit"]["eam"]), "held-out error of the plain EAM, N² m²"),
+            (number_text(entry["fit"]["corrected"]), "of the corrected model, N² m²"),
+            (number_text(entry["noise_floor"]), "noise floor, N² m²"),
         ]
     )
-    text += table(("error of the model against the plant", "#before", "#after", "#less", "#noise"), rows)
-    text += svg(9.5, 2.9, lambda figure: draw_plant(figure, entry))
+    text += html_table(("error of the model against the plant", "#before", "#after", "#less", "#noise"), rows)
+    text += svg_figure(9.5, 2.9, lambda figure: draw_plant(figure, entry))
     columns = ("command vx, vy, wz", "#plant", "#model before", "#model after")
     keys = ("command", "plant", "before", "after")
-    velocities = table(columns, [[_velocity(s[key]) for key in keys] for s in entry["segments"]])
+    velocities = html_table(columns, [[_velocity(s[key]) for key in keys] for s in entry["segments"]])
     return f"{text}<details><summary>mean velocities, m/s and rad/s</summary>{velocities}</details></section>"
 
 

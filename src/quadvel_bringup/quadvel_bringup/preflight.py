@@ -46,7 +46,9 @@ NODE_CHECKS = {
     "board": NodeCheck(
         "quadvel_sim.parameters:BoardParameters", lambda settings: (settings.config(), settings.off())
     ),
-    "driver": NodeCheck("quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()),
+    "driver": NodeCheck(
+        "quadvel_driver.parameters:DriverParameters", lambda settings: settings.load_calibration()
+    ),
     "estimator": NodeCheck(
         "quadvel_estimator.estimator:EstimatorParameters",
         lambda settings: settings.make_estimator() if settings.model else None,

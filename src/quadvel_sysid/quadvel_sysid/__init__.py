@@ -1,1 +1,1 @@
-"""What measured logs say about the joints: residual, diagnosis, correction, before and after."""
+"""System identification of joint actuators from measured logs: diagnosis, model, report."""

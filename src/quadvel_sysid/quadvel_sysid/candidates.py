@@ -1,4 +1,4 @@
-"""The candidates on top of an account: screened, and the most promising fitted with everything else."""
+"""Candidate effects on top of a model: screened, then the best ones fitted with everything else."""
 
 from __future__ import annotations
 
@@ -16,124 +16,156 @@ from .fit import fit, fit_near_delays
 from .fitted_model import FittedModel
 from .library import Context, SignalTerm
 from .model import Model
-from .parallel import side_by_side
-from .screening import CandidateScreening, ScreenedCandidate, best_first
+from .parallel import parallel_map
+from .screening import CandidateScreening, ScreenedCandidate, promising
 from .signals import Bools
 
-FITTED, FITTED_TERMS = 6, 4
-"""Laws, and terms, that are fitted after a screening"""
-SIMPLIFIED = 3
-"""Of these, the best, of which it is tried what their joints share"""
+MAX_FITTED_LAWS, MAX_FITTED_TERMS = 6, 4
+"""Laws, and regressors of named signals, that are fitted after a screening."""
+MAX_SHARED_TRIALS = 3
+"""Best candidates for which sharing across joints is tried."""
 LAWS, TERMS = "laws", "terms"
-L = TypeVar("L", bound=EffectLaw)
-R = TypeVar("R")
+Law = TypeVar("Law", bound=EffectLaw)
+Result = TypeVar("Result")
 
 
 class Candidates:
-    """The candidates on top of an account, fitted, the most promising first."""
+    """Fitted candidates on top of a model, best first."""
 
-    def __init__(self, before: FittedModel, among: Collection[tuple[str, ...]] | None = None) -> None:
-        """`among`: the names of laws, and signals of terms, that are looked at; all without it."""
-        self._before, self._judge, self._among = before, before.evaluator, among
+    def __init__(self, before: FittedModel, only: Collection[tuple[str, ...]] | None = None) -> None:
+        """Prepare the candidates; the work is done on first use.
+
+        Args:
+            before: Model to extend.
+            only: Keys (`candidate_key`) of the candidates to consider; all if None.
+        """
+        self._before, self._evaluator, self._only = before, before.evaluator, only
         self._context = Context(before.model, before.evaluator.parts, before.evaluator.noise)
 
-    def _asked(self, candidates: Iterable[L]) -> Iterator[L]:
-        return (one for one in candidates if self._among is None or key(one) in self._among)
+    def _filtered(self, candidates: Iterable[Law]) -> Iterator[Law]:
+        """The candidates to consider."""
+        return (one for one in candidates if self._only is None or candidate_key(one) in self._only)
 
-    def found(self, kinds: str) -> tuple[list[FittedModel], int]:
-        """Laws, or terms, and of how many laws, or sets of signals, these are the best."""
+    def fitted_candidates(self, kinds: str) -> tuple[list[FittedModel], int]:
+        """Return the best candidates of one kind, fitted.
+
+        Args:
+            kinds: `LAWS` or `TERMS`.
+
+        Returns:
+            Fitted models, and the number of laws or of sets of signals that were screened, which
+            the Bonferroni correction uses.
+        """
         return self._laws if kinds == LAWS else self._terms
 
     @cached_property
-    def _screen(self) -> CandidateScreening:
-        return CandidateScreening(self._context, self._judge.cores)
+    def _screening(self) -> CandidateScreening:
+        """Screening on top of the model."""
+        return CandidateScreening(self._context, self._evaluator.cores)
 
     @cached_property
     def _laws(self) -> tuple[list[FittedModel], int]:
+        """The best laws, fitted, and the number of screened laws."""
         several = len(self._context.samples.joints) > 1
-        found = self._screen.laws(
-            one for one in self._asked(library.laws(self._context)) if several or not one.confounded_with_gain
+        found = self._screening.screen_laws(
+            one
+            for one in self._filtered(library.law_candidates(self._context))
+            if several or not one.confounded_with_gain
         )
         count = len({one.law.name for one in found}) or 1
-        return self._fitted(_distinct(best_first(found), FITTED)), count
+        return self._fit_screened(_first_distinct(promising(found), MAX_FITTED_LAWS)), count
 
     @cached_property
     def _terms(self) -> tuple[list[FittedModel], int]:
-        found = self._screen.terms(list(self._asked(library.terms(self._context))))
-        best = _distinct(best_first(found), FITTED_TERMS)
-        finer = self._side_by_side(lambda k: _refined(best[k], self._screen), len(best))
+        """The best regressors, refined and fitted, and the number of screened sets of signals."""
+        found = self._screening.screen_terms(list(self._filtered(library.term_candidates(self._context))))
+        best = _first_distinct(promising(found), MAX_FITTED_TERMS)
+        finer = self._parallel_map(lambda k: _refine_term(best[k], self._screening), len(best))
         best += [one for one in finer if one not in best]
-        return self._fitted(best), len({key(one.law) for one in found})
+        return self._fit_screened(best), len({candidate_key(one.law) for one in found})
 
-    def _fitted(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
-        first = self._accounts(lambda k: self._fit(chosen[k]), len(chosen))
-        first.sort(key=lambda one: one.criterion)
-        best, others = first[:SIMPLIFIED], first[SIMPLIFIED:]
+    def _fit_screened(self, chosen: Sequence[ScreenedCandidate]) -> list[FittedModel]:
+        """Fit the candidates, and share the values of the best ones across joints."""
+        fitted = self._fit_parallel(lambda k: self._fit_candidate(chosen[k]), len(chosen))
+        fitted.sort(key=lambda one: one.criterion)
+        best, others = fitted[:MAX_SHARED_TRIALS], fitted[MAX_SHARED_TRIALS:]
         last = len(self._context.model.effects)
         return (
-            self._accounts(
-                lambda k: self._judge.share_across_joints(self._deeper(best[k]), last).model, len(best)
+            self._fit_parallel(
+                lambda k: self._evaluator.share_across_joints(self._refit_near_delays(best[k]), last).model,
+                len(best),
             )
             + others
         )
 
-    def _deeper(self, account: FittedModel) -> FittedModel:
-        """The account, from other delays where that is better: a term is screened at one pair of delays alone."""
-        if not isinstance(account.last_effect.law, SignalTerm):
-            return account
-        other = FittedModel(fit_near_delays(account.model, self._judge.parts.fit), self._judge)
-        return min(account, other, key=lambda one: one.criterion)
+    def _refit_near_delays(self, fitted: FittedModel) -> FittedModel:
+        """Refit a regressor from nearby delays if that is better; its screening used one pair."""
+        if not isinstance(fitted.last_effect.law, SignalTerm):
+            return fitted
+        other = FittedModel(fit_near_delays(fitted.model, self._evaluator.parts.fit), self._evaluator)
+        return min(fitted, other, key=lambda one: one.criterion)
 
-    def _accounts(self, work: Callable[[int], Model], count: int) -> list[FittedModel]:
-        return [FittedModel(one, self._judge) for one in self._side_by_side(work, count)]
+    def _fit_parallel(self, work: Callable[[int], Model], count: int) -> list[FittedModel]:
+        """Fitted models of several tasks."""
+        return [FittedModel(one, self._evaluator) for one in self._parallel_map(work, count)]
 
-    def _side_by_side(self, work: Callable[[int], R], count: int) -> list[R]:
-        return side_by_side(work, count, self._judge.cores, self._context.samples)
+    def _parallel_map(self, work: Callable[[int], Result], count: int) -> list[Result]:
+        return parallel_map(work, count, self._evaluator.cores, self._context.samples)
 
-    def _fit(self, one: ScreenedCandidate) -> Model:
-        """The candidate fitted on all joints, or on those that it acts on, whichever is better."""
-        judge, model, law = self._judge, one.model, one.law
+    def _fit_candidate(self, candidate: ScreenedCandidate) -> Model:
+        """Fit a candidate on all joints, and on those where it is significant if that is better."""
+        evaluator, model, law = self._evaluator, candidate.model, candidate.law
         near = model.with_delays(self._before.model.delays)
         if law.confounded_with_gain:
-            # What all joints share is a gain's or a delay's.
-            rows = judge.parts.fit
-            model, near = (_without_weakest(fit(start, rows, 4, delays=False)) for start in (model, near))
+            # A value that all joints share is a change of a gain or a delay. One joint without the
+            # effect makes the fit unique.
+            rows = evaluator.parts.fit
+            model, near = (_drop_weakest_joint(fit(start, rows, 4, delays=False)) for start in (model, near))
         starts = [model, near] if law.shifts or law.confounded_with_gain else [model]
-        every = min((judge.fit(start) for start in starts), key=lambda one: one.criterion)
-        return judge.restrict_joints(every, len(every.model.effects) - 1).model
+        fitted = min((evaluator.fit(start) for start in starts), key=lambda one: one.criterion)
+        return evaluator.restrict_joints(fitted, len(fitted.model.effects) - 1).model
 
 
-def _refined(one: ScreenedCandidate, screen: CandidateScreening) -> ScreenedCandidate:
-    """A term with its place and time constants where it promises most."""
+def _refine_term(candidate: ScreenedCandidate, screening: CandidateScreening) -> ScreenedCandidate:
+    """Hill climbing over the shape parameters of a regressor, by its screening score."""
     for _ in range(3):
-        assert isinstance(one.law, SignalTerm)
-        near = library.refined(one.law)
-        better = max(map(screen.term, near), key=lambda other: other.score, default=one)
-        if better.score <= one.score:
+        assert isinstance(candidate.law, SignalTerm)
+        near = library.refinements(candidate.law)
+        better = max(map(screening.screen_term, near), key=lambda other: other.score, default=candidate)
+        if better.score <= candidate.score:
             break
-        one = better
-    return one
+        candidate = better
+    return candidate
 
 
-def key(law: EffectLaw) -> tuple[str, ...]:
-    """The name of a law, the signals of a term."""
-    return law.inputs if isinstance(law, SignalTerm) else (law.name,)
+def candidate_key(law: EffectLaw) -> tuple[str, ...]:
+    """Return the key by which candidates count as the same.
+
+    Args:
+        law: A law or a regressor of named signals.
+
+    Returns:
+        The name of a law; the input signals of a regressor.
+    """
+    return law.input_signals if isinstance(law, SignalTerm) else (law.name,)
 
 
-def _distinct(found: Sequence[ScreenedCandidate], most: int) -> list[ScreenedCandidate]:
-    """The first so many with different names, or signals, and of each name at most two forms."""
+def _first_distinct(found: Sequence[ScreenedCandidate], most: int) -> list[ScreenedCandidate]:
+    """The first `most` candidates, at most two of one law and one of one set of signals."""
     chosen: list[ScreenedCandidate] = []
-    for one in found:
-        mine = key(one.law)
-        if sum(key(other.law) == mine for other in chosen) < (1 if isinstance(one.law, SignalTerm) else 2):
-            chosen.append(one)
+    for candidate in found:
+        key = candidate_key(candidate.law)
+        if sum(candidate_key(other.law) == key for other in chosen) < (
+            1 if isinstance(candidate.law, SignalTerm) else 2
+        ):
+            chosen.append(candidate)
         if len(chosen) == most:
             break
     return chosen
 
 
-def _without_weakest(model: Model) -> Model:
-    """The last effect off the joint where it is weakest, which gains or delays then stand for."""
+def _drop_weakest_joint(model: Model) -> Model:
+    """Remove the last effect from its weakest joint, where gain or delay stand for it."""
     last = model.effects[-1]
     active: Bools = last.active & (np.arange(len(last.active)) != np.argmin(np.abs(last.values[0])))
     return model.with_replaced_effect(len(model.effects) - 1, attrs.evolve(last, active=active))

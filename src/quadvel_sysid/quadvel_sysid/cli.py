@@ -195,14 +195,14 @@ def _run(
         data, long = _load_data(logs, holdout, joints, names, topics, gains, messages, on_progress)
         if not long:
             keep_freed_arrays()
-        from .identify import identified
+        from .identify import identify_prepared
 
         cores = cores or (1 if long else min(DEFAULT_CORES, len(os.sched_getaffinity(0))))
-        with threadpool_limits(1):  # of each worker process: they share the cores
-            found = identified(data, parameters, cores, on_progress, robot)
-    from .report.report import write
+        with threadpool_limits(1):  # of each copy of this process: they share the cores
+            found = identify_prepared(data, parameters, cores, on_progress, robot)
+    from .report.report import write_report
 
-    write(found, out)
+    write_report(found, out)
     console = Console()
     console.print(escape(str(found.report["decision"])), soft_wrap=True, highlight=False)
     console.print(error_line(found.report), soft_wrap=True, highlight=False)

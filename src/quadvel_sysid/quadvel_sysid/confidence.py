@@ -1,8 +1,9 @@
-"""How sure the parameters are: 95 % intervals from the slopes of the prediction, with residuals that may be correlated.
+"""95 % confidence intervals of all fitted parameters, with a cluster-robust covariance.
 
-Two covariances are compared and the wider one counts: that of white residuals, and the cluster-robust sandwich of sums over
-0.1 s and all joints, which holds whatever the correlation within a cluster. Gains and delays are unknowns of it, too. Where a
-law may have other shapes that the log does not tell apart, what these say of its parameters lies within the interval.
+The wider of two covariances counts: that of white residuals, and the sandwich estimator on cluster
+sums over all joints (Liang and Zeger), which is valid for any correlation within a cluster. Gains
+and delays are among the unknowns. Where another form of a law explains the log equally well, the
+interval contains its parameter values too.
 """
 
 from __future__ import annotations
@@ -18,82 +19,120 @@ from .model import MAX_DELAYS_S, Model, Unknowns
 from .signals import Array, Bools
 
 CONFIDENCE_LEVEL = 0.95
+"""Coverage of the intervals."""
 _CLOCK_ERROR_S = 0.25e-3
-"""s, by which times may be off besides: the clock of a drive, whose step is up to 1 ms, is in no log"""
-_SYSTEMATIC, _SYSTEMATIC_GAIN = 0.01, 0.005
-"""of an effect's value, of a gain, by which they may be off besides: a log holds noisy samples of a motion, not the motion"""
-_EQUIVALENT_ERROR = 1.003
-"""of the error: a shape of a law that leaves no more explains the log as well"""
+"""Systematic error of delays and time constants, s: a log does not record the drive's clock."""
+_SYSTEMATIC_FRACTION, _SYSTEMATIC_GAIN_FRACTION = 0.01, 0.005
+"""Systematic error relative to an effect's value, and to a gain: motion samples are noisy."""
+_EQUIVALENT_ERROR_RATIO = 1.003
+"""Ratio of squared errors below which another form of a law explains the log equally well."""
 
 
 @attrs.frozen(eq=False)
 class Intervals:
-    """Half widths (units of the parameter): of gains (2, J), of each effect's values (P, J), of delays (2, J)."""
+    """Half widths of the 95 % confidence intervals, in the units of the parameters.
+
+    Attributes:
+        gains: Gain ratios, (2, J).
+        effects: Values of each effect, (P, J) each.
+        delays: Input and output delay, (2, J), s.
+        at_bound: Names of parameters that lie on a bound, whose intervals are not valid.
+    """
 
     gains: Array
     effects: tuple[Array, ...]
     delays: Array
-    on_bound: tuple[str, ...]
+    at_bound: tuple[str, ...]
 
 
 def intervals(model: Model, parts: DataSplit) -> Intervals:
-    """Intervals of everything that was fitted to all rows."""
-    wide = _half_widths(model, parts, parts.all_rows)
+    """Compute confidence intervals of a model that was fitted to all rows.
+
+    Args:
+        model: The fitted model.
+        parts: Data split with the clusters.
+
+    Returns:
+        Half widths: random error, plus the error of the law's form, plus the systematic error.
+    """
+    # Half width = random error + error of the law's form + systematic error.
+    random_error = _random_half_widths(model, parts, parts.all_rows)
     effects, first = [], 2
-    for index, one in enumerate(model.effects):
-        mine = wide[first : first + len(one.values)]
-        first += len(one.values)
-        random = one.law.sampling_error(dict(zip(one.law.names, one.values, strict=True)), model.signals)
-        chance = np.array([random.get(name, row) for name, row in zip(one.law.names, mine, strict=True)])
-        clock = np.array(
-            [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in one.law.parameters]
+    for index, effect in enumerate(model.effects):
+        own = random_error[first : first + len(effect.values)]
+        first += len(effect.values)
+        # Some laws know the sampling error of their parameters, which replaces that of the slopes.
+        known = effect.law.sampling_error(
+            dict(zip(effect.law.names, effect.values, strict=True)), model.signals
         )
-        systematic = np.maximum(clock, _SYSTEMATIC * np.abs(one.values)) * one.active
-        effects.append(chance + _shape_error(model, index, parts.all_rows) + systematic)
+        sampling = np.array([known.get(name, row) for name, row in zip(effect.law.names, own, strict=True)])
+        clock = np.array(
+            [[_CLOCK_ERROR_S if parameter.unit == "s" else 0.0] for parameter in effect.law.parameters]
+        )
+        systematic = np.maximum(clock, _SYSTEMATIC_FRACTION * np.abs(effect.values)) * effect.active
+        effects.append(sampling + _law_form_error(model, index, parts.all_rows) + systematic)
+    # A half width as large as the gain (or 1) means that any gain from 0 on is possible.
     size = np.abs(model.gains)
-    gains = np.minimum(wide[:2] + _SYSTEMATIC_GAIN * size, np.maximum(1.0, size))  # or anything from 0 on
-    delays = wide[-2:] + _CLOCK_ERROR_S
+    gains = np.minimum(random_error[:2] + _SYSTEMATIC_GAIN_FRACTION * size, np.maximum(1.0, size))
+    # Input delays may be anywhere in the flat valley of the error.
+    delays = random_error[-2:] + _CLOCK_ERROR_S
     delays[0] = np.maximum(delays[0], delay_flatness(model, parts.all_rows) + _CLOCK_ERROR_S)
-    return Intervals(gains, tuple(effects), np.minimum(delays, MAX_DELAYS_S[:, None]), on_bound(model))
+    delays = np.minimum(delays, MAX_DELAYS_S[:, None])
+    return Intervals(gains, tuple(effects), delays, parameters_at_bound(model))
 
 
-def _half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
-    """Half widths (A, J) of what was fitted to `rows` (N, J), from the slopes there; 0 where nothing was."""
+def _random_half_widths(model: Model, parts: DataSplit, rows: Bools) -> Array:
+    """Half widths (A, J) from the parameter covariance; 0 for slots that are not fitted."""
     unknowns = Unknowns.of(model)
-    hessian, _, slopes, left = normal_equations(model, unknowns, rows)
-    freedom = max(int(rows.sum()) - unknowns.count, 1)
+    hessian, _, slopes, residual = normal_equations(model, unknowns, rows)
+    degrees_of_freedom = max(int(rows.sum()) - unknowns.count, 1)
+
+    # Inverse of H = J'J, scaled to a unit diagonal because the units of the unknowns differ.
     scale = np.sqrt(np.diagonal(hessian)) + 1e-12
     inverse = np.linalg.pinv(hessian / np.outer(scale, scale), rcond=1e-10, hermitian=True)
     inverse /= np.outer(scale, scale)
-    noise = np.sum(left**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
+
+    # Two covariances of the form H^-1 M H^-1; the larger variance of each unknown counts:
+    #     white residuals:   M = sum_j s_j^2 J_j'J_j              (s_j^2: error variance of joint j)
+    #     cluster-robust:    M = sum_c g_c g_c',  g_c = sum over the rows of cluster c of J'r
+    noise = np.sum(residual**2, axis=0) / np.maximum(rows.sum(axis=0), 1)
     white = unknowns.accumulate(noise[:, None, None] * (slopes @ slopes.transpose(0, 2, 1)))
-    sums = np.zeros((len(parts.starts), unknowns.count))
-    for j, moment in enumerate(slopes * left.T[:, None]):  # (A, N)
+    sums = np.zeros((len(parts.cluster_starts), unknowns.count))
+    for j, moment in enumerate(slopes * residual.T[:, None]):  # (A, N)
         used = unknowns.index[:, j] >= 0
         sums[:, unknowns.index[used, j]] += parts.cluster_sums(moment[used].T)
-    meat = sums.T @ sums
-    units = int((parts.cluster_sums(rows.any(axis=1).astype(float)) > 0).sum())
-    of_joint = int((unknowns.index >= 0).any(axis=1).sum())
-    variance = np.maximum(*(np.diagonal(inverse @ middle @ inverse) for middle in (white, meat)))
-    variance = np.maximum(variance * (1.0 + unknowns.count / freedom), 0.0)
-    half = np.sqrt(variance) * stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(units - of_joint, 5))
+    clustered = sums.T @ sums
+    variance = np.maximum(*(np.diagonal(inverse @ inner @ inverse) for inner in (white, clustered)))
+
+    # Small-sample corrections: factor 1 + K / (n - K), and Student's t over the clusters.
+    cluster_count = int((parts.cluster_sums(rows.any(axis=1).astype(float)) > 0).sum())
+    joint_unknowns = int((unknowns.index >= 0).any(axis=1).sum())
+    variance = np.maximum(variance * (1.0 + unknowns.count / degrees_of_freedom), 0.0)
+    half = np.sqrt(variance) * stats.t.ppf(0.5 + CONFIDENCE_LEVEL / 2, max(cluster_count - joint_unknowns, 5))
     return np.where(unknowns.index >= 0, half[unknowns.index], 0.0)
 
 
-def _shape_error(model: Model, index: int, rows: Bools) -> Array:
-    """How far an effect's values (P, J) move where it has another shape that explains the log as well."""
-    one, moved = model.effects[index], np.zeros(model.effects[index].values.shape)
-    if one.law.indistinguishable_forms:
-        bound = _EQUIVALENT_ERROR * squared_error(model, rows)
-        for law in one.law.indistinguishable_forms:
-            other = fit(model.with_replaced_effect(index, attrs.evolve(one, law=law)), rows)
+def _law_form_error(model: Model, index: int, rows: Bools) -> Array:
+    """Largest change (P, J) of an effect's values under equivalent forms of its law."""
+    effect, change = model.effects[index], np.zeros(model.effects[index].values.shape)
+    if effect.law.indistinguishable_forms:
+        bound = _EQUIVALENT_ERROR_RATIO * squared_error(model, rows)
+        for law in effect.law.indistinguishable_forms:
+            other = fit(model.with_replaced_effect(index, attrs.evolve(effect, law=law)), rows)
             if squared_error(other, rows) < bound:
-                moved = np.maximum(moved, np.abs(other.effects[index].values - one.values))
-    return moved
+                change = np.maximum(change, np.abs(other.effects[index].values - effect.values))
+    return change
 
 
-def on_bound(model: Model) -> tuple[str, ...]:
-    """Delays, and effect.parameter, of those that sit on a bound of theirs."""
+def parameters_at_bound(model: Model) -> tuple[str, ...]:
+    """List the parameters that lie on one of their bounds.
+
+    Args:
+        model: The fitted model.
+
+    Returns:
+        Names: `input_delay`, `output_delay`, or `effect.parameter`.
+    """
     found = [
         name
         for name, values, most in zip(
@@ -101,10 +140,11 @@ def on_bound(model: Model) -> tuple[str, ...]:
         )
         if (values >= most - 1e-9).any()
     ]
-    for one in model.effects:
-        for parameter, values in zip(one.law.parameters, one.values, strict=True):
+    for effect in model.effects:
+        for parameter, values in zip(effect.law.parameters, effect.values, strict=True):
+            # Relative round-off of the bounds.
             reach = 1e-9 * max(abs(parameter.low), abs(parameter.high))
-            sits = (values <= parameter.low + reach) | (values >= parameter.high - reach)
-            if (sits & one.active).any():
-                found.append(f"{one.law.name}.{parameter.name}")
+            at_bound = (values <= parameter.low + reach) | (values >= parameter.high - reach)
+            if (at_bound & effect.active).any():
+                found.append(f"{effect.law.name}.{parameter.name}")
     return tuple(found)

@@ -1,8 +1,9 @@
-"""The empirical actuator model as the paper identifies it (Section 3.1), with delays below a millisecond.
+"""Empirical actuator model (EAM) of the paper, Section 3.1: PD gains and two delays.
 
-For every pair of delays on a fine grid the gains, which all joints share, follow by linear regression; the pair that leaves
-least is the model's, and what it leaves is the noise. The cross products that the regressions need are summed once for each
-delay, not once for each pair, which is what makes the grid cheap.
+A grid search over both delays solves a linear regression for the gains at each pair. All joints
+share the gains. The pair with the least squared error is the model, and its residual is the noise.
+The cross products of the regressions separate into sums for each delay rather than each pair, which
+makes a grid finer than a millisecond affordable.
 """
 
 from __future__ import annotations
@@ -15,137 +16,201 @@ import numpy as np
 from .log_signals import LogSignals
 from .signals import Array, Bools, Samples, scattered_rows
 
-LONGEST_INPUT, LONGEST_OUTPUT = 0.020, 0.006  # s
-WINDOWS = (0.0, 0.001)
-"""s, steps that a drive may have"""
+MAX_INPUT_DELAY_S, MAX_OUTPUT_DELAY_S = 0.020, 0.006
+"""Upper bounds of the input and output delay, s."""
+DRIVE_WINDOWS_S = (0.0, 0.001)
+"""Steps of a drive to try, s; 0 for a drive without a step."""
 
-_COARSE = 0.001  # s, step of the first grid
-_REFINEMENTS = ((0.00075, 0.00025), (0.0002, 0.00005))  # s: reach about the best pair so far, step
-_ENOUGH = 1500  # rows for the first, coarse look
-_CHUNK = 20000  # rows summed at once
+_COARSE_STEP_S = 0.001
+"""Step of the first grid, s."""
+_REFINEMENTS_S = ((0.00075, 0.00025), (0.0002, 0.00005))
+"""Half range around the best pair so far, and step, of each finer grid, s."""
+_COARSE_ROWS = 1500
+"""Rows that the first grid uses."""
+_CHUNK_ROWS = 20000
+"""Rows of a partial sum, which bounds the memory."""
 
 
 @attrs.frozen(eq=False)
 class Eam:
-    """Gains and delays of each joint, all joints alike."""
+    """Fitted EAM; the values of all joints are equal.
+
+    Attributes:
+        gains: Ratios of real to commanded kp and kd, (2, J).
+        input_delay: Input delay, (J,), s.
+        output_delay: Output delay, (J,), s.
+        window: Step of the drive, over which commands are averaged, s; 0 for none.
+        mse: Mean squared error of the fitted rows, N^2 m^2.
+    """
 
     gains: Array
-    """(2, J): real over commanded kp and kd"""
     input_delay: Array
-    """(J,) s"""
     output_delay: Array
-    """(J,) s"""
     window: float
-    """the drive's step, s: commands are means over it"""
     mse: float
-    """over the rows that were fitted, N^2 m^2"""
 
     def predict(self, samples: Samples) -> Array:
-        """Torque of every row, (N, J), N m."""
+        """Predict the torque of every row.
+
+        Args:
+            samples: Rows of logs.
+
+        Returns:
+            Torque, (N, J), N m.
+        """
         return pd_torque(samples, self.gains, self.input_delay, self.output_delay, self.window)
 
 
 def pd_torque(
     samples: Samples, gains: Array, input_delay: Array | float, output_delay: Array | float, window: float
 ) -> Array:
-    """Eq. 1 without its noise, (N, J), N m."""
+    """Compute the torque of the PD law with delays, Eq. 1 of the paper without its noise.
+
+        tau(t) = g_p kp (q_des(t - d_in - d_out) - q(t - d_out))
+                 + g_d kd (dq_des(t - d_in - d_out) - dq(t - d_out)) + tau_ff(t - d_in - d_out)
+
+    Args:
+        samples: Rows of logs.
+        gains: Gain ratios g_p and g_d, (2, J).
+        input_delay: d_in, (J,) or scalar, s.
+        output_delay: d_out, (J,) or scalar, s.
+        window: Step of the drive, s; 0 for none.
+
+    Returns:
+        Torque, (N, J), N m.
+    """
     s = samples.at(input_delay, output_delay, window)
     torque: Array = gains[0] * s.stiffness_torque + gains[1] * s.damping_torque + s.tau_ff
     return torque
 
 
-def fit_eam(samples: Samples, rows: Bools, windows: Sequence[float] = WINDOWS) -> Eam:
-    """Fit the EAM to `rows` (N, J). The drive's step is the first of `windows` (s) unless a later one fits better."""
-    few = np.zeros_like(rows)
-    some = scattered_rows(len(rows), max(1, len(rows) // _ENOUGH))
-    few[some] = rows[some]
-    best, *others = (_fitted(samples, few, rows, window) for window in windows)
+def fit_eam(samples: Samples, rows: Bools, windows: Sequence[float] = DRIVE_WINDOWS_S) -> Eam:
+    """Fit gains and delays by a grid search.
+
+    Args:
+        samples: Rows of logs.
+        rows: Samples to fit, (N, J) bool.
+        windows: Steps of a drive to try, s; the first counts unless a later one fits clearly
+            better.
+
+    Returns:
+        The fitted model.
+    """
+    coarse_rows = np.zeros_like(rows)
+    sampled = scattered_rows(len(rows), max(1, len(rows) // _COARSE_ROWS))
+    coarse_rows[sampled] = rows[sampled]
+    best, *others = (_search_delays(samples, coarse_rows, rows, window) for window in windows)
     for eam in others:
         best = best if best.mse <= 1.002 * eam.mse else eam
     return best
 
 
-def _fitted(samples: Samples, few: Bools, rows: Bools, window: float) -> Eam:
-    """The best fit with a step of the drive: on a coarse grid of delays with `few` rows, on finer ones about it with all."""
-    longest = LONGEST_INPUT + LONGEST_OUTPUT, LONGEST_OUTPUT
-    totals, outputs = (_grid(end, _COARSE) for end in longest)
-    eam = _Sums(samples, few, totals, outputs, window, 0.0).best()
-    for reach, step in _REFINEMENTS:
+def _search_delays(samples: Samples, coarse_rows: Bools, rows: Bools, window: float) -> Eam:
+    """Best fit for one drive step: coarse grid on `coarse_rows`, then finer grids on all rows."""
+    longest = MAX_INPUT_DELAY_S + MAX_OUTPUT_DELAY_S, MAX_OUTPUT_DELAY_S
+    totals, outputs = (_delay_grid(end, _COARSE_STEP_S) for end in longest)
+    eam = _CrossProducts(samples, coarse_rows, totals, outputs, window, 0.0).best_fit()
+    for reach, step in _REFINEMENTS_S:
         about = eam.input_delay[0] + eam.output_delay[0], eam.output_delay[0]
-        totals, outputs = (_grid(end, step, near, reach) for end, near in zip(longest, about, strict=True))
-        eam = _Sums(samples, rows, totals, outputs, window, about[0]).best()
+        totals, outputs = (
+            _delay_grid(end, step, near, reach) for end, near in zip(longest, about, strict=True)
+        )
+        eam = _CrossProducts(samples, rows, totals, outputs, window, about[0]).best_fit()
     return eam
 
 
-def _grid(longest: float, step: float, about: float = 0.0, reach: float = np.inf) -> Array:
+def _delay_grid(longest: float, step: float, about: float = 0.0, reach: float = np.inf) -> Array:
     """Delays from 0 to `longest` (s) within `reach` of `about`."""
     grid = np.round(np.arange(0.0, longest + 1e-9, step), 7)
     chosen: Array = grid[np.abs(grid - about) <= reach + 1e-9]
     return chosen
 
 
-class _Sums:
-    """Cross products of the shifted commands and states, so that any pair's regression is a 2 by 2 system.
+class _CrossProducts:
+    """Cross products of shifted commands and states, from which each pair's 2 by 2 system follows.
 
-    The torque less the feed-forward torque F is g0 (C - Q) + g1 (D - V) with C = kp q_des, D = kd dq_des and F shifted by
-    the sum of both delays, Q = kp q and V = kd dq shifted by the output delay. Rows of a sum are such `totals`, columns
-    `outputs`; gains count as they were commanded `at` s before a row.
+    With feed-forward torque F, the regression is
+
+        tau - F = g_p (C - Q) + g_d (D - V)
+
+    where C = kp q_des, D = kd dq_des and F are shifted by the sum of both delays (rows `totals`),
+    and Q = kp q and V = kd dq by the output delay (columns `outputs`). Gains are those commanded
+    `at` s before a row.
     """
 
     def __init__(
         self, samples: Samples, rows: Bools, totals: Array, outputs: Array, window: float, at: float
     ) -> None:
+        """Sum the cross products.
+
+        Args:
+            samples: Rows of logs.
+            rows: Samples to fit, (N, J) bool.
+            totals: Sums of both delays, (T,), s.
+            outputs: Output delays, (D,), s.
+            window: Step of the drive, s; 0 for none.
+            at: Age of the gains that count at a row, s.
+        """
         self._totals, self._outputs, self._window, self._at = totals, outputs, window, at
         self._joints, self._count = len(samples.joints), int(rows.sum())
         self._aa, self._ab, self._bb, self._az, self._bz, self._zz = np.zeros((6, len(totals), len(outputs)))
         offset = 0
-        for one in samples.logs:
-            for first in range(0, len(one.t), _CHUNK):
-                t = one.t[first : first + _CHUNK]
+        for log in samples.logs:
+            for first in range(0, len(log.t), _CHUNK_ROWS):
+                t = log.t[first : first + _CHUNK_ROWS]
                 here = slice(offset + first, offset + first + len(t))
                 if rows[here].any():
-                    self._add(one, t, samples.tau[here], rows[here].astype(float))
-            offset += len(one.t)
+                    self._add(log, t, samples.tau[here], rows[here].astype(float))
+            offset += len(log.t)
 
-    def _add(self, one: LogSignals, t: Array, tau: Array, keep: Array) -> None:
-        packet = one.command_rows(t - self._at)
-        kp, kd = (one.gains[name][packet] * keep for name in ("kp", "kd"))
+    def _add(self, log: LogSignals, t: Array, tau: Array, keep: Array) -> None:
+        """Add the rows at the times `t` of one log; `keep` is 1 on samples to fit, 0 on others."""
+        # With a = C - Q, b = D - V and z = tau - F, each product of sums separates, for example
+        #     a'a = C'C - 2 C'Q + Q'Q,   C by the row of the sum, Q by the column.
+        packet = log.command_rows(t - self._at)
+        kp, kd = (log.gains[name][packet] * keep for name in ("kp", "kd"))
         c, d, f = (
-            _stacked(one.command_at(name, t - late, self._window) * by for late in self._totals)
-            for name, by in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
+            _stack_rows(log.command_at(name, t - delay, self._window) * factor for delay in self._totals)
+            for name, factor in (("q_des", kp), ("dq_des", kd), ("tau_ff", keep))
         )
         q, v = (
-            _stacked(one.state_at(name, t - late) * by for late in self._outputs)
-            for name, by in (("q", kp), ("dq", kd))
+            _stack_rows(log.state_at(name, t - delay) * factor for delay in self._outputs)
+            for name, factor in (("q", kp), ("dq", kd))
         )
         z = (tau * keep).ravel() - f
-        self._aa += _dot(c, c)[:, None] - 2.0 * c @ q.T + _dot(q, q)
-        self._ab += _dot(c, d)[:, None] - c @ v.T - d @ q.T + _dot(q, v)
-        self._bb += _dot(d, d)[:, None] - 2.0 * d @ v.T + _dot(v, v)
-        self._az += _dot(c, z)[:, None] - z @ q.T
-        self._bz += _dot(d, z)[:, None] - z @ v.T
-        self._zz += _dot(z, z)[:, None]
+        self._aa += _row_products(c, c)[:, None] - 2.0 * c @ q.T + _row_products(q, q)
+        self._ab += _row_products(c, d)[:, None] - c @ v.T - d @ q.T + _row_products(q, v)
+        self._bb += _row_products(d, d)[:, None] - 2.0 * d @ v.T + _row_products(v, v)
+        self._az += _row_products(c, z)[:, None] - z @ q.T
+        self._bz += _row_products(d, z)[:, None] - z @ v.T
+        self._zz += _row_products(z, z)[:, None]
 
-    def best(self) -> Eam:
-        """The pair with the least mean squared error, and its gains."""
+    def best_fit(self) -> Eam:
+        """Solve all regressions.
+
+        Returns:
+            The pair of delays with the least mean squared error, with its gains.
+        """
+        # Cramer's rule for [aa ab; ab bb] [g0 g1]' = [az bz]'; g1 = 0 where b is 0 or collinear to
+        # a.
         aa, ab, bb, az, bz = self._aa, self._ab, self._bb, self._az, self._bz
         det, ridge = aa * bb - ab * ab, 1e-12 * (aa + bb) ** 2 + 1e-300
         g0 = np.where(det > ridge, (bb * az - ab * bz) / np.maximum(det, ridge), az / np.maximum(aa, 1e-300))
         g1 = np.where(det > ridge, (aa * bz - ab * az) / np.maximum(det, ridge), 0.0)
         mse = np.maximum(self._zz - g0 * az - g1 * bz, 0.0) / max(self._count, 1)
-        inputs = self._totals[:, None] - self._outputs
-        possible = (inputs >= -1e-9) & (inputs <= LONGEST_INPUT + 1e-9)
+        input_delays = self._totals[:, None] - self._outputs
+        possible = (input_delays >= -1e-9) & (input_delays <= MAX_INPUT_DELAY_S + 1e-9)
         at = np.unravel_index(np.argmin(np.where(possible, mse, np.inf)), mse.shape)
-        gains, delays = np.array([g0[at], g1[at]]), (max(inputs[at], 0.0), self._outputs[at[1]])
-        every = np.ones(self._joints)
-        return Eam(gains[:, None] * every, delays[0] * every, delays[1] * every, self._window, float(mse[at]))
+        gains, delays = np.array([g0[at], g1[at]]), (max(input_delays[at], 0.0), self._outputs[at[1]])
+        ones = np.ones(self._joints)
+        return Eam(gains[:, None] * ones, delays[0] * ones, delays[1] * ones, self._window, float(mse[at]))
 
 
-def _stacked(signals: Iterable[Array]) -> Array:
-    """Signals (N, J), one for each delay, as rows (D, N J)."""
+def _stack_rows(signals: Iterable[Array]) -> Array:
+    """Stack signals (N, J), one for each delay, as rows (D, N J)."""
     return np.stack([one.ravel() for one in signals])
 
 
-def _dot(a: Array, b: Array) -> Array:
-    """Row by row, (D,)."""
+def _row_products(a: Array, b: Array) -> Array:
+    """Inner products of corresponding rows, (D,)."""
     return np.einsum("dn,dn->d", a, b)

@@ -1,4 +1,4 @@
-"""The corrected model as the stack loads it: the fitted gains, delays, laws and terms as `ActuatorParameters`."""
+"""Export a fitted model as `ActuatorParameters`, the file format of the simulator."""
 
 from __future__ import annotations
 
@@ -20,68 +20,91 @@ from .preparation import reference_gains
 from .signals import Array, Bools
 
 
-def parameters(
+def actuator_parameters(
     model: Model, parts: DataSplit, base: ActuatorParameters, widths: Sequence[Array] = ()
 ) -> ActuatorParameters:
-    """A fitted model as parameters; the torque limits are those of `base`.
+    """Convert a fitted model to actuator parameters.
 
-    widths: half of the 95 % interval of each effect's values, (P, J) each; without them the effects tell no ranges.
+    Args:
+        model: The fitted model.
+        parts: Data split.
+        base: Parameters whose torque limits are kept.
+        widths: Half widths of the 95 % intervals of each effect's values, (P, J) each; without them
+            the effects have no ranges.
+
+    Returns:
+        Parameters with gains, one pair of delays, torque noise and effects.
     """
     joints = model.samples.joints
     error = mean_square(model.predictive().residual(), parts.fit_or_select)
     pair = DelayPair(*running_delays(model, parts.fit_or_select), error)
-    deltas, own = _deviations(model)
+    deltas, own = _gain_parameters(model)
     return attrs.evolve(
         base,
         name="identified",
         joints=joints,
-        torque_limit=limits(base, joints),
+        torque_limit=torque_limits(base, joints),
         pairs=(pair,),
         torque_noise=error,
-        effects=(*_laws(model, widths), *_terms(model, parts.fit), *own),
+        effects=(*_law_effects(model, widths), *_term_effect(model, parts.fit), *own),
         **deltas,
     )
 
 
 def mean_square(error: Array, rows: Bools) -> float:
-    """Of an error (N, J) on `rows`; 0 where there are none."""
+    """Mean square of an error over a set of rows.
+
+    Args:
+        error: Error, (N, J).
+        rows: Samples to average, (N, J) bool.
+
+    Returns:
+        Mean square, in squared units of the error; 0 without rows.
+    """
     count = int(rows.sum())
     return float(np.sum(np.where(rows, error, 0.0) ** 2) / count) if count else 0.0
 
 
-def _laws(model: Model, widths: Sequence[Array]) -> list[Effect]:
+def _law_effects(model: Model, widths: Sequence[Array]) -> list[Effect]:
+    """The laws of the registry as effects of a parameter file."""
     found = []
-    for k, one in enumerate(model.effects):
-        if isinstance(one.law, SignalTerm):
+    for k, effect in enumerate(model.effects):
+        if isinstance(effect.law, SignalTerm):
             continue
-        params = parameter_entries(one, widths[k] if widths else np.zeros_like(one.values))
+        params = parameter_entries(effect, widths[k] if widths else np.zeros_like(effect.values))
         values, units, ranges = (
             {name: each[field] for name, each in params.items()} for field in ("value", "unit", "ci95")
         )
-        acts = tuple(acting_joints(one.active, model.samples.joints))
-        found.append(Effect(one.law.name, acts, values | law_settings(one), units, ranges if widths else {}))
+        acts = tuple(acting_joints(effect.active, model.samples.joints))
+        found.append(
+            Effect(effect.law.name, acts, values | law_settings(effect), units, ranges if widths else {})
+        )
     return found
 
 
-def _terms(model: Model, rows: Bools) -> list[Effect]:
-    """All terms as one effect; on `rows` (N, J) it is looked how large their torque becomes."""
+def _term_effect(model: Model, rows: Bools) -> list[Effect]:
+    """All regressors of named signals as one effect; `rows` (N, J) give their torque bounds."""
     joints = model.samples.joints
-    terms = [one for one in model.effects if isinstance(one.law, SignalTerm)]
-    if not terms:
+    saved = [
+        effect.law.running_term(effect, _peak_torque(model, effect, rows)).to_entry(joints)
+        for effect in model.effects
+        if isinstance(effect.law, SignalTerm)
+    ]
+    if not saved:
         return []
-    saved = [one.law.term(one, _largest(model, one, rows)).to_entry(joints) for one in terms]  # type: ignore[attr-defined]
-    acts = acting_joints(np.any([one.active for one in terms], axis=0), joints)
+    active = [effect.active for effect in model.effects if isinstance(effect.law, SignalTerm)]
+    acts = acting_joints(np.any(active, axis=0), joints)
     return [Effect(TERMS, tuple(acts), {"terms": saved})]
 
 
-def _largest(model: Model, one: AppliedEffect, rows: Bools) -> Array:
-    """The largest torque (J,) that a term had on `rows` (N, J): a running model's stays within it."""
-    torque = np.einsum("kj,knj->nj", one.values, linear_columns(model, one))
+def _peak_torque(model: Model, effect: AppliedEffect, rows: Bools) -> Array:
+    """Largest absolute torque (J,) of a regressor on `rows`, the bound in a running model."""
+    torque = np.einsum("kj,knj->nj", effect.values, linear_columns(model, effect))
     return np.max(np.abs(torque) * rows, axis=0)
 
 
-def _deviations(model: Model) -> tuple[dict[str, Any], list[Effect]]:
-    """Gains and how far they are off; a damping of the drive's own where none is commanded, of which there is no deviation."""
+def _gain_parameters(model: Model) -> tuple[dict[str, Any], list[Effect]]:
+    """Reference gains and their deviations; viscous friction for a drive without commanded kd."""
     joints, (kp, kd) = model.samples.joints, reference_gains(model.samples)
     delta_kp, delta_kd = gain_deviations(model)
     own = []
@@ -95,14 +118,29 @@ def _deviations(model: Model) -> tuple[dict[str, Any], list[Effect]]:
 
 
 def gain_deviations(model: Model) -> Array:
-    """Of kp and kd, (2, J), at the gains usual in the log; where no kd is commanded all of it."""
+    """Compute the deviations of the gains from the usual commanded gains.
+
+    Args:
+        model: The fitted model.
+
+    Returns:
+        Deviations of kp (N m/rad) and kd (N m s/rad), (2, J); the whole kd where none is commanded.
+    """
     commanded = np.array([[1.0], [0.0 if model.samples.undamped else 1.0]])
     found: Array = (model.gains - commanded) * np.array(reference_gains(model.samples))[:, None]
     return found
 
 
-def limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
-    """The base's torque limits for these joints: each its own where the base knows it, else the largest."""
+def torque_limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[float, ...]:
+    """Return the torque limits of the base parameters for a set of joints.
+
+    Args:
+        base: Parameters with limits.
+        joints: Names of the joints.
+
+    Returns:
+        Limits, N m; the largest limit of the base for joints that it does not have.
+    """
     limit = base.torque_limit
     if not isinstance(limit, tuple):
         return limit
@@ -111,19 +149,39 @@ def limits(base: ActuatorParameters, joints: Sequence[str]) -> float | tuple[flo
     return tuple(every[names.index(name)] if name in names else max(limit) for name in joints)
 
 
-def parameter_entries(one: AppliedEffect, half: Array) -> dict[str, dict[str, Any]]:
-    """The parameters of an effect on its joints, by name: value, interval and unit."""
+def parameter_entries(effect: AppliedEffect, half: Array) -> dict[str, dict[str, Any]]:
+    """Return an effect's parameters on its joints, as in the report.
+
+    Args:
+        effect: The fitted effect.
+        half: Half widths of the 95 % intervals, (P, J).
+
+    Returns:
+        For each parameter name a dict with `value`, `ci95` and `unit`.
+    """
     params = {}
-    for parameter, values, width in zip(one.law.parameters, one.values, half, strict=True):
-        value, ci = with_interval(values[one.active], width[one.active], parameter.low, parameter.high)
+    for parameter, values, width in zip(effect.law.parameters, effect.values, half, strict=True):
+        value, ci = value_and_interval(
+            values[effect.active], width[effect.active], parameter.low, parameter.high
+        )
         params[parameter.name] = {"value": value, "ci95": ci, "unit": parameter.unit}
     return params
 
 
-def with_interval(
+def value_and_interval(
     values: Array, half: Array, least: float = -np.inf, most: float = np.inf
 ) -> tuple[Any, Any]:
-    """Value and interval, within what is possible: numbers if all joints share them, else lists."""
+    """Return values with their intervals, clipped to bounds.
+
+    Args:
+        values: Values of the joints, (J,).
+        half: Half widths, (J,).
+        least: Lower bound.
+        most: Upper bound.
+
+    Returns:
+        Value and [low, high] if all joints share the value; else lists of these.
+    """
     low, high = np.maximum(values - half, least), np.minimum(values + half, most)
     if np.all(values == values[0]):
         return float(values[0]), [float(low[0]), float(high[0])]
@@ -131,15 +189,30 @@ def with_interval(
 
 
 def acting_joints(active: Bools, joints: Sequence[str]) -> list[str]:
-    """The names of the joints that an effect acts on."""
+    """Return the names of the joints that an effect acts on.
+
+    Args:
+        active: Mask of the joints, (J,).
+        joints: Names of the joints.
+
+    Returns:
+        Names.
+    """
     return [name for name, acts in zip(joints, active, strict=True) if acts]
 
 
-def law_settings(one: AppliedEffect) -> dict[str, Any]:
-    """The settings of a law; what it has for each joint, for those that it acts on."""
+def law_settings(effect: AppliedEffect) -> dict[str, Any]:
+    """Return the settings of an effect's law.
+
+    Args:
+        effect: The fitted effect.
+
+    Returns:
+        Settings by name; lists over joints are restricted to the active joints.
+    """
     return {
-        name: [v for v, acts in zip(value, one.active, strict=True) if acts]
+        name: [v for v, acts in zip(value, effect.active, strict=True) if acts]
         if isinstance(value, list)
         else value
-        for name, value in one.law.settings.items()
+        for name, value in effect.law.settings.items()
     }

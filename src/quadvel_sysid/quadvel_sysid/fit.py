@@ -1,7 +1,8 @@
-"""One bounded least-squares fit of a model's gains, delays and effects (Levenberg and Marquardt).
+"""Bounded nonlinear least squares for the parameters of a model (Levenberg-Marquardt).
 
-Every joint keeps its own small Jacobian, so that the normal equations of all rows are small; each step is a bounded
-quadratic problem.
+`fit` minimises the squared residual over gains, delays and effect parameters. `fit_delay_profile`
+repeats it from a grid of delays, as the error has several local minima along them. Every joint has
+its own small Jacobian block, so that the normal equations stay small for any number of rows.
 """
 
 from __future__ import annotations
@@ -15,144 +16,209 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 from .model import MAX_DELAYS_S, Model, Unknowns, jacobian, pack, with_slots
-from .parallel import side_by_side
+from .parallel import parallel_map
 from .signals import Array, Bools
 
 _CONVERGED = 2e-5
-"""Relative fall of the error below which a fit has converged"""
+"""Relative reduction of the error below which a fit has converged."""
 _DAMPING_FACTORS = (1e-6, 1e-3, 0.1, 10.0)
-"""Shares of the curvature, tried until the error falls"""
-_PIVOTS = 5, 60
-"""Of all bounds at once, and at most; one by one in between, as all at once may go round in circles (Murty)"""
+"""Levenberg-Marquardt damping, as multiples of the curvature, tried in this order."""
+_MAX_PIVOTS = 5, 60
+"""Pivots that exchange all violated bounds, and pivots in total.
+
+After the first ones a single bound changes at a time, as block pivots may cycle (Murty).
+"""
 RIDGE = 1e-4
-"""Weight of a term's own penalty on its weights, of its columns' mean second moment"""
+"""Weight of the smoothness penalty on regressor weights, relative to their mean second moment."""
 
 
 def fit(model: Model, rows: Bools, iterations: int = 12, delays: bool = True) -> Model:
-    """The model with its parameters fitted to `rows` (N, J)."""
+    """Fit the parameters of a model by least squares.
+
+    Args:
+        model: Start of the fit.
+        rows: Samples to fit, (N, J) bool.
+        iterations: Maximum number of Levenberg-Marquardt steps.
+        delays: Whether the delays are fitted as well.
+
+    Returns:
+        The fitted model in canonical form, on the samples of `model`.
+    """
+    # The error falls with every step. Laws with memory need all rows, others the fitted rows alone.
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     unknowns = Unknowns.of(model, delays)
     error = squared_error(model, rows)
     for _ in range(iterations):
-        better = _step(model, unknowns, rows, error)
-        if better is None:
+        step = _damped_step(model, unknowns, rows, error)
+        if step is None:
             break
-        before, (model, error) = error, better
+        before, (model, error) = error, step
         if error > before * (1.0 - _CONVERGED):
             break
     return attrs.evolve(canonical(model), samples=samples)
 
 
 def _fitted_rows_only(model: Model, rows: Bools) -> tuple[Model, Bools]:
-    """The model on `rows` (N, J) alone, and which of these each joint has; on all rows where a law of it remembers some before."""
-    some: Bools = np.asarray(rows.any(axis=1))
-    if some.all() or any(one.law.has_memory for one in model.effects):
+    """The model on the fitted rows and their mask; on all rows if a law has memory."""
+    used: Bools = np.asarray(rows.any(axis=1))
+    if used.all() or any(effect.law.has_memory for effect in model.effects):
         return model, rows
-    return attrs.evolve(model, samples=model.samples.select_rows(some)), rows[some]
+    return attrs.evolve(model, samples=model.samples.select_rows(used)), rows[used]
 
 
 _TOTAL_DELAY_CHANGES_S = np.arange(-0.003, 0.0031, 0.0005)
 _OUTPUT_DELAY_CHANGES_S = np.array([-0.002, -0.001, 0.0, 0.001, 0.002])
-"""s: the grid of delays, as changes of their sum and of the output delay. Commands come in steps, which make small valleys."""
+"""Grid of delays, s: changes of their sum, and of the output delay."""
 _FAR_DELAY_CHANGES_S = np.array([-0.008, -0.007, -0.006, -0.005, -0.004, 0.004, 0.005, 0.006, 0.007, 0.008])
-"""s: changes of the sum alone, as far as what a model lacked may have led its delays astray"""
+"""Further changes of the sum alone, s: a missing effect may have biased the delays by so much."""
 _DELAY_STARTS = 3
-"""Points of the grid that a fit starts from"""
+"""Grid points from which fits start."""
 _NEAR_DELAY_CHANGES_S = (-0.002, -0.001, 0.001, 0.002)
-"""s: a coarser grid of the sum of delays alone"""
+"""Coarse grid of changes of the sum of delays, s."""
 
 
 def fit_delay_profile(model: Model, rows: Bools, cores: int = 1) -> Model:
-    """The model fitted from the best points of a grid of delays, everything else adapted at each (a profile likelihood)."""
+    """Fit a model from the best points of a grid of delays (profile likelihood).
+
+    Args:
+        model: A fitted model.
+        rows: Samples to fit, (N, J) bool.
+        cores: Worker processes.
+
+    Returns:
+        The model with the least squared error, among `model` and the fits.
+    """
+    # Profile likelihood: at each pair of delays one step adapts the other parameters. Full fits
+    # start from the pairs with the least error, as step commands give the error several local
+    # minima.
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
     shifts = (
         *product(_TOTAL_DELAY_CHANGES_S, _OUTPUT_DELAY_CHANGES_S),
         *product(_FAR_DELAY_CHANGES_S, (0.0,)),
     )
     starts = [model, *_one_step_at_each_delay(model, rows, shifts, cores)[:_DELAY_STARTS]]
-    tried = side_by_side(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
-    return attrs.evolve(min([model, *tried], key=lambda one: squared_error(one, rows)), samples=samples)
+    fits = parallel_map(lambda k: fit(starts[k], rows), len(starts), cores, model.samples)
+    return attrs.evolve(min([model, *fits], key=lambda one: squared_error(one, rows)), samples=samples)
 
 
 def fit_near_delays(model: Model, rows: Bools) -> Model:
-    """The model, or one that leaves less, fitted from input delays that are a millisecond or two off."""
+    """Fit a model from input delays that differ by 1 or 2 ms.
+
+    Args:
+        model: A fitted model.
+        rows: Samples to fit, (N, J) bool.
+
+    Returns:
+        The model with the least squared error, among `model` and the fit from the best start.
+    """
     samples, (model, rows) = model.samples, _fitted_rows_only(model, rows)
-    found = _one_step_at_each_delay(model, rows, product(_NEAR_DELAY_CHANGES_S, (0.0,)))
-    tried = [model, *(fit(one, rows) for one in found[:1])]
+    starts = _one_step_at_each_delay(model, rows, product(_NEAR_DELAY_CHANGES_S, (0.0,)))
+    tried = [model, *(fit(one, rows) for one in starts[:1])]
     return attrs.evolve(min(tried, key=lambda one: squared_error(one, rows)), samples=samples)
 
 
 def _one_step_at_each_delay(
     model: Model, rows: Bools, shifts: Iterable[tuple[float, float]], cores: int = 1
 ) -> list[Model]:
-    """The model at other delays, everything else adapted by a step, the best one first.
+    """Models at other delays after one step of the other parameters, ordered by squared error.
 
-    shifts: changes (s) of the sum of both delays and of the output delay.
+    `shifts` are changes (s) of the sum of both delays and of the output delay.
     """
     unknowns = Unknowns.of(model, delays=False)
-    every = [model.delays + np.array([[more - later], [later]]) for more, later in shifts]
-    within = [one for one in every if (one >= -1e-9).all() and (one <= MAX_DELAYS_S[:, None] + 1e-9).all()]
+    grid = [model.delays + np.array([[more - later], [later]]) for more, later in shifts]
+    allowed = [one for one in grid if (one >= -1e-9).all() and (one <= MAX_DELAYS_S[:, None] + 1e-9).all()]
 
     def adapted(k: int) -> tuple[Model, float]:
-        at = model.with_delays(within[k])
+        at = model.with_delays(allowed[k])
         error = squared_error(at, rows)
-        return _step(at, unknowns, rows, error) or (at, error)
+        return _damped_step(at, unknowns, rows, error) or (at, error)
 
-    found = side_by_side(adapted, len(within), cores, model.samples)
+    found = parallel_map(adapted, len(allowed), cores, model.samples)
     return [one for one, _ in sorted(found, key=lambda one: one[1])]
 
 
 def canonical(model: Model) -> Model:
-    """With every law's parameters in their unique order."""
-    return attrs.evolve(model, effects=tuple(one.canonical() for one in model.effects))
+    """Return the model with every effect in canonical form.
+
+    Args:
+        model: The model.
+
+    Returns:
+        An equivalent model; see `AppliedEffect.canonical`.
+    """
+    return attrs.evolve(model, effects=tuple(effect.canonical() for effect in model.effects))
 
 
 def squared_error(model: Model, rows: Bools) -> float:
-    """Sum of squared errors over `rows` (N, J), N^2 m^2."""
-    left = np.where(rows, model.residual(), 0.0)
-    return float(np.sum(left * left))
+    """Sum the squared residuals over a set of rows.
+
+    Args:
+        model: The model.
+        rows: Samples to sum, (N, J) bool.
+
+    Returns:
+        Sum of squared errors, N^2 m^2.
+    """
+    residual = np.where(rows, model.residual(), 0.0)
+    return float(np.sum(residual * residual))
 
 
 def normal_equations(model: Model, unknowns: Unknowns, rows: Bools) -> tuple[Array, Array, Array, Array]:
-    """J'J, J'r, the slopes (J, A, N) on `rows`, and the residual (N, J) there."""
+    """Compute the normal equations of the linearised least-squares problem.
+
+    Args:
+        model: The model.
+        unknowns: Mapping from slots to unknowns.
+        rows: Samples to fit, (N, J) bool.
+
+    Returns:
+        J'J (K, K), J'r (K,), derivatives (J, A, N) and residual (N, J), both 0 outside `rows`.
+    """
     predicted, slopes = jacobian(model, unknowns)
-    left = np.where(rows, model.samples.tau - predicted, 0.0)
+    residual = np.where(rows, model.samples.tau - predicted, 0.0)
     slopes *= rows.T[:, None]
     hessian = unknowns.accumulate(slopes @ slopes.transpose(0, 2, 1))
-    gradient = unknowns.accumulate(np.einsum("jan,nj->ja", slopes, left))
-    return hessian, gradient, slopes, left
+    gradient = unknowns.accumulate(np.einsum("jan,nj->ja", slopes, residual))
+    return hessian, gradient, slopes, residual
 
 
-def _step(model: Model, unknowns: Unknowns, rows: Bools, error: float) -> tuple[Model, float] | None:
-    """The model after a step that lessens the error, and the error; None where none does."""
+def _damped_step(model: Model, unknowns: Unknowns, rows: Bools, error: float) -> tuple[Model, float] | None:
+    """The model after a step that reduces the error, and that error; None if no damping does."""
+    # Levenberg-Marquardt step d of the penalised problem, with H = J'J + P and g = J'r - P x:
+    #     minimise  d'(H + lambda D) d / 2 - g'd   subject to   low <= x + d <= high
+    # where D is the diagonal of H. The first lambda that reduces the true squared error counts.
     hessian, gradient, _, _ = normal_equations(model, unknowns, rows)
     theta = pack(model)
     x = unknowns.vector(theta)
-    penalty = _penalty(model, unknowns, hessian)
+    penalty = _weight_penalty(model, unknowns, hessian)
     hessian, gradient = hessian + penalty, gradient - penalty @ x
-    size = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
+    diagonal = np.diagonal(hessian) + 1e-12 * (1.0 + np.diagonal(hessian).max(initial=0.0))
     for damping in _DAMPING_FACTORS:
         change = _bounded_minimum(
-            hessian + np.diag(damping * size), gradient, unknowns.low - x, unknowns.high - x, np.sqrt(size)
+            hessian + np.diag(damping * diagonal),
+            gradient,
+            unknowns.low - x,
+            unknowns.high - x,
+            np.sqrt(diagonal),
         )
         after = np.where(unknowns.index >= 0, (x + change)[unknowns.index], theta)
-        tried = with_slots(model, after)
-        found = squared_error(tried, rows)
-        if found < error:
-            return tried, found
+        moved = with_slots(model, after)
+        moved_error = squared_error(moved, rows)
+        if moved_error < error:
+            return moved, moved_error
     return None
 
 
-def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
-    """The quadratic penalty on the weights of terms, in the unknowns."""
+def _weight_penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
+    """Matrix of the quadratic penalty on regressor weights, (K, K)."""
     total = np.zeros_like(hessian)
     first = 2
-    for one in model.effects:
-        count = len(one.values)
-        shape = getattr(one.law, "penalty", None)
+    for effect in model.effects:
+        count = len(effect.values)
+        shape = getattr(effect.law, "penalty", None)
         if shape is not None:
-            joints = np.flatnonzero(one.active)
-            _, first_of_group = np.unique(one.groups[joints], return_index=True)
+            joints = np.flatnonzero(effect.active)
+            _, first_of_group = np.unique(effect.groups[joints], return_index=True)
             for j in joints[first_of_group]:
                 at = unknowns.index[first : first + count, j]
                 total[np.ix_(at, at)] += shape * float(np.mean(hessian[at, at])) * RIDGE
@@ -161,25 +227,29 @@ def _penalty(model: Model, unknowns: Unknowns, hessian: Array) -> Array:
 
 
 def _bounded_minimum(matrix: Array, gradient: Array, low: Array, high: Array, scale: Array) -> Array:
-    """The minimum of x'Ax/2 - g'x within bounds that 0 lies in.
+    """Minimum of x'Ax/2 - g'x within bounds that contain 0, by block pivoting.
 
-    What a step takes beyond a bound is held there for as long as the slope does not lead back inside (block pivoting).
+    A variable beyond a bound is fixed there. It becomes free again when the gradient at the bound
+    points back inside (the Karush-Kuhn-Tucker conditions).
     """
     matrix, gradient = matrix / np.outer(scale, scale), gradient / scale
     matrix = matrix + 1e-12 * np.eye(len(matrix))
     low, high = np.minimum(low, 0.0) * scale, np.maximum(high, 0.0) * scale
-    x, held = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
-    for pivot in range(_PIVOTS[1]):
-        free = ~held
-        right = gradient[free] - matrix[np.ix_(free, held)] @ x[held]
+    x, at_bound = np.zeros(len(gradient)), np.zeros(len(gradient), dtype=bool)
+    for pivot in range(_MAX_PIVOTS[1]):
+        # Free variables F solve A_FF x_F = g_F - A_FB x_B, the others B lie on their bounds.
+        free = ~at_bound
+        right = gradient[free] - matrix[np.ix_(free, at_bound)] @ x[at_bound]
         x[free] = splu(csc_array(matrix[np.ix_(free, free)])).solve(right)  # joints share few unknowns
         beyond = free & ((x < low) | (x > high))
         x = x.clip(low, high)
+        # Optimality: x_F is within its bounds, and A x - g points outwards at every bound.
         slope = matrix @ x - gradient
-        wrong = beyond | (held & (low < high) & np.where(x <= low, slope < 0.0, slope > 0.0))
-        if not wrong.any():
+        inwards = np.where(x <= low, slope < 0.0, slope > 0.0)
+        violated = beyond | (at_bound & (low < high) & inwards)
+        if not violated.any():
             break
-        if pivot >= _PIVOTS[0]:
-            wrong[: np.flatnonzero(wrong)[-1]] = False
-        held ^= wrong
+        if pivot >= _MAX_PIVOTS[0]:
+            violated[: np.flatnonzero(violated)[-1]] = False
+        at_bound ^= violated
     return np.asarray(x / scale)

@@ -1,4 +1,4 @@
-"""A fitted model and what it is worth on the rows that select: what the search compares."""
+"""Fitted models and their selection criterion, which the search compares."""
 
 from __future__ import annotations
 
@@ -14,142 +14,230 @@ from .criterion import (
     WHITENESS_LEVEL,
     Comparison,
     DataSplit,
-    normality,
-    whiteness,
+    normality_p_values,
+    whiteness_p_values,
 )
 from .fit import fit, fit_delay_profile
 from .library import complexity
 from .model import AppliedEffect, Groups, Model
-from .parallel import side_by_side
+from .parallel import parallel_map
 from .signals import Array
 
-_TINY = 1e-12  # N^2 m^2, of a log without noise
+_VARIANCE_FLOOR = 1e-12
+"""Added to variances, N^2 m^2, for logs without noise."""
 
 
 @attrs.frozen(eq=False)
 class FittedModel:
-    """A fitted model, and what it is worth on the rows that select."""
+    """A fitted model with its errors and criterion on the selection rows.
+
+    Attributes:
+        model: The fitted model.
+        evaluator: Data that it was fitted to and is compared on.
+    """
 
     model: Model
     evaluator: ModelEvaluator
 
     @cached_property
     def residual(self) -> Array:
-        """Measured less predicted torque, (N, J)."""
+        """Measured minus predicted torque, (N, J), N m."""
         return self.model.residual()
 
     @cached_property
     def selection_mse(self) -> Array:
-        """Mean squared error of the rows that select, N^2 m^2, (J,)."""
+        """Mean squared error of each joint on the selection rows, (J,), N^2 m^2."""
         rows = self.evaluator.parts.select
         square = np.sum(np.where(rows, self.residual, 0.0) ** 2, axis=0)
-        left: Array = square / np.maximum(rows.sum(axis=0), 1)
-        return left
+        mse: Array = square / np.maximum(rows.sum(axis=0), 1)
+        return mse
 
     @cached_property
     def criterion(self) -> float:
-        """Twice the negative log likelihood of a row's torque, of normal noise of unknown variance, and what parameters cost."""
+        """Information criterion: sum over joints of ln(mse / noise) plus the parameter penalty.
+
+        The logarithm is twice the negative log-likelihood of a row for normal noise of unknown
+        variance. Lower is better.
+        """
         return float(
-            np.log((self.selection_mse + _TINY) / (self.evaluator.noise + _TINY)).sum()
+            np.log((self.selection_mse + _VARIANCE_FLOOR) / (self.evaluator.noise + _VARIANCE_FLOOR)).sum()
         ) + PENALTY_PER_PARAMETER * parameter_count(self.model)
 
     def compare_with(self, before: FittedModel) -> Comparison:
-        """On the rows that select."""
+        """Compare with another fitted model on the selection rows.
+
+        Args:
+            before: The model without the change in question.
+
+        Returns:
+            Score test of the change from `before` to this model.
+        """
         return self.evaluator.parts.compare(before.residual, self.residual, self.evaluator.parts.select)
 
     @cached_property
     def is_white(self) -> bool:
-        """Is nothing left but noise, on the rows that fit and select?"""
+        """Whether the residual on the fitted and selection rows passes as white noise."""
         parts, samples = self.evaluator.parts, self.model.samples
-        p = whiteness(self.residual, parts.fit_or_select, samples.start, parts.overlap)
-        p = np.minimum(p, normality(self.residual, parts.fit_or_select))
+        p = whiteness_p_values(self.residual, parts.fit_or_select, samples.start, parts.noise_overlap)
+        p = np.minimum(p, normality_p_values(self.residual, parts.fit_or_select))
         return bool((p * 2 * len(p) > WHITENESS_LEVEL).all())
 
     @property
     def last_effect(self) -> AppliedEffect:
+        """The effect that was added last."""
         return self.model.effects[-1]
 
 
 def parameter_count(model: Model) -> float:
-    """How many parameters a model has, each joint's own counted, those of the plain model not."""
+    """Count the parameters of a model beyond those of the plain EAM.
+
+    Args:
+        model: The model.
+
+    Returns:
+        Number of parameters; values shared by joints count once, see `library.complexity`.
+    """
     total = 2.0 * (len(np.unique(model.gain_groups)) + len(np.unique(model.delay_groups)) - 2)
-    for one in model.effects:
-        total += complexity(one.law) * len(np.unique(one.groups[one.active]))
+    for effect in model.effects:
+        total += complexity(effect.law) * len(np.unique(effect.groups[effect.active]))
     return total
 
 
 @attrs.frozen(eq=False)
 class ModelEvaluator:
-    """The data that models are fitted to and held against."""
+    """Fits models to the fitted rows and compares them on the selection rows.
+
+    Attributes:
+        parts: Data split.
+        noise: Variance of the torque noise, (J,), N^2 m^2.
+        cores: Worker processes.
+    """
 
     parts: DataSplit
     noise: Array
-    """variance of the torque's noise (J,), N^2 m^2"""
     cores: int = 1
-    """that work side by side"""
 
     def fit(self, model: Model) -> FittedModel:
-        """The model fitted to the rows for that."""
+        """Fit a model to the fitted rows.
+
+        Args:
+            model: Start of the fit.
+
+        Returns:
+            The fitted model.
+        """
         return FittedModel(fit(model, self.parts.fit), self)
 
     def fit_each(self, models: Sequence[Model]) -> list[FittedModel]:
-        """Several models of the same samples, each fitted."""
+        """Fit several models of the same samples in parallel.
+
+        Args:
+            models: Starts of the fits.
+
+        Returns:
+            The fitted models, in the same order.
+        """
         if not models:
             return []
-        found = side_by_side(
+        found = parallel_map(
             lambda k: fit(models[k], self.parts.fit), len(models), self.cores, models[0].samples
         )
         return [FittedModel(one, self) for one in found]
 
-    def refine_delays(self, account: FittedModel) -> FittedModel:
-        """With its delays sought on a grid once more: what was added may have hidden the right ones."""
+    def refine_delays(self, fitted: FittedModel) -> FittedModel:
+        """Search the delays again on a grid, as biased delays may have hidden the optimum.
+
+        Args:
+            fitted: A fitted model.
+
+        Returns:
+            `fitted` or the refitted model, whichever has the lower criterion.
+        """
         return min(
-            account,
-            FittedModel(fit_delay_profile(account.model, self.parts.fit, self.cores), self),
+            fitted,
+            FittedModel(fit_delay_profile(fitted.model, self.parts.fit, self.cores), self),
             key=lambda one: one.criterion,
         )
 
-    def restrict_joints(self, every: FittedModel, index: int) -> FittedModel:
-        """The account with an effect on the joints alone that need it, where that is better."""
-        one = every.model.effects[index]
-        if one.law.all_joints_together:
-            return every
-        idle = FittedModel(every.model.without_effect(index), self)
-        found = every.compare_with(idle)
-        cost = PENALTY_PER_PARAMETER * complexity(one.law)
-        needed = one.active & (found.p_joints < SIGNIFICANCE_LEVEL) & (found.share > cost)
-        if not needed.any() or (needed == one.active).all():
-            return every
-        fewer = self.fit(every.model.with_replaced_effect(index, attrs.evolve(one, active=needed)))
-        return min(every, fewer, key=lambda one: one.criterion)
+    def restrict_joints(self, fitted: FittedModel, index: int) -> FittedModel:
+        """Restrict an effect to joints with a significant effect, if that lowers the criterion.
 
-    def share_across_joints(self, account: FittedModel, index: int) -> FittedModel:
-        """With the values of an effect shared by its joints, or by those of a kind, where that costs nothing."""
-        one = account.model.effects[index]
-        every = np.zeros(len(one.active), dtype=np.intp)
-        for groups in (every, *joint_groupings(account.model.samples.joints)):
-            if len(np.unique(groups[one.active])) >= len(np.unique(one.groups[one.active])):
+        Args:
+            fitted: A fitted model.
+            index: Index of the effect.
+
+        Returns:
+            `fitted` or the model with the effect on fewer joints.
+        """
+        effect = fitted.model.effects[index]
+        if effect.law.all_joints_together:
+            return fitted
+        without = FittedModel(fitted.model.without_effect(index), self)
+        comparison = fitted.compare_with(without)
+        cost = PENALTY_PER_PARAMETER * complexity(effect.law)
+        needed = (
+            effect.active
+            & (comparison.joint_p_values < SIGNIFICANCE_LEVEL)
+            & (comparison.relative_gain > cost)
+        )
+        if not needed.any() or (needed == effect.active).all():
+            return fitted
+        fewer = self.fit(fitted.model.with_replaced_effect(index, attrs.evolve(effect, active=needed)))
+        return min(fitted, fewer, key=lambda one: one.criterion)
+
+    def share_across_joints(self, fitted: FittedModel, index: int) -> FittedModel:
+        """Share the values of an effect between joints, if that lowers the criterion.
+
+        All joints are tried first, then joints of one kind (hip, thigh, calf).
+
+        Args:
+            fitted: A fitted model.
+            index: Index of the effect.
+
+        Returns:
+            `fitted` or the model with shared values.
+        """
+        effect = fitted.model.effects[index]
+        all_joints = np.zeros(len(effect.active), dtype=np.intp)
+        for groups in (all_joints, *joint_groupings(fitted.model.samples.joints)):
+            if len(np.unique(groups[effect.active])) >= len(np.unique(effect.groups[effect.active])):
                 continue
-            values = one.values.copy()
-            for g in np.unique(groups[one.active]):
-                alike = one.active & (groups == g)
+            values = effect.values.copy()
+            for g in np.unique(groups[effect.active]):
+                alike = effect.active & (groups == g)
                 values[:, alike] = values[:, alike].mean(axis=1, keepdims=True)
-            shared = attrs.evolve(one, groups=groups, values=values)
-            tied = self.fit(account.model.with_replaced_effect(index, shared))
-            if tied.criterion < account.criterion:
-                return tied
-        return account
+            shared = attrs.evolve(effect, groups=groups, values=values)
+            shared_fit = self.fit(fitted.model.with_replaced_effect(index, shared))
+            if shared_fit.criterion < fitted.criterion:
+                return shared_fit
+        return fitted
 
 
 def joint_kinds(joints: Iterable[str]) -> Groups:
-    """The same number for joints whose names differ in their first part only: FR_hip_joint, FL_hip_joint."""
+    """Number the kinds of joints, whose names differ in the first part only.
+
+    `FR_hip_joint` and `FL_hip_joint` are of one kind.
+
+    Args:
+        joints: Names of the joints.
+
+    Returns:
+        Kind of each joint, (J,).
+    """
     names = [name.partition("_")[2] or name for name in joints]
     found: Groups = np.unique(names, return_inverse=True)[1]
     return found
 
 
 def joint_groupings(joints: Sequence[str]) -> list[Groups]:
-    """By kind, and each joint for itself; by kind only where several joints are of one."""
-    each = np.arange(len(joints))
+    """List the ways to group joints: by kind, and each joint alone.
+
+    Args:
+        joints: Names of the joints.
+
+    Returns:
+        Group numbers, (J,) each; the grouping by kind only where several joints are of one kind.
+    """
+    own = np.arange(len(joints))
     by_kind = joint_kinds(joints)
-    return [by_kind, each] if by_kind.max() + 1 < len(joints) else [each]
+    return [by_kind, own] if by_kind.max() + 1 < len(joints) else [own]

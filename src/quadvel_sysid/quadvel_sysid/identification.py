@@ -1,6 +1,6 @@
-"""What an identification hands to its report: the numbers, the corrected model, and the series for the pictures.
+"""Result records of an identification: report, corrected model and series for the figures.
 
-Records only: `identify` fills them, `report` writes them down.
+`identify` fills these records, and `report` writes them.
 """
 
 from __future__ import annotations
@@ -19,29 +19,40 @@ Array = NDArray[np.float64]
 
 @attrs.frozen(eq=False)
 class Trace:
-    """One joint over held-out time, each (n,): measured torque and what each model predicts, N m.
+    """Held-out torque series of one joint, (n,) each.
 
-    Where a sample cannot be compared it is NaN; gaps in `t` (s) are where nothing was held out.
+    Attributes:
+        t: Time, s; gaps where no rows were held out.
+        measured: Measured torque, N m. It and the predictions are NaN where samples are invalid.
+        pd: Torque of the ideal PD law, N m.
+        before: Torque of the plain EAM, N m.
+        after: Torque of the corrected model, N m.
     """
 
     t: Array
     measured: Array
     pd: Array
-    """ideal PD law"""
     before: Array
-    """plain EAM"""
     after: Array
-    """corrected model"""
 
 
 @attrs.frozen(eq=False)
 class Shape:
-    """Residual of one joint (measured minus predicted, N m) over the signal that explains it, each (n,)."""
+    """Residual of one joint over the signal that explains it.
+
+    Attributes:
+        effect: Name of the effect.
+        joint: Name of the joint.
+        signal: Name of the signal as in the report: `q`, `dq`, `tau@history`, `FR_thigh_joint/dq`.
+        unit: Unit of the signal.
+        x: Values of the signal, (n,).
+        before: Measured minus predicted torque of the plain EAM, (n,), N m.
+        after: The same for the corrected model, (n,), N m.
+    """
 
     effect: str
     joint: str
     signal: str
-    """as in the report: q, dq, tau@history, FR_thigh_joint/dq, ..."""
     unit: str
     x: Array
     before: Array
@@ -50,13 +61,16 @@ class Shape:
 
 @attrs.frozen(eq=False)
 class Identification:
-    """What `identify` found."""
+    """Result of an identification.
+
+    Attributes:
+        report: Content of report.json.
+        parameters: Corrected actuator model.
+        traces: Held-out torque series, by joint name.
+        shapes: One or more for each effect, in the order of the report's effects.
+    """
 
     report: Mapping[str, Any]
-    """the content of report.json"""
     parameters: ActuatorParameters
-    """the corrected model"""
     traces: Mapping[str, Trace]
-    """by joint name"""
     shapes: tuple[Shape, ...] = ()
-    """one or more for each effect, in the report's order of effects"""

@@ -1,4 +1,4 @@
-"""What an identification computes on: logs that were looked at and fit together, of long ones the pieces spread over them."""
+"""Input data of an identification: checked logs, with excerpts of the long ones."""
 
 from __future__ import annotations
 
@@ -13,36 +13,52 @@ from .logs.log import Log
 from .motion import Body, imply_torque
 
 Progress = Callable[[float, str], None]
-"""Told now and then which share is done, and what is done next."""
+"""Callback that receives the completed fraction (0 to 1) and the next step."""
 
-VALUES = 60_000
-"""Of torque that are looked at, of all logs and joints."""
+MAX_TORQUE_VALUES = 60_000
+"""Maximum number of torque values to use, over all logs and joints."""
 
 
 @attrs.frozen(eq=False)
 class IdentificationData:
-    """Logs, of long ones pieces that hold no more than they show, so that these can be let go of."""
+    """Logs and excerpts of logs. Excerpts are copies, so that the full logs can be released.
+
+    Attributes:
+        logs: Logs or excerpts to fit, then those to report on.
+        fitted_count: Number of logs to fit; all of them if there is no held-out log.
+        body: Load of the joints, where the torque is inferred from the motion; None otherwise.
+        findings: Findings of the checks, as (log name, finding).
+    """
 
     logs: tuple[Log, ...]
-    fitted: int
-    """of them, the first ones; all where no log is there to judge on"""
+    fitted_count: int
     body: Body | None
-    """that the joints carry, where the torque is what their motion implies"""
     findings: tuple[tuple[str, Finding], ...]
-    """by log"""
 
     @property
-    def heldout(self) -> bool:
-        """Are there logs to judge on?"""
-        return self.fitted < len(self.logs)
+    def has_heldout(self) -> bool:
+        """Whether there are held-out logs."""
+        return self.fitted_count < len(self.logs)
 
 
 def prepare(
     data: Dataset,
-    values: int = VALUES,
+    values: int = MAX_TORQUE_VALUES,
     progress: Progress = lambda share, text: None,
 ) -> IdentificationData:
-    """Of the logs to fit and to judge on as many `values` of torque in all. Raises LogError where they can't be used together."""
+    """Cut excerpts from the logs, and infer the torque from the motion where none was logged.
+
+    Args:
+        data: Checked logs.
+        values: Maximum number of torque values to use, over all logs and joints.
+        progress: Receives the completed fraction and the next step.
+
+    Returns:
+        Data for `identify_prepared`.
+
+    Raises:
+        LogError: If the logs cannot be used together.
+    """
     logs, train = data.logs, len(data.fitted)
     body = None
     if logs[0].tau is None:
@@ -50,7 +66,8 @@ def prepare(
         first, body = imply_torque(logs[0])
         logs = [first, *(imply_torque(log, body)[0] for log in logs[1:])]
     rows = values // (len(logs) * len(logs[0].joints))
-    # One script may have led all logs: what judges comes from other instants of it than what is fitted.
+    # One script may have generated all logs. Excerpts of held-out logs therefore lie between those
+    # of the fitted logs in time.
     parts = [cut_excerpts(log, rows * log.period, between=k >= train) for k, log in enumerate(logs)]
     chosen = tuple(log for part in parts for log in part)
     fitted = sum(len(part) for part in parts[:train]) if data.heldout else len(chosen)

@@ -1,8 +1,8 @@
-"""From measured logs to a corrected actuator model and a report: the whole of the identification, step by step.
+"""System identification of joint actuators: from measured logs to a corrected model and a report.
 
-`preparation` makes samples of the logs and divides their rows into those that are fitted, that select and that are reported;
-`selection` searches for effects; the chosen model is fitted to all rows, `confidence` says how sure its values are, and
-`outcome` makes the report.
+The steps: `preparation` builds samples from the logs and splits their rows into fitted, selection
+and reported rows; `selection` searches for effects; the selected model is refitted to all rows;
+`confidence` computes the intervals; `outcome` builds the report.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from .baselines import baseline_errors
 from .confidence import intervals
 from .criterion import DataSplit, noise_variance
 from .delays import longest_equivalent_delay, quantised_delays
-from .eam import WINDOWS, pd_torque
-from .export_parameters import parameters
+from .eam import DRIVE_WINDOWS_S, pd_torque
+from .export_parameters import actuator_parameters
 from .fit import fit
 from .fitted_model import FittedModel, ModelEvaluator
 from .identification import Identification
-from .identification_data import VALUES, IdentificationData, Progress, prepare
+from .identification_data import MAX_TORQUE_VALUES, IdentificationData, Progress, prepare
 from .library import SignalTerm
 from .logs.dataset import Dataset
 from .logs.log import Log, LogError
 from .lost_commands import reassign_losses
 from .model import Model
 from .motion import STRETCH_S, Body, Replay, replay_errors
-from .outcome import Outcome, SelectedEffect, identification
+from .outcome import Outcome, SelectedEffect, build_identification
 from .preparation import MIN_BLOCK_S, Preprocessed, preprocess
 from .replay import EXPLANATION as LEG_TEXT
 from .replay import MIN_BLOCK_S as LEG_BLOCK
@@ -42,187 +42,247 @@ from .sanity_checks import contradictions
 from .selection import Search
 from .signals import Array, Bools, Samples
 
-_SEARCHED, _COARSEST = 30_000, 0.002
-"""Values of torque that are searched, as long as their rows are not farther apart (s); what is found is fitted to all"""
-_MOVES = 0.9
-"""Of the error of a replay: what a model with more in it has to leave at most"""
+_SEARCH_VALUES, _MAX_SEARCH_STEP_S = 30_000, 0.002
+"""Number of torque values that the search uses, and the maximum step of its rows, s.
+
+The step has priority: the search uses more values rather than a larger step. The final fit uses all
+rows.
+"""
+_REPLAY_ERROR_RATIO = 0.9
+"""Ratio of the replay error of a larger to a smaller model below which the larger one is chosen."""
 
 
 def identify(
     train: Sequence[Log],
     heldout: Sequence[Log] = (),
     gains: tuple[float, float] | None = None,
-    values: int = VALUES,
+    values: int = MAX_TORQUE_VALUES,
     **options: Any,
 ) -> Identification:
-    """Fit `train`, report on `heldout`, or on blocks of `train` kept aside where there is none.
+    """Identify the actuators from logs.
 
-    gains: kp (N m/rad) and kd (N m s/rad) of logs that hold none. values: how many of torque are looked at, of all logs and
-    joints; longer logs are cut to pieces spread over all of each. options: as those of `identified`. Raises LogError where
-    the logs cannot be used together.
+    Args:
+        train: Logs to fit.
+        heldout: Logs to report on; blocks of `train` if empty.
+        gains: kp (N m/rad) and kd (N m s/rad) of logs without commanded gains.
+        values: Maximum number of torque values to use, over all logs and joints. Longer logs are
+            cut into excerpts spread over their whole length.
+        **options: Keyword arguments of `identify_prepared`.
+
+    Returns:
+        Report, corrected model and series for figures.
+
+    Raises:
+        LogError: If the logs cannot be used together.
     """
-    return identified(prepare(Dataset.inspect_all(train, heldout, gains), values), **options)
+    return identify_prepared(prepare(Dataset.inspect_all(train, heldout, gains), values), **options)
 
 
-def identified(
-    material: IdentificationData,
+def identify_prepared(
+    data: IdentificationData,
     base: ActuatorParameters | None = None,
     cores: int = 1,
     progress: Progress = lambda share, text: None,
     robot: str | None = None,
 ) -> Identification:
-    """The same of `material`: who does not hold the whole of a long log has more memory for it.
+    """Identify the actuators from prepared data.
 
-    base: its torque limits go into the corrected model. cores: that work side by side; the report is the same. robot: whose
-    legs the reported rows are replayed on, `aliengo`, `go2`, or an MJCF or URDF file. `progress(share, text)` is called now
-    and then.
+    Prepare the data first and pass it here, so that the memory of full logs can be released.
+
+    Args:
+        data: Excerpts of the logs; see `identification_data.prepare`.
+        base: Parameters whose torque limits the corrected model keeps; the defaults if None.
+        cores: Worker processes; the report does not depend on them.
+        progress: Receives the completed fraction and the next step.
+        robot: Robot whose legs the reported rows are replayed on: `aliengo`, `go2`, or the path of
+            an MJCF or URDF file. No replay if None.
+
+    Returns:
+        Report, corrected model and series for figures.
     """
-    body = material.body
-    legs = None if robot is None else _legs(robot, material)
+    # 1. Samples, data split and plain EAM.
+    body = data.body
+    legs = None if robot is None else _load_legs(robot, data)
     progress(0.02, "gains and delays")
-    windows = WINDOWS if body is None else (material.logs[0].period,)
-    shortest = MIN_BLOCK_S if legs is None or material.heldout else LEG_BLOCK
-    reading, notes = preprocess(material, windows, shortest)
-    steps = iter(range(10**6))
+    windows = DRIVE_WINDOWS_S if body is None else (data.logs[0].period,)
+    shortest = MIN_BLOCK_S if legs is None or data.has_heldout else LEG_BLOCK
+    preprocessed, notes = preprocess(data, windows, shortest)
+    step_numbers = iter(range(10**6))
 
-    def tick(text: str) -> None:
-        progress(min(0.1 + 0.04 * next(steps), 0.85), text)
+    def report_step(text: str) -> None:
+        progress(min(0.1 + 0.04 * next(step_numbers), 0.85), text)
 
-    plain = _plain(reading)
-    noise = noise_variance(reading.samples, reading.parts.fit_or_select, plain.residual())
-    samples, rows = _searched(reading)
-    judge = ModelEvaluator(reading.parts.select_rows(rows), noise, cores)
+    # 2. Search for effects on a subset of the rows.
+    plain = _plain_model(preprocessed)
+    noise = noise_variance(preprocessed.samples, preprocessed.parts.fit_or_select, plain.residual())
+    samples, rows = _search_rows(preprocessed)
+    evaluator = ModelEvaluator(preprocessed.parts.select_rows(rows), noise, cores)
     plain = attrs.evolve(plain, samples=samples)
-    search, before = Search(judge, tick), judge.fit(plain)
-    best, of_laws = search.best(plain)
+    search, before = Search(evaluator, report_step), evaluator.fit(plain)
+    best, best_laws = search.best(plain)
+
+    # 3. Refit to all rows, and choose between nested models by replays where there is a load.
     corrected = base or ActuatorParameters.default()
-    replayer = None if body is None and legs is None else _Replayer(body, legs, reading, corrected)
+    replayer = None if body is None and legs is None else _Replayer(body, legs, preprocessed, corrected)
     progress(0.88, "replays" if replayer else "intervals")
-    tries = [before, best]
+    models = [before, best]
     if replayer:
-        laws = of_laws if of_laws is best else search.prune(of_laws)
-        tries = [before, laws, best, *search.nested_models(laws)]
-    refitted = {one: _refitted(one, reading, noise) for one in dict.fromkeys(tries)}
+        laws = best_laws if best_laws is best else search.prune(best_laws)
+        models = [before, laws, best, *search.nested_models(laws)]
+    refitted = {one: _refit_all_rows(one, preprocessed, noise) for one in dict.fromkeys(models)}
     chosen = replayer.choose(refitted) if replayer else best
+
+    # 4. Intervals and report.
     progress(0.93, "intervals")
-    outcome = _outcome(chosen, refitted[before], refitted[chosen], search, reading, material, corrected)
-    found = identification(outcome, [*material.findings, *notes])
-    parts, samples = reading.parts, reading.samples
+    outcome = _outcome(chosen, refitted[before], refitted[chosen], search, preprocessed, data, corrected)
+    found = build_identification(outcome, [*data.findings, *notes])
+    parts, samples = preprocessed.parts, preprocessed.samples
     logs = [one.log for one in samples.logs]
     report = {**found.report, "baselines": baseline_errors(logs, parts.fit_or_select, parts.report)}
     if replayer:
         report |= replayer.section(outcome)
     if body is not None:
-        report |= _told_of_motion(report)
+        report |= _motion_sections(report)
     report["warnings"] = [*report["warnings"], *contradictions(report)]
     progress(1.0, "done")
     return attrs.evolve(found, report=report)
 
 
-def _legs(robot: str, material: IdentificationData) -> Legs:
-    """The legs that the logs' commands are replayed on. Raises LogError where the logs do not hold what that takes."""
-    for log in material.logs:
-        known = {"tau": material.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
+def _load_legs(robot: str, data: IdentificationData) -> Legs:
+    """The legs for the replay of the commands. Raises LogError if torque or gains are missing."""
+    for log in data.logs:
+        known = {"tau": data.body is None, "kp": log.kp is not None, "kd": log.kd is not None}
         for name, there in known.items():
             if not there:
                 what = "the torque" if name == "tau" else "the commanded gains (or --gains KP KD)"
                 raise LogError(
                     f"{log.name}: {name}: not in the log, expected {what} to replay the commands (--robot)"
                 )
-    return Legs.load(robot, material.logs[0].joints)
+    return Legs.load(robot, data.logs[0].joints)
 
 
-def _searched(reading: Preprocessed) -> tuple[Samples, NDArray[np.intp]]:
-    """The samples that are searched, and which rows these are: none of a log that is held out, and no more than it takes."""
-    samples = reading.samples.drop_heldout(reading.parts.fit_or_select)
-    step = min(round(samples.tau.size / _SEARCHED), round(_COARSEST / samples.period))
+def _search_rows(preprocessed: Preprocessed) -> tuple[Samples, NDArray[np.intp]]:
+    """The samples that the search uses, and their row numbers; without held-out logs."""
+    samples = preprocessed.samples.drop_heldout(preprocessed.parts.fit_or_select)
+    step = min(round(samples.tau.size / _SEARCH_VALUES), round(_MAX_SEARCH_STEP_S / samples.period))
     if step > 1:
         return samples.thinned(step)
     return samples, np.arange(len(samples.t))
 
 
-def _plain(reading: Preprocessed) -> Model:
+def _plain_model(preprocessed: Preprocessed) -> Model:
     """The EAM as a model that effects can be added to."""
-    eam, one = reading.eam, np.zeros(len(reading.samples.joints), dtype=np.intp)
+    eam, one = preprocessed.eam, np.zeros(len(preprocessed.samples.joints), dtype=np.intp)
     delays = np.stack([eam.input_delay, eam.output_delay])
-    return Model(reading.samples, eam.window, eam.gains, one, delays, one)
+    return Model(preprocessed.samples, eam.window, eam.gains, one, delays, one)
 
 
-def _refitted(account: FittedModel, reading: Preprocessed, noise: Array) -> Model:
-    """The model of an account with values of all rows that fit and select."""
-    parts, samples = reading.parts, reading.samples
-    model = attrs.evolve(account.model, samples=samples)
-    if len(samples.t) > len(account.model.samples.t):
+def _refit_all_rows(fitted: FittedModel, preprocessed: Preprocessed, noise: Array) -> Model:
+    """The model refitted to all rows that fit or select."""
+    parts, samples = preprocessed.parts, preprocessed.samples
+    model = attrs.evolve(fitted.model, samples=samples)
+    if len(samples.t) > len(fitted.model.samples.t):
         model = reassign_losses(model, parts, noise)
     return longest_equivalent_delay(fit(model, parts.fit_or_select), parts.fit_or_select)
 
 
 def _outcome(
-    account: FittedModel,
+    fitted: FittedModel,
     before: Model,
     model: Model,
     search: Search,
-    reading: Preprocessed,
-    material: IdentificationData,
+    preprocessed: Preprocessed,
+    data: IdentificationData,
     base: ActuatorParameters,
 ) -> Outcome:
-    """The chosen model and the plain one, both refitted, with values of every row, and errors of the rows that chose nothing."""
-    parts, samples = reading.parts, reading.samples
-    every = parts.fit_or_select if material.heldout else parts.all_rows
-    before_whole, whole = (
-        quantised_delays(longest_equivalent_delay(fit(one, every), every), every) for one in (before, model)
+    """Collect the results: both models refitted to every row, with errors on the reported rows."""
+    parts, samples = preprocessed.parts, preprocessed.samples
+    final_rows = parts.fit_or_select if data.has_heldout else parts.all_rows
+    before_all_rows, model_all_rows = (
+        quantised_delays(longest_equivalent_delay(fit(one, final_rows), final_rows), final_rows)
+        for one in (before, model)
     )
     effects = tuple(
-        SelectedEffect(*_worth(model, k, parts), search.indistinguishable_effects(account, k))
+        SelectedEffect(*_heldout_gain(model, k, parts), search.indistinguishable_effects(fitted, k))
         for k in range(len(model.effects))
     )
     has_terms = any(isinstance(one.law, SignalTerm) for one in model.effects)
-    leaning = () if account.is_white or has_terms else search.residual_correlates(account)
+    correlates = () if fitted.is_white or has_terms else search.residual_correlates(fitted)
     names = {one.law.name for one in model.effects}
     rejected = tuple((name, *why) for name, why in search.rejected.items() if name not in names)
-    asked = np.ones_like(whole.gains)
-    asked[1] = 0.0 if samples.undamped else 1.0
-    ideal = pd_torque(samples, asked, 0.0, 0.0, 0.0)
+    commanded = np.ones_like(model_all_rows.gains)
+    commanded[1] = 0.0 if samples.undamped else 1.0
     return Outcome(
-        before, before_whole, model, whole, effects, rejected, account.is_white, leaning,
-        intervals(whole, attrs.evolve(parts, report=parts.report & every)), ideal, search.evaluator.noise, parts, base,
-    )  # fmt: skip
+        before=before,
+        before_all_rows=before_all_rows,
+        model=model,
+        model_all_rows=model_all_rows,
+        effects=effects,
+        rejected=rejected,
+        is_white=fitted.is_white,
+        residual_correlates=correlates,
+        half_widths=intervals(model_all_rows, attrs.evolve(parts, report=parts.report & final_rows)),
+        ideal_torque=pd_torque(samples, commanded, 0.0, 0.0, 0.0),
+        noise=search.evaluator.noise,
+        parts=parts,
+        base=base,
+    )
 
 
-def _worth(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
-    """What an effect takes off the error of the rows that chose nothing, and its p-value there."""
+def _heldout_gain(model: Model, index: int, parts: DataSplit) -> tuple[float, float]:
+    """Error reduction (N^2 m^2) of an effect on the reported rows, and its p-value there."""
     without = fit(model.without_effect(index), parts.fit_or_select)
-    worth = parts.compare(without.residual(), model.residual(), parts.report)
-    return worth.gain, worth.p
+    comparison = parts.compare(without.residual(), model.residual(), parts.report)
+    return comparison.gain, comparison.p_value
 
 
 @attrs.frozen(eq=False)
 class _Replayer:
-    """Commands replayed on what the joints carry: of several models the one that moves it as it moved is chosen."""
+    """Replays the commands on the load of the joints, to choose between models.
+
+    Attributes:
+        body: Load of joints without measured torque.
+        legs: Legs of a robot, from its description.
+        preprocessed: Samples and data split.
+        base: Parameters that the corrected model extends.
+    """
 
     body: Body | None
     legs: Legs | None
-    reading: Preprocessed
+    preprocessed: Preprocessed
     base: ActuatorParameters
 
-    def choose(self, tries: Mapping[FittedModel, Model]) -> FittedModel:
-        """The account with whose model the commands replay the motion best.
+    def choose(self, models: Mapping[FittedModel, Model]) -> FittedModel:
+        """Choose the model that replays the motion best.
 
-        A later one has to replay clearly better than those before it on the rows that fit and select: the laws than the plain
-        model, terms than laws, and fewer laws than all. Terms can mistake the errors of encoders for an effect, or foretell a
-        torque only where the joint does what it did, and a law can stand for how the log was written; a replay does not take
-        that for motion.
+        A later model has to reduce the error of the speed clearly: laws against the plain model,
+        regressors against laws, and fewer laws against all. Regressors may fit encoder errors, or
+        predict torque only along the recorded motion. A law may describe how the log was written.
+        None of these improves the replayed motion.
+
+        Args:
+            models: Models refitted to all rows, by their selected form, in order of preference.
+
+        Returns:
+            The chosen model.
         """
-        best, least = next(iter(tries)), np.inf
-        for account, model in tries.items():
-            error = self._replay(model, self.reading.parts.fit_or_select)["dq_rms_rad_s"]
-            if error < _MOVES * least:
-                best, least = account, error
+        best, least = next(iter(models)), np.inf
+        for fitted, model in models.items():
+            error = self._replay(model, self.preprocessed.parts.fit_or_select)["dq_rms_rad_s"]
+            if error < _REPLAY_ERROR_RATIO * least:
+                best, least = fitted, error
         return best
 
     def section(self, outcome: Outcome) -> dict[str, Any]:
-        """The section of the report about the replay of the rows that chose nothing."""
-        rows = self.reading.parts.report
+        """Build the section of the report on the replay of the reported rows.
+
+        Args:
+            outcome: Results of the identification.
+
+        Returns:
+            `{"replay": ...}` or `{"motion": ...}` in the format of report.json.
+        """
+        rows = self.preprocessed.parts.report
         sizes = {"before": self._replay(outcome.before, rows), "after": self._replay(outcome.model, rows)}
         if self.body is None:
             return {"replay": {"stretch_s": LEG_STRETCH, **sizes, "text": LEG_TEXT}}
@@ -230,26 +290,27 @@ class _Replayer:
             "motion": {
                 "inertia": {"value": self.body.inertia.tolist(), "unit": "kg m^2"},
                 "replayed_s": STRETCH_S,
-                "text": "No torque was logged: the one that the motion implies stands for it, so an armature is part of "
-                "the inertia and an encoder bias part of the torque offset.",
+                "text": "No torque was logged. It is inferred from the motion, so that the inertia contains an armature and "
+                "the torque offset contains an encoder bias.",
                 **sizes,
             }
         }
 
     def _replay(self, model: Model, rows: Bools) -> Replay:
-        logs = [one.log for one in self.reading.samples.logs]
-        corrected = parameters(model, self.reading.parts, self.base)
+        """Replay errors of a model on some rows."""
+        logs = [one.log for one in self.preprocessed.samples.logs]
+        corrected = actuator_parameters(model, self.preprocessed.parts, self.base)
         if self.legs is not None:
             return self.legs.replay_errors(logs, corrected, rows)
         assert self.body is not None
         return replay_errors(logs, corrected, self.body, rows)
 
 
-def _told_of_motion(report: Mapping[str, Any]) -> dict[str, Any]:
-    """What changes in a report where the torque is what the motion implies."""
+def _motion_sections(report: Mapping[str, Any]) -> dict[str, Any]:
+    """Sections of the report that differ where the torque is inferred from the motion."""
     before, after = report["motion"]["before"], report["motion"]["after"]
     decision = (
-        f"From motion alone. {report['decision']} Replayed over {1e3 * STRETCH_S:.0f} ms, the error of q goes from "
+        f"From motion alone. {report['decision']} In replays over {1e3 * STRETCH_S:.0f} ms the error of q changes from "
         f"{before['q_rms_rad']:.3g} to {after['q_rms_rad']:.3g} rad."
     )
     return {

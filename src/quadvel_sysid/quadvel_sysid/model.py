@@ -1,11 +1,14 @@
-"""What the actuator model with effects on it predicts for the rows of a log, and how that changes with its parameters.
+"""Forward model of the joint torque: the EAM with effects, and its Jacobian.
 
-    asked torque = g_p kp (q_des - q) + g_d kd (dq_des - dq) + tau_ff      after the laws of the errors
-    drive torque = the asked torque after bounds, lags and gains
-    torque       = drive torque + added torques + terms of named signals
+The equations, in the order in which a drive computes them:
 
-`g_p`, `g_d` are real over commanded gains. Commands come an input delay late, and the whole an output delay later. A
-parameter may be shared by joints: `groups` number what is the same.
+    tau_asked = g_p kp (q_des - q) + g_d kd (dq_des - dq) + tau_ff    (laws of the errors first)
+    tau_drive = tau_asked after the bounds, lags and gains of the effects
+    tau       = tau_drive + added torques + weighted regressors of named signals
+
+`g_p` and `g_d` are the ratios of real to commanded gains. Commands act one input delay late, and
+the torque of the drive appears one output delay later. Joints with the same group number share a
+parameter.
 """
 
 from __future__ import annotations
@@ -25,232 +28,395 @@ from .signals import INSTANTS_PER_ROW, Array, Bools, Samples, Signals
 Groups = NDArray[np.intp]
 
 MAX_DELAYS_S = np.array([0.020, 0.006])
-"""s, input and output delay at most"""
+"""Upper bounds of the input delay and of the output delay, s."""
 
 
 @attrs.frozen(eq=False)
 class AppliedEffect:
-    """A law at work on some joints. A term of named signals is a law whose torque is linear in its weights."""
+    """An effect law with its parameter values on the joints that it acts on.
+
+    A weighted sum of regressors of named signals (`library.SignalTerm`) is a law whose torque is
+    linear in its weights.
+
+    Attributes:
+        law: Equations of the effect.
+        active: Joints that the effect acts on, (J,) bool.
+        values: Parameter values in the order of `law.parameters`, (P, J), in the units of the law.
+        groups: Group numbers, (J,). Joints with the same number share their values.
+    """
 
     law: EffectLaw
-    active: Bools  # (J,)
-    values: Array  # (P, J)
-    groups: Groups  # (J,), joints with the same number share the values
+    active: Bools
+    values: Array
+    groups: Groups
 
     @property
     def reads_total_torque(self) -> bool:
-        """Does it read the torque of all other laws, so that it comes after them?"""
+        """Whether the law reads the torque of all other laws, and is evaluated after them."""
         return bool(getattr(self.law, "reads_total", False))
 
     def parameters_by_name(self, values: Array) -> dict[str, Array]:
-        """Parameters by name; `values` (B, P, J) becomes (B, 1, J) each, or (J,) where the batch has one value."""
+        """Return a batch of parameter values as a dict by parameter name.
+
+        Args:
+            values: Parameter values, (B, P, J).
+
+        Returns:
+            For each parameter an array (B, 1, J), or (J,) where all entries of the batch are equal.
+        """
         found = {}
         for k, name in enumerate(self.law.names):
-            one = values[:, k]
-            found[name] = one[0] if len(one) == 1 or (one == one[0]).all() else one[:, None]
+            column = values[:, k]
+            found[name] = column[0] if len(column) == 1 or (column == column[0]).all() else column[:, None]
         return found
 
     def is_excited(self, s: Signals) -> bool:
-        """Does the motion of one at least of the joints that share values show the law?"""
-        joints = self.law.excited_joints(dict(zip(self.law.names, self.values, strict=True)), s) & self.active
-        return set(self.groups[joints]) == set(self.groups[self.active])
+        """Whether the motion excites the law on at least one joint of every group.
 
-    def with_form(self, law: EffectLaw) -> AppliedEffect:
-        """With another form of its law; parameters that this one had not start from zero."""
+        Args:
+            s: Signals of the log at the delays of the model.
+
+        Returns:
+            True if every group of active joints holds an excited joint.
+        """
+        excited = (
+            self.law.excited_joints(dict(zip(self.law.names, self.values, strict=True)), s) & self.active
+        )
+        return set(self.groups[excited]) == set(self.groups[self.active])
+
+    def with_law(self, law: EffectLaw) -> AppliedEffect:
+        """Return the effect with another form of its law.
+
+        Args:
+            law: The new form. Parameters that the present law lacks start from zero.
+
+        Returns:
+            The effect with values (P', J) in the order of the new law.
+        """
         known = dict(zip(self.law.names, self.values, strict=True))
         none = np.zeros_like(self.values[0])
         return attrs.evolve(self, law=law, values=np.array([known.get(name, none) for name in law.names]))
 
     def canonical(self) -> AppliedEffect:
-        """With the form of its law that its joints need, and parameters in their unique order."""
-        mine = self.with_form(self.law.restricted_to(self.active))
-        p = mine.law.canonical(dict(zip(mine.law.names, mine.values, strict=True)))
-        return attrs.evolve(mine, values=np.array([p[name] for name in mine.law.names]))
+        """Return the effect in canonical form: the simplest law, with parameters in unique order.
+
+        Returns:
+            An equivalent effect. Two fits of one truth have the same canonical form.
+        """
+        restricted = self.with_law(self.law.restricted_to(self.active))
+        p = restricted.law.canonical(dict(zip(restricted.law.names, restricted.values, strict=True)))
+        return attrs.evolve(restricted, values=np.array([p[name] for name in restricted.law.names]))
 
 
 @attrs.frozen(eq=False)
 class Model:
-    """Gains and delays of each joint, (2, J), and the effects on it."""
+    """Actuator model of all joints: gains, delays and effects, on the samples of the logs.
+
+    Attributes:
+        samples: Rows of all logs.
+        window: Step of a drive that averages commands over it, s; 0 for a drive without such a
+            step.
+        gains: Ratios of real to commanded kp and kd, (2, J). Where no gain is commanded, the gains
+            themselves in N m/rad and N m s/rad.
+        gain_groups: Group numbers of the joints, (J,); joints with the same number share their
+            gains.
+        delays: Input and output delay, (2, J), s.
+        delay_groups: Group numbers of the joints, (J,), for the delays.
+        effects: Effects, in the order in which they were added.
+    """
 
     samples: Samples
     window: float
-    """s, the step of a drive that gives means over it; 0 for none"""
     gains: Array
-    gain_groups: Groups  # (J,)
+    gain_groups: Groups
     delays: Array
-    """(2, J) s, input and output"""
-    delay_groups: Groups  # (J,)
+    delay_groups: Groups
     effects: tuple[AppliedEffect, ...] = ()
 
     @property
     def signals(self) -> Signals:
-        """The signals at this model's delays."""
+        """Signals of all rows at the delays of this model, (N, J) each."""
         return self.samples.at(self.delays[0], self.delays[1], self.window)
 
     def signals_at(self, at: str) -> Signals:
-        """The signals for torques that are added by the drive, or at the joint: these do not come an output delay late."""
+        """Return the signals that an added torque depends on.
+
+        Torques at the joint act without the output delay, torques of the drive with it.
+
+        Args:
+            at: `DRIVE` or `JOINT`.
+
+        Returns:
+            Signals at the delays of the model for that place.
+        """
         if at == DRIVE:
             return self.signals
         return self.samples.at_joint(self.delays[0], self.delays[1], self.window)
 
     def predict(self) -> Array:
-        """Torque of every row, (N, J), N m."""
-        torque: Array = self.evaluate(self.gains[None], [one.values[None] for one in self.effects])[0]
+        """Predict the torque of every row.
+
+        Returns:
+            Torque, (N, J), N m.
+        """
+        torque: Array = self.evaluate(self.gains[None], [effect.values[None] for effect in self.effects])[0]
         return torque
 
     def residual(self) -> Array:
-        """Measured minus predicted torque, (N, J)."""
-        left: Array = self.samples.tau - self.predict()
-        return left
+        """Return the measured minus the predicted torque.
+
+        Returns:
+            Residual, (N, J), N m.
+        """
+        residual: Array = self.samples.tau - self.predict()
+        return residual
 
     def evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
-        """Torque (B, N, J) for a batch of gains (B, 2, J) and of each effect's values (B, P, J).
+        """Predict the torque for a batch of parameter values.
 
-        A drive that computes in steps does nothing between them; one that does not is followed between the rows.
+        A drive with a step computes at the rows alone. Without a step, laws that act between rows
+        are evaluated on upsampled signals.
+
+        Args:
+            gains: Gain ratios, (B, 2, J).
+            values: For each effect its parameter values, (B, P, J).
+
+        Returns:
+            Torque, (B, N, J), N m.
         """
-        if self.window == 0.0 and any(one.law.acts_between_rows for one in self.effects):
-            finer = attrs.evolve(self, samples=self.samples.upsampled)
-            return finer._evaluate(gains, values)[..., INSTANTS_PER_ROW - 1 :: INSTANTS_PER_ROW, :]
+        if self.window == 0.0 and any(effect.law.acts_between_rows for effect in self.effects):
+            upsampled = attrs.evolve(self, samples=self.samples.upsampled)
+            return upsampled._evaluate(gains, values)[..., INSTANTS_PER_ROW - 1 :: INSTANTS_PER_ROW, :]
         return self._evaluate(gains, values)
 
     def _evaluate(self, gains: Array, values: Sequence[Array]) -> Array:
-        """The same at the instants of `samples` alone."""
-        x = self._drive(gains, values)
-        total, added = x, [pair for pair in zip(self.effects, values, strict=True) if _is_added(pair[0])]
-        for one, value in added:
-            if not one.reads_total_torque:
-                total = total + self.added_torque(one, x, value)
-        whole = total
-        for one, value in added:
-            if one.reads_total_torque:
-                total = total + self.added_torque(one, whole, value)
+        """Evaluate the torque at the rows of `samples`, without upsampling."""
+        # tau = x + sum_i f_i(x) + sum_k g_k(x + sum_i f_i(x)), with the drive torque x, the added
+        # laws f_i, and the added laws g_k that read the total torque.
+        x = self._drive_torque(gains, values)
+        added = [pair for pair in zip(self.effects, values, strict=True) if _is_added(pair[0])]
+        total = x
+        for effect, value in added:
+            if not effect.reads_total_torque:
+                total = total + self.added_torque(effect, x, value)
+        total_of_laws = total
+        for effect, value in added:
+            if effect.reads_total_torque:
+                total = total + self.added_torque(effect, total_of_laws, value)
         batch = max(len(gains), *(len(value) for value in values)) if values else len(gains)
         return np.broadcast_to(total, (batch, *self.signals.q.shape))
 
-    def _drive(self, gains: Array, values: Sequence[Array]) -> Array:
-        """Torque of the drive, without what is added to it."""
+    def _drive_torque(self, gains: Array, values: Sequence[Array]) -> Array:
+        """Torque of the drive (B, N, J), without the added torques."""
         s = self.signals
-        pull, drag = s.stiffness_torque, s.damping_torque
-        todo = sorted(zip(self.effects, values, strict=True), key=lambda pair: pair[0].law.stage)
-        on_errors = [pair for pair in todo if pair[0].law.stage == Stage.ERRORS]
+        stiffness_torque, damping_torque = s.stiffness_torque, s.damping_torque
+        in_order = sorted(zip(self.effects, values, strict=True), key=lambda pair: pair[0].law.stage)
+        on_errors = [pair for pair in in_order if pair[0].law.stage == Stage.ERRORS]
         if on_errors:
             error: tuple[Array, Array] = (s.q_des - s.q, s.dq_des - s.dq)
-            for one, value in on_errors:
-                error = self._errors(one, error, s, value)
-            pull, drag = s.kp * error[0], s.kd * error[1]
+            for effect, value in on_errors:
+                error = self._apply_to_errors(effect, error, s, value)
+            stiffness_torque, damping_torque = s.kp * error[0], s.kd * error[1]
         g = gains[:1] if len(gains) > 1 and (gains == gains[0]).all() else gains
-        x: Array = g[..., 0, :][..., None, :] * pull + g[..., 1, :][..., None, :] * drag + s.tau_ff
-        for one, value in todo:
-            if Stage.ERRORS < one.law.stage < Stage.ADDED:
-                x = _where(one.active, _series(one, x, s, value), x)
+        x: Array = (
+            g[..., 0, :][..., None, :] * stiffness_torque
+            + g[..., 1, :][..., None, :] * damping_torque
+            + s.tau_ff
+        )
+        for effect, value in in_order:
+            if Stage.ERRORS < effect.law.stage < Stage.ADDED:
+                x = _select_active(effect.active, _apply_law(effect, x, s, value), x)
         return x
 
-    def _errors(
-        self, one: AppliedEffect, error: tuple[Array, Array], s: Signals, value: Array
+    def _apply_to_errors(
+        self, effect: AppliedEffect, error: tuple[Array, Array], s: Signals, value: Array
     ) -> tuple[Array, Array]:
-        """The errors after a law."""
-        after = _series(one, error, s, value)
-        new, speed = (_where(one.active, new, old) for new, old in zip(after, error, strict=True))
+        """Apply a law of the stage ERRORS to the errors of position and speed."""
+        after = _apply_law(effect, error, s, value)
+        new, speed = (_select_active(effect.active, new, old) for new, old in zip(after, error, strict=True))
         return new, speed
 
-    def drive_torque(self, beside: AppliedEffect) -> Array:
-        """What a law that is added is given, (N, J): the torque of the drive, of all laws where it reads that."""
+    def drive_torque(self, effect: AppliedEffect) -> Array:
+        """Return the torque that an added law receives as its input.
+
+        Args:
+            effect: An added effect, part of this model or not.
+
+        Returns:
+            Torque of the drive, (N, J), N m; with all other added torques if the law reads the
+            total.
+        """
         kept = tuple(
-            one
-            for one in self.effects
-            if not _is_added(one) or (beside.reads_total_torque and not one.reads_total_torque)
+            other
+            for other in self.effects
+            if not _is_added(other) or (effect.reads_total_torque and not other.reads_total_torque)
         )
         return attrs.evolve(self, effects=kept).predict()
 
-    def added_torque(self, one: AppliedEffect, x: Array, value: Array) -> Array:
-        """The torque (B, N, J) that a law of the stage ADDED adds to `x`, with a batch of its values (B, P, J)."""
-        extra: Array = _series(one, x, self.signals_at(one.law.at), value)
-        return extra if one.active.all() else extra * one.active
+    def added_torque(self, effect: AppliedEffect, x: Array, value: Array) -> Array:
+        """Return the torque that an effect of the stage ADDED adds.
+
+        Args:
+            effect: The effect.
+            x: Input of the law, (N, J) or (B, N, J), N m; see `drive_torque`.
+            value: Batch of parameter values, (B, P, J).
+
+        Returns:
+            Added torque, (B, N, J), N m; 0 on joints that the effect does not act on.
+        """
+        extra: Array = _apply_law(effect, x, self.signals_at(effect.law.at), value)
+        return extra if effect.active.all() else extra * effect.active
 
     def with_delays(self, delays: Array) -> Model:
-        """The same model with other delays (2, J)."""
-        within = np.asarray(np.clip(delays, 0.0, MAX_DELAYS_S[:, None]), dtype=float).round(7)
-        return attrs.evolve(self, delays=within)
+        """Return the model with other delays.
+
+        Args:
+            delays: Input and output delay, (2, J), s; clipped to [0, `MAX_DELAYS_S`], rounded to
+                0.1 us.
+
+        Returns:
+            A new model.
+        """
+        clipped = np.asarray(np.clip(delays, 0.0, MAX_DELAYS_S[:, None]), dtype=float).round(7)
+        return attrs.evolve(self, delays=clipped)
 
     def with_effect(self, applied: AppliedEffect) -> Model:
-        """With one more effect."""
+        """Return the model with one more effect.
+
+        Args:
+            applied: The effect to append.
+
+        Returns:
+            A new model.
+        """
         return attrs.evolve(self, effects=(*self.effects, applied))
 
     def with_replaced_effect(self, index: int, applied: AppliedEffect) -> Model:
-        """With another effect in the place of this index."""
+        """Return the model with one effect replaced.
+
+        Args:
+            index: Index of the effect to replace.
+            applied: The new effect.
+
+        Returns:
+            A new model.
+        """
         return attrs.evolve(self, effects=(*self.effects[:index], applied, *self.effects[index + 1 :]))
 
     def without_effect(self, index: int) -> Model:
-        """Without the effect of this index."""
+        """Return the model without one of its effects.
+
+        Args:
+            index: Index of the effect to remove.
+
+        Returns:
+            A new model.
+        """
         return attrs.evolve(self, effects=(*self.effects[:index], *self.effects[index + 1 :]))
 
     def predictive(self) -> Model:
-        """With laws that say no more than could be known before the torque was measured."""
+        """Return the model with the predictive form of every law.
+
+        A law may infer random events, such as lost commands, from the measured torque. Its
+        predictive form uses only what is known before the torque is measured.
+
+        Returns:
+            A new model.
+        """
         return attrs.evolve(
-            self, effects=tuple(attrs.evolve(one, law=one.law.predictive()) for one in self.effects)
+            self, effects=tuple(attrs.evolve(effect, law=effect.law.predictive()) for effect in self.effects)
         )
 
 
-def _is_added(one: AppliedEffect) -> bool:
-    return one.law.stage == Stage.ADDED
+def _is_added(effect: AppliedEffect) -> bool:
+    """Whether the effect adds its torque to that of the drive."""
+    return effect.law.stage == Stage.ADDED
 
 
-def _where(active: Bools, new: Array, old: Array) -> Array:
+def _select_active(active: Bools, new: Array, old: Array) -> Array:
+    """Values after a law on the active joints, values before it on the others."""
     return new if active.all() else np.where(active, new, old)
 
 
-def _series(one: AppliedEffect, x: Any, s: Signals, value: Array) -> Any:
-    """What a law makes of `x`."""
-    law, p = one.law, one.parameters_by_name(value)
+def _apply_law(effect: AppliedEffect, x: Any, s: Signals, value: Array) -> Any:
+    """Apply a law of any kind to its input `x` over whole series."""
+    law, p = effect.law, effect.parameters_by_name(value)
     if isinstance(law, ErrorLaw):
         if max(part.ndim for part in x) > 2:
             return law.errors(x, s, p)
         first, which = distinct_indices(value)
-        after = law.errors(x, s, one.parameters_by_name(value[first]))
+        after = law.errors(x, s, effect.parameters_by_name(value[first]))
         return tuple(part[which] if part.ndim > 2 else part for part in after)
     if isinstance(law, MemoryLaw):
         return law.series(x, s, p)
     return law.torque(x, s, p)  # type: ignore[attr-defined]
 
 
-def linear_columns(model: Model, one: AppliedEffect, x: Array | None = None) -> Array:
-    """What a unit of each linear parameter of an added law gives, (L, N, J), the others being as they are.
+def linear_columns(model: Model, effect: AppliedEffect, x: Array | None = None) -> Array:
+    """Return the torque per unit of each linear parameter of an added law.
 
-    `x` (N, J) is what the law is given, `model.driven(one)`, where that is known.
+    The nonlinear parameters keep their values, so that the torque is the weighted sum of these
+    columns.
+
+    Args:
+        model: Model whose delays and drive torque the law sees.
+        effect: The added effect.
+        x: Input of the law, (N, J), N m; `model.drive_torque(one)` if None.
+
+    Returns:
+        Regressors, (L, N, J).
     """
-    x, s = model.drive_torque(one) if x is None else x, model.signals_at(one.law.at)
-    columns = getattr(one.law, "regressors", None)
+    x, s = model.drive_torque(effect) if x is None else x, model.signals_at(effect.law.at)
+    columns = getattr(effect.law, "regressors", None)
     if columns is not None:
         found: Array = columns(x, s)
-        return found if one.active.all() else found * one.active
-    linear = [one.law.names.index(name) for name in one.law.linear]  # type: ignore[attr-defined]
-    unit = np.repeat(one.values[None], len(linear), axis=0)
+        return found if effect.active.all() else found * effect.active
+    linear = [effect.law.names.index(name) for name in effect.law.linear]  # type: ignore[attr-defined]
+    unit = np.repeat(effect.values[None], len(linear), axis=0)
     unit[:, linear] = 0.0
     unit[np.arange(len(linear)), linear] = 1.0
-    return np.broadcast_to(model.added_torque(one, x, unit), (len(linear), *x.shape))
+    return np.broadcast_to(model.added_torque(effect, x, unit), (len(linear), *x.shape))
 
 
 @attrs.frozen(eq=False)
 class Unknowns:
-    """The unknowns of a fit: slot a of joint j is unknown index[a, j]; slots are gains, effects' values, delays."""
+    """Mapping from the parameter slots of a model to the vector of unknowns of a fit.
 
-    index: Groups  # (A, J), -1: not fitted
-    low: Array  # (count,)
+    A slot is one gain, one effect parameter or one delay, on every joint.
+
+    Attributes:
+        index: Unknown of slot a on joint j, (A, J); -1 where the slot is not fitted.
+        low: Lower bounds of the unknowns, (K,).
+        high: Upper bounds of the unknowns, (K,).
+        step: Step of the finite differences of each slot, (A,).
+    """
+
+    index: Groups
+    low: Array
     high: Array
-    step: Array  # (A,), for numerical slopes
+    step: Array
 
     @property
     def count(self) -> int:
+        """Number of unknowns K."""
         return len(self.low)
 
     @classmethod
     def of(cls, model: Model, delays: bool = True) -> Unknowns:
-        """All parameters of the model; its delays only if asked for."""
+        """Collect the unknowns of a model.
+
+        Args:
+            model: The model to fit.
+            delays: Whether the delays are fitted.
+
+        Returns:
+            The mapping, with one unknown for each slot and group of joints.
+        """
         rows: list[Groups] = []
         low: list[float] = []
         high: list[float] = []
         step: list[float] = []
-        for groups, free, bounds, size in _slots(model, delays):
+        for groups, free, bounds, size in _parameter_slots(model, delays):
             names = np.unique(groups[free])
             rows.append(np.where(free, len(low) + np.searchsorted(names, groups), -1))
             low += [bounds[0]] * len(names)
@@ -259,7 +425,14 @@ class Unknowns:
         return cls(np.array(rows), np.array(low, dtype=float), np.array(high, dtype=float), np.array(step))
 
     def accumulate(self, local: Array) -> Array:
-        """Per-joint vectors (J, A) or matrices (J, A, A) summed into the common unknowns."""
+        """Sum vectors or matrices of the joints into the shared unknowns.
+
+        Args:
+            local: Vectors (J, A) or matrices (J, A, A) over the slots of each joint.
+
+        Returns:
+            Vector (K,) or matrix (K, K) over the unknowns.
+        """
         fitted = self.index.T >= 0
         at = np.where(fitted, self.index.T, 0)
         if local.ndim == 2:
@@ -272,7 +445,14 @@ class Unknowns:
         return square
 
     def vector(self, theta: Array) -> Array:
-        """Slots (A, J) as unknowns."""
+        """Return the vector of unknowns of given slot values.
+
+        Args:
+            theta: Slot values, (A, J).
+
+        Returns:
+            Unknowns, (K,).
+        """
         found = np.zeros(self.count)
         used = self.index >= 0
         found[self.index[used]] = theta[used]
@@ -280,87 +460,127 @@ class Unknowns:
 
 
 _MAX_GAIN_RATIO = 4.0
-"""Times the commanded gain: what a drive gives of it at most"""
+"""Upper bound of the ratio of real to commanded gain."""
 RELATIVE_STEP = 0.01
-"""Step of numerical slopes, of a parameter's usual size"""
+"""Finite-difference step, as a fraction of the parameter's scale."""
 DELAY_STEP_S = 0.0003
-"""s, between the predictions that a slope along a delay is taken from, to either side: commands come in steps"""
+"""Half the span of central differences along a delay, s; not small, as commands are steps."""
 
 
-def _slots(model: Model, delays: bool) -> Iterator[tuple[Groups, Bools, tuple[float, float], float]]:
-    """Of each slot: who shares it, where it is free, bounds, and the step of its slope."""
+def _parameter_slots(
+    model: Model, delays: bool
+) -> Iterator[tuple[Groups, Bools, tuple[float, float], float]]:
+    """Groups, free joints, bounds and finite-difference step of each slot."""
     everywhere = np.ones(model.gains.shape[1], dtype=bool)
-    known = model.samples.commanded and not model.samples.undamped
+    has_gains = model.samples.commanded and not model.samples.undamped
     for _ in model.gains:
-        yield model.gain_groups, everywhere, (0.0, _MAX_GAIN_RATIO if known else 1e6), RELATIVE_STEP
-    for one in model.effects:
-        for parameter in one.law.parameters:
-            yield one.groups, one.active, (parameter.low, parameter.high), RELATIVE_STEP * parameter.scale
+        yield model.gain_groups, everywhere, (0.0, _MAX_GAIN_RATIO if has_gains else 1e6), RELATIVE_STEP
+    for effect in model.effects:
+        for parameter in effect.law.parameters:
+            yield (
+                effect.groups,
+                effect.active,
+                (parameter.low, parameter.high),
+                RELATIVE_STEP * parameter.scale,
+            )
     for longest in MAX_DELAYS_S:
         yield model.delay_groups, everywhere & delays, (0.0, float(longest)), DELAY_STEP_S
 
 
 def pack(model: Model) -> Array:
-    """All slots (A, J) of a model."""
-    return np.concatenate([model.gains, *(one.values for one in model.effects), model.delays])
+    """Stack all parameters of a model into slots.
+
+    Args:
+        model: The model.
+
+    Returns:
+        Slot values, (A, J): gains, values of each effect, delays.
+    """
+    return np.concatenate([model.gains, *(effect.values for effect in model.effects), model.delays])
 
 
 def with_slots(model: Model, theta: Array) -> Model:
-    """The model with the slots (A, J)."""
+    """Return the model with other slot values; the inverse of `pack`.
+
+    Args:
+        model: The model.
+        theta: Slot values, (A, J).
+
+    Returns:
+        A new model.
+    """
     gains, values = _unpack(model, theta[None])
     applied = tuple(
-        attrs.evolve(one, values=value[0]) for one, value in zip(model.effects, values, strict=True)
+        attrs.evolve(effect, values=value[0]) for effect, value in zip(model.effects, values, strict=True)
     )
     return attrs.evolve(model, gains=gains[0], effects=applied).with_delays(theta[-2:])
 
 
 def _unpack(model: Model, theta: Array) -> tuple[Array, list[Array]]:
+    """Split slots (B, A, J) into gains and the values of each effect."""
     values, first = [], 2
-    for one in model.effects:
-        values.append(theta[:, first : first + len(one.values)])
-        first += len(one.values)
+    for effect in model.effects:
+        values.append(theta[:, first : first + len(effect.values)])
+        first += len(effect.values)
     return theta[:, :2], values
 
 
 def jacobian(model: Model, unknowns: Unknowns) -> tuple[Array, Array]:
-    """Prediction (N, J) and its slopes (J, A, N) along every slot; 0 where a slot is not fitted.
+    """Predict the torque and differentiate it with respect to every slot.
 
-    Terms that read the torque of the laws are taken not to move with these: they are small beside them.
+    Linear parameters of added laws have exact derivatives, their regressors. Delays use central
+    differences, all others forward differences (backward ones at an upper bound). The derivative of
+    regressors that read the total torque neglects how that torque changes with the other slots.
+
+    Args:
+        model: The model.
+        unknowns: Which slots are fitted.
+
+    Returns:
+        Prediction (N, J), N m, and derivatives (J, A, N); 0 for slots that are not fitted.
     """
     theta, free = pack(model), np.any(unknowns.index >= 0, axis=1)
     high = np.where(unknowns.index >= 0, unknowns.high[unknowns.index], np.inf)
     steps = np.where(theta + unknowns.step[:, None] > high, -unknowns.step[:, None], unknowns.step[:, None])
     slopes = np.zeros((theta.shape[1], len(theta), len(model.samples.t)))
-    numeric, first, read = free.copy(), 2, np.zeros(model.samples.tau.shape)
+
+    # Exact derivatives: tau = ... + sum_l w_l phi_l has d tau / d w_l = phi_l.
+    numeric, first, term_torque = free.copy(), 2, np.zeros(model.samples.tau.shape)
     numeric[-2:] = False
-    for one in model.effects:
-        mine = first + np.arange(len(one.values))
-        first += len(mine)
-        if _is_added(one):
-            columns = linear_columns(model, one)
-            linear = mine[[one.law.names.index(name) for name in one.law.linear]]  # type: ignore[attr-defined]
+    for effect in model.effects:
+        slots = first + np.arange(len(effect.values))
+        first += len(slots)
+        if _is_added(effect):
+            columns = linear_columns(model, effect)
+            linear = slots[[effect.law.names.index(name) for name in effect.law.linear]]  # type: ignore[attr-defined]
             slopes[:, linear] = columns.transpose(2, 0, 1)
             numeric[linear] = False
-            if one.reads_total_torque:
-                numeric[mine] = False
-                read = read + np.einsum("kj,knj->nj", theta[mine], columns)
-    rest = np.flatnonzero(numeric)
-    batch = np.repeat(theta[None], len(rest) + 1, axis=0)
-    batch[1 + np.arange(len(rest)), rest] += steps[rest]
-    laws = attrs.evolve(model, effects=tuple(one for one in model.effects if not one.reads_total_torque))
+            if effect.reads_total_torque:
+                numeric[slots] = False
+                term_torque = term_torque + np.einsum("kj,knj->nj", theta[slots], columns)
+
+    # Finite differences: row 0 of the batch is theta, the others theta + h_a e_a.
+    numeric_slots = np.flatnonzero(numeric)
+    batch = np.repeat(theta[None], len(numeric_slots) + 1, axis=0)
+    batch[1 + np.arange(len(numeric_slots)), numeric_slots] += steps[numeric_slots]
+    kept_effects = tuple(effect for effect in model.effects if not effect.reads_total_torque)
+    without_terms = attrs.evolve(model, effects=kept_effects)
     gains, values = _unpack(model, batch[:, :-2])
-    kept = [value for one, value in zip(model.effects, values, strict=True) if not one.reads_total_torque]
-    torque = laws.evaluate(gains, kept)
-    slopes[:, rest] = ((torque[1:] - torque[0]) / steps[rest][:, None, :]).transpose(2, 0, 1)
+    law_values = [
+        value for effect, value in zip(model.effects, values, strict=True) if not effect.reads_total_torque
+    ]
+    torque = without_terms.evaluate(gains, law_values)
+    differences = (torque[1:] - torque[0]) / steps[numeric_slots][:, None, :]
+    slopes[:, numeric_slots] = differences.transpose(2, 0, 1)
     for k in np.flatnonzero(free[-2:]):
         slopes[:, len(theta) - 2 + k] = _delay_slope(model, int(k)).T
-    return torque[0] + read, slopes
+    return torque[0] + term_torque, slopes
 
 
 def _delay_slope(model: Model, which: int) -> Array:
-    """Slope (N, J) of the torque along the input delay (0) or the output delay (1)."""
-    felt = tuple(one for one in model.effects if _depends_on_delay(one.law, which))
-    moved = attrs.evolve(model, effects=felt)
+    """Derivative (N, J) of the torque along the input delay (0) or the output delay (1)."""
+    dependent = tuple(effect for effect in model.effects if _depends_on_delay(effect.law, which))
+    moved = attrs.evolve(model, effects=dependent)
     step = np.zeros((2, 1))
     step[which] = DELAY_STEP_S
     high, low = moved.with_delays(model.delays + step), moved.with_delays(model.delays - step)
@@ -369,7 +589,10 @@ def _delay_slope(model: Model, which: int) -> Array:
 
 
 def _depends_on_delay(law: EffectLaw, which: int) -> bool:
-    """Does its torque change with the input delay (0), or the output delay (1)? An acceleration is read as commands move it."""
+    """Whether the torque of a law changes with the input delay (0) or the output delay (1).
+
+    The commands select which acceleration is read, so that a law of `ddq` depends on both.
+    """
     if not isinstance(law, AddedLaw) or law.depends_on_drive_torque or law.signal == "ddq":
         return True
     return which == 1 and law.at == DRIVE

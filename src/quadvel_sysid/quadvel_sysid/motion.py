@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from quadvel_actuator.model import ActuatorModel
 from quadvel_actuator.parameters import ActuatorParameters
 
-from .eam import LONGEST_INPUT
+from .eam import MAX_INPUT_DELAY_S
 from .logs.log import Log, LogError
 from .signals import Array, Bools, Samples
 
@@ -258,7 +258,7 @@ def imply_torque(log: Log, body: Body | None = None) -> tuple[Log, Body]:
     coarse, ddq = average_over_steps(log)
     samples = Samples([coarse])
     if body is None:
-        delays = np.arange(0.0, LONGEST_INPUT, _DELAY_STEP_S)
+        delays = np.arange(0.0, MAX_INPUT_DELAY_S, _DELAY_STEP_S)
         body = min((_fit_body(samples, ddq, delay) for delay in delays), key=lambda one: one[1])[0]
         for joint, inertia in zip(log.joints, body.inertia, strict=True):
             if inertia <= 0.0:

@@ -1,4 +1,4 @@
-"""Everything that was found, as the report and the series for the pictures."""
+"""Build the report and the figure series from the results of an identification."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from quadvel_actuator.parameters import ActuatorParameters
 
 from .baselines import explained_share, torque_variance
 from .confidence import Intervals
-from .criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, DataSplit, normality, whiteness
+from .criterion import SIGNIFICANCE_LEVEL, WHITENESS_LEVEL, DataSplit, normality_p_values, whiteness_p_values
 from .export_parameters import (
     acting_joints,
+    actuator_parameters,
     gain_deviations,
     law_settings,
-    limits,
     mean_square,
     parameter_entries,
-    parameters,
-    with_interval,
+    torque_limits,
+    value_and_interval,
 )
 from .identification import Identification, Shape, Trace
 from .library import SignalTerm
@@ -30,18 +30,23 @@ from .logs.findings import Finding as LogFinding
 from .model import AppliedEffect, Model
 from .preparation import reference_gains
 from .signals import Array
-from .summary_text import decision
+from .summary_text import summary_text
 
 SCHEMA = 1
+"""Version of the format of report.json."""
 _DELTAS = "delta_kp", "delta_kd"
 UNITS = {"mse": "N^2 m^2", "torque": "N m", "delta_kp": "N m/rad", "delta_kd": "N m s/rad", "delay": "ms"}
-_REMOVABLE = 0.05
-"""Of the floor: what the plain EAM leaves above it must be more than this to speak of a share of it."""
+"""Units of the report's numbers."""
+_MIN_REMOVABLE = 0.05
+"""Minimum error of the plain EAM above the noise floor, relative to it, to state a fraction."""
 
-_ALIKE = 0.05  # ms
-_OVER = 1.1  # times the limit, that noise and a short peak may reach
+_SAME_DELAY_MS = 0.05
+"""Difference of delays between joints, ms, below which they count as equal."""
+_TORQUE_LIMIT_MARGIN = 1.1
+"""Ratio of measured torque to the limit that noise and short peaks may reach."""
 
-_SHOWN = 4000  # points of a series in a picture
+_MAX_POINTS = 4000
+"""Maximum number of points of a series in a figure."""
 _SIGNAL_UNITS = {
     "q": "rad",
     "q_des": "rad",
@@ -54,60 +59,92 @@ _SIGNAL_UNITS = {
 
 @attrs.frozen(eq=False)
 class SelectedEffect:
-    """An effect that was chosen, of the corrected model the one of the same index, on the rows that are reported."""
+    """Evidence for a selected effect on the reported rows.
+
+    Attributes:
+        gain: Mean squared error without the effect, all else refitted, minus that with it, N^2 m^2.
+        p_value: p-value of the score test.
+        indistinguishable: Names of laws that explain the log equally well.
+    """
 
     gain: float
-    """error without it, everything else fitted anew, less that with it, N^2 m^2"""
-    p: float
+    p_value: float
     indistinguishable: tuple[str, ...]
-    """laws that say the same"""
 
 
 @attrs.frozen(eq=False)
 class Outcome:
-    """What the steps of an identification found. Models `whole` are fitted to every row, the others to those that chose."""
+    """Results of all steps of an identification.
+
+    Models `*_all_rows` are fitted to every row, the others to the fitted and selection rows.
+
+    Attributes:
+        before: Plain EAM.
+        before_all_rows: Plain EAM, fitted to every row.
+        model: Corrected model.
+        model_all_rows: Corrected model, fitted to every row.
+        effects: Evidence for each effect of `model`, in the same order.
+        rejected: Rejected laws: name, gain on the selection rows (N^2 m^2), reason.
+        is_white: Whether the residual is indistinguishable from white noise.
+        residual_correlates: Signals that a structured residual correlates with, if no term does.
+        half_widths: 95 % confidence intervals of `model_all_rows`.
+        ideal_torque: Torque of the commanded PD law without delays, (N, J), N m.
+        noise: Variance of the torque noise, (J,), N^2 m^2.
+        parts: Data split.
+        base: Parameters that the corrected model extends.
+    """
 
     before: Model
-    before_whole: Model
+    before_all_rows: Model
     model: Model
-    whole: Model
+    model_all_rows: Model
     effects: tuple[SelectedEffect, ...]
     rejected: tuple[tuple[str, float, str], ...]
-    """law, gain on the rows that select, reason"""
     is_white: bool
-    """is what is left nothing but noise?"""
     residual_correlates: tuple[str, ...]
-    """the signals that what is left goes with most, where it is not white and no term says more of it"""
-    widths: Intervals
-    ideal: Array  # (N, J), torque of the PD law as commanded
-    noise: Array  # (J,)
+    half_widths: Intervals
+    ideal_torque: Array
+    noise: Array
     parts: DataSplit
     base: ActuatorParameters
 
     @property
     def predicted(self) -> Array:
-        """Torque that the corrected model foretells, (N, J)."""
+        """Torque that the corrected model predicts, (N, J), N m."""
         return self.model.predictive().predict()
 
     @property
-    def terms(self) -> list[tuple[int, AppliedEffect]]:
-        """The terms of named signals, and which of the effects they are."""
-        return [(k, one) for k, one in enumerate(self.model.effects) if isinstance(one.law, SignalTerm)]
+    def term_effects(self) -> list[tuple[int, AppliedEffect]]:
+        """Regressors of named signals, each with its index among the effects."""
+        return [
+            (k, effect) for k, effect in enumerate(self.model.effects) if isinstance(effect.law, SignalTerm)
+        ]
 
 
-def identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
-    """The report, the corrected model and the series; `findings` are (log, finding)."""
+def build_identification(outcome: Outcome, findings: Sequence[tuple[str, LogFinding]]) -> Identification:
+    """Build the report, the corrected model and the series.
+
+    Args:
+        outcome: Results of all steps.
+        findings: Findings of the log checks, as (log name, finding).
+
+    Returns:
+        The complete result.
+    """
     report = _report(outcome)
     report["findings"] = [{"log": name, **attrs.asdict(one)} for name, one in findings]
-    corrected = parameters(outcome.whole, outcome.parts, outcome.base, outcome.widths.effects)
+    corrected = actuator_parameters(
+        outcome.model_all_rows, outcome.parts, outcome.base, outcome.half_widths.effects
+    )
     return Identification(report, corrected, _traces(outcome), _shapes(outcome))
 
 
 def _report(o: Outcome) -> dict[str, Any]:
+    """The dict of report.json, without findings, baselines and replays."""
     samples, parts = o.model.samples, o.parts
     errors = {
         name: samples.tau - torque
-        for name, torque in (("pd", o.ideal), ("before", o.before.predict()), ("after", o.predicted))
+        for name, torque in (("pd", o.ideal_torque), ("before", o.before.predict()), ("after", o.predicted))
     }
     mses: dict[str, dict[str, Any]] = {
         name: {
@@ -135,98 +172,98 @@ def _report(o: Outcome) -> dict[str, Any]:
         | {
             **{
                 name: float(each[0])
-                for name, each in zip(_DELTAS, gain_deviations(o.before_whole), strict=True)
+                for name, each in zip(_DELTAS, gain_deviations(o.before_all_rows), strict=True)
             },
-            "input_delay_ms": 1e3 * float(o.before_whole.delays[0, 0]),
-            "output_delay_ms": 1e3 * float(o.before_whole.delays[1, 0]),
+            "input_delay_ms": 1e3 * float(o.before_all_rows.delays[0, 0]),
+            "output_delay_ms": 1e3 * float(o.before_all_rows.delays[1, 0]),
         },
-        "after": mses["after"] | _gains(o),
-        "effects": sorted(_effects(o), key=lambda one: -one["heldout_gain"]),
+        "after": mses["after"] | _gain_entries(o),
+        "effects": sorted(_effect_entries(o), key=lambda one: -one["heldout_gain"]),
         "rejected": [{"name": name, "selecting_gain": gain, "reason": why} for name, gain, why in o.rejected],
         "unexplained": _unexplained(o, mses["before"]["heldout_mse"], mses["after"]["heldout_mse"], floor),
         "warnings": [
-            f"{name} sits on its bound: its value and interval are not to be trusted"
-            for name in o.widths.on_bound
+            f"{name} is at its bound: its value and interval are not valid" for name in o.half_widths.at_bound
         ]
-        + _unconfirmed(o)
-        + _unlike_delays(o.whole)
-        + _negative_gains(o.whole)
-        + _beyond_limits(o),
+        + _unconfirmed_warnings(o)
+        + _delay_spread_warnings(o.model_all_rows)
+        + _negative_gain_warnings(o.model_all_rows)
+        + _torque_limit_warnings(o),
     }
-    report["decision"] = decision(report)
+    report["decision"] = summary_text(report)
     return report
 
 
 def _unexplained(o: Outcome, before: float, after: float, floor: float) -> dict[str, Any]:
-    """What no law explains: terms of named signals, or a residual that is not white."""
+    """Section on the residual: regressors of signals, or structure that no effect explains."""
     parts, samples = o.parts, o.model.samples
-    left = samples.tau - o.model.predict()
+    residual = samples.tau - o.model.predict()
     p = np.minimum(
-        whiteness(left, parts.all_rows, samples.start, parts.overlap), normality(left, parts.all_rows)
+        whiteness_p_values(residual, parts.all_rows, samples.start, parts.noise_overlap),
+        normality_p_values(residual, parts.all_rows),
     )
     coloured = p < WHITENESS_LEVEL
-    names = [name for _, one in o.terms for name in one.law.inputs]  # type: ignore[attr-defined]
-    joints = np.any([one.active for _, one in o.terms], axis=0) if names else np.zeros(len(coloured), bool)
+    names = [name for _, one in o.term_effects for name in one.law.inputs]  # type: ignore[attr-defined]
+    joints = (
+        np.any([one.active for _, one in o.term_effects], axis=0) if names else np.zeros(len(coloured), bool)
+    )
     removable = before - floor
     structured = bool(names) or not o.is_white
     return {
         "verdict": "structured" if structured else "white",
         "fraction": float(np.clip((after - floor) / removable, 0.0, 1.0))
-        if removable > _REMOVABLE * floor
+        if removable > _MIN_REMOVABLE * floor
         else 0.0,
         "depends_on": list(dict.fromkeys(names or o.residual_correlates)),
         "joints": np.array(samples.joints)[joints | (coloured & structured)].tolist(),
     }
 
 
-def _unconfirmed(o: Outcome) -> list[str]:
-    """Effects that the rows which chose nothing do not show."""
+def _unconfirmed_warnings(o: Outcome) -> list[str]:
+    """Warnings about effects that are not significant on the reported rows."""
     return [
-        f"{one.law.name} is not confirmed by the rows that are reported (p = {found.p:.2g} there)"
-        for one, found in zip(o.model.effects, o.effects, strict=True)
-        if found.p > SIGNIFICANCE_LEVEL
+        f"{effect.law.name} is not confirmed by the reported rows (p = {evidence.p_value:.2g} there)"
+        for effect, evidence in zip(o.model.effects, o.effects, strict=True)
+        if evidence.p_value > SIGNIFICANCE_LEVEL
     ]
 
 
-def _unlike_delays(model: Model) -> list[str]:
-    """A model that runs has one pair of delays."""
+def _delay_spread_warnings(model: Model) -> list[str]:
+    """Warnings about delays that differ between joints: a running model has one pair."""
     spread = 1e3 * float(np.ptp(model.delays, axis=1).max())
-    if spread < _ALIKE:
+    if spread < _SAME_DELAY_MS:
         return []
     return [
-        f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml holds their median, so a model that runs "
-        "with it does worse than the error after says"
+        f"delays differ by up to {spread:.1f} ms between joints: actuator.yaml contains their median, so that a model that "
+        "runs with it has a larger error than reported"
     ]
 
 
-def _negative_gains(model: Model) -> list[str]:
-    """A drive that pushes away from its target does not exist: the log or the model is wrong."""
+def _negative_gain_warnings(model: Model) -> list[str]:
+    """Warnings about negative gains, which no drive has: the log or the model is wrong."""
     found = []
     for name, row in zip(("kp", "kd"), model.gains, strict=True):
         joints = np.array(model.samples.joints)[row < 0.0]
         if len(joints):
             text = f"{name} + delta_{name} is negative on {', '.join(joints)}"
-            found.append(
-                f"{text}: look at the signs and stamps of the log before believing anything else here"
-            )
+            found.append(f"{text}: check the signs and stamps of the log before you use this report")
     return found
 
 
-def _beyond_limits(o: Outcome) -> list[str]:
-    """Torques that were measured and that the corrected model can not give."""
-    joints, most = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
-    allowed = np.broadcast_to(limits(o.base, joints), most.shape)
+def _torque_limit_warnings(o: Outcome) -> list[str]:
+    """Warnings about measured torques that the corrected model cannot produce."""
+    joints, peak = o.model.samples.joints, np.abs(o.model.samples.tau).max(axis=0)
+    allowed = np.broadcast_to(torque_limits(o.base, joints), peak.shape)
     return [
-        f"{joint}: up to {torque:.1f} N m were measured, and torque_limit in actuator.yaml, which is the base's, is "
+        f"{joint}: the measured torque reaches {torque:.1f} N m, but torque_limit in actuator.yaml, from the base, is "
         f"{limit:.1f} N m"
-        for joint, torque, limit in zip(joints, most, allowed, strict=True)
-        if torque > _OVER * limit
+        for joint, torque, limit in zip(joints, peak, allowed, strict=True)
+        if torque > _TORQUE_LIMIT_MARGIN * limit
     ]
 
 
-def _gains(o: Outcome) -> dict[str, Any]:
-    """Gain deviations and delays of the corrected model, a number, or one for each joint, with intervals."""
-    model, widths = o.whole, o.widths
+def _gain_entries(o: Outcome) -> dict[str, Any]:
+    """Gain deviations and delays with intervals: a number if joints share it, else a list."""
+    model, widths = o.model_all_rows, o.half_widths
     found: dict[str, Any] = {}
     halves = widths.gains * np.array(reference_gains(model.samples))[:, None]
     rows = {
@@ -236,70 +273,77 @@ def _gains(o: Outcome) -> dict[str, Any]:
     }
     for name, (values, half) in rows.items():
         least = -np.inf if name.startswith("delta") else 0.0
-        value, ci = with_interval(values, half, least)
+        value, ci = value_and_interval(values, half, least)
         found[name], found[f"{name}_ci95"] = value, ci
     return found
 
 
-def _effects(o: Outcome) -> list[dict[str, Any]]:
+def _effect_entries(o: Outcome) -> list[dict[str, Any]]:
+    """Entries of the report for all effects; the regressors of named signals share one."""
     joints = o.model.samples.joints
     found = [
-        _effect(of_it, one, half, joints)
-        for of_it, one, half in zip(o.effects, o.whole.effects, o.widths.effects, strict=True)
-        if not isinstance(one.law, SignalTerm)
+        _effect_entry(evidence, effect, half, joints)
+        for evidence, effect, half in zip(
+            o.effects, o.model_all_rows.effects, o.half_widths.effects, strict=True
+        )
+        if not isinstance(effect.law, SignalTerm)
     ]
-    if o.terms:
-        found.append(_terms(o, joints))
+    if o.term_effects:
+        found.append(_terms_entry(o, joints))
     return found
 
 
-def _terms(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
-    """All terms as one effect."""
-    ranked = sorted(o.terms, key=lambda pair: -o.effects[pair[0]].gain)
-    acts = np.any([one.active for _, one in ranked], axis=0)
+def _terms_entry(o: Outcome, joints: Sequence[str]) -> dict[str, Any]:
+    """Entry of the report for all regressors of named signals."""
+    ranked = sorted(o.term_effects, key=lambda pair: -o.effects[pair[0]].gain)
+    acts = np.any([effect.active for _, effect in ranked], axis=0)
     return {
         "name": TERMS,
         "joints": acting_joints(acts, joints),
         "params": {},
         "indistinguishable": [],
         "heldout_gain": sum(o.effects[k].gain for k, _ in ranked),
-        "p_value": min(o.effects[k].p for k, _ in ranked),
-        "inputs": list(dict.fromkeys(name for _, one in ranked for name in one.law.inputs)),  # type: ignore[attr-defined]
+        "p_value": min(o.effects[k].p_value for k, _ in ranked),
+        "inputs": list(dict.fromkeys(name for _, effect in ranked for name in effect.law.inputs)),  # type: ignore[attr-defined]
         "terms": [
             {
-                "kind": one.law.shape.kind,  # type: ignore[attr-defined]
-                "inputs": list(one.law.inputs),  # type: ignore[attr-defined]
-                "at": one.law.at,
-                "joints": acting_joints(one.active, joints),
+                "kind": effect.law.shape.kind,  # type: ignore[attr-defined]
+                "inputs": list(effect.law.inputs),  # type: ignore[attr-defined]
+                "at": effect.law.at,
+                "joints": acting_joints(effect.active, joints),
                 "heldout_gain": o.effects[k].gain,
             }
-            for k, one in ranked
+            for k, effect in ranked
         ],
     }
 
 
-def _effect(of_it: SelectedEffect, one: AppliedEffect, half: Array, joints: Sequence[str]) -> dict[str, Any]:
-    settings = law_settings(one)
+def _effect_entry(
+    evidence: SelectedEffect, effect: AppliedEffect, half: Array, joints: Sequence[str]
+) -> dict[str, Any]:
+    """Entry of the report for one law."""
+    settings = law_settings(effect)
     entry: dict[str, Any] = {
-        "name": one.law.name,
-        "joints": acting_joints(one.active, joints),
-        "params": parameter_entries(one, half),
-        "indistinguishable": list(of_it.indistinguishable),
-        "heldout_gain": of_it.gain,
-        "p_value": of_it.p,
-        **one.law.record_statistics(),
+        "name": effect.law.name,
+        "joints": acting_joints(effect.active, joints),
+        "params": parameter_entries(effect, half),
+        "indistinguishable": list(evidence.indistinguishable),
+        "heldout_gain": evidence.gain,
+        "p_value": evidence.p_value,
+        **effect.law.record_statistics(),
     }
     if settings:
         entry["form"] = settings
-    if of_it.indistinguishable:
-        entry["separated_by"] = one.law.motion
+    if evidence.indistinguishable:
+        entry["separated_by"] = effect.law.motion
     return entry
 
 
 def _traces(o: Outcome) -> dict[str, Trace]:
+    """Held-out torque series of each joint."""
     samples, reported = o.model.samples, o.parts.report
-    series = (samples.tau, o.ideal, o.before.predict(), o.predicted)
-    rows = np.flatnonzero(reported.any(axis=1))[:_SHOWN]
+    series = (samples.tau, o.ideal_torque, o.before.predict(), o.predicted)
+    rows = np.flatnonzero(reported.any(axis=1))[:_MAX_POINTS]
     return {
         joint: Trace(samples.t[rows], *(np.where(reported[rows, j], x[rows, j], np.nan) for x in series))
         for j, joint in enumerate(samples.joints)
@@ -307,22 +351,22 @@ def _traces(o: Outcome) -> dict[str, Trace]:
 
 
 def _shapes(o: Outcome) -> tuple[Shape, ...]:
-    """The residual over the signal that explains it, of up to three joints an effect."""
+    """Residual over the signal that explains it, for up to three joints of each effect."""
     samples = o.model.samples
     before, after = samples.tau - o.before.predict(), samples.tau - o.predicted
     rows = np.flatnonzero(o.parts.report.any(axis=1))
-    rows = rows[:: max(1, len(rows) // _SHOWN)]
+    rows = rows[:: max(1, len(rows) // _MAX_POINTS)]
     found = []
-    for one in o.model.effects:
-        for j in np.flatnonzero(one.active)[:3]:
-            x, unit = _signal(o, one.law.signal, int(j))
+    for effect in o.model.effects:
+        for j in np.flatnonzero(effect.active)[:3]:
+            x, unit = _signal_series(o, effect.law.signal, int(j))
             x, e0, e1 = x[rows], before[rows, j], after[rows, j]
-            found.append(Shape(one.law.name, samples.joints[j], one.law.signal, unit, x, e0, e1))
+            found.append(Shape(effect.law.name, samples.joints[j], effect.law.signal, unit, x, e0, e1))
     return tuple(found)
 
 
-def _signal(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
-    """A signal of the report by its name, and its unit."""
+def _signal_series(o: Outcome, name: str, joint: int) -> tuple[Array, str]:
+    """A signal of one joint by its name in the report, and its unit."""
     s, samples = o.model.signals, o.model.samples
     owner, _, plain = name.rpartition("/")
     j = samples.joints.index(owner) if owner else joint

@@ -1,7 +1,7 @@
-"""Several cores at work on what does not hang on each other; the answers are those that one core would give.
+"""Parallel map over forked worker processes, with the results of a serial run.
 
-A helper is a copy of this process, so that it knows all that is known here; what it sends back goes without the samples,
-which are here already.
+A worker is a fork of this process and therefore shares its data. Results return by pickle, without
+the samples, which this process holds already.
 """
 
 from __future__ import annotations
@@ -18,40 +18,55 @@ from typing import Any, TypeVar
 from .memory import trim_heap
 from .signals import Samples
 
-R = TypeVar("R")
+Result = TypeVar("Result")
 PR_SET_PDEATHSIG = 1
-INTERRUPT = {signal.SIGINT}
-_MOST = 2048
-"""Pieces of work: as many numbers of two bytes as a pipe of one page holds"""
+INTERRUPT_SIGNALS = {signal.SIGINT}
+_MAX_TASKS = 2048
+"""Maximum number of tasks: a pipe of one page holds so many 2-byte numbers."""
 
 
-def side_by_side(work: Callable[[int], R], count: int, cores: int, samples: Samples) -> list[R]:
-    """What the work gives for each of the numbers below `count`; it may hold `samples`, and no others.
+def parallel_map(work: Callable[[int], Result], count: int, cores: int, samples: Samples) -> list[Result]:
+    """Call a function for the numbers 0 to count - 1, on several cores.
 
-    This process works as well. Raises what the work raises, and ChildProcessError where a helper was killed.
+    This process works as well.
+
+    Args:
+        work: Function of the task number. Its result may refer to `samples`, and to no other
+            samples.
+        count: Number of tasks.
+        cores: Processes, this one included.
+        samples: Samples that results refer to; they are not copied.
+
+    Returns:
+        Results in the order of the task numbers.
+
+    Raises:
+        ChildProcessError: If a worker process was killed.
+        ValueError: If there are too many tasks.
+        Exception: Whatever `work` raises.
     """
     if cores < 2 or count < 2:
         return [work(k) for k in range(count)]
-    if count > _MOST:
-        raise ValueError(f"{count} pieces of work, expected {_MOST} at most")
+    if count > _MAX_TASKS:
+        raise ValueError(f"count: found {count}, expected at most {_MAX_TASKS}")
     trim_heap()
-    todo = _numbers(count)
-    helpers = []
+    queue = _task_queue(count)
+    workers = []
     try:
         for _ in range(min(cores, count) - 1):
-            helpers.append(_Helper(work, todo, samples))
-        found = {k: work(k) for k in _taken(todo)}
-        for helper in helpers:
-            found |= helper.found()
+            workers.append(_Worker(work, queue, samples))
+        found = {k: work(k) for k in _claim_tasks(queue)}
+        for worker in workers:
+            found |= worker.results()
     finally:
-        os.close(todo)
-        for helper in helpers:
-            helper.end()
+        os.close(queue)
+        for worker in workers:
+            worker.kill()
     return [found[k] for k in range(count)]
 
 
-def _numbers(count: int) -> int:
-    """The end to read from of a pipe with the numbers below `count`, each of which one process takes."""
+def _task_queue(count: int) -> int:
+    """Read end of a pipe with the task numbers; each number is read by one process."""
     reader, writer = os.pipe()
     with os.fdopen(writer, "wb") as file:
         for k in range(count):
@@ -59,51 +74,60 @@ def _numbers(count: int) -> int:
     return reader
 
 
-def _taken(todo: int) -> Iterator[int]:
-    while number := os.read(todo, 2):
+def _claim_tasks(queue: int) -> Iterator[int]:
+    """Read task numbers until the pipe is empty."""
+    while number := os.read(queue, 2):
         yield int.from_bytes(number, "big")
 
 
-class _Helper:
-    """A copy of this process that takes numbers until none are left."""
+class _Worker:
+    """A fork of this process that works on tasks until none are left."""
 
-    def __init__(self, work: Callable[[int], Any], todo: int, samples: Samples) -> None:
+    def __init__(self, work: Callable[[int], Any], queue: int, samples: Samples) -> None:
         self._samples = samples
         reader, writer = os.pipe()
-        signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT)  # until the copy ends without a word
+        signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPT_SIGNALS)  # until the worker has its own handler
         self._pid = os.fork()
         if self._pid == 0:
-            _serve(work, todo, writer, samples)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
+            _run_worker(work, queue, writer, samples)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT_SIGNALS)
         os.close(writer)
         self._answer = os.fdopen(reader, "rb")
 
-    def found(self) -> dict[int, Any]:
-        """Its answers by number. Waits for them."""
+    def results(self) -> dict[int, Any]:
+        """Wait for the results.
+
+        Returns:
+            Results by task number.
+
+        Raises:
+            ChildProcessError: If the worker was killed.
+            Exception: The exception that the worker's task raised.
+        """
         answer = self._answer.read()
         if not answer:
-            raise ChildProcessError("a process that helps to identify was killed; is memory short?")
+            raise ChildProcessError("a worker process was killed; check that there is enough memory")
         found = _Unpickler(io.BytesIO(answer), self._samples).load()
         if isinstance(found, Exception):
             raise found
         return dict(found)
 
-    def end(self) -> None:
-        """Kill it, should it still be at work."""
+    def kill(self) -> None:
+        """Kill the worker, if it still runs, and reap it."""
         self._answer.close()
         os.kill(self._pid, signal.SIGKILL)
         os.waitpid(self._pid, 0)
 
 
-def _serve(work: Callable[[int], Any], todo: int, writer: int, samples: Samples) -> None:
-    """What a helper does; it never returns."""
+def _run_worker(work: Callable[[int], Any], queue: int, writer: int, samples: Samples) -> None:
+    """Main function of a worker process; does not return."""
     try:
-        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # who would hear it has ended
+        ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # end with the parent
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT)
-        sys.stdout = sys.stderr = None  # their locks may have been copied while held
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPT_SIGNALS)
+        sys.stdout = sys.stderr = None  # the fork may have copied their locks locked
         try:
-            found: Any = {k: work(k) for k in _taken(todo)}
+            found: Any = {k: work(k) for k in _claim_tasks(queue)}
         except Exception as error:
             found = error
         answer = io.BytesIO()
@@ -115,6 +139,8 @@ def _serve(work: Callable[[int], Any], todo: int, writer: int, samples: Samples)
 
 
 class _Pickler(pickle.Pickler):
+    """Pickler that stores a reference instead of the samples."""
+
     def __init__(self, file: io.BytesIO, samples: Samples) -> None:
         super().__init__(file, pickle.HIGHEST_PROTOCOL)
         self._samples = samples
@@ -124,6 +150,8 @@ class _Pickler(pickle.Pickler):
 
 
 class _Unpickler(pickle.Unpickler):
+    """Unpickler that resolves the reference to the samples."""
+
     def __init__(self, file: io.BytesIO, samples: Samples) -> None:
         super().__init__(file)
         self._samples = samples

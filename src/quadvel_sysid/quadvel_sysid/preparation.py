@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import attrs
 import numpy as np
 
-from .criterion import DataSplit, clusters, encoder_variance, noise_variance
+from .criterion import DataSplit, cluster_starts, encoder_variance, noise_variance
 from .eam import Eam, fit_eam
 from .identification_data import IdentificationData
 from .logs.excerpts import has_jitter, restore_even_clock
@@ -112,8 +112,8 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
     spans = [one.log.duration for one in samples.logs]
     length = float(np.clip(min(spans) / _MIN_BLOCKS, shortest, _MAX_BLOCK_S))
     block = np.floor(samples.t / length).astype(int)
-    if data.heldout:
-        report = samples.log_of_row >= data.fitted
+    if data.has_heldout:
+        report = samples.log_of_row >= data.fitted_count
         select = (block % 2 == 1) & ~report
     else:
         report, select = block % 5 == 4, np.isin(block % 5, (1, 3))
@@ -128,7 +128,7 @@ def split_rows(samples: Samples, data: IdentificationData, shortest: float) -> D
                 f"expected {_MIN_ROWS} or more"
             )
     overlap = 0 if data.body is None else 1
-    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], clusters(samples), overlap)
+    return DataSplit(parts["fitted"], parts["selecting"], parts["reported"], cluster_starts(samples), overlap)
 
 
 def reference_gains(samples: Samples) -> tuple[float, float]:

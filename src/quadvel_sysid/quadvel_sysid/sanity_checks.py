@@ -1,4 +1,4 @@
-"""What in a report contradicts itself, in sentences for the terminal: results that nobody should act on unread."""
+"""Sanity checks of a report: results that must not be used without inspection."""
 
 from __future__ import annotations
 
@@ -7,35 +7,42 @@ from typing import Any
 
 from .baselines import FILTER_SPAN_S
 
-FAR = 1.0
-"""rad; a replay that strays so far from the measured angles shows nothing of the model."""
-HALF = 0.5
-"""Share of the torque's variance that a model explains at least where the torque is that of the drive."""
-WORTH = 1.05
-"""Times the error of what needs no model, below which a model is as good."""
+MAX_REPLAY_ERROR_RAD = 1.0
+"""Replay error, rad, above which a replay is no evidence for the model."""
+MIN_EXPLAINED_FRACTION = 0.5
+"""Minimum fraction of the torque's variance that a valid model explains."""
+BASELINE_ERROR_RATIO = 1.05
+"""Error ratio to a baseline above which the model is worse than the baseline."""
 
 
 def contradictions(report: Mapping[str, Any]) -> Iterator[str]:
-    """Sentences about a report with the fields of report.json."""
+    """Check a report for contradictions.
+
+    Args:
+        report: Content of report.json.
+
+    Yields:
+        One warning for each contradiction.
+    """
     after = report["after"]
     for name, what in (
         ("joint_pd", "a PD law of each joint"),
         ("ridge", f"a ridge regression over {1e3 * FILTER_SPAN_S:.0f} ms"),
     ):
         other = report["baselines"][name]["heldout_mse"]
-        if after["heldout_mse"] > WORTH * other:
+        if after["heldout_mse"] > BASELINE_ERROR_RATIO * other:
             yield (
-                f"{what} leaves less of the held-out torque, {other:.3g} N^2 m^2, than the corrected model, "
-                f"{after['heldout_mse']:.3g}: what was named is not what the joints do"
+                f"{what} has a smaller held-out error, {other:.3g} N^2 m^2, than the corrected model, "
+                f"{after['heldout_mse']:.3g}: the named effects do not describe the joints"
             )
     share = after.get("heldout_explained")
-    if share is not None and share < HALF:
+    if share is not None and share < MIN_EXPLAINED_FRACTION:
         yield (
-            f"the corrected model explains {100.0 * share:.0f} % of the torque's variance, less than half: what moves it "
-            "is not known, and what was named is not to be trusted before it is"
+            f"the corrected model explains {100.0 * share:.0f} % of the torque's variance, less than half: do not use the "
+            "named effects before the main cause of the torque is known"
         )
-    if after.get("heldout_q_rms_rad", 0.0) > FAR:
+    if after.get("heldout_q_rms_rad", 0.0) > MAX_REPLAY_ERROR_RAD:
         yield (
-            f"replayed, the commands lead {after['heldout_q_rms_rad']:.3g} rad away from the measured angles: look at the signs, "
-            "units and stamps of the log before believing anything else here"
+            f"the replayed commands end {after['heldout_q_rms_rad']:.3g} rad from the measured angles: check the signs, "
+            "units and stamps of the log before you use this report"
         )

@@ -1,9 +1,9 @@
-"""Which candidates are worth a fit: a score test of each, profiled over the delays.
+"""Screening of candidate effects: a linearised score test, profiled over a grid of delays.
 
-An effect that the model lacks bends the gains and delays that were fitted without it. So candidates are looked at on a
-grid of delays, where the model is linear in its gains, in small changes of the delays and in the weights of its laws. What
-these explain is projected out of the residual and of the candidate's regressors (Frisch, Waugh and Lovell); what the
-regressors then explain of the residual is the candidate's promise.
+A missing effect biases the gains and delays that were fitted without it. At each grid point the
+model is linear in the gains, in small changes of the delays, and in the weights of the laws. Their
+columns are projected out of the residual and of the candidate's regressors (Frisch, Waugh and
+Lovell). The reduction of the squared error by the projected regressors gives the candidate's score.
 """
 
 from __future__ import annotations
@@ -18,129 +18,171 @@ from quadvel_actuator.effects import EffectLaw, Stage
 
 from .criterion import PENALTY_PER_PARAMETER
 from .fit import RIDGE
-from .library import Context, SignalTerm, complexity, may_act
+from .library import Context, SignalTerm, allowed_joints, complexity
 from .model import MAX_DELAYS_S, AppliedEffect, Model, Unknowns, jacobian, linear_columns
-from .parallel import side_by_side
+from .parallel import parallel_map
 from .signals import Array, scattered_rows
 
 _TOTAL_DELAY_CHANGES_S = (-0.006, -0.004, -0.002, 0.0, 0.002, 0.004, 0.006, 0.008)
-_FEW_SHIFTS = (0.0,)
+_NO_DELAY_CHANGES_S = (0.0,)
 _OUTPUT_DELAYS_S = (0.0005, 0.0025, 0.0045)
-"""s: the grid of delays, as changes of their sum and as output delays"""
+"""Grid of delays, s: changes of their sum, and output delays."""
 _MAX_DELAY_CHANGE_S = 0.0015
-"""s, that slopes along the delays are followed between points of the grid"""
+"""Range, s, of the linearisation along the delays around a grid point."""
 _ROWS_PER_JOINT = 1500
-"""Of each joint that a score test looks at"""
-_BATCH = 8
-"""Starting values evaluated at once"""
+"""Rows of each joint that the score test uses."""
+_BATCH_SIZE = 8
+"""Batch size of starting values."""
 _MIN_ERROR_RATIO = 1e-3
-"""Of the error: less than that a score test does not promise to leave"""
+"""Lower bound of the remaining error in the score, relative to the error before."""
 _AMPLITUDE_RANGE = (0.7, 1.4)
-"""Times a start that is not linear: how far it is followed"""
+"""Range of the amplitude of a nonlinear law, relative to its starting values."""
 
 
 @attrs.frozen(eq=False)
 class ScreenedCandidate:
-    """A candidate at its best starting values and delays."""
+    """A candidate at its best starting values and delays.
+
+    Attributes:
+        model: Model with the candidate as its last effect.
+        score: Expected reduction of the criterion.
+    """
 
     model: Model
-    """with the candidate as its last law"""
     score: float
-    """what it takes off the criterion"""
 
     @property
     def law(self) -> EffectLaw:
+        """Law of the candidate."""
         return self.model.effects[-1].law
 
 
 class CandidateScreening:
-    """The model that candidates are held against, on some of the fitted rows.
+    """Scores candidate effects on a subset of the fitted rows.
 
-    Laws that remember are followed over all rows; for others these rows are enough.
+    Laws with memory are simulated over all rows, and compared on the subset.
+
+    Attributes:
+        context: Model to extend, and its data.
+        joints: Names of the joints.
+        rows: Row numbers of the subset, (n,).
+        weight: Inverse standard deviation of the noise on fitted samples, 0 on others, (n, J), 1/(N
+            m).
+        screening_rows: Samples of the subset.
     """
 
     def __init__(self, context: Context, cores: int = 1) -> None:
-        """`cores` that share the work."""
+        """Choose the rows and the grid of delays.
+
+        Args:
+            context: Model to extend, and its data.
+            cores: Worker processes.
+        """
         self.context, self._cores = context, cores
         self.joints = context.samples.joints
         fitted = np.flatnonzero(context.parts.fit.any(axis=1))
         self.rows = fitted[scattered_rows(len(fitted), max(1, len(fitted) // _ROWS_PER_JOINT))]
         self.weight = np.where(context.parts.fit[self.rows], 1.0, 0.0) / np.sqrt(context.noise)
-        """(n, J): rows that are fitted, in units of the noise"""
         self.screening_rows = context.samples.take_rows(self.rows)
-        """the rows that are looked at, alone"""
-        self._remembers = any(one.law.has_memory for one in context.model.effects)
-        shifts = _FEW_SHIFTS if self._remembers else _TOTAL_DELAY_CHANGES_S
+        self._has_memory = any(one.law.has_memory for one in context.model.effects)
+        shifts = _NO_DELAY_CHANGES_S if self._has_memory else _TOTAL_DELAY_CHANGES_S
         self._grid = [context.model, *_delay_grid(context.model, shifts)]
-        """the model as it is, and at the points of the grid of delays"""
-        self._here: dict[bool, DelayGridPoint] = {}
+        self._term_points: dict[bool, DelayGridPoint] = {}
 
-    def laws(self, candidates: Iterable[EffectLaw]) -> list[ScreenedCandidate]:
-        """Laws, each at the point of the grid where it promises most."""
-        asked = [(law, table) for law in candidates if (table := self._start_values(law)) is not None]
+    def screen_laws(self, candidates: Iterable[EffectLaw]) -> list[ScreenedCandidate]:
+        """Score laws at every point of the grid of delays.
 
-        def at(k: int) -> tuple[Array, list[tuple[Model, Array]]]:
-            spots = self._grid_points(k, (law for law, _ in asked))
-            return spots[False].baseline_sse, [
-                spots[law.has_memory].best_start(law, table) for law, table in asked
-            ]
+        Args:
+            candidates: Laws, in all their forms.
 
-        found = side_by_side(at, len(self._grid), self._cores, self.context.samples)
-        self.baseline_sse = np.min([bare for bare, _ in found], axis=0)
+        Returns:
+            Each law at its best grid point; laws without starting values are left out.
+        """
+        with_starts = [(law, table) for law in candidates if (table := self._start_values(law)) is not None]
+
+        def solve_at(k: int) -> tuple[Array, list[tuple[Model, Array]]]:
+            points = self._grid_points(k, (law for law, _ in with_starts))
+            solutions = [points[law.has_memory].best_start(law, table) for law, table in with_starts]
+            return points[False].baseline_sse, solutions
+
+        # Profile over the delays: the baseline is the best grid point without a candidate, and each
+        # law is scored at its own best grid point.
+        found = parallel_map(solve_at, len(self._grid), self._cores, self.context.samples)
+        self.baseline_sse = np.min([baseline for baseline, _ in found], axis=0)
         return [
-            max((self._scored(*one) for one in points), key=lambda one: one.score)
-            for points in zip(*(each for _, each in found), strict=True)
+            max((self._scored(*solution) for solution in of_law), key=lambda one: one.score)
+            for of_law in zip(*(solutions for _, solutions in found), strict=True)
         ]
 
-    def terms(self, candidates: Sequence[SignalTerm]) -> list[ScreenedCandidate]:
-        """Terms, at the delays of the model."""
-        self.prepare(candidates)
-        return side_by_side(
-            lambda k: self.term(candidates[k]), len(candidates), self._cores, self.context.samples
+    def screen_terms(self, candidates: Sequence[SignalTerm]) -> list[ScreenedCandidate]:
+        """Score regressors of named signals at the delays of the model.
+
+        Args:
+            candidates: Regressors.
+
+        Returns:
+            The scored regressors, in the same order.
+        """
+        self.prepare_terms(candidates)
+        return parallel_map(
+            lambda k: self.screen_term(candidates[k]), len(candidates), self._cores, self.context.samples
         )
 
-    def prepare(self, candidates: Iterable[SignalTerm]) -> None:
-        """Do now what `term` needs for all of these."""
-        self._here = self._grid_points(0, candidates)
+    def prepare_terms(self, candidates: Iterable[SignalTerm]) -> None:
+        """Compute what `screen_term` needs for a set of regressors.
+
+        Args:
+            candidates: Regressors that will be scored.
+        """
+        self._term_points = self._grid_points(0, candidates)
         self.baseline_sse  # noqa: B018
 
-    def term(self, law: SignalTerm) -> ScreenedCandidate:
-        """One of the terms that were prepared for."""
+    def screen_term(self, law: SignalTerm) -> ScreenedCandidate:
+        """Score one regressor; call `prepare_terms` first.
+
+        Args:
+            law: Regressor of named signals.
+
+        Returns:
+            The scored regressor.
+        """
         table = np.zeros((1, law.shape.count, len(self.joints)))
-        return self._scored(*self._here[law.has_memory].best_start(law, table))
+        return self._scored(*self._term_points[law.has_memory].best_start(law, table))
 
     @cached_property
     def baseline_sse(self) -> Array:
-        """Squared error (J,) of the model without a candidate, at its best delays."""
-        bare = side_by_side(
+        """Weighted squared error (J,) of the model without a candidate, at its best delays."""
+        baselines = parallel_map(
             lambda k: self._grid_points(k)[False].baseline_sse,
             len(self._grid),
             self._cores,
             self.context.samples,
         )
-        least: Array = np.min(bare, axis=0)
+        least: Array = np.min(baselines, axis=0)
         return least
 
     def _grid_points(self, k: int, candidates: Iterable[EffectLaw] = ()) -> dict[bool, DelayGridPoint]:
-        """A point of the grid, for laws that remember and for others, where these are asked for."""
-        model, few = self._grid[k], attrs.evolve(self._grid[k], samples=self.screening_rows)
-        if self._remembers:
-            return dict.fromkeys((False, True), DelayGridPoint(self, model, whole=True))
-        spots = {False: DelayGridPoint(self, few, whole=False)}
+        """One grid point, keyed by whether a law has memory."""
+        model, on_subset = self._grid[k], attrs.evolve(self._grid[k], samples=self.screening_rows)
+        if self._has_memory:
+            return dict.fromkeys((False, True), DelayGridPoint(self, model, all_rows=True))
+        points = {False: DelayGridPoint(self, on_subset, all_rows=False)}
         if any(law.has_memory for law in candidates):
-            spots[True] = DelayGridPoint(self, model, whole=True)
-        return spots
+            points[True] = DelayGridPoint(self, model, all_rows=True)
+        return points
 
     def _scored(self, model: Model, error: Array) -> ScreenedCandidate:
-        """A candidate at its best start, and the squared error (J,) that it leaves."""
+        """A candidate at its best start, with the score of its squared error (J,)."""
+        # Score = sum over joints of max(ln(SSE_0 / SSE) - cost, 0): the fall of the criterion.
         law = model.effects[-1].law
-        fall = np.maximum(self.baseline_sse - error, 0.0) * may_act(law, self.joints)
-        gain = -np.log(np.maximum(1.0 - fall / np.maximum(self.baseline_sse, 1e-300), _MIN_ERROR_RATIO))
-        promise = float(np.sum(np.maximum(gain - PENALTY_PER_PARAMETER * complexity(law), 0.0)))
-        return ScreenedCandidate(model, promise)
+        reduction = np.maximum(self.baseline_sse - error, 0.0) * allowed_joints(law, self.joints)
+        ratio = 1.0 - reduction / np.maximum(self.baseline_sse, 1e-300)
+        gain = -np.log(np.maximum(ratio, _MIN_ERROR_RATIO))
+        score = float(np.sum(np.maximum(gain - PENALTY_PER_PARAMETER * complexity(law), 0.0)))
+        return ScreenedCandidate(model, score)
 
     def _start_values(self, law: EffectLaw) -> Array | None:
-        """The starting values (S, P, J) of a law; None where there are none."""
+        """Starting values (S, P, J) of a law; None if there are none."""
         context, joints = self.context, len(self.joints)
         starts = law.initial_guesses(context.signals, context.torque, context.residual)
         rows = [
@@ -151,7 +193,7 @@ class CandidateScreening:
 
 
 def _delay_grid(model: Model, shifts: Sequence[float]) -> Iterator[Model]:
-    """The model at the points of the grid of delays."""
+    """The model at the grid points within the bounds of the delays."""
     total = model.delays.sum(axis=0)
     for shift in shifts:
         for output in _OUTPUT_DELAYS_S:
@@ -161,117 +203,195 @@ def _delay_grid(model: Model, shifts: Sequence[float]) -> Iterator[Model]:
 
 
 class DelayGridPoint:
-    """The model at one pair of delays: what its own slopes explain is projected out of everything."""
+    """Linearised model at one pair of delays, with the columns of its own effects projected out.
 
-    def __init__(self, screen: CandidateScreening, model: Model, whole: bool) -> None:
-        self.screen, self.model = screen, model
-        self.rows = screen.rows if whole else slice(None)
+    Attributes:
+        screening: Rows, weights and samples.
+        model: The model at this pair of delays.
+        rows: Rows of the subset within the samples of `model`.
+        basis: Orthonormal basis of the derivatives of the model's effects, (n, k) for each joint.
+        residual: Weighted, projected residual, (J, n).
+        shared_slopes: Weighted, projected derivatives along both gains and both delays, (J, 4, n).
+        index: Unknown of each of these on each joint, (4, J); shared as the model shares them.
+        count: Number of these unknowns.
+    """
+
+    def __init__(self, screening: CandidateScreening, model: Model, all_rows: bool) -> None:
+        """Linearise the model.
+
+        Args:
+            screening: Rows, weights and samples.
+            model: The model at this pair of delays.
+            all_rows: Whether `model` has the samples of all rows, rather than the subset alone.
+        """
+        self.screening, self.model = screening, model
+        self.rows = screening.rows if all_rows else slice(None)
         unknowns = Unknowns.of(model)
         predicted, slopes = jacobian(model, unknowns)
-        rows, weight = self.rows, screen.weight
-        left = (model.samples.tau - predicted)[rows] * weight  # (n, J)
+        rows, weight = self.rows, screening.weight
+        residual = (model.samples.tau - predicted)[rows] * weight  # (n, J)
         slopes = slopes[:, :, rows] * weight.T[:, None]  # (J, A, n)
-        shared = [0, 1, slopes.shape[1] - 2, slopes.shape[1] - 1]
-        own = slopes[:, 2:-2]
+
+        # Parameters of effects belong to one joint each: with an orthonormal basis B of their
+        # columns every other column c becomes (I - B B') c. Gains and delays are shared by joints
+        # and stay columns.
+        shared_slots = [0, 1, slopes.shape[1] - 2, slopes.shape[1] - 1]
         self.basis = [
-            _orthonormal_basis(one[np.linalg.norm(one, axis=1) > 0.0]) for one in own
+            _orthonormal_basis(one[np.linalg.norm(one, axis=1) > 0.0]) for one in slopes[:, 2:-2]
         ]  # of each joint (n, k)
-        self.left = self.project(left.T[:, None])[:, 0]  # (J, n)
-        self.shared = self.project(slopes[:, shared])  # (J, 4, n)
+        self.residual = self.project_out(residual.T[:, None])[:, 0]  # (J, n)
+        self.shared_slopes = self.project_out(slopes[:, shared_slots])  # (J, 4, n)
+
+        # Numbers of the unknowns: two gains, then two delays, one for each group of joints.
         groups = np.array([model.gain_groups, model.gain_groups, model.delay_groups, model.delay_groups])
         offsets = np.cumsum([0, *(int(one.max()) + 1 for one in groups)])
         self.index, self.count = groups + offsets[:4, None], int(offsets[4])
 
-    def project(self, columns: Array) -> Array:
-        """Columns (J, ..., n) without what the laws of the model explain on each joint."""
+    def project_out(self, columns: Array) -> Array:
+        """Project the effects of the model out of columns.
+
+        Args:
+            columns: Columns, (J, ..., n).
+
+        Returns:
+            Columns orthogonal to the basis of each joint, (J, ..., n).
+        """
         return np.stack([c - (c @ q) @ q.T for c, q in zip(columns, self.basis, strict=True)])
 
     @cached_property
     def baseline_sse(self) -> Array:
-        """Squared error (J,) of the model alone, gains and delays at their best."""
-        joints = len(self.left)
-        error, _, _ = self._solve(np.zeros((1, joints, 0, self.left.shape[1])), None)
+        """Weighted squared error (J,) of the model alone, with the best gains and delays."""
+        joints = len(self.residual)
+        error, _, _ = self._solve(np.zeros((1, joints, 0, self.residual.shape[1])), None)
         return error
 
     @cached_property
     def torque(self) -> Array:
+        """Predicted torque, (N, J), N m."""
         return self.model.predict()
 
-    def drive_torque(self, one: AppliedEffect) -> Array:
-        """What an added law is given; kept, as every law asks."""
-        if one.reads_total_torque:
-            return self.model.drive_torque(one)
+    def drive_torque(self, effect: AppliedEffect) -> Array:
+        """Return the input torque of an added law; cached, as every law needs it.
+
+        Args:
+            effect: The effect.
+
+        Returns:
+            Torque, (N, J), N m.
+        """
+        if effect.reads_total_torque:
+            return self.model.drive_torque(effect)
         if not hasattr(self, "_x"):
-            self._x = self.model.drive_torque(one)
+            self._x = self.model.drive_torque(effect)
         return self._x
 
-    def columns(self, law: EffectLaw, table: Array) -> Array:
-        """The regressors of a law at starting values (S, P, J): (S, J, L, n)."""
-        joints = self.left.shape[0]
-        every = np.ones(joints, dtype=bool)
+    def regressors(self, law: EffectLaw, table: Array) -> Array:
+        """Compute the weighted regressors of a law at its starting values.
+
+        An added law has one regressor per linear parameter. Other laws have a single one, the
+        change of the torque that they cause.
+
+        Args:
+            law: The candidate.
+            table: Starting values, (S, P, J).
+
+        Returns:
+            Regressors, (S, J, L, n).
+        """
+        joints = self.residual.shape[0]
+        all_joints = np.ones(joints, dtype=bool)
         found = []
         model, groups = self.model, np.arange(joints)
         if law.stage == Stage.ADDED:
-            x, rows = self.drive_torque(AppliedEffect(law, every, table[0], groups)), self.rows
-            if len(x) > len(self.screen.rows) and not law.has_memory:
+            # Regressors phi_l of tau = ... + sum_l w_l phi_l, at the starts of the other
+            # parameters.
+            x, rows = self.drive_torque(AppliedEffect(law, all_joints, table[0], groups)), self.rows
+            if len(x) > len(self.screening.rows) and not law.has_memory:
                 x, rows = x[rows], slice(None)
-                model = attrs.evolve(model, samples=self.screen.screening_rows)
+                model = attrs.evolve(model, samples=self.screening.screening_rows)
             for values in table:
-                one = AppliedEffect(law, every, values, groups)
-                found.append(linear_columns(model, one, x)[:, rows].transpose(2, 0, 1))
+                effect = AppliedEffect(law, all_joints, values, groups)
+                found.append(linear_columns(model, effect, x)[:, rows].transpose(2, 0, 1))
         else:
+            # d tau = tau(with the law at its start) - tau, for an amplitude of 1.
             base = self.torque
-            for first in range(0, len(table), _BATCH):
-                values = table[first : first + _BATCH]
-                grown = model.with_effect(AppliedEffect(law, every, values[0], groups))
-                batch = [np.repeat(one.values[None], len(values), axis=0) for one in model.effects]
-                torque = grown.evaluate(np.repeat(model.gains[None], len(values), axis=0), [*batch, values])
+            for first in range(0, len(table), _BATCH_SIZE):
+                values = table[first : first + _BATCH_SIZE]
+                extended = model.with_effect(AppliedEffect(law, all_joints, values[0], groups))
+                batch = [np.repeat(effect.values[None], len(values), axis=0) for effect in model.effects]
+                torque = extended.evaluate(
+                    np.repeat(model.gains[None], len(values), axis=0), [*batch, values]
+                )
                 found += list((torque - base)[:, self.rows].transpose(0, 2, 1)[:, :, None])
-        return np.stack(found) * self.screen.weight.T[None, :, None]
+        return np.stack(found) * self.screening.weight.T[None, :, None]
 
     def best_start(self, law: EffectLaw, table: Array) -> tuple[Model, Array]:
-        """The model with the law at the best of its starting values for each joint, and the squared error (J,) there."""
-        columns = self.columns(law, table)
-        columns = np.stack([self.project(one) for one in columns])
-        error, choice, (change, weights) = self._solve(columns, law, getattr(law, "penalty", None))
+        """Find the best starting values of a law on each joint.
+
+        Args:
+            law: The candidate.
+            table: Starting values, (S, P, J).
+
+        Returns:
+            Model with the law at its best start, and the remaining weighted squared error (J,).
+        """
+        regressors = self.regressors(law, table)
+        projected = np.stack([self.project_out(one) for one in regressors])
+        error, choice, (change, weights) = self._solve(projected, law, getattr(law, "penalty", None))
         return self._model_at_start(law, table, choice, change, weights), error
 
     def _solve(
         self, columns: Array, law: EffectLaw | None, penalty: Array | None = None
     ) -> tuple[Array, Array, tuple[Array, Array]]:
-        """Squared error (J,), the best start of each joint, the shared change (4, J) and the columns' weights (J, L)."""
+        """Solve the linear least-squares problem of each joint and start.
+
+        Returns the squared error (J,), the best start of each joint, the change (4, J) of gains and
+        delays, and the weights (J, L) of the regressors.
+        """
+        # Linear model of joint j at start s: residual r = C'w + S'b + noise, with the regressors
+        # C (L, n) and weights w of the candidate, and the derivatives S (4, n) and changes b of
+        # gains and delays. cc, cr, cs, ss and sr are the products C C', C r, C S', S S' and S r.
         joints, size = columns.shape[1:3]
         cc = columns @ columns.swapaxes(-1, -2)
         scale = np.einsum("sjll->sj", cc)[..., None, None] / max(size, 1)
         ridge = 1e-8 * np.eye(size) if penalty is None else RIDGE * penalty
         cc = cc + ridge * scale + 1e-12 * np.eye(size)
-        cr = np.einsum("sjln,jn->sjl", columns, self.left)
-        cs = np.einsum("sjln,jkn->sjlk", columns, self.shared)
-        follows = np.linalg.solve(cc, cs)
+        cr = np.einsum("sjln,jn->sjl", columns, self.residual)
+        cs = np.einsum("sjln,jkn->sjlk", columns, self.shared_slopes)
+        cc_cs = np.linalg.solve(cc, cs)
         local = np.linalg.solve(cc, cr[..., None])[..., 0]
-        ss = self.shared @ self.shared.swapaxes(-1, -2)
-        sr = np.einsum("jkn,jn->jk", self.shared, self.left)
-        error = np.einsum("jn,jn->j", self.left, self.left) - np.einsum("sjl,sjl->sj", cr, local)
+        ss = self.shared_slopes @ self.shared_slopes.swapaxes(-1, -2)
+        sr = np.einsum("jkn,jn->jk", self.shared_slopes, self.residual)
+
+        # For given b the best weights are w = cc^-1 (cr - cs b). The reduced problem in b is
+        #     error(b) = r'r - cr'cc^-1 cr - 2 g'b + b'H b
+        #     g = sr - cs'cc^-1 cr,   H = ss - cs'cc^-1 cs
+        # (the Schur complement of cc in the normal equations).
+        error = np.einsum("jn,jn->j", self.residual, self.residual) - np.einsum("sjl,sjl->sj", cr, local)
         gradient = sr - np.einsum("sjlk,sjl->sjk", cs, local)
-        hessian = ss - np.einsum("sjlk,sjlm->sjkm", cs, follows)
-        alone = error - np.einsum("sjk,sjk->sj", gradient, _ridge_solve(hessian, gradient))
-        joint, choice = np.arange(joints), np.argmin(alone, axis=0)
+        hessian = ss - np.einsum("sjlk,sjlm->sjkm", cs, cc_cs)
+
+        # The best start of each joint depends on b, which joints share. Alternate twice: begin with
+        # a separate b of each joint, solve b for the chosen starts, and choose the starts again.
+        joint_error = error - np.einsum("sjk,sjk->sj", gradient, _ridge_solve(hessian, gradient))
+        joint, choice = np.arange(joints), np.argmin(joint_error, axis=0)
         for _ in range(2):
             change = self._shared_change(hessian[choice, joint], gradient[choice, joint])
-            weights = local - np.einsum("sjlk,kj->sjl", follows, change)
-            at = (
+            weights = local - np.einsum("sjlk,kj->sjl", cc_cs, change)
+            shared_error = (
                 error
                 - 2.0 * np.einsum("sjk,kj->sj", gradient, change)
                 + np.einsum("kj,sjkm,mj->sj", change, hessian, change)
             )
+            # Clipping the weights by v raises the error by v'cc v, as w was the minimum.
             bounded = self._bounded(law, weights)
-            off = weights - bounded
-            at = at + np.einsum("sjl,sjlm,sjm->sj", off, cc, off)
-            choice = np.argmin(at, axis=0)
-        return at[choice, joint], choice, (change, bounded[choice, joint])
+            clipped = weights - bounded
+            shared_error = shared_error + np.einsum("sjl,sjlm,sjm->sj", clipped, cc, clipped)
+            choice = np.argmin(shared_error, axis=0)
+        return shared_error[choice, joint], choice, (change, bounded[choice, joint])
 
     def _bounded(self, law: EffectLaw | None, weights: Array) -> Array:
-        """Weights (S, J, L) within the bounds of the linear parameters, or of the amplitude of a start."""
+        """Clip weights (S, J, L) to the parameter bounds, or to the amplitude range."""
         if law is None:
             return weights
         if law.stage != Stage.ADDED:
@@ -281,42 +401,43 @@ class DelayGridPoint:
         return weights.clip(low, high)
 
     def _shared_change(self, hessian: Array, gradient: Array) -> Array:
-        """The best change (4, J) of gains and delays, shared as the model shares them."""
+        """Best change (4, J) of gains and delays, shared by joints as in the model."""
+        # Sum of the joints' normal equations H b = g, in the unknowns that they share.
         total, right = np.zeros((self.count, self.count)), np.zeros(self.count)
         for j in range(hessian.shape[0]):
             at = self.index[:, j]
             total[np.ix_(at, at)] += hessian[j]
             right[at] += gradient[j]
         change = _ridge_solve(total, right)
-        far = (np.arange(self.count) >= self.index[2].min()) & (
-            np.abs(change) > _MAX_DELAY_CHANGE_S
-        )  # delays come last
-        if far.any():
-            change[far] = change[far].clip(-_MAX_DELAY_CHANGE_S, _MAX_DELAY_CHANGE_S)
-            rest = right[~far] - total[np.ix_(~far, far)] @ change[far]
-            change[~far] = _ridge_solve(total[np.ix_(~far, ~far)], rest)
+        # Delays, the last unknowns, stay in the range of the linearisation; the gains follow them.
+        is_delay = np.arange(self.count) >= self.index[2].min()
+        beyond = is_delay & (np.abs(change) > _MAX_DELAY_CHANGE_S)
+        if beyond.any():
+            change[beyond] = change[beyond].clip(-_MAX_DELAY_CHANGE_S, _MAX_DELAY_CHANGE_S)
+            remaining = right[~beyond] - total[np.ix_(~beyond, beyond)] @ change[beyond]
+            change[~beyond] = _ridge_solve(total[np.ix_(~beyond, ~beyond)], remaining)
         shared: Array = change[self.index]
         return shared
 
     def _model_at_start(
         self, law: EffectLaw, table: Array, choice: Array, change: Array, weights: Array
     ) -> Model:
-        """The model with the law at the chosen starts, gains and delays changed."""
+        """The model with the law at the selected starts and with changed gains and delays."""
         model, joint = self.model, np.arange(table.shape[2])
         values = table[choice, :, joint].T.copy()
         if law.stage == Stage.ADDED:
             linear = [law.names.index(name) for name in law.linear]  # type: ignore[attr-defined]
             values[linear] = weights.T
         groups = np.zeros(len(joint), dtype=np.intp) if law.shared_by_joints else joint
-        one = AppliedEffect(law, may_act(law, self.screen.joints), values, groups)
+        effect = AppliedEffect(law, allowed_joints(law, self.screening.joints), values, groups)
         moved = attrs.evolve(model, gains=np.maximum(model.gains + change[:2], 0.0)).with_delays(
             model.delays + change[2:]
         )
-        return attrs.evolve(moved.with_effect(one), samples=self.screen.context.samples)
+        return attrs.evolve(moved.with_effect(effect), samples=self.screening.context.samples)
 
 
 def _ridge_solve(hessian: Array, gradient: Array) -> Array:
-    """Solutions of systems (..., K, K), a little ridged, as some slopes may be 0."""
+    """Solve systems (..., K, K) with a small ridge, as some derivatives may be 0."""
     size = np.einsum("...kk->...k", hessian)
     ridged = hessian + np.eye(hessian.shape[-1]) * (1e-7 * size[..., None] + 1e-12)
     solution: Array = np.linalg.solve(ridged, gradient[..., None])[..., 0]
@@ -324,13 +445,20 @@ def _ridge_solve(hessian: Array, gradient: Array) -> Array:
 
 
 def _orthonormal_basis(columns: Array) -> Array:
-    """An orthonormal basis (n, k) of columns (A, n)."""
+    """Orthonormal basis (n, k) of columns (A, n), without dependent ones."""
     if not len(columns):
         return np.zeros((columns.shape[1], 0))
     q, r = np.linalg.qr((columns / np.linalg.norm(columns, axis=1, keepdims=True)).T)
     return q[:, np.abs(np.diagonal(r)) > 1e-6]
 
 
-def best_first(found: Iterable[ScreenedCandidate]) -> Sequence[ScreenedCandidate]:
-    """Those that promise something, the most promising one first."""
+def promising(found: Iterable[ScreenedCandidate]) -> Sequence[ScreenedCandidate]:
+    """Select the candidates with a positive score.
+
+    Args:
+        found: Scored candidates.
+
+    Returns:
+        Candidates in descending order of their score.
+    """
     return sorted((one for one in found if one.score > 0.0), key=lambda one: -one.score)

@@ -1,8 +1,9 @@
-"""One floating forward search for the effects that a log shows: add, drop, tie.
+"""Floating forward search for the effects that a log shows: add, drop, share.
 
-Candidates are screened on top of the model so far, the most promising are fitted with everything else, and the one with
-the least criterion on the rows that select is added if it passes the test. After each step effects that the others made
-needless are left out. In the end it is tried what joints share.
+Each step screens the candidates on top of the present model, and fits the best ones together with
+everything else. It adds the candidate with the lowest criterion on the selection rows, if the
+candidate passes the score test. Backward elimination then removes effects that became unnecessary.
+At the end the search tests which values joints share.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 
 from quadvel_actuator.effects import EffectLaw
 
-from .candidates import LAWS, TERMS, Candidates, key
+from .candidates import LAWS, TERMS, Candidates, candidate_key
 from .criterion import MIN_EFFECT_SIZE, SIGNIFICANCE_LEVEL
 from .fitted_model import FittedModel, ModelEvaluator, joint_groupings
 from .library import SignalTerm
@@ -22,105 +23,158 @@ from .model import AppliedEffect, Model
 from .signals import Array
 
 MAX_EFFECTS = 5
-"""Effects of one log at most"""
+"""Maximum number of effects of one log."""
 RIVAL_FRACTION = 0.5
-"""Of the best candidate's worth: what is worth so much is its rival, which may say the same"""
+"""Fraction of the best candidate's gain above which another candidate is its rival."""
 EQUIVALENCE_MARGIN = 0.02
-"""Of a joint's error: laws whose errors differ by less cannot be told apart"""
+"""Relative difference of a joint's error below which two laws are indistinguishable."""
 
 ProgressText = Callable[[str], None]
 
 
 class Search:
-    """Searches on one set of data."""
+    """Search for the effects of one set of data.
 
-    def __init__(self, judge: ModelEvaluator, tick: ProgressText = lambda text: None) -> None:
-        self.evaluator, self._on_progress = judge, tick
+    Attributes:
+        evaluator: Data that models are fitted to and compared on.
+        rejected: Rejected effects by name: gain on the selection rows (N^2 m^2), and the reason.
+    """
+
+    def __init__(self, evaluator: ModelEvaluator, on_progress: ProgressText = lambda text: None) -> None:
+        """Start a search.
+
+        Args:
+            evaluator: Data that models are fitted to and compared on.
+            on_progress: Receives a short text before each step.
+        """
+        self.evaluator, self._on_progress = evaluator, on_progress
         self.rejected: dict[str, tuple[float, str]] = {}
         self._tested_count = 1
         self._rivals: dict[tuple[str, ...], set[tuple[str, ...]]] = {}
         self._candidate_cache: dict[tuple[object, ...], Candidates] = {}
 
     def best(self, start: Model) -> tuple[FittedModel, FittedModel]:
-        """The account of the data with the least criterion, and the best one without terms.
+        """Find the model with the lowest criterion.
 
-        Nothing is sought where a residual is white. Up to two laws are held against one term of named signals. Where these
-        laws leave more than noise, terms alone come into question; and where those do so, too, or cost more, further laws,
-        and terms on top of the laws.
+        The search ends at once where the plain model leaves a white residual. Up to two laws
+        compete with one regressor of named signals. If two laws leave a structured residual, the
+        search tries regressors alone. If these leave structure too, or cost more, it tries further
+        laws, and regressors on top.
+
+        Args:
+            start: The plain EAM.
+
+        Returns:
+            The best model, and the best model without regressors of named signals.
         """
         plain = self.evaluator.refine_delays(self.evaluator.fit(start))
         if plain.is_white:
             return plain, plain
+        # One law that leaves white noise needs no comparison.
         laws = self.extend(plain, LAWS, most=1)
         if laws.is_white:
             laws = self.prune(laws)
             return laws, laws
+        # Otherwise up to two laws compete with one regressor of named signals.
         terms = self.extend(plain, TERMS, most=1)
         laws = self.extend(laws, LAWS, most=2, bound=terms.criterion)
         if not laws.is_white:
             terms = self.extend(terms, TERMS)
-        accounts = [terms]
+        models = [terms]
         if laws.is_white or not terms.is_white or laws.criterion < terms.criterion:
             laws = self.prune(self.extend(laws, LAWS, bound=terms.criterion))
-            accounts += [laws] if laws.is_white else [laws, self.extend(laws, TERMS, bound=terms.criterion)]
-        least = min(one.criterion for one in accounts)
-        alike = [
-            one for one in accounts if one.criterion < least + EQUIVALENCE_MARGIN * len(self.evaluator.noise)
-        ]
-        return self.prune(min(alike, key=_regressor_count)), laws
+            models += [laws] if laws.is_white else [laws, self.extend(laws, TERMS, bound=terms.criterion)]
+        # Among models with nearly equal criteria the one with the fewest regressors counts.
+        least = min(one.criterion for one in models)
+        margin = EQUIVALENCE_MARGIN * len(self.evaluator.noise)
+        equivalent = [one for one in models if one.criterion < least + margin]
+        return self.prune(min(equivalent, key=_term_count)), laws
 
-    def residual_correlates(self, account: FittedModel) -> tuple[str, ...]:
-        """The signals that what is left goes with most, whether or not a term of them would pay."""
-        terms, _ = self._candidates_of(account).found(TERMS)
+    def residual_correlates(self, fitted: FittedModel) -> tuple[str, ...]:
+        """Return the signals that the residual correlates with most.
+
+        Args:
+            fitted: A fitted model.
+
+        Returns:
+            Names of signals, even if a regressor of them would not pay for its parameters.
+        """
+        terms, _ = self._candidates_of(fitted).fitted_candidates(TERMS)
         best = min(terms, key=lambda one: one.criterion, default=None)
         return () if best is None else best.last_effect.law.inputs  # type: ignore[attr-defined]
 
-    def prune(self, account: FittedModel) -> FittedModel:
-        """Without what costs more than it is worth: effects, joints of effects, values and gains of each joint."""
-        account = self.eliminate(account)
-        for k in range(len(account.model.effects)):
-            account = self._replace_by_special_case(
-                self.evaluator.restrict_joints(self._replace_by_special_case(account, k), k), k
+    def prune(self, fitted: FittedModel) -> FittedModel:
+        """Simplify a model: fewer effects and joints, special cases, shared values and gains.
+
+        Args:
+            fitted: A fitted model.
+
+        Returns:
+            The simplified model; its criterion on the selection rows is not significantly worse.
+        """
+        fitted = self.eliminate(fitted)
+        for k in range(len(fitted.model.effects)):
+            fitted = self._replace_by_special_case(
+                self.evaluator.restrict_joints(self._replace_by_special_case(fitted, k), k), k
             )
-        model, one = account.model, np.zeros(len(self.evaluator.noise), dtype=np.intp)
+        model, common = fitted.model, np.zeros(len(self.evaluator.noise), dtype=np.intp)
         if model.gain_groups.any():
             shared = self.evaluator.fit(
-                attrs.evolve(model, gains=_mean_over_joints(model.gains), gain_groups=one)
+                attrs.evolve(model, gains=_mean_over_joints(model.gains), gain_groups=common)
             )
-            account = min(account, shared, key=lambda each: each.criterion)
+            fitted = min(fitted, shared, key=lambda each: each.criterion)
         if model.delay_groups.any():
-            same = attrs.evolve(account.model, delay_groups=one).with_delays(_mean_over_joints(model.delays))
-            account = min(account, self.evaluator.fit(same), key=lambda each: each.criterion)
-        for k in range(len(account.model.effects)):
-            account = self.evaluator.share_across_joints(account, k)
-        return account
+            same = attrs.evolve(fitted.model, delay_groups=common).with_delays(
+                _mean_over_joints(model.delays)
+            )
+            fitted = min(fitted, self.evaluator.fit(same), key=lambda each: each.criterion)
+        for k in range(len(fitted.model.effects)):
+            fitted = self.evaluator.share_across_joints(fitted, k)
+        return fitted
 
-    def nested_models(self, account: FittedModel) -> list[FittedModel]:
-        """The account with fewer of its effects, those that were found first, the most of them first."""
-        model = account.model
+    def nested_models(self, fitted: FittedModel) -> list[FittedModel]:
+        """Fit the nested models with the first effects only.
+
+        Args:
+            fitted: A fitted model with n effects.
+
+        Returns:
+            Models with n-1, n-2, ..., 1 effects, in the order in which the effects were found.
+        """
+        whole = fitted.model
         return self.evaluator.fit_each(
-            [attrs.evolve(model, effects=model.effects[:k]) for k in range(len(model.effects) - 1, 0, -1)]
+            [attrs.evolve(whole, effects=whole.effects[:k]) for k in range(len(whole.effects) - 1, 0, -1)]
         )
 
-    def _replace_by_special_case(self, account: FittedModel, index: int) -> FittedModel:
-        """With the effect's law replaced by its special case, as Stribeck friction by Coulomb's, unless selecting rows need it."""
-        one = account.model.effects[index]
-        less = one.law.special_case(dict(zip(one.law.names, one.values, strict=True)))
-        if less is None:
-            return account
-        law, start = less
+    def _replace_by_special_case(self, fitted: FittedModel, index: int) -> FittedModel:
+        """Replace a law by its special case (Stribeck by Coulomb friction), unless rows need it."""
+        effect = fitted.model.effects[index]
+        special_case = effect.law.special_case(dict(zip(effect.law.names, effect.values, strict=True)))
+        if special_case is None:
+            return fitted
+        law, start = special_case
         values = np.array([start[name] for name in law.names])
-        other = self.evaluator.fit(
-            account.model.with_replaced_effect(index, attrs.evolve(one, law=law, values=values))
+        simpler = self.evaluator.fit(
+            fitted.model.with_replaced_effect(index, attrs.evolve(effect, law=law, values=values))
         )
-        return account if self._is_needed(other, account) else other
+        return fitted if self._is_needed(simpler, fitted) else simpler
 
     def extend(
         self, best: FittedModel, kinds: str, most: int = MAX_EFFECTS, bound: float = np.inf
     ) -> FittedModel:
-        """The account with candidates of these kinds added while it pays and may come below `bound`.
+        """Add candidates while that lowers the criterion.
 
-        Effects are taken to gain less one by one, so that what the last one gained tells how far the others may get.
+        The gain of successive effects is assumed to decrease. The gain of the last effect therefore
+        bounds what the remaining effects can reach.
+
+        Args:
+            best: Model to extend.
+            kinds: `candidates.LAWS` or `candidates.TERMS`.
+            most: Maximum number of effects.
+            bound: Criterion that the result has to reach; the search stops when it cannot.
+
+        Returns:
+            The extended model, or `best`.
         """
         while len(best.model.effects) < most and not best.is_white:
             self._on_progress(f"effect {len(best.model.effects) + 1}")
@@ -128,66 +182,70 @@ class Search:
             if more is None:
                 break
             best = self.evaluator.refine_delays(self.eliminate(more, kept=1))
+            # Further effects gain at most as much as the last one each.
             gained, left = before.criterion - best.criterion, most - len(best.model.effects)
             if best.criterion - left * gained > bound:
                 break
         return best
 
     def _add_best(self, before: FittedModel, kinds: str) -> FittedModel | None:
-        """The account with the candidate more that has the least criterion; None where none passes."""
-        candidates = [*self._candidates(before, kinds), *self._finer_groups(before)]
+        """The model with the best candidate added; None if no candidate passes the test."""
+        candidates = [*self._candidates(before, kinds), *self._finer_groupings(before)]
         candidates.sort(key=lambda one: one.criterion)
         self._record_rivals(before, candidates)
-        for one in candidates:
-            reason = self._rejection_reason(before, one)
+        for candidate in candidates:
+            reason = self._rejection_reason(before, candidate)
             if not reason:
-                return one
-            if len(one.model.effects) > len(before.model.effects):
-                self.rejected.setdefault(one.last_effect.law.name, (one.compare_with(before).gain, reason))
+                return candidate
+            if len(candidate.model.effects) > len(before.model.effects):
+                self.rejected.setdefault(
+                    candidate.last_effect.law.name, (candidate.compare_with(before).gain, reason)
+                )
         return None
 
     def _record_rivals(self, before: FittedModel, candidates: Sequence[FittedModel]) -> None:
-        """Keep in mind what is worth nearly as much as the best candidate: it may say the same."""
-        fall = [before.criterion - one.criterion for one in candidates]
-        if fall:
+        """Store which candidates nearly equal the best one, for `indistinguishable_effects`."""
+        gains = [before.criterion - candidate.criterion for candidate in candidates]
+        if gains:
             near = {
-                key(one.last_effect.law)
-                for one, by in zip(candidates, fall, strict=True)
-                if len(one.model.effects) > len(before.model.effects) and by > RIVAL_FRACTION * fall[0]
+                candidate_key(candidate.last_effect.law)
+                for candidate, gain in zip(candidates, gains, strict=True)
+                if len(candidate.model.effects) > len(before.model.effects)
+                and gain > RIVAL_FRACTION * gains[0]
             }
             for name in near:
                 self._rivals.setdefault(name, set()).update(near)
 
     def _rejection_reason(self, before: FittedModel, after: FittedModel) -> str:
-        """Why what was added does not count; nothing where it does."""
+        """Reason why an added effect is rejected; empty if it is accepted."""
         grown = len(after.model.effects) > len(before.model.effects)
         if grown and duplicates_effect(after.last_effect, before.model.effects):
-            return "a law that it contains, or that contains it, is on the same joints already"
+            return "the same joints already have a law that is its special or its general case"
         if grown and not after.last_effect.is_excited(after.model.signals):
-            return "the joints moved too little to tell it from other laws"
-        found = after.compare_with(before)
-        p = found.p * self._tested_count
-        worth = float(np.max(found.share))
+            return "the joints moved too little to distinguish it from other laws"
+        comparison = after.compare_with(before)
+        p = comparison.p_value * self._tested_count
+        relative_gain = float(np.max(comparison.relative_gain))
         if p >= SIGNIFICANCE_LEVEL:
             return f"not significant on rows that select (p = {min(p, 1.0):.2g} after {self._tested_count} candidates)"
-        if worth <= MIN_EFFECT_SIZE:
-            return f"takes {100 * worth:.1f} % off the error of a joint, below {100 * MIN_EFFECT_SIZE:.0f} %"
-        return "" if after.criterion < before.criterion else "costs more parameters than it is worth"
+        if relative_gain <= MIN_EFFECT_SIZE:
+            return f"reduces the error of a joint by {100 * relative_gain:.1f} %, below {100 * MIN_EFFECT_SIZE:.0f} %"
+        return "" if after.criterion < before.criterion else "its gain is below the cost of its parameters"
 
     def _candidates_of(self, before: FittedModel) -> Candidates:
-        """The candidates on top of an account; kept, as several searches come by."""
-        model = _structure_key(before.model)
-        if model not in self._candidate_cache:
-            self._candidate_cache[model] = Candidates(before)
-        return self._candidate_cache[model]
+        """Candidates on top of a model, from the cache if several searches reach the same model."""
+        structure = _structure_key(before.model)
+        if structure not in self._candidate_cache:
+            self._candidate_cache[structure] = Candidates(before)
+        return self._candidate_cache[structure]
 
     def _candidates(self, before: FittedModel, kinds: str) -> list[FittedModel]:
-        """The most promising candidates of these kinds on top of an account, fitted."""
-        found, self._tested_count = self._candidates_of(before).found(kinds)
+        """The best candidates of these kinds on top of a model, fitted."""
+        found, self._tested_count = self._candidates_of(before).fitted_candidates(kinds)
         return found
 
-    def _finer_groups(self, before: FittedModel) -> list[FittedModel]:
-        """The account with gains, or delays, for each kind of joint and for each joint."""
+    def _finer_groupings(self, before: FittedModel) -> list[FittedModel]:
+        """Models with gains, or delays, for each kind of joint and for each joint."""
         model, joints = before.model, before.model.samples.joints
         found = []
         for groups in joint_groupings(joints):
@@ -198,73 +256,107 @@ class Search:
                 found.append(attrs.evolve(model, delay_groups=groups))
         return self.evaluator.fit_each(found)
 
-    def eliminate(self, account: FittedModel, kept: int = 0) -> FittedModel:
-        """Without the effects that the others made needless (backward elimination), but with the last `kept` ones."""
-        while len(account.model.effects) > max(kept, 1):
-            model = account.model
-            among = range(len(model.effects) - kept)
-            least = min(
-                self.evaluator.fit_each([model.without_effect(k) for k in among]),
+    def eliminate(self, fitted: FittedModel, kept: int = 0) -> FittedModel:
+        """Remove effects that are no longer significant (backward elimination).
+
+        Args:
+            fitted: A fitted model.
+            kept: Number of effects at the end that are not removed.
+
+        Returns:
+            The model with the necessary effects.
+        """
+        while len(fitted.model.effects) > max(kept, 1):
+            model = fitted.model
+            removable = range(len(model.effects) - kept)
+            reduced = min(
+                self.evaluator.fit_each([model.without_effect(k) for k in removable]),
                 key=lambda one: one.criterion,
             )
-            if self._is_needed(least, account):
-                return account
-            account = least
-        return account
+            if self._is_needed(reduced, fitted):
+                return fitted
+            fitted = reduced
+        return fitted
 
-    def _is_needed(self, without: FittedModel, account: FittedModel) -> bool:
-        found = account.compare_with(without)
-        worth = float(np.max(found.share))
+    def _is_needed(self, without: FittedModel, fitted: FittedModel) -> bool:
+        """Whether the model is significantly better than the one without the effect."""
+        comparison = fitted.compare_with(without)
+        relative_gain = float(np.max(comparison.relative_gain))
         return (
-            account.criterion < without.criterion and worth > MIN_EFFECT_SIZE and found.p < SIGNIFICANCE_LEVEL
+            fitted.criterion < without.criterion
+            and relative_gain > MIN_EFFECT_SIZE
+            and comparison.p_value < SIGNIFICANCE_LEVEL
         )
 
-    def indistinguishable_effects(self, account: FittedModel, index: int) -> tuple[str, ...]:
-        """The laws that say the same in the place of an effect, to what rows that select can tell."""
-        one = account.model.effects[index].law
-        if isinstance(one, SignalTerm):
+    def indistinguishable_effects(self, fitted: FittedModel, index: int) -> tuple[str, ...]:
+        """List other laws that explain the selection rows equally well in place of an effect.
+
+        Args:
+            fitted: A fitted model.
+            index: Index of the effect.
+
+        Returns:
+            Names of laws whose error on every joint differs by less than `EQUIVALENCE_MARGIN`.
+        """
+        law = fitted.model.effects[index].law
+        if isinstance(law, SignalTerm):
             return ()
-        rest = self.evaluator.fit(account.model.without_effect(index))
-        alone = len(account.model.effects) == 1
-        pool = self._candidates_of(rest) if alone else Candidates(rest, self._rivals.get(key(one), set()))
+        rest = self.evaluator.fit(fitted.model.without_effect(index))
+        alone = len(fitted.model.effects) == 1
+        pool = (
+            self._candidates_of(rest)
+            if alone
+            else Candidates(rest, self._rivals.get(candidate_key(law), set()))
+        )
         found = []
-        for other in pool.found(LAWS)[0]:
-            lost = account.compare_with(other)
-            if other.last_effect.law.name != one.name and (lost.share < EQUIVALENCE_MARGIN).all():
+        for other in pool.fitted_candidates(LAWS)[0]:
+            comparison = fitted.compare_with(other)
+            if (
+                other.last_effect.law.name != law.name
+                and (comparison.relative_gain < EQUIVALENCE_MARGIN).all()
+            ):
                 found.append(other.last_effect.law.name)
         return tuple(dict.fromkeys(found))
 
 
-def _regressor_count(account: FittedModel) -> tuple[int, float]:
-    """How many terms of named signals there are in an account, whose laws say more to who reads them; and its criterion."""
-    return sum(isinstance(one.law, SignalTerm) for one in account.model.effects), account.criterion
+def _term_count(fitted: FittedModel) -> tuple[int, float]:
+    """Number of regressors of named signals, then the criterion: laws are easier to interpret."""
+    return sum(isinstance(effect.law, SignalTerm) for effect in fitted.model.effects), fitted.criterion
 
 
-def duplicates_effect(one: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
-    """Does a law act where a law is at work that it contains as an end of its parameters, or that contains it?"""
-    mine = _effect_family(one.law)
+def duplicates_effect(effect: AppliedEffect, others: Iterable[AppliedEffect]) -> bool:
+    """Whether an effect is nested with one that acts on the same joints already.
+
+    Args:
+        effect: The added effect.
+        others: Effects of the model before.
+
+    Returns:
+        True if one law is the special case of the other, or the same, on all joints of `one`.
+    """
+    mine = _effect_family(effect.law)
     return any(
-        not (one.active & ~other.active).any() and mine & _effect_family(other.law) for other in others
+        not (effect.active & ~other.active).any() and mine & _effect_family(other.law) for other in others
     )
 
 
 def _effect_family(law: EffectLaw) -> set[str]:
-    """The names of a law and of that which it becomes at the end of one of its parameters; none of a term."""
+    """Names of a law and of its special case; empty for a regressor of named signals."""
     if isinstance(law, SignalTerm):
         return set()
-    less = law.special_case({p.name: np.array([p.scale]) for p in law.parameters})
-    return {law.name} | ({less[0].name} if less else set())
+    special_case = law.special_case({p.name: np.array([p.scale]) for p in law.parameters})
+    return {law.name} | ({special_case[0].name} if special_case else set())
 
 
 def _structure_key(model: Model) -> tuple[object, ...]:
-    """What tells two fitted models apart: their laws, forms and joints, and what is shared."""
+    """Key of a model's structure: laws, forms, joints and groups."""
     effects = [
-        (one.law.name, str(one.law.settings), one.active.tobytes(), one.groups.tobytes())
-        for one in model.effects
+        (effect.law.name, str(effect.law.settings), effect.active.tobytes(), effect.groups.tobytes())
+        for effect in model.effects
     ]
     return (*sorted(effects), model.gain_groups.tobytes(), model.delay_groups.tobytes())
 
 
 def _mean_over_joints(values: Array) -> Array:
-    """The mean over the joints, for each of them."""
+    """Mean over the joints, repeated for each joint."""
     return np.repeat(values.mean(axis=-1, keepdims=True), values.shape[-1], axis=-1)

@@ -1,5 +1,5 @@
-"""Logs of robots whose drives do something that nobody declared: the blind test of the identification.
+"""Generator of logs with undeclared effects, for a blind test of the identification.
 
-Everything here is written apart from the product: it imports nothing of it, has its own plant, its own laws and its
-own measure of what an effect is worth. `cases.make_case` is the entry.
+It imports nothing of the product: it has its own plant, its own laws and its own measure of an
+effect's size. `cases.make_case` is the entry.
 """

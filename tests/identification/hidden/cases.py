@@ -1,7 +1,8 @@
-"""A case: the log that the tool sees, and the truth that it does not.
+"""Cases of the blind test: a log for the identification, and its ground truth.
 
-`make_case(kind, index, seed)` is reproducible. Chance draws robot, motion, gains, delays, noise, the joints affected and
-the parameters; the effect's strength is then set so that it is worth between 0.3 and about 5 times the torque noise.
+`make_case(kind, index, seed)` is reproducible. Robot, motion, gains, delays, noise, joints and
+parameters are random. The effect's strength is scaled so that its error is 0.3 to about 5 times the
+variance of the torque noise.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ CLOSE = (
     ("gain_asymmetry", "thermal_drift"),
     ("hysteresis", "quadratic_drag"),
 )
-"""Of one group, and yet not the same."""
+"""Pairs of similar effects that are nevertheless distinguishable."""
 
 GROUP_OF = {
     "table_4": "table 4",
@@ -65,7 +66,14 @@ GROUP_OF = {
 
 @dataclass(frozen=True)
 class Case:
-    """`log` and `holdout` hold arrays by the names of the log format; `truth` is plain data."""
+    """One case of the blind test.
+
+    Attributes:
+        name: Name of the case.
+        log: Arrays of the log to fit, by the names of the log format.
+        truth: Ground truth, JSON data.
+        holdout: Arrays of a held-out log, or None.
+    """
 
     name: str
     log: dict[str, Any]
@@ -73,7 +81,14 @@ class Case:
     holdout: dict[str, Any] | None = None
 
     def save(self, folder: Path) -> list[Path]:
-        """Writes the logs as NPZ, the truth beside them, and returns the logs' paths, the holdout's last."""
+        """Write the logs as NPZ files, and the ground truth next to them.
+
+        Args:
+            folder: Folder; created if it does not exist.
+
+        Returns:
+            Paths of the logs, that of the held-out log last.
+        """
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{self.name}.truth.json").write_text(json.dumps(self.truth, indent=1))
         paths = []
@@ -86,7 +101,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Setting:
-    """All of a case that is drawn before its effects."""
+    """Random choices of a case except for its effects; delays in ms, SI units otherwise."""
 
     names: list[str]
     motion: str
@@ -108,13 +123,15 @@ class Setting:
     extra: dict[str, Any] = field(default_factory=dict)
 
     def rng(self, *purpose: int) -> np.random.Generator:
+        """Return a random generator for one purpose, independent of the others."""
         return np.random.default_rng([*self.seed, *purpose])
 
     def stride(self, dt: float) -> int:
-        """Plant ticks between two samples of the log."""
+        """Return the number of plant ticks (of `dt` s) between two rows of the log."""
         return round(1 / (self.rate * dt))
 
     def drive(self, dt: float) -> Drive:
+        """Return the drives with delays in ticks of `dt` s."""
         return Drive(
             self.kp + self.delta_kp,
             self.kd + self.delta_kd,
@@ -127,8 +144,13 @@ class Setting:
 class Run:
     """One simulation of a setting with its effects.
 
-    `held` (K, J) are the targets as sent, at each tick; `hit` is the share of ticks at which another one was in force;
-    `voltage` (K,) is empty where none is measured.
+    Attributes:
+        motion: Commands and loads.
+        held: Targets as sent, at each tick, (K, J), rad.
+        trace: Simulated series.
+        hit: Fraction of ticks at which another command acted than without effects.
+        voltage: Supply voltage, (K,), V; empty where it is not measured.
+        dt: Tick, s.
     """
 
     motion: Motion
@@ -140,7 +162,20 @@ class Run:
 
 
 def make_case(kind: str, index: int, seed: int = 0) -> Case:
-    """The case `index` of `kind` (a key of GROUP_OF): even indices lift feet, odd ones move in mixed ways."""
+    """Generate a case.
+
+    Args:
+        kind: Kind of case, a key of `GROUP_OF`.
+        index: Number of the case; even ones lift feet, odd ones use mixed motions.
+        seed: Seed of the benchmark.
+
+    Returns:
+        The case.
+
+    Raises:
+        ValueError: If the kind is unknown.
+        RuntimeError: If no draw has an effect of the intended size.
+    """
     if kind not in GROUP_OF:
         raise ValueError(f"kind: found {kind!r}, expected one of {', '.join(GROUP_OF)}")
     for attempt in range(12):
@@ -154,6 +189,7 @@ def make_case(kind: str, index: int, seed: int = 0) -> Case:
 
 
 def _setting(kind: str, index: int, seed: tuple[int, ...]) -> Setting:
+    """Draw everything but the effects."""
     rng = np.random.default_rng(seed)
     paper = kind == "table_4"
     legs = LEGS if paper or index % 10 in (6, 9) else (str(rng.choice(LEGS)),)
@@ -188,6 +224,7 @@ def _setting(kind: str, index: int, seed: tuple[int, ...]) -> Setting:
 
 
 def _effects_of(kind: str, rng: np.random.Generator) -> tuple[str, ...]:
+    """Names of the effects of a kind."""
     if kind == "close_pair":
         return CLOSE[rng.integers(len(CLOSE))]
     if kind in ("pair", "triple"):
@@ -197,7 +234,7 @@ def _effects_of(kind: str, rng: np.random.Generator) -> tuple[str, ...]:
 
 
 def _scope(name: str, joints: int, rng: np.random.Generator) -> tuple[int, ...]:
-    """On all joints, on one or two kinds of them, or on some; speed proportional friction never on all."""
+    """Joints of an effect: all, one or two kinds, or some; viscous friction never on all."""
     everywhere = tuple(range(joints))
     draw = rng.random()
     if name in SHARED or (draw < 0.4 and name != "viscous_friction"):
@@ -209,6 +246,7 @@ def _scope(name: str, joints: int, rng: np.random.Generator) -> tuple[int, ...]:
 
 
 def _make_effects(setting: Setting, strengths: list[float], nominal: Trace) -> list[Effect]:
+    """Draw the effects' parameters for given strengths."""
     made = []
     for place, (name, joints) in enumerate(zip(setting.names_of_effects, setting.joints, strict=True)):
         draw = Draw(
@@ -228,6 +266,7 @@ def _make_effects(setting: Setting, strengths: list[float], nominal: Trace) -> l
 
 
 def _run(setting: Setting, effects: list[Effect], dt: float, motion: str, replay: Trace | None = None) -> Run:
+    """Simulate a setting with its effects."""
     rng = setting.rng(1)
     legs = tuple(name.split("_")[0] for name in setting.names[::3])
     plan = make_motion(rng, motion, legs, dt, setting.duration, setting.kp)
@@ -251,7 +290,7 @@ def _run(setting: Setting, effects: list[Effect], dt: float, motion: str, replay
 def _arrivals(
     setting: Setting, effects: list[Effect], plan: Motion, drive: Drive, dt: float
 ) -> NDArray[np.int64]:
-    """Which command is in force at each tick, with what effects lose or make late."""
+    """Command in force at each tick, after losses and late arrivals."""
     through, late = np.ones(len(plan.ticks), dtype=bool), np.zeros(len(plan.ticks))
     for effect in effects:
         if effect.lose is not None:
@@ -262,6 +301,7 @@ def _arrivals(
 
 
 def _hooks(effects: list[Effect], joints: int) -> dict[str, list[list[Any]]]:
+    """Step makers of each stage and joint."""
     stages: dict[str, list[list[Any]]] = {
         stage: [[] for _ in range(joints)] for stage in ("error", "speed", "drive", "joint")
     }
@@ -274,7 +314,14 @@ def _hooks(effects: list[Effect], joints: int) -> dict[str, list[list[Any]]]:
 
 @dataclass(frozen=True)
 class Worth:
-    """Mean squared errors (N^2 m^2) without noise: what the paper's model leaves, and what of it each effect is."""
+    """Size of the effects: mean squared errors without noise, N^2 m^2.
+
+    Attributes:
+        left: Error of the paper's model.
+        each: Part of that error due to each effect.
+        base: Regressors of the paper's model, (N J, 2).
+        scene: Series of the regressions.
+    """
 
     left: float
     each: list[float]
@@ -283,6 +330,7 @@ class Worth:
 
 
 def _worth(setting: Setting, run: Run, effects: list[Effect]) -> Worth:
+    """Measure the size of each effect in a run."""
     drive = setting.drive(run.dt)
     scene = worth.Scene.of(run.held, _as_logged(run, effects), run.dt, setting.stride(run.dt))
     left, input_ticks, output_ticks = worth.best_model(scene, drive.input_ticks, drive.output_ticks)
@@ -300,13 +348,13 @@ def _worth(setting: Setting, run: Run, effects: list[Effect]) -> Worth:
 
 
 def _run_without(setting: Setting, run: Run, effects: list[Effect], absent: int) -> Trace:
-    """The torque without one of the effects, on the same motion."""
+    """Torque without one of the effects, on the same motion."""
     present = [effect for i, effect in enumerate(effects) if i != absent]
     return _run(setting, present, run.dt, setting.motion, replay=run.trace).trace
 
 
 def _as_logged(run: Run, effects: list[Effect]) -> Trace:
-    """The series as they are stamped, which a skewed channel is not as it happened."""
+    """Series as stamped in the log; a skewed channel is shifted in time."""
     series = {name: getattr(run.trace, name) for name in ("q", "dq", "ddq", "asked", "tau")}
     for effect in effects:
         if effect.skew is not None:
@@ -320,6 +368,7 @@ def _as_logged(run: Run, effects: list[Effect]) -> Trace:
 
 
 def _attempt(kind: str, index: int, seed: tuple[int, ...]) -> Case | None:
+    """One draw of a case; None if the effect does not have the intended size."""
     setting = _setting(kind, index, seed)
     if not setting.names_of_effects:
         return _finish(
@@ -349,7 +398,7 @@ def _attempt(kind: str, index: int, seed: tuple[int, ...]) -> Case | None:
 
 
 def _noise(setting: Setting, size: Worth, slack: float = 1.0) -> float | None:
-    """Noise under which each effect is worth the ratio drawn, less where the whole would be too loud; None: no such."""
+    """Noise variance for the drawn ratio of effect to noise; None if there is no such variance."""
     wanted = max(min(size.each) / setting.ratio, size.left / MOST)
     noise = float(np.clip(wanted, 0.02, 0.4)) if np.isfinite(wanted) else np.inf
     fits = min(size.each) * slack >= LEAST * noise and size.left <= MOST * noise * slack
@@ -365,7 +414,7 @@ def _finish(
     run: Run,
     size: Worth | None = None,
 ) -> Case:
-    """Samples, noise, and the truth."""
+    """Sample the log, add noise, and collect the ground truth."""
     rng = setting.rng(4)
     log, encoder_var = _log(setting, effects, noise_var, run, rng)
     truth: dict[str, Any] = {
@@ -400,6 +449,7 @@ def _finish(
 
 
 def _truth_of(effect: Effect, setting: Setting, run: Run) -> dict[str, Any]:
+    """Ground truth of one effect."""
     return {
         "name": effect.name,
         "accepted": [effect.name, *effect.also],
@@ -413,7 +463,7 @@ def _truth_of(effect: Effect, setting: Setting, run: Run) -> dict[str, Any]:
 def _log(
     setting: Setting, effects: list[Effect], noise_var: float, run: Run, rng: np.random.Generator
 ) -> tuple[dict[str, Any], float]:
-    """The log, and the torque error that the encoders' noise alone makes (N^2 m^2)."""
+    """The log, and the error that the encoder noise causes, N^2 m^2."""
     series, dt = _as_logged(run, effects), run.dt
     stride = setting.stride(dt)
     at = np.arange(stride, len(run.held) - stride, stride)

@@ -1,4 +1,4 @@
-"""What an effect is to the plant, and what it may know when its size is drawn."""
+"""Interface of a hidden effect to the plant, and the information for drawing its parameters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,21 @@ Maker = Callable[[State, int, float], Step]
 
 @dataclass(frozen=True)
 class Effect:
-    """One effect on some joints: where it hooks into the plant, and its true parameters (SI units).
+    """One effect on some joints, with its hooks into the plant and its true parameters (SI units).
 
-    `signals` says what an effect outside the registry depends on: a report has to name one of `key`; `all` holds a
-    set of alternatives for each signal that takes part. Other joints' signals carry that joint's name.
+    Attributes:
+        name: Name of the effect.
+        joints: Indices of the joints.
+        params: True parameters by name.
+        hooks: Step makers by stage of the plant.
+        armature: Added inertia, kg m^2.
+        lose: Draws which commands arrive, and how late (s), from a generator and their number.
+        skew: Channel of the log with shifted stamps, and the shift, s.
+        temperature: Logged temperature, degrees Celsius, over time, s.
+        voltage: Logged voltage at each tick, V.
+        signals: For effects outside the registry: the report has to name one of `key`; `all` has a
+            list of alternatives for each signal. Signals of other joints have the joint's name.
+        also: Names of laws that count as right too.
     """
 
     name: str
@@ -36,7 +47,20 @@ class Effect:
 
 @dataclass(frozen=True)
 class Draw:
-    """Where the parameters of an effect come from: chance, its strength, and how the joints move without it."""
+    """Source of an effect's parameters: chance, strength, and the motion without the effect.
+
+    Attributes:
+        rng: Random generator.
+        strength: Factor on the size of the effect.
+        joints: Indices of the affected joints.
+        names: Names of all joints.
+        nominal: Series without effects.
+        dt: Tick of `nominal`, s.
+        duration: Duration of the log, s.
+        kp: Commanded position gain, N m/rad.
+        kd: Commanded velocity gain, N m s/rad.
+        turn: Offset, 1 or 2, of the neighbour among the joints of a leg.
+    """
 
     rng: np.random.Generator
     strength: float
@@ -50,37 +74,41 @@ class Draw:
     turn: int  # 1 or 2: which of the leg's other joints is the neighbour
 
     def uniform(self, low: float, high: float) -> float:
+        """Draw a uniform number between `low` and `high`."""
         return float(self.rng.uniform(low, high))
 
     def sign(self) -> float:
+        """Draw -1 or 1."""
         return float(self.rng.choice([-1.0, 1.0]))
 
     def place(self) -> str:
-        """In the drive, before its output delay, or at the joint."""
+        """Draw where a torque acts: in the drive, before its output delay, or at the joint."""
         return str(self.rng.choice(["drive", "joint"]))
 
     def smooth_sign_width(self) -> float:
+        """Draw the width of a smooth sign, rad/s."""
         return self.uniform(0.02, 0.1)
 
     def neighbour(self, joint: int) -> int:
-        """Another joint of the same leg."""
+        """Return the index of another joint of the same leg."""
         first = joint - joint % 3
         return first + (joint - first + self.turn) % 3
 
     def torque(self, quantile: float) -> float:
-        """The size of torque that the affected joints stay under for this share of time, N m."""
+        """Return a quantile of the affected joints' absolute torque, N m."""
         return float(np.quantile(np.abs(self.nominal.tau[:, list(self.joints)]), quantile))
 
     def speed(self, quantile: float) -> float:
+        """Return a quantile of the affected joints' absolute speed, rad/s."""
         return float(np.quantile(np.abs(self.nominal.dq[:, list(self.joints)]), quantile))
 
     def travel(self) -> float:
-        """How far the affected joint that moves least moves, rad."""
+        """Return the smallest travel of an affected joint, 2 % to 98 % quantile, rad."""
         q = self.nominal.q[:, list(self.joints)]
         return float(np.min(np.quantile(q, 0.98, axis=0) - np.quantile(q, 0.02, axis=0)))
 
 
 def smooth(width: float) -> Callable[[float], float]:
-    """A sign that is smooth over speeds of about `width`."""
+    """Return a smooth sign function, tanh(speed / width); `width` in rad/s."""
     tanh = math.tanh
     return lambda speed: tanh(speed / width)

@@ -1,6 +1,6 @@
-"""Effects that the registry lists, by its names, in the generator's own physics.
+"""Effects of the registry, in the generator's own physics.
 
-Each takes a `Draw` and gives an `Effect`. Where text leaves a law open (where it acts, hard or soft), chance decides.
+Each function draws one effect. Where its law is ambiguous (place, hard or soft), chance decides.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from tests.identification.hidden.plant import State, Step
 
 
 def coulomb_friction(draw: Draw) -> Effect:
+    """Friction of constant torque against the motion."""
     c, sign = draw.strength * draw.uniform(0.3, 0.8), smooth(draw.smooth_sign_width())
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -24,6 +25,7 @@ def coulomb_friction(draw: Draw) -> Effect:
 
 
 def viscous_friction(draw: Draw) -> Effect:
+    """Friction proportional to the speed."""
     b = draw.strength * draw.uniform(0.1, 0.4)
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -34,6 +36,7 @@ def viscous_friction(draw: Draw) -> Effect:
 
 
 def stribeck_friction(draw: Draw) -> Effect:
+    """Friction that decreases from standstill with the speed."""
     c = draw.strength * draw.uniform(0.2, 0.5)
     c_s, v_s = c * draw.uniform(2.0, 3.5), draw.speed(0.5) * draw.uniform(0.25, 0.6)
     sign, exp = smooth(draw.smooth_sign_width()), math.exp
@@ -46,6 +49,7 @@ def stribeck_friction(draw: Draw) -> Effect:
 
 
 def quadratic_drag(draw: Draw) -> Effect:
+    """Drag proportional to the square of the speed."""
     c = draw.strength * draw.uniform(0.03, 0.1)
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -56,6 +60,7 @@ def quadratic_drag(draw: Draw) -> Effect:
 
 
 def load_dependent_friction(draw: Draw) -> Effect:
+    """Friction proportional to the torque."""
     mu, sign = min(draw.strength * draw.uniform(0.05, 0.15), 0.5), smooth(draw.smooth_sign_width())
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -66,6 +71,7 @@ def load_dependent_friction(draw: Draw) -> Effect:
 
 
 def torque_saturation(draw: Draw) -> Effect:
+    """Limit of the torque."""
     bound = draw.torque(1 - min(0.04 * draw.strength, 0.3))
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -75,7 +81,7 @@ def torque_saturation(draw: Draw) -> Effect:
 
 
 def torque_speed_limit(draw: Draw) -> Effect:
-    """A straight line from the stall torque to the no-load speed; braking is held by the stall torque alone."""
+    """Limit of driving torque, linear from stall torque to no-load speed."""
     stall = draw.torque(1.0) * draw.uniform(1.0, 1.3)
     power = draw.nominal.tau[:, list(draw.joints)] * np.sign(draw.nominal.dq[:, list(draw.joints)])
     speed = np.abs(draw.nominal.dq[:, list(draw.joints)])
@@ -103,6 +109,7 @@ def torque_speed_limit(draw: Draw) -> Effect:
 
 
 def slew_limit(draw: Draw) -> Effect:
+    """Limit of the rate of the torque."""
     change = np.abs(np.diff(draw.nominal.asked[:, list(draw.joints)], axis=0)) / draw.dt
     rate = float(np.quantile(change, 1 - min(0.06 * draw.strength, 0.4)))
 
@@ -119,6 +126,7 @@ def slew_limit(draw: Draw) -> Effect:
 
 
 def first_order_lag(draw: Draw) -> Effect:
+    """First-order lag of the torque."""
     constant = min(draw.strength * draw.uniform(0.002, 0.006), 0.015)
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -134,7 +142,7 @@ def first_order_lag(draw: Draw) -> Effect:
 
 
 def velocity_filter(draw: Draw) -> Effect:
-    """The drive damps a low-passed speed, or an old one."""
+    """Damping of a low-passed or of a delayed speed."""
     constant = min(draw.strength * draw.uniform(0.004, 0.01), 0.03)
     delayed = bool(draw.rng.random() < 0.4)
 
@@ -165,11 +173,13 @@ def velocity_filter(draw: Draw) -> Effect:
 
 
 def armature(draw: Draw) -> Effect:
+    """Added rotor inertia."""
     inertia = min(draw.strength * draw.uniform(0.004, 0.015), 0.06)
     return Effect("armature", draw.joints, {"J": inertia}, armature=inertia)
 
 
 def torque_offset(draw: Draw) -> Effect:
+    """Constant torque."""
     offset = draw.strength * draw.uniform(0.15, 0.5) * draw.sign()
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -179,6 +189,7 @@ def torque_offset(draw: Draw) -> Effect:
 
 
 def parallel_spring(draw: Draw) -> Effect:
+    """Spring parallel to the joint."""
     k_s = draw.strength * draw.uniform(1.0, 4.0)
     rest = float(np.mean(draw.nominal.q[:, draw.joints[0]])) + draw.uniform(-0.3, 0.3)
 
@@ -190,7 +201,7 @@ def parallel_spring(draw: Draw) -> Effect:
 
 
 def cogging(draw: Draw) -> Effect:
-    """Between 1.5 and 5 periods over the joint's travel."""
+    """Sine over the angle, with 1.5 to 5 periods over the travel."""
     height = draw.strength * draw.uniform(0.2, 0.6)
     number = float(min(max(round(2 * math.pi * draw.uniform(1.5, 5.0) / max(draw.travel(), 0.05)), 4), 120))
     phase = draw.uniform(-math.pi, math.pi)
@@ -204,7 +215,7 @@ def cogging(draw: Draw) -> Effect:
 
 
 def deadband(draw: Draw) -> Effect:
-    """Small position errors are not answered; larger ones fully (hard) or from the edge on (soft)."""
+    """No torque for small position errors; above the band all of it (hard) or the excess (soft)."""
     width = draw.strength * draw.torque(0.5) / draw.kp * draw.uniform(0.2, 0.6)
     hard = bool(draw.rng.random() < 0.5)
 
@@ -220,7 +231,7 @@ def deadband(draw: Draw) -> Effect:
 
 
 def backlash(draw: Draw) -> Effect:
-    """The drive's own angle follows the joint's through a play of `width` to each side."""
+    """The drive's angle follows the joint's with a play of `width` to each side."""
     width = draw.strength * draw.uniform(0.006, 0.02)
 
     def make(state: State, j: int, dt: float) -> Step:
@@ -236,7 +247,7 @@ def backlash(draw: Draw) -> Effect:
 
 
 def hysteresis(draw: Draw) -> Effect:
-    """Bouc-Wen with exponent 1: a spring that yields over `reach` to the torque `c`."""
+    """Bouc-Wen hysteresis with exponent 1: a spring that yields over `reach` at the torque `c`."""
     c = draw.strength * draw.uniform(0.3, 0.8)
     reach, shape = draw.travel() * draw.uniform(0.1, 0.3), draw.uniform(0.5, 0.9)
 
@@ -254,7 +265,7 @@ def hysteresis(draw: Draw) -> Effect:
 
 
 def gain_asymmetry(draw: Draw) -> Effect:
-    """Half of the drives are as strong as they should be one way: their mean gain is off, too."""
+    """Torque gain that differs between directions; half of the drives have the nominal gain in one."""
     share = min(draw.strength * draw.uniform(0.04, 0.12), 0.4) * draw.sign()
     mean = 1.0 / (1.0 - abs(share)) if draw.uniform(0.0, 1.0) < 0.5 else 1.0
 
@@ -265,7 +276,7 @@ def gain_asymmetry(draw: Draw) -> Effect:
 
 
 def thermal_drift(draw: Draw) -> Effect:
-    """A gain that falls while the motor warms up; half of the logs hold the temperature."""
+    """Gain that decreases while the motor warms up; half of the logs contain the temperature."""
     loss = min(draw.strength * draw.uniform(0.08, 0.25), 0.6)
     settling = draw.uniform(0.5, 2.0) * draw.duration
 
@@ -288,7 +299,7 @@ def thermal_drift(draw: Draw) -> Effect:
 
 
 def supply_sag(draw: Draw) -> Effect:
-    """The gain falls with the voltage, which falls with the mechanical power of all joints; half log the voltage."""
+    """Gain that decreases with the supply voltage under load; half of the logs contain the voltage."""
     power = np.maximum(draw.nominal.tau * draw.nominal.dq, 0).sum(axis=1)
     drop = min(draw.strength * draw.uniform(0.1, 0.25), 0.6) / max(float(np.quantile(power, 0.95)), 1.0)
     settling, supply = draw.uniform(0.005, 0.02), draw.uniform(24, 52)
@@ -317,7 +328,7 @@ def supply_sag(draw: Draw) -> Effect:
 
 
 def cross_coupling(draw: Draw) -> Effect:
-    """A share of another joint's angle, speed or torque; the same on each affected joint."""
+    """Torque proportional to another joint's angle, speed or torque."""
     source = str(draw.rng.choice(["q", "dq", "tau"]))
     share = draw.sign() * draw.strength * draw.uniform(0.6, 1.4) * {"q": 2.0, "dq": 0.15, "tau": 0.07}[source]
 
@@ -333,7 +344,7 @@ def cross_coupling(draw: Draw) -> Effect:
 
 
 def command_hold(draw: Draw) -> Effect:
-    """Commands lost in short bursts, or late by some milliseconds; the log holds what was sent."""
+    """Commands lost in short bursts, or late by some milliseconds; the log has the commands as sent."""
     share = min(draw.strength * draw.uniform(0.05, 0.2), 0.5)
     longest = int(draw.rng.integers(1, 5))
     late = float(draw.rng.choice([0.0, draw.uniform(0.006, 0.02)]))
@@ -352,7 +363,7 @@ def command_hold(draw: Draw) -> Effect:
 
 
 def timestamp_skew(draw: Draw) -> Effect:
-    """The logged angle or speed is that of another instant; late is positive."""
+    """Logged angle or speed of another instant; a positive shift is late."""
     channel = str(draw.rng.choice(["q", "dq"]))
     shift = draw.sign() * min(draw.strength * draw.uniform(0.001, 0.004), 0.012)
     also = ("velocity_filter",) if channel == "dq" and shift < 0 else ()

@@ -1,6 +1,7 @@
-"""What the legs are asked to do: foot lifting (Eq. 9 of the paper) and mixed motion, with the loads of the ground.
+"""Motions of the legs: foot lifting (Eq. 9 of the paper) and mixed motions, with ground forces.
 
-A motion is made on the plant's ticks. It is no gait that keeps a robot upright: the ground's force is a given of time.
+Motions are made on the plant's ticks. They are no gaits that balance a robot: the ground force is a
+given function of time.
 """
 
 from __future__ import annotations
@@ -21,9 +22,12 @@ KINDS = ("hip", "thigh", "calf")
 
 @dataclass(frozen=True)
 class Motion:
-    """Commands, and the torque that the ground puts on the joints.
+    """Commands, and the joint torque of the ground.
 
-    `ticks` (M,) when a command is sent, in plant ticks; `targets` (M, J) rad; `load` (K, J) N m.
+    Attributes:
+        ticks: Ticks at which commands are sent, (M,).
+        targets: Commanded angles, (M, J), rad.
+        load: Joint torque of the ground, (K, J), N m.
     """
 
     ticks: NDArray[np.int64]
@@ -32,11 +36,21 @@ class Motion:
 
 
 def joint_names(legs: tuple[str, ...]) -> list[str]:
+    """Return the joint names of some legs."""
     return [f"{leg}_{kind}_joint" for leg in legs for kind in KINDS]
 
 
 def leg_angles(x: Array, y: Array, z: Array) -> Array:
-    """Joint angles (K, 3) that put the foot at (x, y) from below the hip, at height z < 0; m, rad."""
+    """Inverse kinematics of one leg.
+
+    Args:
+        x: Forward position of the foot from below the hip, (K,), m.
+        y: Left position of the foot from below the hip, (K,), m.
+        z: Height of the foot above the hip, negative, (K,), m.
+
+    Returns:
+        Angles of hip, thigh and calf, (K, 3), rad.
+    """
     hip = np.arctan2(y, -z)
     drop = np.hypot(y, z)
     reach = np.clip(np.hypot(x, drop), 0.1, 2 * LINK - 1e-3)
@@ -45,7 +59,15 @@ def leg_angles(x: Array, y: Array, z: Array) -> Array:
 
 
 def ground_torque(angles: Array, force: Array) -> Array:
-    """What a ground force (K, 3), N, at the foot asks of the joints (K, 3), N m: the transposed Jacobian."""
+    """Joint torques of a force at the foot, by the transposed Jacobian.
+
+    Args:
+        angles: Joint angles, (K, 3), rad.
+        force: Force at the foot, (K, 3), N.
+
+    Returns:
+        Torques, (K, 3), N m.
+    """
     thigh, knee = angles[:, 1], angles[:, 1] + angles[:, 2]
     dx = np.stack([-LINK * (np.cos(thigh) + np.cos(knee)), -LINK * np.cos(knee)], axis=1)
     dz = np.stack([LINK * (np.sin(thigh) + np.sin(knee)), LINK * np.sin(knee)], axis=1)
@@ -55,7 +77,16 @@ def ground_torque(angles: Array, force: Array) -> Array:
 
 
 def foot_height(k: Array, lift: Array | float = 0.1, ground: float = -0.4) -> Array:
-    """Eq. 9: desired height (m) of a foot at phase k in [0, 4)."""
+    """Desired foot height of Eq. 9.
+
+    Args:
+        k: Phase, in [0, 4).
+        lift: Lift, m.
+        ground: Height of the ground, m.
+
+    Returns:
+        Height, m.
+    """
     up = -2 * k**3 + 3 * k**2
     down = 2 * k**3 - 9 * k**2 + 12 * k - 4
     return lift * np.where(k < 1, up, np.where(k < 2, down, 0.0)) + ground

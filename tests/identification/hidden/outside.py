@@ -1,7 +1,7 @@
-"""Effects that the registry does not hold. A report cannot name them; it has to say on what they depend.
+"""Effects outside the registry. A report cannot name them; it has to name the signals involved.
 
-`key` are the names of the signal without which the effect cannot be told (any one of them will do), `all` those of each
-signal that takes part.
+`key` lists the names of the essential signal, any one of which counts; `all` lists the names of
+each signal that takes part.
 """
 
 from __future__ import annotations

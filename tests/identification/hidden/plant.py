@@ -1,7 +1,7 @@
-"""Legs under drives that follow the paper's actuator model (Eq. 1) and the effects hooked into it; time-stepped.
+"""Time-stepped plant: legs under drives of the paper's actuator model (Eq. 1), with effects.
 
-Per tick and joint: the command that has arrived -> error, speed -> asked torque -> effects in the drive -> output delay
--> effects at the joint -> acceleration. All in plain floats: with a few joints that is faster than small arrays.
+Each tick and joint: arrived command -> error and speed -> requested torque -> effects in the drive
+-> output delay -> effects at the joint -> acceleration. Plain floats are faster than small arrays.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ HIP_INERTIA = 0.045
 
 @dataclass(frozen=True)
 class Drive:
-    """What the drives do besides the effects: gains as they really are, and delays in ticks."""
+    """True gains (N m/rad, N m s/rad) and delays (ticks) of the drives."""
 
     kp: float
     kd: float
@@ -37,7 +37,7 @@ class Drive:
 
 @dataclass
 class State:
-    """What an effect may look at: lists of one float a joint, of this tick (torques: of the tick before)."""
+    """State that effects can read, one float for each joint; torques are of the tick before."""
 
     q: list[float]
     dq: list[float]
@@ -50,7 +50,7 @@ class State:
 
 @dataclass(frozen=True)
 class Body:
-    """Inertia that differs from leg to leg, and joint damping, which no drive sees."""
+    """Scale of each leg's inertia, and joint damping (N m s/rad) outside the drive, (J,) each."""
 
     scale: Array
     damping: Array
@@ -58,7 +58,7 @@ class Body:
 
 @dataclass(frozen=True)
 class Trace:
-    """What happened, one row a tick: rad, rad/s, rad/s^2, N m. `asked` is what Eq. 1 asks for, undelayed."""
+    """Simulated series, (K, J) each: rad, rad/s, rad/s^2, N m; `asked` is Eq. 1 without delays."""
 
     q: Array
     dq: Array
@@ -68,7 +68,16 @@ class Trace:
 
 
 def arrivals(ticks: NDArray[np.int64], delay: NDArray[np.int64] | int, steps: int) -> NDArray[np.int64]:
-    """Which command is in force at each tick (steps,): the newest of those that have arrived, at first the first."""
+    """Find the command in force at each tick.
+
+    Args:
+        ticks: Ticks at which commands are sent, (M,).
+        delay: Delay of each command, ticks.
+        steps: Number of ticks K.
+
+    Returns:
+        Index of the newest arrived command, (K,); the first one before any arrival.
+    """
     newest = np.full(steps + 1, 0)
     when = np.minimum(ticks + delay, steps)
     np.maximum.at(newest, when, np.arange(len(ticks)))
@@ -85,10 +94,20 @@ def simulate(
     dt: float,
     replay: Trace | None = None,
 ) -> Trace:
-    """Steps the joints through `targets` (K, J), as they arrive, under `load` (K, J).
+    """Simulate the joints.
 
-    `hooks` maps a stage ("error", "speed", "drive", "joint") to the makers of steps of each joint. With `replay` the
-    joints move as they did there, whatever the torque.
+    Args:
+        drive: Gains and delays.
+        body: Inertia and damping.
+        hooks: Step makers of each joint, by stage: `error`, `speed`, `drive`, `joint`.
+        armature: Added inertia, (J,), kg m^2.
+        targets: Targets as they arrive, (K, J), rad.
+        load: Joint torque of the ground, (K, J), N m.
+        dt: Tick, s.
+        replay: Motion to impose, instead of the motion that the torque causes.
+
+    Returns:
+        Series of all ticks.
     """
     joints = targets.shape[1]
     state = State(*([0.0] * joints for _ in range(6)))
@@ -144,7 +163,7 @@ def simulate(
 
 
 def _follower(replay: Trace) -> Callable[[State, Sequence[float], Sequence[float]], list[float]]:
-    """The motion of another run, whatever the torque."""
+    """Step function that imposes the motion of another run."""
     following = zip(replay.q[1:].tolist(), replay.dq[1:].tolist(), strict=True)
     accelerations = iter(replay.ddq.tolist())
 
@@ -158,7 +177,7 @@ def _follower(replay: Trace) -> Callable[[State, Sequence[float], Sequence[float
 def _integrator(
     body: Body, armature: Array, dt: float
 ) -> Callable[[State, Sequence[float], Sequence[float]], list[float]]:
-    """Semi-implicit Euler over legs of hip, thigh and calf; thigh and calf are a double pendulum."""
+    """Semi-implicit Euler for legs of hip, thigh and calf; thigh and calf are a double pendulum."""
     cos, sin = math.cos, math.sin
     scale, damping, extra = body.scale.tolist(), body.damping.tolist(), armature.tolist()
 

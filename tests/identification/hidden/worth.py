@@ -1,7 +1,7 @@
-"""What an effect is worth: the mean squared torque error that it leaves to the paper's model, fitted as well as can be.
+"""Size of an effect: the mean squared torque error of the paper's model, fitted optimally.
 
-And which simpler laws explain it as well, so that a report that names one of them is right too. Linear regressions on
-the plant's own noise-free series.
+Also finds simpler laws that explain the effect equally well, so that a report which names one of
+them is right. Uses linear regressions on the noise-free series of the plant.
 """
 
 from __future__ import annotations
@@ -22,7 +22,14 @@ INPUT_MAX, OUTPUT_MAX = 0.020, 0.006  # s, what the paper's search covers
 
 @dataclass(frozen=True)
 class Scene:
-    """A run as the regressions see it: `held` (K, J) the targets as sent, on ticks; `rows` (N,) the ticks looked at."""
+    """Series for the regressions.
+
+    Attributes:
+        held: Targets as sent, at each tick, (K, J), rad.
+        trace: Simulated series.
+        rows: Ticks that are used, (N,).
+        dt: Tick, s.
+    """
 
     held: Array
     trace: Trace
@@ -31,7 +38,7 @@ class Scene:
 
     @staticmethod
     def of(held: Array, trace: Trace, dt: float, stride: int) -> Scene:
-        """Rows are some of those that a log of one sample every `stride` ticks holds."""
+        """Choose random rows of those that a log with one row every `stride` ticks contains."""
         first = round((INPUT_MAX + OUTPUT_MAX) / dt / stride + 1) * stride
         logged = np.arange(first, len(held) - stride, stride)
         chosen = np.random.default_rng(0).permutation(len(logged))[:ROWS]
@@ -39,17 +46,18 @@ class Scene:
 
     @property
     def tau(self) -> Array:
+        """Torque of the rows, (N, J), N m."""
         return self.trace.tau[self.rows]
 
     def pd_columns(self, input_ticks: int, output_ticks: int) -> Array:
-        """Position error and speed as the delayed drive sees them, (N J, 2)."""
+        """Regressors of the PD law: delayed position error and speed, (N J, 2)."""
         seen = self.rows - output_ticks
         error = self.held[seen - input_ticks] - self.trace.q[seen]
         return np.stack([error.ravel(), -self.trace.dq[seen].ravel()], axis=1)
 
 
 def _left(columns: Array, target: Array) -> tuple[float, Array]:
-    """Mean square and residual of the least squares of `target` on `columns`."""
+    """Mean square and residual of the least-squares fit of `target` to `columns`."""
     scale = np.sqrt(np.mean(columns**2, axis=0)) + 1e-12
     normal = (columns / scale).T @ (columns / scale)
     solution = np.linalg.lstsq(
@@ -60,7 +68,16 @@ def _left(columns: Array, target: Array) -> tuple[float, Array]:
 
 
 def best_model(scene: Scene, input_ticks: int, output_ticks: int) -> tuple[float, int, int]:
-    """Least error of the paper's model and its delays (ticks), searched from the true delays on."""
+    """Fit the paper's model over its delays, starting from the true ones.
+
+    Args:
+        scene: Series.
+        input_ticks: True input delay, ticks.
+        output_ticks: True output delay, ticks.
+
+    Returns:
+        Least mean squared error, N^2 m^2, and its delays, ticks.
+    """
     target = scene.tau.ravel()
     most_in, most_out = round(INPUT_MAX / scene.dt), round(OUTPUT_MAX / scene.dt)
     best = (np.inf, input_ticks, output_ticks)
@@ -80,7 +97,16 @@ def best_model(scene: Scene, input_ticks: int, output_ticks: int) -> tuple[float
 
 
 def rivals(scene: Scene, joints: tuple[int, ...], base: Array) -> dict[str, Array]:
-    """Columns (N J, C) of simple laws, each with a coefficient of its own for each affected joint."""
+    """Compute regressors of simple laws, with one coefficient for each affected joint.
+
+    Args:
+        scene: Series.
+        joints: Indices of the affected joints.
+        base: Regressors of the paper's model, (N J, 2).
+
+    Returns:
+        Regressors by law, (N J, C) each.
+    """
     rows, trace, dt = scene.rows, scene.trace, scene.dt
     asked = scene.tau - _left(base, scene.tau.ravel())[1].reshape(scene.tau.shape)
     q, dq, ddq = trace.q[rows], trace.dq[rows], trace.ddq[rows]
@@ -108,7 +134,7 @@ def rivals(scene: Scene, joints: tuple[int, ...], base: Array) -> dict[str, Arra
 
 
 def _blocks(column: Array, joints: list[int]) -> Array:
-    """(N, J) as (N J, len(joints)): one column for each joint, zero on the others."""
+    """Expand (N, J) to (N J, len(joints)): one column for each joint, zero on the others."""
     blocks = np.zeros((*column.shape, len(joints)))
     for place, joint in enumerate(joints):
         blocks[:, joint, place] = column[:, joint]
@@ -116,7 +142,17 @@ def _blocks(column: Array, joints: list[int]) -> Array:
 
 
 def equals(scene: Scene, base: Array, laws: dict[str, Array], allowed: float) -> list[str]:
-    """The laws that, beside the paper's model, leave less than `allowed` of the torque unexplained."""
+    """List the laws that together with the paper's model have an error below a bound.
+
+    Args:
+        scene: Series.
+        base: Regressors of the paper's model, (N J, 2).
+        laws: Regressors by law.
+        allowed: Bound of the mean squared error, N^2 m^2.
+
+    Returns:
+        Names of laws.
+    """
     target = scene.tau.ravel()
     return [
         name for name, law in laws.items() if _left(np.concatenate([base, law], axis=1), target)[0] < allowed
@@ -124,10 +160,28 @@ def equals(scene: Scene, base: Array, laws: dict[str, Array], allowed: float) ->
 
 
 def beyond(scene: Scene, base: Array, laws: dict[str, Array]) -> float:
-    """What the paper's model and all these laws together leave."""
+    """Return the error of the paper's model together with all simple laws, N^2 m^2.
+
+    Args:
+        scene: Series.
+        base: Regressors of the paper's model, (N J, 2).
+        laws: Regressors by law.
+
+    Returns:
+        Mean squared error, N^2 m^2.
+    """
     return _left(np.concatenate([base, *laws.values()], axis=1), scene.tau.ravel())[0]
 
 
 def marginal(difference: Array, base: Array, others: list[Array]) -> float:
-    """What is left of an effect's torque `difference` (N J,) when the model and the other effects are fitted to it."""
+    """Return the part of an effect's torque that the model and other effects do not explain.
+
+    Args:
+        difference: Torque of the effect, (N J,), N m.
+        base: Regressors of the paper's model, (N J, 2).
+        others: Torques of the other effects, (N J,), N m.
+
+    Returns:
+        Mean squared error, N^2 m^2.
+    """
     return _left(np.concatenate([base, *(other[:, None] for other in others)], axis=1), difference)[0]

@@ -1,1 +1,1 @@
-"""What an identification found, as a page for people and a file for programs."""
+"""Report of an identification: an HTML page for people, JSON and YAML files for programs."""

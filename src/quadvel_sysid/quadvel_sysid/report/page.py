@@ -1,6 +1,6 @@
-"""The page of an identification: sections of HTML in the order in which one asks, in one file that needs nothing else.
+"""HTML page of an identification report, self-contained in one file.
 
-It shows what the report's numbers and the pictures say; it computes nothing that report.json does not hold.
+It displays the numbers of report.json and the figures, and computes no further results.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 
 from ..excitation import propose
 from ..identification import Identification
-from ..summary_text import UNTRACED
+from ..summary_text import UNCORRELATED_TEXT
 from . import figures
-from .figures import short
+from .figures import short_joint_name
 
 _STYLE = """
 :root { color-scheme: light dark; --ink: #1b1f24; --soft: #656d76; --paper: #ffffff; --card: #f5f7f9;
@@ -52,8 +52,15 @@ summary { cursor: pointer; font-weight: 600; }
 """
 
 
-def page(identification: Identification) -> str:
-    """The whole page as HTML text."""
+def report_page(identification: Identification) -> str:
+    """Render the page of a report.
+
+    Args:
+        identification: The result to show.
+
+    Returns:
+        HTML text of the whole page.
+    """
     report = identification.report
     sections = [
         ("Before and after, joint by joint", _joints(identification)),
@@ -62,16 +69,25 @@ def page(identification: Identification) -> str:
         ("What the residual depends on", _shapes(identification)),
         ("Candidates", _candidates(report)),
         ("Parameters", _parameters(report)),
-        ("What no effect explains", _unexplained(report)),
-        ("What to record next", _next(report)),
-        ("What the log showed before the fit", _findings(report)),
+        ("Residual that no effect explains", _unexplained(report)),
+        ("What to record next", _next_recordings(report)),
+        ("Findings in the logs before the fit", _findings(report)),
     ]
     body = "".join(f"<section><h2>{escape(title)}</h2>{text}</section>" for title, text in sections if text)
-    return document("Identification of the actuators", report["decision"], _tiles(report) + body)
+    return html_document("Identification of the actuators", report["decision"], _tiles(report) + body)
 
 
-def document(title: str, decision: str, body: str) -> str:
-    """A page of its own with the report's style; `title` and `decision` are text, `body` is HTML."""
+def html_document(title: str, decision: str, body: str) -> str:
+    """Render a page in the style of the report.
+
+    Args:
+        title: Title, plain text.
+        decision: Summary below the title, plain text.
+        body: Content, HTML.
+
+    Returns:
+        HTML text of the whole page.
+    """
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{escape(title)}</title>'
     top = f'<h1>{escape(title)}</h1><p class="decision">{escape(decision)}</p>'
     return (
@@ -80,8 +96,16 @@ def document(title: str, decision: str, body: str) -> str:
     )
 
 
-def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table; cells are HTML. A column whose title starts with "#" holds numbers."""
+def html_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Render a table.
+
+    Args:
+        head: Column titles, plain text; `#` at the start marks a column of numbers.
+        rows: Cells, HTML.
+
+    Returns:
+        HTML text.
+    """
     kinds = [' class="n"' if title.startswith("#") else "" for title in head]
     first = "".join(
         f"<th{kind}>{escape(title.removeprefix('#'))}</th>" for kind, title in zip(kinds, head, strict=True)
@@ -93,28 +117,44 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f'<div class="scroll"><table><tr>{first}</tr>{"".join(lines)}</table></div>'
 
 
-def tiles(entries: Iterable[tuple[str, str]]) -> str:
-    """Figures in large type: value (HTML) and what it is."""
+def html_tiles(entries: Iterable[tuple[str, str]]) -> str:
+    """Render key figures in large type.
+
+    Args:
+        entries: Value (HTML) and description (plain text) of each.
+
+    Returns:
+        HTML text.
+    """
     each = (f'<div class="tile"><b>{value}</b><span>{escape(name)}</span></div>' for value, name in entries)
     return f'<div class="tiles">{"".join(each)}</div>'
 
 
-def number(value: float | None, digits: int = 3) -> str:
-    """A number as people read it; a dash where there is none."""
+def number_text(value: float | None, digits: int = 3) -> str:
+    """Format a number for people.
+
+    Args:
+        value: The number, or None.
+        digits: Significant digits.
+
+    Returns:
+        The number; a dash for None and for numbers that are not finite.
+    """
     return "–" if value is None or not np.isfinite(value) else f"{value:.{digits}g}"
 
 
 def _tiles(report: Mapping[str, Any]) -> str:
+    """Key figures: errors, gains and delays."""
     before, after = report["before"], report["after"]
     unit = f"{report['units'].get('mse', 'N² m²')}, held out"
-    return tiles(
+    return html_tiles(
         [
-            _error(report["pd"], f"ideal PD, {unit}"),
-            _error(before, f"plain EAM, {unit}"),
-            _error(report["baselines"]["joint_pd"], "a PD law of each joint"),
-            _error(report["baselines"]["ridge"], "a linear filter over 16 ms"),
-            _error(after, f"corrected model, {unit}"),
-            (number(report["noise_floor"]), "noise floor, N² m²"),
+            _error_tile(report["pd"], f"ideal PD, {unit}"),
+            _error_tile(before, f"plain EAM, {unit}"),
+            _error_tile(report["baselines"]["joint_pd"], "a PD law of each joint"),
+            _error_tile(report["baselines"]["ridge"], "a linear filter over 16 ms"),
+            _error_tile(after, f"corrected model, {unit}"),
+            (number_text(report["noise_floor"]), "noise floor, N² m²"),
             (f"{before['delta_kp']:+.3g} / {before['delta_kd']:+.3g}", "ΔKp, ΔKd of the plain EAM"),
             (
                 f"{before['input_delay_ms']:.2f} / {before['output_delay_ms']:.2f}",
@@ -124,28 +164,29 @@ def _tiles(report: Mapping[str, Any]) -> str:
     )
 
 
-def _error(entry: Mapping[str, Any], name: str) -> tuple[str, str]:
-    """A tile of a held-out error and the share of the torque's variance that it leaves explained."""
+def _error_tile(entry: Mapping[str, Any], name: str) -> tuple[str, str]:
+    """Tile of a held-out error and of the explained fraction of the torque's variance."""
     share = entry.get("heldout_explained")
-    explained = "" if share is None else f"; explains {number(100.0 * share)} % of the torque's variance"
-    return number(entry["heldout_mse"]), name + explained
+    explained = "" if share is None else f"; explains {number_text(100.0 * share)} % of the torque's variance"
+    return number_text(entry["heldout_mse"]), name + explained
 
 
 def _joints(identification: Identification) -> str:
+    """Table of errors before and after for each joint, and the distribution of residuals."""
     report, traces = identification.report, identification.traces
     before, after = report["before"]["per_joint"], report["after"]["per_joint"]
     largest = max([value for value in (*before, *after) if value is not None], default=1.0) or 1.0
     rows = [
         (
-            short(joint),
-            number(old),
-            number(new),
-            _cut(old, new),
+            short_joint_name(joint),
+            number_text(old),
+            number_text(new),
+            _reduction_text(old, new),
             _bars(old, new, largest),
         )
         for joint, old, new in zip(report["joints"], before, after, strict=True)
     ]
-    text = table(("joint", "#plain EAM", "#corrected", "#less", "held-out error, N² m²"), rows)
+    text = html_table(("joint", "#plain EAM", "#corrected", "#less", "held-out error, N² m²"), rows)
     if traces:
         text += figures.distribution_figure(traces, report["noise_floor"] or 0.0)
         text += (
@@ -155,11 +196,13 @@ def _joints(identification: Identification) -> str:
     return text
 
 
-def _cut(old: float | None, new: float | None) -> str:
+def _reduction_text(old: float | None, new: float | None) -> str:
+    """Error reduction in percent; a dash if unknown."""
     return "–" if not old or new is None else f"{100 * (1 - new / old):.0f} %"
 
 
 def _bars(old: float | None, new: float | None, largest: float) -> str:
+    """Two bars with the errors before and after."""
     each = (
         f'<i style="top:{top}%;width:{100 * (value or 0.0) / largest:.1f}%;background:var(--{colour})"></i>'
         for value, colour, top in ((old, "before", 0), (new, "after", 50))
@@ -168,7 +211,7 @@ def _bars(old: float | None, new: float | None, largest: float) -> str:
 
 
 def _torques(identification: Identification) -> str:
-    """A picture a joint, folded up but for the one that gained most."""
+    """Torque figure of each joint, collapsed except for the joint with the largest gain."""
     report, traces = identification.report, identification.traces
     gains = {
         joint: (old or 0.0) - (new or 0.0)
@@ -179,14 +222,14 @@ def _torques(identification: Identification) -> str:
     }
     best = max(gains, key=lambda joint: gains[joint], default=None)
     return "".join(
-        f"<details{' open' if joint == best else ''}><summary>{escape(short(joint))}</summary>"
+        f"<details{' open' if joint == best else ''}><summary>{escape(short_joint_name(joint))}</summary>"
         f"{figures.torque_figure(traces[joint])}</details>"
         for joint in gains
     )
 
 
 def _shapes(identification: Identification) -> str:
-    """For each effect its joints side by side, three in a row."""
+    """Residual figures of each effect, three joints in a row."""
     text = ""
     for name in dict.fromkeys(shape.effect for shape in identification.shapes):
         mine = [shape for shape in identification.shapes if shape.effect == name]
@@ -197,7 +240,7 @@ def _shapes(identification: Identification) -> str:
 
 
 def _replay(report: Mapping[str, Any]) -> str:
-    """How far the legs leave their measured track, joint by joint."""
+    """Table of the replay errors of each joint."""
     if "replay" not in report:
         return ""
     replay, rows = report["replay"], []
@@ -207,43 +250,51 @@ def _replay(report: Mapping[str, Any]) -> str:
             for what in ("q_rms_rad", "dq_rms_rad_s")
             for when in ("before", "after")
         ]
-        rows.append([f"<code>{escape(joint)}</code>", *(number(one) for one in sizes)])
+        rows.append([f"<code>{escape(joint)}</code>", *(number_text(one) for one in sizes)])
     head = ("joint", "#angle before, rad", "#after", "#speed before, rad/s", "#after")
     note = (
         f"Root mean square after up to {1e3 * replay['stretch_s']:.0f} ms, {replay['after']['stretches']} stretches, "
         f"held out. {replay['text']}"
     )
-    return f'<p class="note">{escape(note)}</p>{table(head, rows)}'
+    return f'<p class="note">{escape(note)}</p>{html_table(head, rows)}'
 
 
 def _candidates(report: Mapping[str, Any]) -> str:
-    taken = [
-        (one["heldout_gain"], one["p_value"], one["name"], _taken(one, report["joints"]))
+    """Figure and table of selected and rejected candidates."""
+    selected = [
+        (one["heldout_gain"], one["p_value"], one["name"], _placement_text(one, report["joints"]))
         for one in report["effects"]
     ]
     rejected = [(one["selecting_gain"], None, one["name"], one["reason"]) for one in report["rejected"]]
-    ranked = sorted([*taken, *rejected], key=lambda entry: -entry[0])
+    ranked = sorted([*selected, *rejected], key=lambda entry: -entry[0])
     if not ranked:
         return "<p>No candidate was tried.</p>"
     gains, ps, names, reasons = zip(*ranked, strict=True)
-    picture = figures.candidate_figure(names, gains, [one in taken for one in ranked])
-    rows = zip(map(escape, names), map(number, gains), map(number, ps), map(escape, reasons), strict=True)
+    picture = figures.candidate_figure(names, gains, [one in selected for one in ranked])
+    rows = zip(
+        map(escape, names), map(number_text, gains), map(number_text, ps), map(escape, reasons), strict=True
+    )
     note = (
-        '<p class="note">The gain of what was left out is that on the rows that select.</p>'
+        '<p class="note">The gain of rejected candidates is that on the selection rows.</p>'
         if rejected
         else ""
     )
-    return picture + table(("candidate", "#gain, N² m²", "#p", ""), list(rows)) + note
+    return picture + html_table(("candidate", "#gain, N² m²", "#p", ""), list(rows)) + note
 
 
-def _taken(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
-    where = "all joints" if len(effect["joints"]) == len(joints) else ", ".join(map(short, effect["joints"]))
+def _placement_text(effect: Mapping[str, Any], joints: Sequence[str]) -> str:
+    """Where an effect was added, and which laws are indistinguishable from it."""
+    where = (
+        "all joints"
+        if len(effect["joints"]) == len(joints)
+        else ", ".join(map(short_joint_name, effect["joints"]))
+    )
     also = effect["indistinguishable"]
-    return f"added, on {where}" + (f"; not told apart from {', '.join(also)}" if also else "")
+    return f"added, on {where}" + (f"; indistinguishable from {', '.join(also)}" if also else "")
 
 
 def _parameters(report: Mapping[str, Any]) -> str:
-    """Gains, delays and the parameters of every effect, with their intervals, and what the fit warns of."""
+    """Tables of gains, delays and effect parameters with intervals, and the warnings."""
     after, joints = report["after"], report["joints"]
     groups = [
         (
@@ -252,26 +303,31 @@ def _parameters(report: Mapping[str, Any]) -> str:
                 row
                 for name, title, unit in _EAM
                 if f"{name}_ci95" in after
-                for row in _values(title, after[name], after[f"{name}_ci95"], unit, joints)
+                for row in _parameter_rows(title, after[name], after[f"{name}_ci95"], unit, joints)
             ],
         )
     ]
     for effect in report["effects"]:
         each = effect["params"].items()
         rows = [
-            r for name, p in each for r in _values(name, p["value"], p["ci95"], p["unit"], effect["joints"])
+            r
+            for name, p in each
+            for r in _parameter_rows(name, p["value"], p["ci95"], p["unit"], effect["joints"])
         ]
         groups.append((effect["name"], rows))
     head = ("parameter", "#value", "#95 % interval", "unit", "from zero")
     text = "".join(f"<p>{escape(warning)}.</p>" for warning in report.get("warnings", ()))
-    return text + "".join(
-        f"<details{' open' if len(rows) <= _SHORT else ''}><summary>{escape(name)}</summary>{table(head, rows)}</details>"
+    tables = (
+        f"<details{' open' if len(rows) <= _MAX_UNFOLDED_ROWS else ''}><summary>{escape(name)}</summary>"
+        f"{html_table(head, rows)}</details>"
         for name, rows in groups
         if rows
     )
+    return text + "".join(tables)
 
 
-_SHORT = 12  # rows of a table that is shown unfolded
+_MAX_UNFOLDED_ROWS = 12
+"""Maximum number of rows of a table that is shown expanded."""
 _EAM = (
     ("delta_kp", "ΔKp", "N m/rad"),
     ("delta_kd", "ΔKd", "N m s/rad"),
@@ -280,30 +336,32 @@ _EAM = (
 )
 
 
-def _values(name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """Rows of the table: one where the joints share the value, else one for each."""
+def _parameter_rows(
+    name: str, value: Any, interval: Any, unit: str, joints: Sequence[str]
+) -> list[tuple[str, ...]]:
+    """Rows of the parameter table: one if joints share the value, else one for each."""
     values, intervals = np.atleast_1d(value), np.atleast_2d(interval)
     return [
         (
-            escape(f"{name} {short(owner)}".strip()),
-            number(one, 4),
-            f"{number(low, 4)} … {number(high, 4)}",
+            escape(f"{name} {short_joint_name(owner)}".strip()),
+            number_text(one, 4),
+            f"{number_text(low, 4)} … {number_text(high, 4)}",
             escape(unit),
             _interval(float(one), float(low), float(high)),
         )
-        for owner, one, (low, high) in zip(_owners(len(values), joints), values, intervals, strict=True)
+        for owner, one, (low, high) in zip(_value_owners(len(values), joints), values, intervals, strict=True)
     ]
 
 
-def _owners(count: int, joints: Sequence[str]) -> Sequence[str]:
-    """What each of `count` values of one parameter belongs to: the joints, or its place."""
+def _value_owners(count: int, joints: Sequence[str]) -> Sequence[str]:
+    """Owner of each of `count` values: the joint, or the index."""
     if count == 1:
         return [""]
     return joints if count == len(joints) else [f"[{place}]" for place in range(count)]
 
 
 def _interval(value: float, low: float, high: float) -> str:
-    """Value and interval on a line that begins or ends at zero."""
+    """Value and interval on an axis that contains zero."""
     left, right = min(low, value, 0.0), max(high, value, 0.0)
     if not np.isfinite([left, right]).all() or right == left:
         return ""
@@ -319,30 +377,35 @@ def _interval(value: float, low: float, high: float) -> str:
 
 
 def _unexplained(report: Mapping[str, Any]) -> str:
+    """Text on the remaining residual and its correlated signals."""
     rest = report["unexplained"]
     signals = ", ".join(f"<code>{escape(signal)}</code>" for signal in rest["depends_on"])
-    where = ", ".join(escape(short(joint)) for joint in rest["joints"])
-    share = "" if rest["fraction"] is None else f", {100 * rest['fraction']:.1f} % of what the plain EAM left"
+    where = ", ".join(escape(short_joint_name(joint)) for joint in rest["joints"])
+    share = (
+        ""
+        if rest["fraction"] is None
+        else f", {100 * rest['fraction']:.1f} % of the residual of the plain EAM"
+    )
     text = f'<p>The remainder is <b class="{rest["verdict"]}">{escape(rest["verdict"])}</b>{share}.'
     if signals:
         text += (
             f" Beyond the effects of the registry it depends on {signals}{f' at {where}' if where else ''}."
         )
     elif rest["verdict"] != "white":
-        text += f" {UNTRACED.capitalize()}."
+        text += f" It is {UNCORRELATED_TEXT}."
     text += "</p>"
     learned = next((e for e in report["effects"] if e["name"] == "learned_residual"), None)
     if learned:
         inputs = ", ".join(f"<code>{escape(signal)}</code>" for signal in learned["inputs"])
-        text += f"<p>A bounded term took up what it could, with the inputs {inputs}.</p>"
-        text += table(
+        text += f"<p>A bounded learned term explains a part of it, with the inputs {inputs}.</p>"
+        text += html_table(
             ("term", "inputs", "joints", "#held-out gain, N² m²"),
             [
                 (
                     escape(str(term["kind"]).replace("_", " ")),
                     ", ".join(f"<code>{escape(signal)}</code>" for signal in term["inputs"]),
-                    escape(", ".join(map(short, term["joints"]))),
-                    number(term["heldout_gain"]),
+                    escape(", ".join(map(short_joint_name, term["joints"]))),
+                    number_text(term["heldout_gain"]),
                 )
                 for term in learned.get("terms", ())
             ],
@@ -350,10 +413,10 @@ def _unexplained(report: Mapping[str, Any]) -> str:
     return text
 
 
-def _next(report: Mapping[str, Any]) -> str:
-    """What could not be told apart, in the effects' own words, and the motions that would do it."""
+def _next_recordings(report: Mapping[str, Any]) -> str:
+    """Indistinguishable effects, and the motions that would distinguish them."""
     text = "".join(
-        f"<p>{escape(effect['name'])} and {escape(', '.join(effect['indistinguishable']))} come apart with "
+        f"<p>To distinguish {escape(effect['name'])} from {escape(', '.join(effect['indistinguishable']))}, record "
         f"{escape(effect['separated_by'])}.</p>"
         for effect in report["effects"]
         if effect.get("separated_by")
@@ -363,14 +426,16 @@ def _next(report: Mapping[str, Any]) -> str:
         for one in propose(report)
     ]
     if not rows:
-        return "<p>Nothing is left open that another motion would settle.</p>"
-    return text + table(("not told apart", "a motion that would", "to record it"), rows)
+        return "<p>No question is open that another motion would answer.</p>"
+    return text + html_table(
+        ("indistinguishable", "motion that distinguishes them", "command to record it"), rows
+    )
 
 
 def _findings(report: Mapping[str, Any]) -> str:
-    """What the logs said before anything was fitted."""
+    """Table of the log checks' findings."""
     rows = [
         (escape(Path(finding["log"]).name), escape(finding["kind"]), escape(finding["text"]))
         for finding in report.get("findings", ())
     ]
-    return table(("log", "", ""), rows) if rows else ""
+    return html_table(("log", "", ""), rows) if rows else ""

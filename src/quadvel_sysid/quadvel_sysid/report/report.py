@@ -1,6 +1,7 @@
-"""Writes what an identification found: report.html for people, report.json for programs, actuator.yaml for the stack.
+"""Write report.html, report.json and actuator.yaml.
 
-All three or none: they are complete beside their places before the first of them takes its own.
+The three files are written to a temporary folder and then moved, so that a failure leaves no
+partial report.
 """
 
 from __future__ import annotations
@@ -10,15 +11,22 @@ import tempfile
 from pathlib import Path
 
 from ..identification import Identification
-from .page import page
+from .page import report_page
 
-FILES = ("report.html", "report.json", "actuator.yaml")
+REPORT_FILES = ("report.html", "report.json", "actuator.yaml")
+"""Names of the files of a report."""
 
 
-def write(identification: Identification, out: Path) -> None:
-    """Write FILES to the folder `out`, which is made if need be; other files in it stay.
+def write_report(identification: Identification, out: Path) -> None:
+    """Write the files of a report.
 
-    Raises ValueError where a number of the report is not finite, OSError where the folder cannot be written.
+    Args:
+        identification: The result to write.
+        out: Folder; created if it does not exist. Other files in it are kept.
+
+    Raises:
+        ValueError: If a number of the report is not finite.
+        OSError: If the folder cannot be written.
     """
     out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=out, prefix=".report-") as folder:
@@ -26,6 +34,6 @@ def write(identification: Identification, out: Path) -> None:
         content = json.dumps(identification.report, indent=1, allow_nan=False)
         (drafts / "report.json").write_text(content + "\n")
         identification.parameters.save(drafts / "actuator.yaml")
-        (drafts / "report.html").write_text(page(identification), encoding="utf-8")
-        for name in FILES:
+        (drafts / "report.html").write_text(report_page(identification), encoding="utf-8")
+        for name in REPORT_FILES:
             (drafts / name).replace(out / name)

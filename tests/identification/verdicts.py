@@ -1,4 +1,4 @@
-"""Judges one report.json against the truth of its case, by the table of the specification."""
+"""Compares one report.json with the ground truth of its log."""
 
 from __future__ import annotations
 
@@ -9,14 +9,15 @@ import numpy as np
 Report = dict[str, Any]
 Truth = dict[str, Any]
 
-INDISTINGUISHABLE_MOST = 3
-REMOVED_LEAST = 0.6
-WITHIN = {"table 4": 1.05}
-WITHIN_OTHERS = 1.15
-SHARE_OFF, SHARE_LEAST = 0.25, 0.005
-"""A share of samples may be off by so much of itself and so much more."""
-SHOWS = 1.08
-"""of the floor: a joint with less error than this hides nothing that could be found"""
+MAX_INDISTINGUISHABLE = 3
+"""Maximum number of indistinguishable laws for which naming the truth among them counts."""
+MIN_REMOVED_FRACTION = 0.6
+ERROR_RATIO_LIMITS = {"table 4": 1.05}
+DEFAULT_ERROR_RATIO_LIMIT = 1.15
+SAMPLES_HIT_RELATIVE_TOLERANCE, SAMPLES_HIT_TOLERANCE = 0.25, 0.005
+"""Relative and absolute tolerance of the fraction of samples that an effect affects."""
+VISIBLE_ERROR_RATIO = 1.08
+"""Ratio of a joint's error to the noise floor below which nothing is left to be found."""
 
 # A true parameter by the names under which reports may give it, and the units in which they may do so.
 ALIASES = {
@@ -35,8 +36,16 @@ ALIASES = {
 UNITS = {"ms": 1e-3, "mrad": 1e-3, "kN m/s": 1e3, "%": 1e-2}
 
 
-def judge(report: Report, truth: Truth) -> dict[str, Any]:
-    """One row of the score: verdict, what was named, errors in N^2 m^2, intervals."""
+def score_report(report: Report, truth: Truth) -> dict[str, Any]:
+    """Score one report.
+
+    Args:
+        report: Content of report.json.
+        truth: Ground truth from the generator.
+
+    Returns:
+        One row of the score: verdict, named effects, errors (N^2 m^2), intervals.
+    """
     effects = report["effects"]
     true_names = [effect["name"] for effect in truth["effects"]]
     before, after = report["before"]["heldout_mse"], report["after"]["heldout_mse"]
@@ -49,7 +58,7 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
         "effects": true_names,
         "named": [effect["name"] for effect in effects],
         "verdict": _VERDICTS[truth["group"]](report, truth),
-        "extra": [e["name"] for e in effects if not any(_answers(e, true) for true in truth["effects"])],
+        "extra": [e["name"] for e in effects if not any(_names_effect(e, true) for true in truth["effects"])],
         "right_joints": _right_joints(report, truth),
         "before": before,
         "after": after,
@@ -62,35 +71,41 @@ def judge(report: Report, truth: Truth) -> dict[str, Any]:
         "all_signals": _all_signals(report, truth),
         "intervals": _intervals(effects, truth),
     }
-    if truth["group"] == "outside" and row["verdict"] == "right" and row["removed"] < REMOVED_LEAST:
+    if truth["group"] == "outside" and row["verdict"] == "right" and row["removed"] < MIN_REMOVED_FRACTION:
         row["verdict"] = "right, too little removed"
     return row
 
 
 def _within(report: Report, truth: Truth) -> bool:
-    """The error that is asked for; of an effect whose occurrences are random, the share of samples that it hit."""
+    """Whether the error, or the fraction of samples of a random effect, meets the target."""
     if truth["group"] == "alone" and "share_of_samples" in truth["effects"][0]["params"]:
         share = truth["effects"][0]["params"]["share_of_samples"]
-        said = [entry["samples_hit"] for entry in report["effects"] if "samples_hit" in entry]
-        return any(abs(one - share) <= SHARE_OFF * share + SHARE_LEAST for one in said)
-    return report["after"]["heldout_mse"] <= WITHIN.get(truth["group"], WITHIN_OTHERS) * truth["floor"]
+        reported = [entry["samples_hit"] for entry in report["effects"] if "samples_hit" in entry]
+        return any(
+            abs(one - share) <= SAMPLES_HIT_RELATIVE_TOLERANCE * share + SAMPLES_HIT_TOLERANCE
+            for one in reported
+        )
+    return (
+        report["after"]["heldout_mse"]
+        <= ERROR_RATIO_LIMITS.get(truth["group"], DEFAULT_ERROR_RATIO_LIMIT) * truth["floor"]
+    )
 
 
-def _answers(entry: dict[str, Any], true: dict[str, Any]) -> bool:
-    """An entry of the report names this effect, itself or as one of few that it cannot tell apart."""
+def _names_effect(entry: dict[str, Any], true: dict[str, Any]) -> bool:
+    """Whether an entry names this effect, itself or among a few indistinguishable ones."""
     others = entry["indistinguishable"]
-    names = {entry["name"], *(others if len(others) <= INDISTINGUISHABLE_MOST else ())}
+    names = {entry["name"], *(others if len(others) <= MAX_INDISTINGUISHABLE else ())}
     return not names.isdisjoint(true.get("accepted", [true["name"]]))
 
 
 def _alone(report: Report, truth: Truth) -> str:
     if not report["effects"]:
         return "missed"
-    return "right" if _answers(report["effects"][0], truth["effects"][0]) else "wrong"
+    return "right" if _names_effect(report["effects"][0], truth["effects"][0]) else "wrong"
 
 
 def _together(report: Report, truth: Truth) -> str:
-    found = [any(_answers(entry, true) for entry in report["effects"]) for true in truth["effects"]]
+    found = [any(_names_effect(entry, true) for entry in report["effects"]) for true in truth["effects"]]
     return "right" if all(found) else "some" if any(found) else "wrong" if report["effects"] else "missed"
 
 
@@ -126,24 +141,24 @@ _VERDICTS = {"alone": _alone, "together": _together, "none": _none, "outside": _
 
 
 def _all_signals(report: Report, truth: Truth) -> bool:
-    """The report names a signal for each that takes part in an effect outside the registry."""
+    """Whether the report names a signal of each part of an effect outside the registry."""
     named = set(report["unexplained"]["depends_on"])
     return all(named & set(names) for true in truth["effects"] for names in true["signals"].get("all", []))
 
 
 def _right_joints(report: Report, truth: Truth) -> bool:
-    """Every true effect is reported on joints of its own alone, and on all of those where without it something is left."""
+    """Whether every true effect is reported on its own joints, and on all where it is visible."""
     after = dict(zip(report.get("joints", ()), report["after"].get("per_joint", ()), strict=True))
     for true in truth["effects"]:
-        on = {joint for entry in report["effects"] if _answers(entry, true) for joint in entry["joints"]}
-        idle = {joint for joint, error in after.items() if error <= SHOWS * truth["floor"]}
+        on = {joint for entry in report["effects"] if _names_effect(entry, true) for joint in entry["joints"]}
+        idle = {joint for joint, error in after.items() if error <= VISIBLE_ERROR_RATIO * truth["floor"]}
         if not (on and on <= set(true["joints"]) <= on | idle):
             return False
     return True
 
 
 def _intervals(effects: list[dict[str, Any]], truth: Truth) -> list[dict[str, Any]]:
-    """The 95 % intervals of rightly named effects' parameters, of all joints or of each, beside the truth."""
+    """The 95 % intervals of correctly named effects' parameters, next to the true values."""
     found = []
     for true in truth["effects"]:
         for entry in effects:
