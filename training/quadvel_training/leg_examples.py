@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from quadvel_eval.people.laser import FloorPlan, Laser
 from quadvel_follow.clusters import NUMBERS, WIDEST, Scan, describe, find_clusters
 from quadvel_follow.looking import to_frame
-from quadvel_sim.walker import Walker, circles
+from quadvel_sim.walker import Walker, leg_circles
 
 Array = NDArray[np.float64]
 
@@ -133,7 +133,7 @@ def _scene(rng: np.random.Generator) -> Iterator[Examples]:
     for _ in range(10):
         for walker in people:
             walker.step(rng.uniform(0.05, 0.4))
-        legs = circles(people)
+        legs = leg_circles(people)
         pose = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(-np.pi, np.pi)])
         scan = Scan.checked(
             laser.scan(place.with_circles(legs), pose, rng), laser.angle_min, laser.angle_increment

@@ -10,7 +10,7 @@ from typing import Any
 import attrs
 import yaml
 
-from quadvel_description.bounded_yaml import BoundedLoader, bounded_text, load_yaml
+from quadvel_description.bounded_yaml import BoundedLoader, load_yaml, read_bounded_text
 
 SCOPE_KEY = "ros__parameters"
 FLAGS = {
@@ -152,7 +152,7 @@ def read_parameter_file(path: Path) -> list[ParameterOverride]:
     """Overrides of a YAML file. Raises InvalidROSArgsError that names the file and the key at fault."""
     where = f"parameter file '{path}'"
     try:
-        document = _load(where, bounded_text(path))
+        document = _load(where, read_bounded_text(path))
     except (OSError, UnicodeDecodeError) as error:
         fault = f"cannot be read: {error.strerror}" if isinstance(error, OSError) else "is not text"
         raise InvalidROSArgsError(f"{where} {fault}") from error

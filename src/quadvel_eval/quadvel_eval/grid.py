@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_sim.physics import SECOND
+from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from .pool import Call, in_parallel
 from .robot_loop import PERIOD, RobotLoop
@@ -30,7 +30,7 @@ GRIDS: dict[str, tuple[Array, Array, Array]] = {  # vx, vy (m/s), wz (rad/s): ev
 STANCE_WALK = [((0.5, 0.0, 0.0), 2.0), ((0.0, 0.0, 0.0), 2.0)]  # how the robot comes to stand
 STANCE_SECONDS = 10.0
 LEAST_SPEED, LEAST_TURN = 0.2, 0.3  # m/s, rad/s: of slower ones no delay can be told
-PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": SECOND}}
+PLANTS: dict[str, Mapping[str, Any]] = {"usual": {}, "second": {"physics": HELD_OUT_PHYSICS}}
 """Fields of `SimulatorConfig` of the plants that a policy is judged on: the usual one, and one that solves contacts otherwise."""
 
 

@@ -238,7 +238,7 @@ def open_loop(
 def _stretch(simulator: Simulator, joints: Joints, truth: Callable[[float], Truth], row: int) -> Array:
     """Mean squares over the joints of the errors of q, dq and torque, (n, 3), a row each ms from `row` on."""
     past = [(joints.q[i], joints.dq[i], _command(joints, i)) for i in range(row - PAST, row)]
-    simulator.place(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
+    simulator.set_state(truth(joints.time[row]), joints.q[row], joints.dq[row], past)
     squares = np.empty((round(STRETCH / DT), 3))
     for i, square in enumerate(squares, start=row):
         simulator.command(_command(joints, i))

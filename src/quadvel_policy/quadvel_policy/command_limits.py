@@ -12,7 +12,7 @@ import attrs
 import numpy as np
 from numpy.typing import NDArray
 
-from quadvel_description.command_range import held, within_range
+from quadvel_description.command_range import clip_to_command_range, split_target
 from quadvel_description.robot import TORQUE_LIMIT, VELOCITY_LIMIT
 from quadvel_description.state import MODE_DAMPING, JointCommand, RobotState
 
@@ -57,8 +57,8 @@ class CommandLimits:
         """Change `command`, which is to answer `state` after `previous`, where it is beyond a limit."""
         if command.mode == MODE_DAMPING:
             return
-        beyond = (command.q != held(command.q)).any()
-        command.q, torque = within_range(command.q, command.kp, state.q)
+        beyond = (command.q != clip_to_command_range(command.q)).any()
+        command.q, torque = split_target(command.q, command.kp, state.q)
         command.tau = command.tau + torque
         self._count("target_out_of_range", beyond)
         asked = command.torque(state.q, state.dq)
@@ -103,6 +103,6 @@ class CommandLimits:
 def _ask_for(command: JointCommand, change: Array) -> None:
     """Change the torque by `change` (12,) N m: by the target as far as there is stiffness and range, else by feed-forward."""
     way = np.divide(change, command.kp, out=np.zeros(12), where=command.kp > 0.0)
-    q = np.where(way == 0.0, command.q, held(command.q + way))
+    q = np.where(way == 0.0, command.q, clip_to_command_range(command.q + way))
     command.tau = command.tau + change - command.kp * (q - command.q)
     command.q = q

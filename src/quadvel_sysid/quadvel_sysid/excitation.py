@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from quadvel_description import robot
-from quadvel_description.command_range import held
+from quadvel_description.command_range import clip_to_command_range
 from quadvel_description.kinematics import HIPS, foot_jacobians, inverse_kinematics
 
 Array = NDArray[np.float64]
@@ -47,7 +47,7 @@ class Excitation(ABC):
 
     def targets(self) -> Array:
         """Joint targets within the limits, (n, 12) rad, one row each PERIOD."""
-        return within_speed(held(self._motion(self._times())))
+        return within_speed(clip_to_command_range(self._motion(self._times())))
 
     def support(self) -> Array:
         """Joint torque (n, 12) N m that carries the robot on its feet, a row each PERIOD; zero for motions in the air."""
@@ -246,8 +246,8 @@ def within_torque(target: Array, q: Array, dq: Array, kp: float, kd: float, tau:
     tau: feed-forward torque (12,) N m that goes with it.
     """
     bound = TORQUE_SHARE * robot.TORQUE_LIMIT
-    held = kd * dq - np.asarray(tau)
-    return np.clip(target, q + (held - bound) / kp, q + (held + bound) / kp)
+    clip_to_command_range = kd * dq - np.asarray(tau)
+    return np.clip(target, q + (clip_to_command_range - bound) / kp, q + (clip_to_command_range + bound) / kp)
 
 
 @attrs.frozen

@@ -15,7 +15,7 @@ from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput
 from quadvel_sim.laser import Scan
-from quadvel_sim.walker import circles
+from quadvel_sim.walker import leg_circles
 
 from ..people.laser import FloorPlan, Laser
 from .follower import Follower
@@ -123,7 +123,7 @@ class Stage:
 
     def _look(self, now: float) -> None:
         """Scan and track."""
-        plan = self._scene.plan.with_circles(circles(self._scene.persons))
+        plan = self._scene.plan.with_circles(leg_circles(self._scene.persons))
         ranges = self._hit_ground(LASER.scan(plan, self.robot.sensor, self._rng))
         if self.mute == "scan":
             return
@@ -154,7 +154,7 @@ class Stage:
                 self._ahead[i] = way / np.hypot(*way)
 
     def _instant(self, now: float, command: Array, state: State, words: str, took: float) -> Instant:
-        pose, persons = self.robot.pose, circles(self._scene.persons)
+        pose, persons = self.robot.pose, leg_circles(self._scene.persons)
         standing = outline_distance(self._standing[:, :2], pose, self._half) - self._standing[:, 2]
         legs = outline_distance(persons[:, :2], pose, self._half) - persons[:, 2]
         return Instant(

@@ -102,7 +102,7 @@ class Tour:
             distance=self.setup.distance,
             walked=self.walked,
             fell=self.fell,
-            touched=self.simulator.touched,
+            touched=self.simulator.touch_counts,
             planning=self.planning,
         )
 

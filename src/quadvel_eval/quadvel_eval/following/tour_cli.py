@@ -45,4 +45,4 @@ def run_tour(setup: TourSetup, out: Path, console: Console) -> bool:
         console.print(f"written to {out}: tour.json, tour.png; no video is drawn of a tour")
     if is_stopped:
         raise KeyboardInterrupt
-    return bool(moments) and not (tour.fell or tour.simulator.touched)
+    return bool(moments) and not (tour.fell or tour.simulator.touch_counts)

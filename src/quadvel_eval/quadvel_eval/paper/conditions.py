@@ -9,7 +9,7 @@ import attrs
 import numpy as np
 from matplotlib.axes import Axes
 
-from quadvel_sim.physics import SECOND
+from quadvel_sim.physics import HELD_OUT_PHYSICS
 
 from ..grid import DURATION, PLANTS, Cell, CellResult, judge, mass
 from ..walk import Setup, make_loop, record
@@ -18,7 +18,11 @@ from .section import Job, Record, Study, distinct, mean, select
 
 COMMANDS: tuple[Command, ...] = ((1.0, 0.0, 0.0), (0.0, 0.5, 0.0), (0.6, 0.0, 0.6))
 """ahead, sideways, along an arc; m/s, rad/s"""
-LOOSE: Mapping[str, Any] = {"physics": SECOND, "joint_friction": np.zeros(12), "joint_damping": np.zeros(12)}
+LOOSE: Mapping[str, Any] = {
+    "physics": HELD_OUT_PHYSICS,
+    "joint_friction": np.zeros(12),
+    "joint_damping": np.zeros(12),
+}
 """Fields of `SimulatorConfig`: the second plant with joints that have neither friction nor damping."""
 HARD_PLANTS: Mapping[str, Mapping[str, Any]] = {**PLANTS, "loose joints": LOOSE}
 PLANT_NAMES = {"second": "second plant", "loose joints": "second plant, loose joints"}

@@ -66,4 +66,4 @@ class Laser(Scanner):
 
     def scan(self, plan: FloorPlan, pose: Array, rng: np.random.Generator) -> Array:
         """Ranges (rays,) in m, from a pose x, y, yaw."""
-        return self.read(plan.cast(pose[:2], self.angles + pose[2]), rng)
+        return self.measure(plan.cast(pose[:2], self.angles + pose[2]), rng)
