@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from quadvel_follow.follow_planner import PERIOD, State
+from quadvel_follow.follow_planner import PERIOD_S, State
 from quadvel_follow.leg_detector import LegDetector
 
 from .scenes import SCENES, FollowScene
@@ -27,14 +27,14 @@ def figures(instants: Sequence[Instant], distance: float) -> dict[str, float]:
     clearance, gap = min(one.clearance for one in instants), min(one.gap for one in instants)
     walks = np.flatnonzero((np.diff(person, axis=0) != 0.0).any(1))
     away = np.flatnonzero(~inside | (np.hypot(*velocity.T) > 0.1))
-    jerk = np.diff(velocity, n=2, axis=0) / PERIOD**2
+    jerk = np.diff(velocity, n=2, axis=0) / PERIOD_S**2
     took = [one.milliseconds for one in instants]
     return {
         "success": float(
             clearance > 0.0 and gap > 0.0 and inside[-1] and instants[-1].state is State.FOLLOWING
         ),
         "share": float(inside[time >= SETTLED].mean()),
-        "late": max(0.0, PERIOD * float(away[-1] - walks[-1])),
+        "late": max(0.0, PERIOD_S * float(away[-1] - walks[-1])),
         "jerk": float(np.sqrt((jerk**2).sum(1).mean())),
         "clearance": clearance,
         "gap": gap,

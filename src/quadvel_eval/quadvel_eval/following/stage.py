@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from quadvel_follow.clearance import outline_distance
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, State
 from quadvel_follow.leg_detector import LegDetector
 from quadvel_policy.command_mux import CommandMux, MuxConfig, MuxInput
 from quadvel_sim.laser import Scan
@@ -103,7 +103,7 @@ class Stage:
 
     def run(self) -> Any:
         """Instants, PERIOD apart."""
-        often = round(PERIOD / STEP)
+        often = round(PERIOD_S / STEP)
         command = np.zeros(3)
         for tick in range(round(self._scene.seconds / STEP)):
             now = tick * STEP
@@ -117,7 +117,7 @@ class Stage:
                 took = process_time() - begin
                 if self.mute != "planner":
                     self._mux.receive(FOLLOW.name, now, plan.velocity)
-                yield self._instant(now, command, plan.state, plan.words, 1e3 * took)
+                yield self._instant(now, command, plan.state, plan.reason, 1e3 * took)
             self.robot.step(command)
             self._walk()
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from quadvel_description.kinematics import rotate, yaw
 from quadvel_estimator.kalman import KalmanEstimator
 from quadvel_estimator.learned import SHIPPED_MODEL
-from quadvel_follow.follow_planner import PERIOD, FollowConfig, Plan, State
+from quadvel_follow.follow_planner import PERIOD_S, FollowConfig, Plan, State
 from quadvel_follow.pose_history import PoseHistory
 from quadvel_policy.policy_file import SHIPPED_POLICY, PolicyFile
 from quadvel_policy.supervisor import Supervisor
@@ -111,7 +111,7 @@ class Tour:
         loop, follower, place = self._loop, self._follower, np.zeros(3)
         loop.start_walking()
         asked, velocity, command = np.zeros(3), np.zeros(3), np.zeros(3)
-        share, often, tick = TICK / STRIDE, round(PERIOD / TICK), 0
+        share, often, tick = TICK / STRIDE, round(PERIOD_S / TICK), 0
         last = self.simulator.truth().position[:2].copy()
         plan: Plan | None = None
         while self.walked < self.setup.metres:
@@ -159,7 +159,7 @@ class Tour:
             asked,
             velocity,
             plan.state,
-            plan.words,
+            plan.reason,
             self._clearances.of(pose),
             self._clearances.of_persons(pose, persons),
         )
@@ -201,8 +201,8 @@ def summary(outcome: Outcome, moments: Sequence[Moment]) -> dict[str, Any]:
         "least_clearance": min(one.clearance for one in moments),
         "least_gap": min(one.gap for one in moments),
         "losses": len(begins),
-        "lost_seconds": PERIOD * sum(lost),
-        "seconds": {name: PERIOD * count for name, count in states.items()},
+        "lost_seconds": PERIOD_S * sum(lost),
+        "seconds": {name: PERIOD_S * count for name, count in states.items()},
     }
     if outcome.planning:
         found["planner_ms"] = {

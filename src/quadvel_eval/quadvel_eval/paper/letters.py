@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from quadvel_follow.trajectory import SHIPPED, Trajectory, read_table
+from quadvel_follow.trajectory import SHIPPED_FOLDER, Trajectory, read_table
 
 from ..robot_loop import PERIOD
 from ..walk import Setup, Walk, make_loop, record_to_the_fall
@@ -39,7 +39,7 @@ Stroke = tuple[Command, float]  # velocity in the body frame and its seconds
 
 def _strokes() -> tuple[Stroke, ...]:
     """Z without turning, J from its hook, U sideways over to its top."""
-    _, rows = read_table(SHIPPED / "zju.csv")
+    _, rows = read_table(SHIPPED_FOLDER / "zju.csv")
     return tuple(((vx, vy, wz), seconds) for seconds, vx, vy, wz in rows.tolist())
 
 
@@ -49,7 +49,7 @@ LETTERS = _strokes()
 def reference(strokes: Sequence[Stroke]) -> Array:
     """Where the commands lead (n, 3): x, y (m) and heading (rad), a row a tick, from the origin facing +x."""
     commands, seconds = zip(*strokes, strict=True)
-    return Trajectory.of_commands(seconds, commands, PERIOD).pose
+    return Trajectory.from_commands(seconds, commands, PERIOD).pose
 
 
 def walked(walk: Walk) -> Array:
